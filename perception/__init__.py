@@ -1,0 +1,1 @@
+"""Camera images to tactile frames: detect dots, fit the grid, measure displacement."""

@@ -1,0 +1,1 @@
+"""Codecs, transports, drivers and the insertion runner for real hardware."""

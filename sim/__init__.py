@@ -1,0 +1,1 @@
+"""The differentiable tactile simulator: scenes, C++ core, torch layer, tasks."""

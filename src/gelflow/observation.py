@@ -1,0 +1,191 @@
+"""The one observation format: the tactile frame, and the normalized flow map made from frames.
+
+Whatever made a frame (the simulator's markers, tracked markers of a camera image, a recorded session), what a
+policy sees comes through `normalize` below and nothing else. Axes on every pad: z the outward normal, x from the
+finger's base to its tip (= +rows), y = z × x (= +cols). A shear vector is the force of the object on the pad, and a
+marker's displacement has its sign. Sensor 0 is the left finger, the one at the gripper's −x.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gelflow.errors import UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+Unit = Literal["N", "mm", "px"]
+
+# The largest vector is never divided by less than this: a frame without contact stays near zero instead of
+# becoming a picture of its noise. About three times the noise of each kind of source.
+DEFAULT_FLOORS: Mapping[str, float] = MappingProxyType({"N": 3e-3, "mm": 0.02, "px": 0.3})
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid of markers on a pad: rows along x (base to tip), columns along y, centred on `center`."""
+
+    rows: int
+    cols: int
+    pitch: float  # distance between neighbours [mm]
+    center: tuple[float, float] = (0.0, 0.0)  # (x, y) of the grid's centre on the pad [mm]
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.cols < 1 or not self.pitch > 0:
+            raise UsageError(f"a grid needs rows, cols ≥ 1 and pitch > 0, got {self}")
+
+    def positions(self) -> NDArray[np.float64]:
+        """Positions on the pad (x, y) [mm], shape (rows * cols, 2), row by row."""
+        x = (np.arange(self.rows) - (self.rows - 1) / 2) * self.pitch + self.center[0]
+        y = (np.arange(self.cols) - (self.cols - 1) / 2) * self.pitch + self.center[1]
+        return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class TactileFrame:
+    """What all tactile sensors felt at one moment."""
+
+    shear: NDArray[np.float32]  # in `unit`, shape (sensors, markers, 2): x, y on the pad
+    valid: NDArray[np.bool_]  # shape (sensors, markers); a marker that was not seen is False
+    positions: NDArray[np.float32]  # of the markers on the pad at rest [mm], shape (markers, 2)
+    stamp: float  # [s]
+    unit: Unit
+    normal: NDArray[np.float32] | None = None  # in `unit`, shape (sensors, markers), ≥ 0 in compression
+    grid: Grid | None = None
+
+    def __post_init__(self) -> None:
+        sensors_markers = self.shear.shape[:2]
+        if self.shear.ndim != 3 or self.shear.shape[2] != 2:
+            raise UsageError(f"shear must have shape (sensors, markers, 2), got {self.shear.shape}")
+        if self.valid.shape != sensors_markers:
+            raise UsageError(f"valid must have shape {sensors_markers}, got {self.valid.shape}")
+        if self.positions.shape != (sensors_markers[1], 2):
+            raise UsageError(f"positions must have shape ({sensors_markers[1]}, 2), got {self.positions.shape}")
+        if self.unit not in DEFAULT_FLOORS:
+            raise UsageError(f"unit must be one of {', '.join(DEFAULT_FLOORS)}, got {self.unit!r}")
+
+
+@dataclass(frozen=True)
+class FlowMap:
+    """The normalized flow map of one attempt: what a policy sees."""
+
+    image: NDArray[np.float32]  # shape (frames * sensors * 2, rows, cols); largest vector has length ≤ 1
+    divisor: float  # what the shear was divided by, in `unit`: kept, so that force stays comparable
+    unit: Unit
+    filled: NDArray[np.bool_]  # (frames * sensors, rows, cols): True where a neighbour's value stands in
+
+
+def normalize(shear: Any, reference: Any, *, floor: float) -> tuple[Any, Any]:
+    """The flow map itself: the single implementation, for NumPy arrays and torch tensors alike.
+
+    Parameters
+    ----------
+    shear: any leading batch, then (frames, sensors, rows, cols, 2)
+    reference: the frame at rest, same leading batch, (sensors, rows, cols, 2)
+    floor: smallest divisor, in the unit of shear
+
+    Returns
+    -------
+    image (…, frames * sensors * 2, rows, cols) and divisor (…), by which the difference was divided: the larger of
+    `floor` and the longest vector over all frames, sensors and markers together. Differentiable in torch.
+    """
+    flow = shear - reference[..., None, :, :, :, :]
+    frames, sensors, rows, cols = flow.shape[-5:-1]
+    lead = tuple(flow.shape[:-5])
+    squared = (flow * flow).sum(-1).reshape(*lead, frames * sensors * rows * cols)
+    # The square root is taken of something that is never zero: its gradient stays finite at rest.
+    largest = squared.max(-1)
+    largest = largest if isinstance(largest, np.ndarray | np.generic) else largest.values
+    divisor = largest.clip(floor * floor, None) ** 0.5
+    image = flow / divisor[..., None, None, None, None, None]
+    # (…, frames, sensors, rows, cols, 2) → (…, frames, sensors, 2, rows, cols)
+    order = (*range(len(lead)), *(len(lead) + axis for axis in (0, 1, 4, 2, 3)))
+    image = image.transpose(order) if isinstance(image, np.ndarray) else image.permute(order)
+    return image.reshape(*lead, frames * sensors * 2, rows, cols), divisor
+
+
+def resampling(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
+    """Weights that carry marker values to `grid`: linear between markers, nearest outside their hull.
+
+    `positions` [mm], shape (markers, 2). Returns shape (rows * cols, markers); every row sums to 1. Where a grid
+    point lies on a marker its row selects that marker exactly, so equal grids pass through unchanged.
+    """
+    points = np.asarray(positions, dtype=float)
+    targets = grid.positions()
+    weights = np.zeros((len(targets), len(points)))
+    distance = np.linalg.norm(targets[:, None] - points[None], axis=-1)
+    nearest = distance.argmin(axis=1)
+    exact = distance.min(axis=1) < 1e-6 * grid.pitch
+    inside = np.full(len(targets), -1)
+    if not exact.all() and len(points) >= 3:
+        from scipy.spatial import Delaunay  # here: only grids that differ need it
+
+        mesh = Delaunay(points)
+        inside = mesh.find_simplex(targets)
+    for i, (target, simplex) in enumerate(zip(targets, inside, strict=True)):
+        if exact[i] or simplex < 0:
+            weights[i, nearest[i]] = 1.0
+        else:
+            transform = mesh.transform[simplex]
+            two = transform[:2] @ (target - transform[2])
+            weights[i, mesh.simplices[simplex]] = [*two, 1 - two.sum()]
+    return weights
+
+
+def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
+    """Shear of a frame, each invalid marker replaced by the inverse-distance mean of its 6 nearest valid ones.
+
+    Returns shape (sensors, markers, 2). Raises UsageError when a sensor has fewer than 6 valid markers.
+    """
+    shear = frame.shear.astype(float)
+    for sensor, valid in enumerate(frame.valid):
+        if valid.all():
+            continue
+        if valid.sum() < 6:
+            raise UsageError(f"sensor {sensor} shows {valid.sum()} valid markers of {valid.size}; at least 6 are needed")
+        lost = np.flatnonzero(~valid)
+        distance = np.linalg.norm(frame.positions[lost, None] - frame.positions[None, valid], axis=-1)
+        near = np.argsort(distance, axis=1)[:, :6]
+        weight = 1 / np.take_along_axis(distance, near, axis=1)
+        values = shear[sensor, valid][near]
+        shear[sensor, lost] = (weight[..., None] * values).sum(1) / weight.sum(1)[:, None]
+    return shear
+
+
+def flow_map(
+    frames: Sequence[TactileFrame],
+    reference: TactileFrame,
+    *,
+    grid: Grid,
+    floors: Mapping[str, float] = DEFAULT_FLOORS,
+) -> FlowMap:
+    """The normalized flow map of `frames` against `reference`, on `grid`.
+
+    Raises UsageError when frames differ in unit, sensors or markers, or a sensor lost nearly all its markers.
+    """
+    if not frames:
+        raise UsageError("a flow map needs at least one frame")
+    for frame in frames:
+        if frame.unit != reference.unit:
+            raise UsageError(f"frames are in {frame.unit!r} but the reference is in {reference.unit!r}")
+        if frame.shear.shape != reference.shear.shape:
+            raise UsageError(f"a frame has shape {frame.shear.shape}, the reference {reference.shear.shape}")
+        if not np.allclose(frame.positions, reference.positions, atol=1e-3):
+            raise UsageError("frames and reference have their markers in different places")
+    weights = resampling(reference.positions, grid)
+    sensors = reference.shear.shape[0]
+
+    def on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.einsum("gm,smc->sgc", weights, values).reshape(sensors, grid.rows, grid.cols, 2)
+
+    stack = np.stack([on_grid(fill_invalid(frame)) for frame in frames])
+    image, divisor = normalize(stack, on_grid(fill_invalid(reference)), floor=floors[reference.unit])
+    touched = weights > 0
+    lost = np.stack([(~(frame.valid & reference.valid))[:, None] & touched for frame in frames]).any(-1)
+    filled = lost.reshape(len(frames) * sensors, grid.rows, grid.cols)
+    return FlowMap(image.astype(np.float32), float(divisor), reference.unit, filled)

@@ -1,0 +1,1 @@
+"""Recorded sessions: write, read, recover and replay MCAP files."""
