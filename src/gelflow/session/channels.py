@@ -1,0 +1,103 @@
+"""The channels of a session file: topic, schema and encoding of each. The writer and the tests read this one table.
+
+Images, poses and joints use Foxglove's published protobuf schemas, so that Foxglove and Rerun show them; what has no
+standard schema is JSON with a JSON schema beside it.
+"""
+
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from gelflow.session.records import SENSORS
+
+NUMBER = {"type": ["number", "string"]}  # a string only for "NaN", "Infinity" and "-Infinity"
+INTEGER = {"type": "integer"}
+TEXT = {"type": "string"}
+FLAG = {"type": "boolean"}
+NUMBERS = {"type": "array", "items": NUMBER}
+INTEGERS = {"type": "array", "items": INTEGER}
+TABLE = {"type": "object"}
+
+BASE_FRAME = "base"
+TOOL_FRAME = "tool"
+
+
+@dataclass(frozen=True)
+class JsonChannel:
+    """A channel of JSON objects with these properties; those of `required` are always there."""
+
+    name: str
+    properties: dict[str, Any] = field(default_factory=dict)
+    required: tuple[str, ...] = ()
+
+    def schema(self) -> bytes:
+        document = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": self.name,
+            "type": "object",
+            "properties": self.properties,
+            "required": list(self.required),
+        }
+        return json.dumps(document).encode()
+
+
+PROTOBUF: dict[str, Any] = {
+    **{f"/{sensor}/image": CompressedImage for sensor in SENSORS},
+    "/arm/pose": PoseInFrame,
+    "/arm/joints": JointStates,
+    "/arm/command": PoseInFrame,
+    "/arm/applied": PoseInFrame,
+    "/tf": FrameTransform,
+    "/flow_map": RawImage,
+}
+
+JSON: dict[str, JsonChannel] = {
+    "/session": JsonChannel("gelflow.Session", {"format": INTEGER, "task": TABLE, "versions": TABLE}, ("format",)),
+    "/arm/status": JsonChannel(
+        "gelflow.ArmStatus",
+        {"stamp": NUMBER, "motors_on": FLAG, "running": FLAG, "operating_mode": TEXT, "fault": TEXT},
+        ("stamp", "motors_on", "running", "operating_mode", "fault"),
+    ),
+    "/gripper/state": JsonChannel(
+        "gelflow.GripperState",
+        {
+            "width": NUMBER,
+            "speed": NUMBER,
+            "force": NUMBER,
+            "referenced": FLAG,
+            "grasp": TEXT,
+            "fault": TEXT,
+            "stamp": NUMBER,
+        },
+        ("width", "speed", "force", "referenced", "grasp", "fault", "stamp"),
+    ),
+    "/gripper/command": JsonChannel(
+        "gelflow.GripperCommand", {"stamp": NUMBER, "name": TEXT, "values": TABLE}, ("stamp", "name", "values")
+    ),
+    "/attempt": JsonChannel("gelflow.Attempt", {"insertion": INTEGER, "attempt": INTEGER}),
+    "/decision": JsonChannel(
+        "gelflow.Decision",
+        {
+            "insertion": INTEGER,
+            "attempt": INTEGER,
+            "tracked": {"type": "array", "items": INTEGERS},
+            "reference": INTEGERS,
+            "frames": {"type": "array", "items": INTEGERS},
+            "flow": NUMBERS,
+            "flow_shape": INTEGERS,
+            "divisor": NUMBER,
+            "unit": TEXT,
+            "action": NUMBERS,
+            "correction": NUMBERS,
+            "depths": NUMBERS,
+        },
+        ("insertion", "attempt", "tracked", "reference", "frames", "flow", "flow_shape", "divisor", "unit", "action"),
+    ),
+    "/event": JsonChannel("gelflow.Event", {"stamp": NUMBER, "name": TEXT, "values": TABLE}, ("name", "values")),
+}

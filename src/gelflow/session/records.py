@@ -1,0 +1,168 @@
+"""What a session holds: topics, the decision record, and how our values become plain JSON and back."""
+
+import dataclasses
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow import __version__
+from gelflow.errors import PeerError, UsageError
+from gelflow.observation import FlowMap
+from gelflow.task import InsertionTask
+
+FORMAT = 1
+SENSORS = ("left", "right")  # topic names of sensor 0 and 1
+VERSIONED = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
+Number = float | Literal["NaN", "Infinity", "-Infinity"]
+
+
+def plain(value: Any) -> Any:
+    """`value` as data that strict JSON can hold; numbers come back bit for bit.
+
+    NaN and the infinities become the strings "NaN", "Infinity" and "-Infinity", as in protobuf's JSON form, so that
+    a bad measurement is recorded and does not make the file unreadable. Raises UsageError on other types.
+    """
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return plain({field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else ("Infinity" if value > 0 else "-Infinity")
+    if value is None or isinstance(value, str | int | float):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    raise UsageError(f"a record holds a {type(value).__name__}; it can hold numbers, text, lists, tables and arrays")
+
+
+def to_json(value: Any) -> bytes:
+    """`plain` data as UTF-8 JSON. Raises UsageError on types that JSON cannot hold."""
+    return json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode()
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision of the policy, with everything that is needed to make it again from the recorded images.
+
+    For each sensor a fresh tracker is started on the first image of `tracked` and given the others in their order;
+    the tactile frames made on the way are picked by `reference` and `frames`.
+    """
+
+    insertion: int  # counts insertions from 0; the policy is reset when it changes
+    attempt: int  # counts attempts of this insertion from 0
+    tracked: tuple[tuple[int, ...], ...]  # per sensor: sequence numbers of all images tracked, in order
+    reference: tuple[int, ...]  # per sensor: the image of the reference frame
+    frames: tuple[tuple[int, ...], ...]  # per frame of the observation, per sensor: its image
+    flow: NDArray[np.float32]  # the flow map, shape (frames * sensors * 2, rows, cols)
+    divisor: float  # of the flow map, in `unit`
+    unit: str
+    action: NDArray[np.float64]  # what the policy said: dx [m], dy [m], dtheta [rad] in the gripper's frame
+    correction: NDArray[np.float64]  # what was sent to the arm after it: x [m], y [m], yaw [rad], base frame
+    depths: tuple[float, ...] = ()  # depth of the reference and of each frame below the attempt's start [m]
+
+    def __post_init__(self) -> None:
+        sensors = len(self.tracked)
+        for name, images in [("reference", self.reference), *(("frames", frame) for frame in self.frames)]:
+            if len(images) != sensors:
+                raise UsageError(f"decision: {name} names {len(images)} images, but {sensors} sensors were tracked")
+            for sensor, sequence in enumerate(images):
+                if sequence not in self.tracked[sensor]:
+                    raise UsageError(f"decision: image {sequence} of sensor {sensor} in {name} was never tracked")
+        if not self.frames:
+            raise UsageError("decision: at least one frame is needed beside the reference")
+
+    @classmethod
+    def of(cls, observation: FlowMap, **values: Any) -> "Decision":
+        """A decision about `observation`; the other fields by name."""
+        return cls(flow=observation.image, divisor=observation.divisor, unit=observation.unit, **values)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain data, for `SessionRecorder.decision`."""
+        return {**plain(self), "flow": plain(self.flow.reshape(-1)), "flow_shape": list(self.flow.shape)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> "Decision":
+        """The reverse of `to_json`. Raises PeerError when the record lacks something."""
+        try:
+            flow = np.array([float(v) for v in data["flow"]], dtype=np.float32).reshape(data["flow_shape"])
+            return cls(
+                insertion=int(data["insertion"]),
+                attempt=int(data["attempt"]),
+                tracked=tuple(tuple(map(int, images)) for images in data["tracked"]),
+                reference=tuple(map(int, data["reference"])),
+                frames=tuple(tuple(map(int, images)) for images in data["frames"]),
+                flow=flow,
+                divisor=float(data["divisor"]),
+                unit=str(data["unit"]),
+                action=np.array([float(v) for v in data["action"]]),
+                correction=np.array([float(v) for v in data["correction"]]),
+                depths=tuple(float(v) for v in data.get("depths", ())),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            cause = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+            raise PeerError(f"decision record {cause}; expected the fields that Decision.to_json writes") from error
+
+
+def file_digest(path: str | Path) -> str:
+    """SHA-256 of a file's bytes, in hex: names the checkpoint in a session. Raises UsageError if unreadable."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}; name an existing file") from error
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of what decides a replay's numbers, with the machine's kind."""
+    versions = {"gelflow": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for package in VERSIONED:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def describe_session(
+    *,
+    task: InsertionTask,
+    tracker: Mapping[str, Any],
+    mounts: Sequence[Mapping[str, Any]],
+    checkpoint: str | Path | None = None,
+    lab: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """The description that `SessionRecorder.metadata` takes: what a replay needs, and what a reader will ask for.
+
+    `tracker` and `mounts` are the tracker's configuration and the cameras' mounts as plain data; `checkpoint` is the
+    policy's file, stored by path and digest; `lab` the lab configuration; anything else is kept as it is.
+    """
+    policy = None
+    if checkpoint is not None:
+        policy = {"path": str(Path(checkpoint).resolve()), "digest": file_digest(checkpoint)}
+    described = {
+        "format": FORMAT,
+        "task": task.to_json(),
+        "task_digest": task.digest(),
+        "checkpoint": policy,
+        "tracker": tracker,
+        "mounts": mounts,
+        "lab": lab or {},
+        "versions": software_versions(),
+        **more,
+    }
+    return dict(plain(described))
