@@ -96,6 +96,7 @@ JSON: dict[str, JsonChannel] = {
             "action": NUMBERS,
             "correction": NUMBERS,
             "depths": NUMBERS,
+            "stamp": NUMBER,
         },
         ("insertion", "attempt", "tracked", "reference", "frames", "flow", "flow_shape", "divisor", "unit", "action"),
     ),

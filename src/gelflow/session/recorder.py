@@ -64,7 +64,7 @@ class SessionRecorder:
         except FileExistsError as error:
             raise UsageError(f"{self.path} exists; a recording never overwrites: name a new file") from error
         except OSError as error:
-            raise UsageError(f"cannot create {self.path}: {error.strerror}; name a file in a writable folder") from error
+            raise UsageError(f"cannot create {self.path}: {error.strerror}; name a file one can write") from error
         # Held as long as the recorder lives, so that nobody takes a session in progress for a crashed one.
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._thread = threading.Thread(target=self._write_all, args=(stream,), name="recorder", daemon=True)
@@ -157,7 +157,7 @@ class SessionRecorder:
         while not done.wait(0.05):
             self._check()
             if time.monotonic() > given_up:
-                raise PeerTimeout(f"{self.path}: not stored after {PATIENCE:g} s; look whether the disk is full or slow")
+                raise PeerTimeout(f"{self.path}: not stored after {PATIENCE:g} s; is the disk full or slow?")
 
     def close(self) -> None:
         """Write the index, make all safe and close. Raises PeerError when the file could not be finished."""
@@ -222,7 +222,7 @@ class SessionRecorder:
         try:
             with stream:
                 self._write(stream)
-        except Exception as error:  # whatever it was, the next call must raise it: a thread has no caller
+        except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it, whatever it was
             self._fail(str(error) or type(error).__name__)
 
     def _write(self, stream: BinaryIO) -> None:
@@ -239,7 +239,7 @@ class SessionRecorder:
             except queue.Empty:
                 item = ()  # type: ignore[assignment]
             if item is None:
-                writer.finish()
+                writer.finish()  # type: ignore[no-untyped-call]
                 stream.flush()
                 os.fsync(stream.fileno())
                 self._finished = True
@@ -271,7 +271,8 @@ def _register(writer: Writer) -> dict[str, int]:
     for topic, kind in PROTOBUF.items():
         name = kind.DESCRIPTOR.full_name
         if name not in schemas:
-            schemas[name] = writer.register_schema(name, "protobuf", build_file_descriptor_set(kind).SerializeToString())
+            description = build_file_descriptor_set(kind).SerializeToString()
+            schemas[name] = writer.register_schema(name, "protobuf", description)
         channels[topic] = writer.register_channel(topic, "protobuf", schemas[name])
     for topic, channel in JSON.items():
         schema = writer.register_schema(channel.name, "jsonschema", channel.schema())
@@ -280,5 +281,5 @@ def _register(writer: Writer) -> dict[str, int]:
 
 
 def _sync(writer: Writer, stream: BinaryIO) -> None:
-    writer.flush()
+    writer.flush()  # type: ignore[no-untyped-call]
     os.fsync(stream.fileno())

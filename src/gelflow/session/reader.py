@@ -1,0 +1,214 @@
+"""Reads a finished session file, record by record, in the order in which things were recorded."""
+
+import fcntl
+import json
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+import zstandard
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import DecodeError
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+from mcap.records import Message
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError, UsageError
+from gelflow.protocols import CameraImage
+from gelflow.session.channels import JSON, PROTOBUF
+from gelflow.session.records import FORMAT, SENSORS, Decision
+
+# All that a damaged file has been seen to raise inside the libraries that read it.
+DAMAGE = (
+    McapError,
+    DecodeError,
+    struct.error,
+    zlib.error,
+    zstandard.ZstdError,
+    ValueError,
+    KeyError,
+    IndexError,
+    EOFError,
+    MemoryError,
+    OverflowError,
+)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A recorded pose in the robot's base frame."""
+
+    position: NDArray[np.float64]  # [m], shape (3,)
+    quaternion: NDArray[np.float64]  # w x y z, shape (4,)
+
+
+@dataclass(frozen=True)
+class Record:
+    """One record. `value` depends on the topic: `CameraImage`, `Pose`, `Decision`, joint angles [rad] by name
+    (dict), a table (dict) of a JSON topic, or the protobuf message of the other standard schemas.
+    """
+
+    topic: str
+    time: float  # when it was recorded, robot time [s]
+    stamp: float  # when it was measured or commanded, robot time [s]
+    value: Any
+
+
+class SessionReader:
+    """Reads the session at `path`; a context manager, or `open` and `close`."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._stream: BinaryIO | None = None
+        self._reader: SeekingReader | None = None
+
+    def open(self) -> "SessionReader":
+        """Open and check the file.
+
+        Raises UsageError when it is missing, is no gelflow session, or has a newer format, and PeerError when it
+        was not finished (`gelflow recover` then helps) or is damaged.
+        """
+        stream = open_recording(self.path)
+        try:
+            if not is_finished(stream):
+                raise PeerError(self._unfinished(stream))
+            self._reader = SeekingReader(stream, validate_crcs=True)
+            self._check_format(self._reader)
+        except DAMAGE as error:
+            stream.close()
+            if isinstance(error, UsageError):
+                raise
+            raise self._damaged(error) from error
+        except PeerError:
+            stream.close()
+            raise
+        self._stream = stream
+        return self
+
+    def close(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = self._reader = None
+
+    def __enter__(self) -> "SessionReader":
+        return self if self._stream is not None else self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    def description(self) -> dict[str, Any]:
+        """What `SessionRecorder.metadata` wrote. Raises PeerError when the session has none."""
+        for record in self.records(["/session"]):
+            return dict(record.value)
+        raise PeerError(f"{self.path} holds no session description; it was recorded without `metadata`")
+
+    def counts(self) -> dict[str, int]:
+        """How many records each topic has; topics without any are left out."""
+        summary = self._opened().get_summary()
+        if summary is None or summary.statistics is None:
+            return {}
+        found = summary.statistics.channel_message_counts
+        return {channel.topic: found[key] for key, channel in summary.channels.items() if found.get(key)}
+
+    def records(self, topics: Collection[str] | None = None) -> Iterator[Record]:
+        """All records, or those of `topics`, in the order of recording. Raises PeerError where the file is damaged."""
+        if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
+            known = ", ".join([*PROTOBUF, *JSON])
+            raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; a session has {known}")
+        messages = self._opened().iter_messages(topics)
+        while True:
+            try:
+                _, channel, message = next(messages)
+                value = _decode(channel.topic, message)
+            except StopIteration:
+                return
+            except DAMAGE as error:
+                raise self._damaged(error) from error
+            yield Record(channel.topic, message.log_time / 1e9, message.publish_time / 1e9, value)
+
+    def decisions(self) -> Iterator[Decision]:
+        """All decisions in their order."""
+        for record in self.records(["/decision"]):
+            yield record.value
+
+    def _opened(self) -> SeekingReader:
+        if self._reader is None:
+            raise UsageError(f"{self.path}: the reader is not open")
+        return self._reader
+
+    def _check_format(self, reader: SeekingReader) -> None:
+        for metadata in reader.iter_metadata():
+            if metadata.name == "gelflow":
+                written = int(metadata.metadata["format"])
+                if written > FORMAT:
+                    raise UsageError(
+                        f"{self.path} has session format {written}; this gelflow reads format {FORMAT}: update gelflow"
+                    )
+                return
+        raise UsageError(f"{self.path} is an MCAP file, but no session that gelflow recorded; name one of gelflow's")
+
+    def _unfinished(self, stream: BinaryIO) -> str:
+        if is_being_recorded(stream):
+            return f"{self.path} is still being recorded; wait until the recorder has closed it"
+        return f"{self.path} was not finished, its recorder was killed; salvage it with: gelflow recover {self.path}"
+
+    def _damaged(self, error: BaseException) -> PeerError:
+        cause = " ".join(f"{type(error).__name__} {error}".split())[:120]
+        return PeerError(f"{self.path} is damaged ({cause}); salvage what is whole with: gelflow recover {self.path}")
+
+
+def open_recording(path: Path) -> BinaryIO:
+    """Open an MCAP file for reading. Raises UsageError when there is none."""
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise UsageError(f"cannot open {path}: {error.strerror}; name a recorded session (.mcap)") from error
+    if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        stream.close()
+        raise UsageError(f"{path} is not an MCAP file; name a session that gelflow recorded")
+    stream.seek(0)
+    return stream
+
+
+def is_finished(stream: BinaryIO) -> bool:
+    """Whether an MCAP file ends as a finished one does."""
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - len(MCAP0_MAGIC)))
+    finished = size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
+    stream.seek(0)
+    return finished
+
+
+def is_being_recorded(stream: BinaryIO) -> bool:
+    """Whether a recorder lives that holds this file."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    fcntl.flock(stream, fcntl.LOCK_UN)
+    return False
+
+
+def _decode(topic: str, message: Message) -> Any:
+    if topic == "/decision":
+        return Decision.from_json(json.loads(message.data))
+    if topic in JSON:
+        return json.loads(message.data)
+    if topic not in PROTOBUF:
+        return message.data
+    decoded = PROTOBUF[topic].FromString(message.data)
+    if topic in [f"/{sensor}/image" for sensor in SENSORS]:
+        return CameraImage(decoded.data, message.publish_time / 1e9, message.sequence, decoded.format)
+    if topic == "/arm/joints":
+        return {joint.name: joint.position for joint in decoded.joints}
+    if isinstance(decoded, PoseInFrame):
+        position, turn = decoded.pose.position, decoded.pose.orientation
+        return Pose(np.array([position.x, position.y, position.z]), np.array([turn.w, turn.x, turn.y, turn.z]))
+    return decoded
