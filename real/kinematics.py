@@ -1,0 +1,237 @@
+"""Forward and inverse kinematics of the ABB IRB 120, in plain floats: called once per 4 ms cycle, arrays would cost more.
+
+Poses are those of the flange (tool0) in the robot's base frame: position [m] and quaternion w x y z. Angles are the
+controller's joint angles [rad]; all zero is the home pose with the flange at (0.374, 0, 0.630) m.
+"""
+
+import math
+from collections.abc import Sequence
+
+from gelflow.errors import SafetyError
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Joints = tuple[float, float, float, float, float, float]
+Frame = tuple[Vector, Quaternion]
+Columns = tuple[Vector, Vector, Vector]  # a rotation matrix by its columns: where x, y and z point
+
+# Standard DH: offset of θ [rad], d [m], a [m], α [rad].
+DH = (
+    (0.0, 0.290, 0.0, -math.pi / 2),
+    (-math.pi / 2, 0.0, 0.270, 0.0),
+    (0.0, 0.0, 0.070, -math.pi / 2),
+    (0.0, 0.302, 0.0, math.pi / 2),
+    (0.0, 0.0, 0.0, -math.pi / 2),
+    (math.pi, 0.072, 0.0, 0.0),
+)
+LIMITS = tuple(
+    (math.radians(low), math.radians(high))
+    for low, high in ((-165, 165), (-110, 110), (-110, 70), (-160, 160), (-120, 120), (-400, 400))
+)
+MAX_SPEEDS = tuple(math.radians(s) for s in (250, 250, 250, 320, 320, 420))  # [rad/s]
+HOME: Joints = (0.0,) * 6
+
+_SHOULDER = DH[0][1]
+_UPPER = DH[1][2]
+_FOREARM = math.hypot(DH[2][2], DH[3][1])
+_ELBOW = math.atan2(DH[3][1], DH[2][2])  # the forearm is bent: from joint 3's x axis to the wrist's centre
+_FLANGE = DH[5][1]
+_TWIST = tuple((math.sin(row[3]), math.cos(row[3])) for row in DH)
+# Below this the axes of joints 4 and 6 are one line, and only their sum is defined.
+_SINGULAR = 1e-9
+_RANGE_SLACK = 1e-9  # rounding at the end of a range is not out of range [rad]
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Hamilton product of two quaternions w x y z."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    """The vector `v` turned by the unit quaternion `q`."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx)
+
+
+def compose(a: Frame, b: Frame) -> Frame:
+    """The frame `b`, given in frame `a`, in the parent of `a`."""
+    (px, py, pz), q = a
+    x, y, z = rotate(q, b[0])
+    return (px + x, py + y, pz + z), multiply(q, b[1])
+
+
+def invert(a: Frame) -> Frame:
+    """The parent of frame `a`, given in `a`."""
+    (px, py, pz), (w, x, y, z) = a
+    back = (w, -x, -y, -z)
+    return rotate(back, (-px, -py, -pz)), back
+
+
+def angle_between(a: Quaternion, b: Quaternion) -> float:
+    """The angle of the turn from one unit quaternion to another [rad], 0 to π."""
+    aw, ax, ay, az = a
+    w, x, y, z = multiply((aw, -ax, -ay, -az), b)
+    return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
+
+
+def columns(q: Quaternion) -> Columns:
+    """The rotation matrix of a unit quaternion, by columns."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def quaternion(matrix: Columns) -> Quaternion:
+    """The unit quaternion of a rotation matrix, with w ≥ 0; the largest component is found first, so none is lost."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    largest = max(w, x, y, z)
+    scale = 0.5 / math.sqrt(largest)
+    if largest == w:
+        q = (w * scale, (yz - zy) * scale, (zx - xz) * scale, (xy - yx) * scale)
+    elif largest == x:
+        q = ((yz - zy) * scale, x * scale, (xy + yx) * scale, (zx + xz) * scale)
+    elif largest == y:
+        q = ((zx - xz) * scale, (xy + yx) * scale, y * scale, (yz + zy) * scale)
+    else:
+        q = ((xy - yx) * scale, (zx + xz) * scale, (yz + zy) * scale, z * scale)
+    return q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
+
+
+def _chain(joints: Sequence[float], count: int) -> tuple[Vector, Columns]:
+    """Origin and axes of the frame behind the first `count` joints."""
+    px = py = pz = 0.0
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0
+    for i in range(count):
+        offset, d, a, _ = DH[i]
+        sine, cosine = _TWIST[i]
+        s, c = math.sin(joints[i] + offset), math.cos(joints[i] + offset)
+        # x turns about z by θ; then y and z turn about the new x by α.
+        nx, ny, nz = c * xx + s * yx, c * xy + s * yy, c * xz + s * yz
+        hx, hy, hz = c * yx - s * xx, c * yy - s * xy, c * yz - s * xz
+        px, py, pz = px + d * zx + a * nx, py + d * zy + a * ny, pz + d * zz + a * nz
+        yx, yy, yz = cosine * hx + sine * zx, cosine * hy + sine * zy, cosine * hz + sine * zz
+        zx, zy, zz = cosine * zx - sine * hx, cosine * zy - sine * hy, cosine * zz - sine * hz
+        xx, xy, xz = nx, ny, nz
+    return (px, py, pz), ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
+
+
+def forward(joints: Sequence[float]) -> Frame:
+    """The flange in the base frame: position [m] and quaternion w x y z, of six joint angles [rad]."""
+    position, matrix = _chain(joints, 6)
+    return position, quaternion(matrix)
+
+
+def outside(joints: Sequence[float]) -> str:
+    """Which joint is out of its range, in words; empty when none is."""
+    for number, (angle, (low, high)) in enumerate(zip(joints, LIMITS, strict=True), start=1):
+        if not low - _RANGE_SLACK <= angle <= high + _RANGE_SLACK:
+            degrees = (round(math.degrees(value), 1) for value in (angle, low, high))
+            return "joint {} would be at {}°, its range is {}° to {}°".format(number, *degrees)
+    return ""
+
+
+def inverse(position: Sequence[float], orientation: Quaternion, *, near: Sequence[float]) -> Joints:
+    """Joint angles [rad] that bring the flange to a pose, in range, the solution closest to `near` [rad].
+
+    Closed form for a spherical wrist: the wrist's centre gives joints 1 to 3 (shoulder before or behind, elbow up or
+    down), what is left of the orientation gives 4 to 6 (wrist flipped or not); up to eight solutions.
+
+    Raises SafetyError when the pose is out of reach, or when every solution has a joint out of its range.
+    """
+    matrix = columns(orientation)
+    axis = matrix[2]
+    wrist = tuple(p - _FLANGE * z for p, z in zip(position, axis, strict=True))
+    best, best_distance, refused, refused_distance = None, math.inf, None, math.inf
+    for arm in _arm_solutions(wrist):
+        for joints in _wrist_solutions(arm, matrix, near[3]):
+            turned = _closest_turn(joints, near)
+            distance = sum((a - b) * (a - b) for a, b in zip(turned, near, strict=True))
+            if distance < best_distance and not outside(turned):
+                best, best_distance = turned, distance
+            elif distance < refused_distance:
+                refused, refused_distance = turned, distance
+    if best is not None:
+        return best
+    where = ", ".join(f"{p:.3f}" for p in position)
+    if refused is not None:
+        raise SafetyError(f"no joint angles in range reach the pose at ({where}) m: {outside(refused)}")
+    reach = math.dist(wrist, (0.0, 0.0, _SHOULDER))
+    raise SafetyError(
+        f"the pose at ({where}) m is out of reach: its wrist is {reach:.3f} m from the shoulder, "
+        f"possible is {_FOREARM - _UPPER:.3f} to {_FOREARM + _UPPER:.3f} m"
+    )
+
+
+def _arm_solutions(wrist: Sequence[float]) -> list[tuple[float, float, float]]:
+    x, y, z = wrist
+    radius, height = math.hypot(x, y), z - _SHOULDER
+    bend = (radius * radius + height * height - _UPPER * _UPPER - _FOREARM * _FOREARM) / (2 * _UPPER * _FOREARM)
+    # A stretched arm rounds to slightly more than 1.
+    if not abs(bend) <= 1 + 1e-12:
+        return []
+    bend = math.acos(max(-1.0, min(1.0, bend)))
+    front = math.atan2(y, x)
+    solutions = []
+    for first, reach in ((front, radius), (_wrap(front + math.pi), -radius)):
+        for elbow in (bend, -bend):
+            second = math.atan2(reach, height) - math.atan2(
+                _FOREARM * math.sin(elbow), _UPPER + _FOREARM * math.cos(elbow)
+            )
+            solutions.append((first, _wrap(second), _wrap(elbow - _ELBOW)))
+    return solutions
+
+
+def _wrist_solutions(arm: tuple[float, float, float], matrix: Columns, fourth: float) -> list[Joints]:
+    _, (x3, y3, z3) = _chain(arm, 3)
+    # The flange's axes in the frame of joint 3: z6 = (−s5 c4, −s5 s4, c5), and along z3: x6 = s5 c6, y6 = −s5 s6,
+    # with the DH offset of 180° still in joint 6.
+    tool_x, tool_y, tool_z = matrix
+    zx, zy, zz = _dot(x3, tool_z), _dot(y3, tool_z), _dot(z3, tool_z)
+    sine = math.hypot(zx, zy)
+    if sine < _SINGULAR and zz > 0:
+        total = math.atan2(_dot(y3, tool_x), _dot(x3, tool_x))
+        return [(*arm, fourth, 0.0, _wrap(total - fourth - math.pi))]
+    along_x, along_y = _dot(z3, tool_x), _dot(z3, tool_y)
+    solutions: list[Joints] = []
+    for sign in (1.0, -1.0):
+        solutions.append(
+            (
+                *arm,
+                math.atan2(-sign * zy, -sign * zx),
+                math.atan2(sign * sine, zz),
+                _wrap(math.atan2(-sign * along_y, sign * along_x) - math.pi),
+            )
+        )
+    return solutions
+
+
+def _closest_turn(joints: Joints, near: Sequence[float]) -> Joints:
+    """Joint 6 can turn more than once: take the turn closest to `near`, within its range."""
+    low, high = LIMITS[5]
+    last = joints[5] + 2 * math.pi * round((near[5] - joints[5]) / (2 * math.pi))
+    if last > high:
+        last -= 2 * math.pi
+    elif last < low:
+        last += 2 * math.pi
+    return (*joints[:5], last)
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _wrap(angle: float) -> float:
+    return math.remainder(angle, 2 * math.pi)

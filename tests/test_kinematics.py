@@ -1,0 +1,110 @@
+"""The IRB 120: its home pose, its DH table against a product of matrices, and inverse against forward."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gelflow.errors import SafetyError
+from gelflow.real import kinematics as k
+
+
+def matrix(joints: k.Joints) -> np.ndarray:
+    """The textbook product of 4 × 4 DH matrices, an independent route."""
+    total = np.eye(4)
+    table = [(0, 0.29, 0, -90), (-90, 0, 0.27, 0), (0, 0, 0.07, -90), (0, 0.302, 0, 90), (0, 0, 0, -90), (180, 0.072, 0, 0)]
+    for angle, (offset, d, a, alpha) in zip(joints, table, strict=True):
+        t, u = angle + math.radians(offset), math.radians(alpha)
+        ct, st, cu, su = math.cos(t), math.sin(t), math.cos(u), math.sin(u)
+        total = total @ np.array(
+            [[ct, -st * cu, st * su, a * ct], [st, ct * cu, -ct * su, a * st], [0, su, cu, d], [0, 0, 0, 1]]
+        )
+    return total
+
+
+def random_joints(rng: np.random.Generator, share: float = 0.98) -> k.Joints:
+    low, high = np.array(k.LIMITS).T
+    return tuple(float(v) for v in rng.uniform(low * share, high * share))  # type: ignore[return-value]
+
+
+def test_home_flange() -> None:
+    position, quaternion = k.forward(k.HOME)
+    assert position == pytest.approx((0.374, 0.0, 0.630), abs=1e-12)
+    # The flange looks forward: its z is the base's x.
+    assert k.rotate(quaternion, (0.0, 0.0, 1.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
+
+
+def test_forward_is_the_product_of_dh_matrices() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        joints = random_joints(rng)
+        expected = matrix(joints)
+        position, quaternion = k.forward(joints)
+        assert np.allclose(position, expected[:3, 3], atol=1e-12)
+        assert np.allclose(np.array(k.columns(quaternion)).T, expected[:3, :3], atol=1e-12)
+
+
+def test_inverse_finds_the_pose_and_the_joints_it_came_from() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(1000):
+        joints = random_joints(rng)
+        position, quaternion = k.forward(joints)
+        again = k.inverse(position, quaternion, near=joints)
+        assert np.allclose(again, joints, atol=1e-6)
+        elsewhere = k.inverse(position, quaternion, near=random_joints(rng))
+        reached, turned = k.forward(elsewhere)
+        assert np.allclose(reached, position, atol=1e-9)
+        assert k.angle_between(turned, quaternion) < 1e-8
+        assert not k.outside(elsewhere)
+
+
+def test_inverse_follows_a_path_without_a_jump() -> None:
+    """A straight move with the flange looking down: neighbours on the path are neighbours in joint space."""
+    joints = k.inverse((0.40, -0.05, 0.30), (0.0, 0.0, 1.0, 0.0), near=k.HOME)
+    for step in range(200):
+        following = k.inverse((0.40, -0.05 + step * 5e-4, 0.30), (0.0, 0.0, 1.0, 0.0), near=joints)
+        assert max(abs(a - b) for a, b in zip(joints, following, strict=True)) < 0.005
+        joints = following
+
+
+def test_inverse_keeps_joint_4_where_joints_4_and_6_are_one_axis() -> None:
+    joints = (0.3, 0.2, -0.4, 0.7, 0.0, -1.1)
+    position, quaternion = k.forward(joints)
+    assert np.allclose(k.inverse(position, quaternion, near=joints), joints, atol=1e-6)
+
+
+def test_joint_6_takes_the_turn_that_is_near() -> None:
+    position, quaternion = k.forward((0.1, 0.2, 0.1, 0.4, 0.8, 0.5))
+    for turns in (-1, 0, 1):
+        near = (0.1, 0.2, 0.1, 0.4, 0.8, 0.5 + 2 * math.pi * turns)
+        assert k.inverse(position, quaternion, near=near)[5] == pytest.approx(near[5], abs=1e-6)
+
+
+def test_quaternion_of_every_half_turn() -> None:
+    for q in ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)):
+        assert k.angle_between(k.quaternion(k.columns(q)), q) < 1e-12
+
+
+def test_frames_compose_and_invert() -> None:
+    rng = np.random.default_rng(2)
+    a, b = k.forward(random_joints(rng)), k.forward(random_joints(rng))
+    position, quaternion = k.compose(k.invert(a), k.compose(a, b))
+    assert np.allclose(position, b[0], atol=1e-12)
+    assert k.angle_between(quaternion, b[1]) < 1e-8
+
+
+def test_a_pose_out_of_reach_says_so() -> None:
+    with pytest.raises(SafetyError, match=r"out of reach: its wrist is 1\.\d+ m from the shoulder"):
+        k.inverse((1.2, 0.0, 0.3), (0.0, 0.0, 1.0, 0.0), near=k.HOME)
+
+
+def test_a_pose_out_of_range_names_the_joint() -> None:
+    """The flange looking straight back at the arm from far in front needs more than joint 5 has."""
+    back = k.quaternion(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)))
+    with pytest.raises(SafetyError, match=r"joint \d would be at -?\d+\.\d°, its range is"):
+        k.inverse((0.45, 0.0, 0.30), back, near=k.HOME)
+
+
+def test_ranges_are_those_of_the_robot() -> None:
+    assert k.outside((0.0, 0.0, math.radians(69.9), 0.0, 0.0, math.radians(-399))) == ""
+    assert k.outside((0.0, 0.0, math.radians(70.5), 0.0, 0.0, 0.0)).startswith("joint 3 would be at 70.5°")
