@@ -1,0 +1,255 @@
+"""Scenes: mechanics from MJCF or URDF, and what those cannot say from a small TOML file beside it.
+
+`load_scene` reads both, checks every key and name, and returns a `Scene`: plain data, frozen, from which `build`
+makes the core's model. Only what the scene requires is passed on: geometry that is in no contact and under no pad is
+left out, and `Scene.left_out` says so. The format is described in docs/scenes.md.
+"""
+
+import copy
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import Grid
+from gelflow.sim.scene_mjcf import ActuatorDef, BodyDef, JointDef, read_mechanics
+from gelflow.sim.scene_parts import (
+    LAWS,
+    ContactDef,
+    Limit,
+    PadDef,
+    PointsDef,
+    ShapeDef,
+    read_contacts,
+    read_limits,
+    read_pads,
+    read_points,
+    used_shapes,
+)
+from gelflow.sim.scene_toml import Table, nearest, read_toml, set_path
+
+Array = NDArray[np.float64]
+
+SECTIONS = ("format", "model", "step", "friction", "joints", "points", "contacts", "pads")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about a scene, as data. Indices follow the model file's order."""
+
+    name: str
+    path: Path
+    step: float  # [s]
+    friction: str  # the law that contacts and pads follow unless they fix their own
+    gravity: Array  # [m/s²]
+    bodies: tuple[BodyDef, ...]
+    joints: tuple[JointDef, ...]
+    limits: tuple[Limit, ...]  # one per joint
+    actuators: tuple[ActuatorDef, ...]
+    shapes: tuple[ShapeDef, ...]
+    points: tuple[PointsDef, ...]
+    contacts: tuple[ContactDef, ...]
+    pads: tuple[PadDef, ...]
+    q0: Array  # where the scene starts: the keyframe "start", or the pose in the model file
+    left_out: tuple[str, ...]  # what the files have and the simulation doesn't, and why
+
+    @property
+    def nq(self) -> int:
+        return sum(7 if joint.type == "free" else 1 for joint in self.joints)
+
+    @property
+    def nv(self) -> int:
+        return sum(6 if joint.type == "free" else 1 for joint in self.joints)
+
+    @property
+    def nu(self) -> int:
+        return len(self.actuators)
+
+    @property
+    def markers(self) -> int:
+        """Markers of all pads together, in the order of `pads`."""
+        return sum(len(pad.positions) for pad in self.pads)
+
+    @property
+    def grids(self) -> tuple[Grid, ...]:
+        """The marker grid of each pad [mm]."""
+        return tuple(pad.grid for pad in self.pads)
+
+    def q(self, joint: str) -> slice:
+        """Where a joint's positions stand in q. Raises UsageError on an unknown name."""
+        found = self._joint(joint)
+        return slice(found.q, found.q + (7 if found.type == "free" else 1))
+
+    def v(self, joint: str) -> slice:
+        """Where a joint's velocities stand in v. Raises UsageError on an unknown name."""
+        found = self._joint(joint)
+        return slice(found.v, found.v + (6 if found.type == "free" else 1))
+
+    def u(self, actuator: str) -> int:
+        """Where an actuator stands in u. Raises UsageError on an unknown name."""
+        return _index("actuator", actuator, [a.name for a in self.actuators])
+
+    def body(self, name: str) -> int:
+        """Index of a moving body. Raises UsageError on an unknown name."""
+        return _index("moving body", name, [b.name for b in self.bodies])
+
+    def contact_names(self, contact: str) -> tuple[str, ...]:
+        """The core's names of a contact of the TOML file: one for each shape that it is against."""
+        groups = [c.group for c in self.contacts]
+        _index("contact", contact, groups)
+        return tuple(c.name for c in self.contacts if c.group == contact)
+
+    def markers_of(self, pad: str) -> slice:
+        """Where a pad's markers stand in the tactile reading. Raises UsageError on an unknown name."""
+        index = _index("pad", pad, [p.name for p in self.pads])
+        first = sum(len(p.positions) for p in self.pads[:index])
+        return slice(first, first + len(self.pads[index].positions))
+
+    def build(self) -> Any:
+        """The core's model of this scene (gelflow.sim._core.Model)."""
+        core = importlib.import_module("gelflow.sim._core")  # here: scenes can be checked where it is not built
+        return core.Model(self.describe_to(core.ModelSpec()))
+
+    def describe_to(self, spec: Any) -> Any:
+        """Tell a model builder (gelflow.sim._core.ModelSpec) every part of this scene; returns it."""
+        spec.gravity = tuple(self.gravity)
+        spec.step = self.step
+        for body in self.bodies:
+            spec.add_body(body.name, body.parent, body.pose.pos, body.pose.quat, body.mass, body.com, body.inertia)
+        for joint, limit in zip(self.joints, self.limits, strict=True):
+            low, high = joint.range or (-np.inf, np.inf)
+            spec.add_joint(
+                joint.name,
+                joint.body,
+                joint.type,
+                joint.pos,
+                joint.axis,
+                damping=joint.damping,
+                armature=joint.armature,
+                stiffness=joint.stiffness,
+                springref=joint.springref,
+                lower=low,
+                upper=high,
+                limit_stiffness=limit.stiffness,
+                limit_damping=limit.damping,
+            )
+        shapes = {
+            shape.name: spec.add_shape(shape.name, shape.body, shape.kind, shape.pose.pos, shape.pose.quat, shape.size)
+            for shape in self.shapes
+        }
+        points = {p.name: spec.add_points(p.name, p.body, p.points, p.weights, radius=p.radius) for p in self.points}
+        for contact in self.contacts:
+            spec.add_contact(
+                contact.name,
+                points[contact.points],
+                shapes[contact.shape],
+                law=contact.law,
+                damping=contact.damping,
+                **contact.numbers,
+            )
+        for pad in self.pads:
+            frames = [np.tile(axis, (len(pad.positions), 1)) for axis in pad.axes.T]
+            spec.add_pad(
+                pad.name,
+                pad.body,
+                pad.positions,
+                *frames,
+                shapes=[shapes[name] for name in pad.against],
+                law=pad.law,
+                weights=pad.weights,
+                **pad.numbers,
+            )
+        for a in self.actuators:
+            spec.add_actuator(
+                a.name,
+                a.joint,
+                kind=a.kind,
+                gear=a.gear,
+                kp=a.kp,
+                kd=a.kd,
+                force_lower=a.force[0],
+                force_upper=a.force[1],
+            )
+        return spec
+
+    def _joint(self, name: str) -> JointDef:
+        return self.joints[_index("joint", name, [j.name for j in self.joints])]
+
+
+def scene_names() -> tuple[str, ...]:
+    """Names of the scenes that come with gelflow."""
+    return tuple(sorted(p.name.removesuffix(".toml") for p in _shipped().iterdir() if p.name.endswith(".toml")))
+
+
+def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read a scene.
+
+    Parameters
+    ----------
+    scene: name of a scene that comes with gelflow, or path of a TOML file
+    friction: "viscous" or "elastic", instead of the file's own choice
+    overrides: values that replace those of the file, by dotted key, such as {"pads.pad.rows": 50}; `*` for every
+        table at its place. Keys are checked like the file's own.
+
+    Raises UsageError, in one line, on an unknown key or name, a missing file, or what the simulator does not model.
+    """
+    path = _find(scene)
+    data = copy.deepcopy(read_toml(path))
+    for key, value in (overrides or {}).items():
+        set_path(data, key, value)
+    if friction is not None:
+        data["friction"] = friction
+    top = Table(data, str(path))
+    if top.integer("format") > 1:
+        raise UsageError(f"{path}: format is {top.integer('format')}; this gelflow reads format 1")
+    top.only(SECTIONS)
+    law = top.word("friction", "viscous", among=LAWS)
+    mechanics = read_mechanics(path.parent / top.word("model"))
+    points = read_points(top.tables("points"), mechanics)
+    contacts = read_contacts(top.tables("contacts"), points, mechanics, law)
+    pads = read_pads(top.tables("pads"), mechanics, law)
+    shapes, unused = used_shapes(mechanics, points, contacts, pads)
+    idle = tuple(f"points {name}: in no contact" for name in points if all(c.points != name for c in contacts))
+    return Scene(
+        name=path.stem,
+        path=path,
+        step=top.number("step", least=1e-6),
+        friction=law,
+        gravity=mechanics.gravity,
+        bodies=mechanics.bodies,
+        joints=mechanics.joints,
+        limits=read_limits(top.tables("joints"), mechanics, top.where),
+        actuators=mechanics.actuators,
+        shapes=shapes,
+        points=tuple(p for p in points.values() if any(c.points == p.name for c in contacts)),
+        contacts=contacts,
+        pads=pads,
+        q0=mechanics.q0,
+        left_out=(*mechanics.left_out, *unused, *idle),
+    )
+
+
+def _find(scene: str | Path) -> Path:
+    path = Path(scene)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    shipped = Path(str(_shipped())) / f"{scene}.toml"
+    if not shipped.is_file():
+        raise UsageError(f"no scene {str(scene)!r}; {nearest(str(scene), scene_names())} (or give a .toml file)")
+    return shipped
+
+
+def _shipped() -> Any:
+    return resources.files("gelflow.sim") / "scenes"
+
+
+def _index(what: str, name: str, names: list[str]) -> int:
+    if name not in names:
+        raise UsageError(f"no {what} {name!r}; {nearest(name, names)}")
+    return names.index(name)

@@ -1,0 +1,77 @@
+"""Sampled points: they lie on the surface, and their weights add up to its area."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gelflow.errors import UsageError
+from gelflow.sim.sampling import FACES, box_surface, disc
+
+
+def test_the_rolling_pad_has_as_many_points_as_published() -> None:
+    points, weights = box_surface((0.025, 0.025, 0.005), (20, 20, 20))
+    assert len(points) == len(weights) == 20**3 - 18**3
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    half=st.tuples(*[st.floats(0.01, 1.0)] * 3),
+    resolution=st.tuples(*[st.integers(2, 6)] * 3),
+    faces=st.lists(st.sampled_from(FACES), min_size=1, max_size=6, unique=True),
+)
+def test_box_weights_add_up_to_the_area_of_the_faces(
+    half: tuple[float, float, float], resolution: tuple[int, int, int], faces: list[str]
+) -> None:
+    points, weights = box_surface(half, resolution, faces=faces)
+    area = {"x": 4 * half[1] * half[2], "y": 4 * half[0] * half[2], "z": 4 * half[0] * half[1]}
+    assert weights.sum() == pytest.approx(sum(area[face[1]] for face in faces))
+    assert (weights > 0).all()
+    scaled = points / np.array(half)
+    assert np.abs(scaled).max(axis=1) == pytest.approx(1)  # on the surface
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # edges and corners once
+    for face in faces:
+        axis, sign = "xyz".index(face[1]), -1 if face[0] == "-" else 1
+        on_face = np.isclose(scaled[:, axis], sign)
+        others = [n for i, n in enumerate(resolution) if i != axis]
+        assert on_face.sum() >= others[0] * others[1]
+
+
+def test_box_points_include_the_corners() -> None:
+    points, weights = box_surface((1.0, 2.0, 3.0), (2, 2, 2))
+    assert sorted(map(tuple, points.tolist())) == sorted(
+        (x, y, z) for x in (-1.0, 1.0) for y in (-2.0, 2.0) for z in (-3.0, 3.0)
+    )
+    assert weights == pytest.approx(11.0)  # a quarter of each of the three faces that meet there
+
+
+def test_disc_has_the_published_points_and_its_area() -> None:
+    points, weights = disc(0.018, 0.0015)
+    assert len(points) == 66
+    assert weights.sum() == pytest.approx(2 * np.pi * 0.018**2)
+    assert np.linalg.norm(points[:, :2], axis=1).max() == pytest.approx(0.018)
+    assert set(points[:, 2]) == {-0.0015, 0.0015}
+
+
+def test_integrals_over_a_disc_converge() -> None:
+    """∫ x² dA over a unit disc is π/4: the error falls with the square of the spacing."""
+    errors = []
+    for radii in (4, 8, 16):
+        points, weights = disc(1.0, 0.1, angles=16, radii=radii, faces=["+z"])
+        errors.append(abs((weights * points[:, 0] ** 2).sum() - np.pi / 4))
+    assert errors[0] > 1.7 * errors[1] > 1.7**2 * errors[2]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: box_surface((1, 1, 1), (1, 2, 2)), "at least 2 points"),
+        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["z"]), "unknown face 'z'"),
+        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["-z", "-z"]), "once each"),
+        (lambda: disc(1, 1, angles=2), "at least 3 angles"),
+        (lambda: disc(1, 1, faces=["-x"]), "faces of a disc"),
+    ],
+)
+def test_wrong_sampling_is_refused(call: object, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        call()  # type: ignore[operator]
