@@ -1,0 +1,321 @@
+#include "batch.hpp"
+
+#include <stdexcept>
+
+namespace gelflow {
+
+ThreadPool::ThreadPool(int threads) {
+  for (int i = 1; i < threads; ++i) threads_.emplace_back([this, i] { loop(i); });
+}
+
+ThreadPool::~ThreadPool() {
+  {
+    const std::lock_guard lock(mutex_);
+    stop_ = true;
+  }
+  start_.notify_all();
+  for (auto& thread : threads_) thread.join();
+}
+
+void ThreadPool::take(int thread) {
+  for (int item = next_.fetch_add(1); item < items_; item = next_.fetch_add(1)) (*work_)(item, thread);
+}
+
+void ThreadPool::loop(int thread) {
+  std::uint64_t seen = 0;
+  for (;;) {
+    {
+      std::unique_lock lock(mutex_);
+      start_.wait(lock, [&] { return stop_ || round_ != seen; });
+      if (stop_) return;
+      seen = round_;
+    }
+    take(thread);
+    const std::lock_guard lock(mutex_);
+    if (--busy_ == 0) done_.notify_one();
+  }
+}
+
+void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
+  if (threads_.empty() || items <= 1) {
+    for (int i = 0; i < items; ++i) work(i, 0);
+    return;
+  }
+  {
+    const std::lock_guard lock(mutex_);
+    work_ = &work;
+    items_ = items;
+    next_ = 0;
+    busy_ = static_cast<int>(threads_.size());
+    ++round_;
+  }
+  start_.notify_all();
+  take(0);
+  std::unique_lock lock(mutex_);
+  done_.wait(lock, [&] { return busy_ == 0; });
+}
+
+template <class T>
+Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
+    : model(std::move(m)),
+      n(environments),
+      q(static_cast<std::size_t>(n) * model->nq),
+      v(static_cast<std::size_t>(n) * model->nv),
+      params(static_cast<std::size_t>(n) * model->param_names.size()),
+      anchors(static_cast<std::size_t>(n) * model->na, V3<T>::Zero()),
+      anchored(static_cast<std::size_t>(n) * model->na),
+      status(n),
+      iterations(n),
+      halved(n),
+      pool_(threads) {
+  for (int i = 0; i < pool_.size(); ++i) memory_.emplace_back(*model);
+  for (int e = 0; e < n; ++e) {
+    std::copy(model->param_defaults.begin(), model->param_defaults.end(),
+              params.begin() + static_cast<std::ptrdiff_t>(e * model->param_names.size()));
+  }
+  reset(nullptr);
+}
+
+template <class T>
+StateView<T> Batch<T>::state(int env) {
+  const auto e = static_cast<std::size_t>(env);
+  return {q.data() + e * model->nq, v.data() + e * model->nv, anchors.data() + e * model->na,
+          anchored.data() + e * model->na};
+}
+
+template <class T>
+void Batch<T>::reset(const std::uint8_t* which) {
+  for (int e = 0; e < n; ++e) {
+    if (which && !which[e]) continue;
+    const StateView<T> s = state(e);
+    std::copy(model->q0.begin(), model->q0.end(), s.q);
+    std::fill(s.v, s.v + model->nv, T(0));
+    std::fill(s.anchored, s.anchored + model->na, 0);
+    std::fill(s.anchors, s.anchors + model->na, V3<T>::Zero());
+    status[e] = 0;
+    iterations[e] = halved[e] = 0;
+  }
+}
+
+template <class T>
+void Batch<T>::check_controls(const T* u, int rows) const {
+  const int nu = static_cast<int>(model->actuators.size());
+  for (std::ptrdiff_t i = 0; i < static_cast<std::ptrdiff_t>(rows) * nu; ++i) {
+    if (is_finite(u[i])) continue;
+    throw std::invalid_argument("control of actuator '" + model->actuators[i % nu].name + "' in environment " +
+                                std::to_string(i / nu % n) + " is not finite");
+  }
+}
+
+template <class T>
+void Batch<T>::check_state() const {
+  const auto check = [&](const std::vector<T>& values, const char* what, int width) {
+    for (std::size_t i = 0; i < values.size(); ++i) {
+      if (is_finite(values[i])) continue;
+      throw std::invalid_argument(std::string(what) + "[" + std::to_string(i / width) + ", " +
+                                  std::to_string(i % width) + "] is not finite");
+    }
+  };
+  check(q, "q", model->nq);
+  check(v, "v", model->nv);
+}
+
+template <class T>
+void Batch<T>::step(const T* u, int steps) {
+  check_controls(u, n);
+  check_state();
+  const std::size_t nu = model->actuators.size();
+  pool_.run(n, [&](int e, int thread) {
+    for (int i = 0; i < steps && status[e] == 0; ++i) {
+      const StepReport report =
+          gelflow::step<T>(*model, params_of(e), u + static_cast<std::size_t>(e) * nu, 0, state(e), memory_[thread]);
+      status[e] = static_cast<std::int32_t>(report.status);
+      iterations[e] += report.iterations;
+      halved[e] += report.halvings > 0 ? 1 : 0;
+    }
+  });
+}
+
+template <class T>
+void Batch<T>::kinematics(int env, Workspace<T>& w) {
+  const StateView<T> s = state(env);
+  w.update.setZero();
+  forward_positions<T>(*model, params_of(env), s.q, w);
+  forward_velocities<T>(*model, params_of(env), s.v, w.update.data(), w);
+}
+
+template <class T>
+void Batch<T>::tactile(T* out) {
+  pool_.run(n, [&](int e, int thread) {
+    kinematics(e, memory_[thread].work);
+    read_markers<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored, memory_[thread].work,
+                    out + static_cast<std::size_t>(e) * model->markers * 3);
+  });
+}
+
+template <class T>
+void Batch<T>::wrenches(T* out) {
+  pool_.run(n, [&](int e, int thread) {
+    kinematics(e, memory_[thread].work);
+    contact_wrenches<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored,
+                        memory_[thread].work, out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
+  });
+}
+
+template <class T>
+void Batch<T>::poses(T* out) {
+  Workspace<T>& w = memory_[0].work;
+  for (int e = 0; e < n; ++e) {
+    kinematics(e, w);
+    for (std::size_t b = 0; b < model->bodies.size(); ++b, out += 7) {
+      const Eigen::Quaternion<T> turn(w.rotation[b]);
+      for (int i = 0; i < 3; ++i) out[i] = w.position[b][i];
+      out[3] = turn.w();
+      out[4] = turn.x();
+      out[5] = turn.y();
+      out[6] = turn.z();
+    }
+  }
+}
+
+template <class T>
+void Batch<T>::mass_matrix(T* out) {
+  Workspace<T>& w = memory_[0].work;
+  const std::size_t size = static_cast<std::size_t>(model->nv) * model->nv;
+  for (int e = 0; e < n; ++e, out += size) {
+    kinematics(e, w);
+    w.residual.setZero();
+    w.by_q.setZero();
+    w.by_v.setZero();
+    w.mass.setZero();
+    add_inverse_dynamics<true, T>(*model, params_of(e), T(1), w);
+    for (const Joint& joint : model->joints) {
+      for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += params_of(e)[joint.param + 1];
+    }
+    std::copy(w.mass.data(), w.mass.data() + size, out);  // symmetric: storage order does not matter
+  }
+}
+
+template <class T>
+void Batch<T>::bias(T* out) {
+  Workspace<T>& w = memory_[0].work;
+  for (int e = 0; e < n; ++e, out += model->nv) {
+    kinematics(e, w);
+    w.residual.setZero();
+    add_inverse_dynamics<false, T>(*model, params_of(e), T(1), w);
+    std::copy(w.residual.data(), w.residual.data() + model->nv, out);
+  }
+}
+
+template <class T>
+void Batch<T>::rollout(const Rollout<T>& r) {
+  const Model& m = *model;
+  const std::size_t nu = m.actuators.size(), na = m.na, N = n;
+  check_controls(r.u, r.steps * n);
+  pool_.run(n, [&](int env, int thread) {
+    const std::size_t e = env;
+    StepMemory<T>& memory = memory_[thread];
+    r.status[e] = 0;
+    int read = 0;
+    const auto at = [&](int t) {
+      const std::size_t row = t * N + e;
+      return StateView<T>{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
+                          r.anchored + row * na};
+    };
+    for (int t = 0;; ++t) {
+      const StateView<T> now = at(t);
+      for (; read < r.reads && r.read_after[read] == t; ++read) {
+        memory.work.update.setZero();
+        forward_positions<T>(m, params_of(env), now.q, memory.work);
+        forward_velocities<T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
+        read_markers<T>(m, params_of(env), T(m.step), now.anchors, now.anchored, memory.work,
+                        r.tactile + (read * N + e) * m.markers * 3);
+      }
+      if (t == r.steps) break;
+      const StateView<T> next = at(t + 1);
+      std::copy(now.q, now.q + m.nq, next.q);
+      std::copy(now.v, now.v + m.nv, next.v);
+      std::copy(now.anchors, now.anchors + na, next.anchors);
+      std::copy(now.anchored, now.anchored + na, next.anchored);
+      if (r.status[e] != 0) continue;
+      const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, 0, next, memory);
+      r.status[e] = static_cast<std::int32_t>(report.status);
+      r.halvings[t * N + e] = static_cast<std::int8_t>(report.halvings);
+    }
+  });
+}
+
+template <class T>
+void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient<T>& g, StepMemory<T>& memory) {
+  const Model& m = *model;
+  const std::size_t nu = m.actuators.size(), na = m.na, N = n, e = env;
+  const T* params = params_of(env);
+  StateGradient<T> gradient(m);
+  std::copy_n(reinterpret_cast<const V3<T>*>(g.anchors_end) + e * na, na, gradient.anchors.begin());
+  std::vector<Record<T>> records;
+  int read = r.reads - 1;
+  for (int t = r.steps; t >= 0; --t) {
+    const std::size_t row = t * N + e;
+    const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
+                           r.anchored + row * na};
+    gradient.q += to_tangent<T>(m, now.q, g.q + row * m.nq);
+    gradient.v += Eigen::Map<const VX<T>>(g.v + row * m.nv, m.nv);
+    for (; read >= 0 && r.read_after[read] == t; --read) {
+      tactile_transposed<T>(m, params, now, g.tactile + (read * N + e) * m.markers * 3, gradient, memory.work);
+    }
+    if (t == 0) break;
+    // The step is taken again from where it started, so that each substep's start and anchors are at hand.
+    const std::size_t before = (t - 1) * N + e;
+    Record<T> record;
+    record.q0 = Eigen::Map<const VX<T>>(r.q + before * m.nq, m.nq);
+    record.v0 = Eigen::Map<const VX<T>>(r.v + before * m.nv, m.nv);
+    const V3<T>* anchors = reinterpret_cast<const V3<T>*>(r.anchors) + before * na;
+    record.anchors.assign(anchors, anchors + na);
+    record.anchored.assign(r.anchored + before * na, r.anchored + before * na + na);
+    const T* u = r.u + before * nu;
+    const int halvings = r.halvings[before];
+    records.clear();
+    if (halvings == 0) {
+      record.h = T(m.step);
+      record.v1 = Eigen::Map<const VX<T>>(now.v, m.nv);
+      records.push_back(std::move(record));
+    } else {
+      const StateView<T> scratch{record.q0.data(), record.v0.data(), record.anchors.data(), record.anchored.data()};
+      int iterations = 0;
+      substeps<T>(m, params, T(m.step / (1 << halvings)), 1 << halvings, u, 0, scratch, memory, iterations,
+                  [&](const T& h, const StateView<T>& s, const StepMemory<T>& taken) {
+                    Record<T> part;
+                    part.h = h;
+                    part.q0 = Eigen::Map<const VX<T>>(s.q, m.nq);
+                    part.v0 = Eigen::Map<const VX<T>>(s.v, m.nv);
+                    part.anchors.assign(s.anchors, s.anchors + na);
+                    part.anchored.assign(s.anchored, s.anchored + na);
+                    part.v1 = taken.v_new;
+                    records.push_back(std::move(part));
+                  });
+    }
+    for (auto it = records.rbegin(); it != records.rend(); ++it) {
+      substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory);
+    }
+  }
+  add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, g.q0 + e * m.nq);
+  std::copy_n(gradient.v.data(), m.nv, g.v0 + e * m.nv);
+  std::copy_n(gradient.anchors.data(), na, reinterpret_cast<V3<T>*>(g.anchors0) + e * na);
+}
+
+template <class T>
+void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g) {
+  const std::size_t N = n;
+  std::fill_n(g.u, static_cast<std::size_t>(r.steps) * N * model->actuators.size(), T(0));
+  std::fill_n(g.q0, N * model->nq, T(0));
+  std::fill_n(g.v0, N * model->nv, T(0));
+  std::fill_n(g.anchors0, N * model->na * 3, T(0));
+  pool_.run(n, [&](int e, int thread) {
+    if (r.status[e] == 0) transpose_one(e, r, g, memory_[thread]);  // a failed environment has gradient zero
+  });
+}
+
+template class Batch<double>;
+template class Batch<float>;
+
+}  // namespace gelflow

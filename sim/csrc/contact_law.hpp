@@ -1,0 +1,160 @@
+// The force of a shape on one point (eq. 8), its derivatives (eqs. 11-16), and the memory of the elastic law.
+//
+// In the shape's frame, x the point, v its velocity relative to the shape, d, n, H the distance there (d < 0 inside),
+// ḋ = n·v, v_t = v − ḋ n:
+//     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8, which has no max and can pull)
+//                 N = max(−k_n d − k_d ḋ, 0)            plain damping, for grounds
+//     wanted      f* = −k_t v_t                         viscous friction
+//                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
+//     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch: no division there
+//     force       f = N n + f_t
+// e is x − X with the anchor X in the shape's frame; for a rolling point (the lowest point of a sphere, which is not a
+// material point) e = X + h v: the anchor then stores the slip itself. A point that just touched has e = 0.
+// On slip the anchor moves so that −k_s s = f_t + k_t v_t.
+#pragma once
+
+#include "shapes.hpp"
+
+namespace gelflow {
+
+template <class T>
+struct PointLaw {
+  T kn, kt, mu, kd, ks;  // of this point: already times its weight
+  DampingLaw damping;
+  bool elastic;
+  bool rolling;
+  T h;
+};
+
+template <class T>
+struct PointForce {
+  V3<T> force;
+  M3<T> by_x, by_v, by_anchor;  // ∂force/∂(x, v, X); the anchor moves the friction alone
+  bool slips;
+  V3<T> friction, slip;          // f_t, v_t
+  M3<T> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
+};
+
+template <class T>
+V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor, bool anchored) {
+  if (!law.elastic || !anchored) return V3<T>::Zero();
+  return law.rolling ? V3<T>(anchor + law.h * v) : V3<T>(x - anchor);
+}
+
+// `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
+template <int derivatives, class T>
+void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e, bool anchored,
+                 PointForce<T>& out) {
+  using std::sqrt;
+  const V3<T>& n = at.n;
+  const T rate = n.dot(v);
+  T normal, by_d, by_rate;
+  if (law.damping == DampingLaw::depth) {
+    const T stiffness = law.kn - law.kd * rate;
+    const bool pushes = stiffness > T(0);
+    normal = pushes ? -stiffness * at.d : T(0);
+    by_d = pushes ? -stiffness : T(0);
+    by_rate = pushes ? law.kd * at.d : T(0);
+  } else {
+    const T push = -law.kn * at.d - law.kd * rate;
+    const bool pushes = push > T(0);
+    normal = pushes ? push : T(0);
+    by_d = pushes ? -law.kn : T(0);
+    by_rate = pushes ? -law.kd : T(0);
+  }
+  const V3<T> slip = v - rate * n;
+  V3<T> wanted = -law.kt * slip;
+  T along = T(0);
+  const bool memory = law.elastic && anchored;
+  if (memory) {
+    along = n.dot(e);
+    wanted -= law.ks * (e - along * n);
+  }
+  const T bound = law.mu * normal, squared = wanted.squaredNorm();
+  out.slips = squared > bound * bound;
+  const T length = out.slips ? T(sqrt(squared)) : T(1);
+  const T ratio = out.slips ? T(bound / length) : T(1);
+  out.friction = wanted * ratio;
+  out.slip = slip;
+  out.force = normal * n + out.friction;
+  if constexpr (derivatives > 0) {
+    const M3<T> project = M3<T>::Identity() - n * n.transpose();
+    const T ex = memory && !law.rolling ? T(1) : T(0);
+    const T ev = memory && law.rolling ? law.h : T(0);
+    V3<T> normal_by_x = by_d * n;
+    const V3<T> normal_by_v = by_rate * n;
+    M3<T> wanted_by_x = (-law.ks * ex) * project;
+    const M3<T> wanted_by_v = (-law.kt - law.ks * ev) * project;
+    if (at.curved) {
+      const V3<T> hv = at.hessian * v;
+      normal_by_x += by_rate * hv;
+      wanted_by_x += law.kt * (n * hv.transpose() + rate * at.hessian);
+      if (memory) wanted_by_x += law.ks * (n * (at.hessian * e).transpose() + along * at.hessian);
+    }
+    // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
+    V3<T> direction = V3<T>::Zero();
+    M3<T> through = M3<T>::Identity();
+    T mu = T(0);
+    if (out.slips) {
+      direction = wanted / length;
+      through = ratio * (M3<T>::Identity() - direction * direction.transpose());
+      mu = law.mu;
+    }
+    const V3<T> lever = n + mu * direction;
+    out.by_x.noalias() = through * wanted_by_x + lever * normal_by_x.transpose();
+    if (at.curved) out.by_x += normal * at.hessian;
+    out.by_v.noalias() = through * wanted_by_v + lever * normal_by_v.transpose();
+    if constexpr (derivatives > 1) {
+      const T sign = law.rolling ? T(-1) : T(1);  // ∂f*/∂X = sign k_s (1 − n nᵀ)
+      out.by_anchor = memory ? M3<T>((sign * law.ks) * (through * project)) : M3<T>(M3<T>::Zero());
+      out.friction_by_x = through * wanted_by_x + mu * direction * normal_by_x.transpose();
+      out.friction_by_v = through * wanted_by_v + mu * direction * normal_by_v.transpose();
+      out.slip_by_v = project;
+      out.slip_by_x = M3<T>::Zero();
+      if (at.curved) out.slip_by_x = -(n * (at.hessian * v).transpose() + rate * at.hessian);
+    }
+  }
+}
+
+// The anchor after an accepted step, for a point that is inside (outside, the anchor is cleared).
+template <class T>
+V3<T> next_anchor(const PointLaw<T>& law, const PointForce<T>& f, const V3<T>& n, const V3<T>& x, const V3<T>& e,
+                  const V3<T>& anchor, bool anchored) {
+  if (f.slips) {
+    const V3<T> s = -(f.friction + law.kt * f.slip) / law.ks;
+    return law.rolling ? s : V3<T>(x - s);
+  }
+  if (law.rolling) return e - n.dot(e) * n;
+  return anchored ? anchor : x;
+}
+
+// Gradient of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
+template <class T>
+struct AnchorGradient {
+  V3<T> x = V3<T>::Zero(), v = V3<T>::Zero(), anchor = V3<T>::Zero();
+};
+template <class T>
+AnchorGradient<T> next_anchor_transposed(const PointLaw<T>& law, const PointForce<T>& f, bool anchored,
+                                         const V3<T>& lambda) {
+  AnchorGradient<T> g;
+  if (f.slips) {
+    const V3<T> scaled = (law.rolling ? T(-1) : T(1)) / law.ks * lambda;
+    g.x = f.friction_by_x.transpose() * scaled + law.kt * (f.slip_by_x.transpose() * scaled);
+    g.v = f.friction_by_v.transpose() * scaled + law.kt * (f.slip_by_v.transpose() * scaled);
+    g.anchor = f.by_anchor.transpose() * scaled;
+    if (!law.rolling) g.x += lambda;
+  } else if (law.rolling) {
+    const V3<T> projected = f.slip_by_v * lambda;  // 1 − n nᵀ, symmetric
+    if (anchored) {
+      g.v = law.h * projected;
+      g.anchor = projected;
+    }
+  } else if (anchored) {
+    g.anchor = lambda;
+  } else {
+    g.x = lambda;
+  }
+  return g;
+}
+
+}  // namespace gelflow

@@ -1,0 +1,383 @@
+#include "model.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <stdexcept>
+
+namespace gelflow {
+
+namespace {
+
+constexpr int leaf_size = 8;
+constexpr int leaves_per_group = 16;
+
+[[noreturn]] void refuse(const std::string& what) { throw std::invalid_argument(what); }
+
+void check_finite(const std::string& owner, const char* what, const double* values, int n) {
+  for (int i = 0; i < n; ++i) {
+    if (!std::isfinite(values[i])) refuse(owner + ": " + what + " has an entry that is not finite");
+  }
+}
+
+// Sorts indices [begin, end) so that every run of `leaf_size` is compact: split the longest axis at a multiple of it.
+void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& order, int begin, int end) {
+  const int n = end - begin;
+  if (n <= leaf_size) return;
+  V3<double> low = points[order[begin]], high = low;
+  for (int i = begin; i < end; ++i) {
+    low = low.cwiseMin(points[order[i]]);
+    high = high.cwiseMax(points[order[i]]);
+  }
+  int axis = 0;
+  (high - low).maxCoeff(&axis);
+  int unit = leaf_size;
+  while (unit * 2 < n) unit *= 2;  // the left half is a full subtree: groups of leaves stay contiguous
+  const int middle = begin + unit;
+  // Ties are broken by the index, so that the order is the same with every standard library.
+  std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [&](int a, int b) {
+    const double pa = points[a][axis], pb = points[b][axis];
+    return pa < pb || (pa == pb && a < b);
+  });
+  std::sort(order.begin() + begin, order.begin() + middle);
+  std::sort(order.begin() + middle, order.begin() + end);
+  sort_in_space(points, order, begin, middle);
+  sort_in_space(points, order, middle, end);
+}
+
+PointCloud::Block bounding_block(const std::vector<V3<double>>& points, int begin, int end) {
+  V3<double> low = points[begin], high = low;
+  for (int i = begin; i < end; ++i) {
+    low = low.cwiseMin(points[i]);
+    high = high.cwiseMax(points[i]);
+  }
+  PointCloud::Block block{0.5 * (low + high), 0, begin, end};
+  for (int i = begin; i < end; ++i) block.radius = std::max(block.radius, (points[i] - block.center).norm());
+  block.radius *= 1 + 1e-6;  // also covers the rounding of single precision
+  return block;
+}
+
+template <class Item>
+int next_index(const std::vector<Item>& items) {
+  return static_cast<int>(items.size());
+}
+
+FrictionLaw friction_law(const std::string& owner, const std::string& name) {
+  if (name == "viscous") return FrictionLaw::viscous;
+  if (name == "elastic") return FrictionLaw::elastic;
+  refuse(owner + ": friction law '" + name + "' is not one of viscous, elastic");
+}
+
+void check_law(const std::string& owner, const std::array<double, 5>& numbers, FrictionLaw law) {
+  static const char* names[5] = {"kn", "kt", "mu", "kd", "ks"};
+  for (int i = 0; i < 5; ++i) {
+    if (!(numbers[i] >= 0) || !std::isfinite(numbers[i])) {
+      refuse(owner + ": " + names[i] + " must be finite and not negative, got " + std::to_string(numbers[i]));
+    }
+  }
+  if (law == FrictionLaw::elastic && !(numbers[4] > 0)) refuse(owner + ": the elastic friction law needs ks > 0");
+}
+
+}  // namespace
+
+PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& given_weights) {
+  const int n = static_cast<int>(given.size());
+  original.resize(n);
+  std::iota(original.begin(), original.end(), 0);
+  sort_in_space(given, original, 0, n);
+  for (const int i : original) {
+    points.push_back(given[i]);
+    weights.push_back(given_weights[i]);
+  }
+  for (int begin = 0; begin < n; begin += leaf_size) {
+    leaves.push_back(bounding_block(points, begin, std::min(begin + leaf_size, n)));
+  }
+  const int leaf_count = static_cast<int>(leaves.size());
+  for (int begin = 0; begin < leaf_count; begin += leaves_per_group) {
+    const int end = std::min(begin + leaves_per_group, leaf_count);
+    Block group = bounding_block(points, leaves[begin].begin, leaves[end - 1].end);
+    group.begin = begin;
+    group.end = end;
+    groups.push_back(group);
+  }
+}
+
+PairDofs Model::pair_dofs(int first, int second) const {
+  PairDofs pair;
+  for (int k = 0; k < nv; ++k) {
+    const auto moves = [&](int body) {
+      if (body == world) return false;
+      const auto& dofs = bodies[body].dofs;
+      return std::find(dofs.begin(), dofs.end(), k) != dofs.end();
+    };
+    const bool moves_first = moves(first), moves_second = moves(second);
+    if (moves_first == moves_second) continue;
+    pair.dof.push_back(k);
+    pair.first.push_back(moves_first ? 1 : 0);
+  }
+  return pair;
+}
+
+int ModelSpec::add_params(const std::string& owner, const std::vector<std::string>& names,
+                          const std::vector<double>& values) {
+  const int offset = next_index(model_.param_names);
+  for (std::size_t i = 0; i < names.size(); ++i) {
+    const std::string name = owner + "." + names[i];
+    if (std::find(model_.param_names.begin(), model_.param_names.end(), name) != model_.param_names.end()) {
+      refuse("the name '" + owner + "' is used twice (parameter " + name + ")");
+    }
+    model_.param_names.push_back(name);
+    model_.param_defaults.push_back(values[i]);
+  }
+  return offset;
+}
+
+void ModelSpec::check_body(const std::string& what, int body, bool world_allowed) const {
+  if (body >= next_index(model_.bodies) || body < (world_allowed ? world : 0)) {
+    refuse(what + ": body " + std::to_string(body) + " does not exist");
+  }
+}
+
+int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat,
+                        double mass, const V3<double>& com, const V6<double>& inertia) {
+  check_body("body '" + name + "'", parent, true);
+  check_finite("body '" + name + "'", "pos", pos.data(), 3);
+  check_finite("body '" + name + "'", "com", com.data(), 3);
+  check_finite("body '" + name + "'", "inertia", inertia.data(), 6);
+  if (!(mass >= 0) || !std::isfinite(mass)) refuse("body '" + name + "': mass must be finite and not negative");
+  if (!(std::abs(quat.norm() - 1) < 1e-6)) refuse("body '" + name + "': quat must have length 1");
+  Body body;
+  body.name = name;
+  body.parent = parent;
+  body.quat = quat.normalized();
+  body.joint_begin = body.joint_end = next_index(model_.joints);
+  if (parent != world) body.dofs = model_.bodies[parent].dofs;
+  body.mass = add_params(name,
+                         {"mass", "com.x", "com.y", "com.z", "inertia.xx", "inertia.yy", "inertia.zz", "inertia.xy",
+                          "inertia.xz", "inertia.yz"},
+                         {mass, com[0], com[1], com[2], inertia[0], inertia[1], inertia[2], inertia[3], inertia[4],
+                          inertia[5]});
+  body.pos = add_params(name, {"pos.x", "pos.y", "pos.z"}, {pos[0], pos[1], pos[2]});
+  model_.bodies.push_back(body);
+  return next_index(model_.bodies) - 1;
+}
+
+int ModelSpec::add_joint(const std::string& name, int body, const std::string& type, const V3<double>& pos,
+                         const V3<double>& axis, double damping, double armature, double stiffness, double springref,
+                         double lower, double upper, double limit_stiffness, double limit_damping) {
+  check_body("joint '" + name + "'", body, false);
+  if (body != next_index(model_.bodies) - 1) {
+    refuse("joint '" + name + "': joints must follow their body, before the next body is added");
+  }
+  Joint joint;
+  joint.name = name;
+  joint.body = body;
+  joint.pos = pos;
+  joint.axis = axis;
+  joint.q = model_.nq;
+  joint.v = model_.nv;
+  if (type == "slide") {
+    joint.type = JointType::slide;
+  } else if (type == "hinge") {
+    joint.type = JointType::hinge;
+  } else if (type == "free") {
+    joint.type = JointType::free;
+  } else {
+    refuse("joint '" + name + "': type '" + type + "' is not one of slide, hinge, free");
+  }
+  const bool free = joint.type == JointType::free;
+  Body& owner = model_.bodies[body];
+  if (free && (owner.parent != world || owner.joint_begin != owner.joint_end)) {
+    refuse("joint '" + name + "': a free joint must be the only joint of a body whose parent is the world");
+  }
+  if (!free) {
+    if (!(axis.norm() > 1e-9)) refuse("joint '" + name + "': axis must not be zero");
+    joint.axis = axis.normalized();
+    if (!(lower < upper)) refuse("joint '" + name + "': lower limit must be below upper");
+  }
+  joint.dofs = free ? 6 : 1;
+  joint.param = add_params(
+      name,
+      {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping"},
+      {damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping});
+  for (int i = 0; i < joint.dofs; ++i) {
+    const int k = model_.nv + i;
+    const bool turning = free && i >= 3;
+    model_.dof_body.push_back(body);
+    model_.dof_joint.push_back(next_index(model_.joints));
+    model_.group_begin.push_back(turning ? model_.nv + 3 : k);
+    model_.group_end.push_back(turning ? model_.nv + 6 : k + 1);
+    model_.angular.push_back(turning || joint.type == JointType::hinge ? 1 : 0);
+    owner.dofs.push_back(k);
+  }
+  if (free) {
+    const double* p = &model_.param_defaults[owner.pos];
+    model_.q0.insert(model_.q0.end(), {p[0], p[1], p[2], owner.quat[0], owner.quat[1], owner.quat[2], owner.quat[3]});
+  } else {
+    model_.q0.push_back(0);
+  }
+  model_.nq += free ? 7 : 1;
+  model_.nv += joint.dofs;
+  model_.joints.push_back(joint);
+  owner.joint_end = next_index(model_.joints);
+  return next_index(model_.joints) - 1;
+}
+
+int ModelSpec::add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
+                         const V4<double>& quat, const V3<double>& size) {
+  check_body("shape '" + name + "'", body, true);
+  check_finite("shape '" + name + "'", "size", size.data(), 3);
+  Shape shape;
+  shape.name = name;
+  shape.body = body;
+  shape.pos = pos;
+  shape.rotation = rotation_of<double>(quat.normalized());
+  int sizes = 0;
+  if (kind == "plane") {
+    shape.kind = ShapeKind::plane;
+  } else if (kind == "sphere") {
+    shape.kind = ShapeKind::sphere;
+    sizes = 1;
+  } else if (kind == "box") {
+    shape.kind = ShapeKind::box;
+    sizes = 3;
+  } else {
+    refuse("shape '" + name + "': kind '" + kind + "' is not one of plane, sphere, box");
+  }
+  for (int i = 0; i < sizes; ++i) {
+    if (!(size[i] > 0)) refuse("shape '" + name + "': size must be positive");
+  }
+  shape.size = add_params(name, {"size.x", "size.y", "size.z"}, {size[0], size[1], size[2]});
+  model_.shapes.push_back(shape);
+  return next_index(model_.shapes) - 1;
+}
+
+int ModelSpec::add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
+                          const std::vector<double>& weights, double radius) {
+  check_body("points '" + name + "'", body, true);
+  if (points.empty()) refuse("points '" + name + "': at least one point is needed");
+  if (points.size() != weights.size()) refuse("points '" + name + "': as many weights as points are needed");
+  for (const auto& p : points) check_finite("points '" + name + "'", "position", p.data(), 3);
+  for (const double w : weights) {
+    if (!(w >= 0) || !std::isfinite(w)) refuse("points '" + name + "': weights must be finite and not negative");
+  }
+  if (!(radius >= 0) || (radius > 0 && points.size() != 1)) {
+    refuse("points '" + name + "': a radius goes with a single point, the sphere's centre");
+  }
+  model_.point_sets.push_back({name, body, radius, PointCloud(points, weights)});
+  return next_index(model_.point_sets) - 1;
+}
+
+int ModelSpec::add_contact(const std::string& name, int points, int shape, const std::string& law,
+                           const std::string& damping, const std::array<double, 5>& law_numbers) {
+  const std::string owner = "contact '" + name + "'";
+  if (points < 0 || points >= next_index(model_.point_sets)) refuse(owner + ": no such point set");
+  if (shape < 0 || shape >= next_index(model_.shapes)) refuse(owner + ": no such shape");
+  if (model_.point_sets[points].radius > 0 && model_.shapes[shape].kind != ShapeKind::plane) {
+    refuse(owner + ": a sphere's moving point touches planes only");
+  }
+  Contact contact;
+  contact.name = name;
+  contact.points = points;
+  contact.shape = shape;
+  contact.law = friction_law(owner, law);
+  check_law(owner, law_numbers, contact.law);
+  if (damping != "depth" && damping != "plain") refuse(owner + ": damping '" + damping + "' is not depth or plain");
+  contact.damping = damping == "depth" ? DampingLaw::depth : DampingLaw::plain;
+  contact.param = add_params(name, {"kn", "kt", "mu", "kd", "ks"}, {law_numbers.begin(), law_numbers.end()});
+  contact.anchor = -1;
+  if (contact.law == FrictionLaw::elastic) {
+    contact.anchor = model_.na;
+    model_.na += model_.point_sets[points].cloud.size();
+  }
+  model_.contacts.push_back(contact);
+  return next_index(model_.contacts) - 1;
+}
+
+int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
+                       const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
+                       const std::array<double, 5>& law_numbers, const std::vector<double>& weights) {
+  const std::string owner = "pad '" + name + "'";
+  check_body(owner, body, true);
+  if (positions.empty()) refuse(owner + ": at least one marker is needed");
+  if (frames.size() != positions.size() || weights.size() != positions.size()) {
+    refuse(owner + ": every marker needs a position, a frame and a weight");
+  }
+  for (const int s : shapes) {
+    if (s < 0 || s >= next_index(model_.shapes)) refuse(owner + ": no such shape");
+  }
+  Pad pad;
+  pad.name = name;
+  pad.body = body;
+  pad.cloud = PointCloud(positions, weights);
+  for (const int i : pad.cloud.original) pad.frames.push_back(frames[i]);
+  pad.shapes = shapes;
+  pad.law = friction_law(owner, law);
+  check_law(owner, law_numbers, pad.law);
+  pad.param = add_params(name, {"kn", "kt", "mu", "kd", "ks"}, {law_numbers.begin(), law_numbers.end()});
+  pad.anchor = -1;
+  if (pad.law == FrictionLaw::elastic) {
+    pad.anchor = model_.na;
+    model_.na += pad.cloud.size() * static_cast<int>(shapes.size());
+  }
+  pad.first_marker = model_.markers;
+  model_.markers += pad.cloud.size();
+  model_.pads.push_back(pad);
+  return next_index(model_.pads) - 1;
+}
+
+int ModelSpec::add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp,
+                            double kd, double force_lower, double force_upper) {
+  const std::string owner = "actuator '" + name + "'";
+  if (joint < 0 || joint >= next_index(model_.joints)) refuse(owner + ": no such joint");
+  if (model_.joints[joint].type == JointType::free) refuse(owner + ": a free joint can not be actuated");
+  if (!(force_lower < force_upper)) refuse(owner + ": force_lower must be below force_upper");
+  Actuator actuator;
+  actuator.name = name;
+  if (kind == "motor") {
+    actuator.kind = ActuatorKind::motor;
+  } else if (kind == "position") {
+    actuator.kind = ActuatorKind::position;
+  } else {
+    refuse(owner + ": kind '" + kind + "' is not motor or position");
+  }
+  actuator.dof = model_.joints[joint].v;
+  actuator.q = model_.joints[joint].q;
+  actuator.param = add_params(name, {"gear", "kp", "kd", "force_lower", "force_upper"},
+                              {gear, kp, kd, force_lower, force_upper});
+  model_.actuators.push_back(actuator);
+  return next_index(model_.actuators) - 1;
+}
+
+Model ModelSpec::build() const {
+  Model model = model_;
+  if (model.nv == 0) refuse("the scene has no joint: nothing can move");
+  if (model.nv > 64) refuse("the scene has " + std::to_string(model.nv) + " degrees of freedom; at most 64 are supported");
+  model.gravity = next_index(model.param_names);
+  for (const char* axis : {"gravity.x", "gravity.y", "gravity.z"}) model.param_names.emplace_back(axis);
+  for (int i = 0; i < 3; ++i) model.param_defaults.push_back(gravity[i]);
+  if (!(step > 0) || !std::isfinite(step)) refuse("step must be positive and finite");
+  if (!(tolerance > 0)) refuse("tolerance must be positive");
+  model.step = step;
+  model.tolerance = tolerance;
+  model.max_iterations = max_iterations;
+  model.max_halvings = max_halvings;
+  const int nv = model.nv;
+  model.carries_.assign(static_cast<std::size_t>(nv) * nv, 0);
+  for (int k = 0; k < nv; ++k) {
+    for (const int j : model.bodies[model.dof_body[k]].dofs) {
+      if (j <= k || model.group_begin[j] == model.group_begin[k]) {
+        model.carries_[static_cast<std::size_t>(j) * nv + k] = 1;
+      }
+    }
+  }
+  for (auto& contact : model.contacts) {
+    contact.pair = model.pair_dofs(model.point_sets[contact.points].body, model.shapes[contact.shape].body);
+  }
+  for (auto& pad : model.pads) {
+    for (const int s : pad.shapes) pad.pairs.push_back(model.pair_dofs(pad.body, model.shapes[s].body));
+  }
+  return model;
+}
+
+}  // namespace gelflow

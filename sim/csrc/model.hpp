@@ -1,0 +1,179 @@
+// The immutable model: what is in the scene and how it hangs together. Numbers that randomization, calibration and
+// gradients change live in Params, one flat array per environment; the model holds the offsets and the names.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <limits>
+#include <string>
+#include <vector>
+
+#include "spatial.hpp"
+
+namespace gelflow {
+
+enum class JointType : std::uint8_t { slide, hinge, free };
+enum class ShapeKind : std::uint8_t { plane, sphere, box };
+enum class FrictionLaw : std::uint8_t { viscous, elastic };
+enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not (ground)
+enum class ActuatorKind : std::uint8_t { motor, position };
+
+constexpr int world = -1;
+
+struct Body {
+  std::string name;
+  int parent;             // moving body, or world
+  V4<double> quat;        // of the frame in the parent's frame at q = 0
+  int joint_begin, joint_end;
+  int mass, pos;          // offsets in Params: mass, com (3), inertia (6); pos (3)
+  std::vector<int> dofs;  // all dofs that move this body, root first
+};
+
+struct Joint {
+  std::string name;
+  JointType type;
+  int body;
+  V3<double> pos, axis;  // in the body's frame
+  int q, v;              // first position and first velocity
+  int dofs;              // 1 or 6
+  int param;             // damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping
+};
+
+struct Shape {
+  std::string name;
+  ShapeKind kind;
+  int body;
+  V3<double> pos;
+  M3<double> rotation;
+  int size;  // offset in Params (3): half sizes of a box, radius of a sphere
+};
+
+// Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
+// a block whose sphere lies outside a shape is skipped whole.
+struct PointCloud {
+  struct Block {
+    V3<double> center;
+    double radius;
+    int begin, end;  // points (leaves) or leaves (groups)
+  };
+  std::vector<V3<double>> points;  // sorted
+  std::vector<double> weights;     // sorted
+  std::vector<int> original;       // sorted index → index as given
+  std::vector<Block> leaves, groups;
+
+  PointCloud() = default;
+  PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& weights);
+  int size() const { return static_cast<int>(points.size()); }
+};
+
+struct PointSet {
+  std::string name;
+  int body;
+  double radius;  // > 0: one point, the centre of a sphere whose lowest point touches planes
+  PointCloud cloud;
+};
+
+// The dofs that move one body of a pair and not the other; they alone change the relative motion.
+struct PairDofs {
+  std::vector<int> dof;
+  std::vector<std::int8_t> first;  // 1 where the dof moves the first body, 0 where it moves the second
+};
+
+struct Contact {
+  std::string name;
+  int points, shape;
+  FrictionLaw law;
+  DampingLaw damping;
+  int param;   // kn, kt, mu, kd, ks
+  int anchor;  // first anchor slot, −1 under the viscous law
+  PairDofs pair;
+};
+
+struct Pad {
+  std::string name;
+  int body;
+  PointCloud cloud;
+  std::vector<M3<double>> frames;  // sorted like the cloud; columns x, y, z
+  std::vector<int> shapes;
+  FrictionLaw law;
+  int param;         // kn, kt, mu, kd, ks
+  int anchor;        // first anchor slot; shape s, marker i is at anchor + s * markers + i
+  int first_marker;  // in the tactile output
+  std::vector<PairDofs> pairs;  // one per shape
+};
+
+struct Actuator {
+  std::string name;
+  ActuatorKind kind;
+  int dof, q;
+  int param;  // gear, kp, kd, force_lower, force_upper
+};
+
+struct Model {
+  std::vector<Body> bodies;
+  std::vector<Joint> joints;
+  std::vector<Shape> shapes;
+  std::vector<PointSet> point_sets;
+  std::vector<Contact> contacts;
+  std::vector<Pad> pads;
+  std::vector<Actuator> actuators;
+
+  std::vector<std::string> param_names;
+  std::vector<double> param_defaults;
+  int gravity = 0;  // offset in Params (3)
+
+  int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
+  std::vector<double> q0;                   // reference positions
+
+  // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, its joint.
+  std::vector<int> dof_body, dof_joint;
+  std::vector<int> group_begin, group_end;
+  std::vector<std::uint8_t> angular;
+  // carries(j, k): moving dof j carries dof k's axis along (j is before k on its chain, or in its group).
+  std::vector<std::uint8_t> carries_;
+  bool carries(int j, int k) const { return carries_[static_cast<std::size_t>(j) * nv + k] != 0; }
+
+  double step = 5e-3;       // h [s]
+  double tolerance = 1e-9;  // Newton: residual relative to the forces at work
+  int max_iterations = 50;
+  int max_halvings = 6;
+
+  PairDofs pair_dofs(int first, int second) const;
+};
+
+// Collects a scene piece by piece, checks each, and hands out the Model.
+class ModelSpec {
+ public:
+  V3<double> gravity{0, 0, -9.8};
+  double step = 5e-3;
+  double tolerance = 1e-9;
+  int max_iterations = 50;
+  int max_halvings = 6;
+
+  static constexpr double inf = std::numeric_limits<double>::infinity();
+
+  int add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat, double mass,
+               const V3<double>& com, const V6<double>& inertia);
+  int add_joint(const std::string& name, int body, const std::string& type, const V3<double>& pos,
+                const V3<double>& axis, double damping, double armature, double stiffness, double springref,
+                double lower, double upper, double limit_stiffness, double limit_damping);
+  int add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
+                const V4<double>& quat, const V3<double>& size);
+  int add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
+                 const std::vector<double>& weights, double radius);
+  int add_contact(const std::string& name, int points, int shape, const std::string& law, const std::string& damping,
+                  const std::array<double, 5>& law_numbers);
+  int add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
+              const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
+              const std::array<double, 5>& law_numbers, const std::vector<double>& weights);
+  int add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
+                   double force_lower, double force_upper);
+  Model build() const;
+
+ private:
+  Model model_;
+  int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
+  void check_body(const std::string& what, int body, bool world_allowed) const;
+};
+
+}  // namespace gelflow

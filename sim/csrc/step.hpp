@@ -1,0 +1,228 @@
+// One implicit step (eqs. 6-7): the residual with its derivatives, Newton's method with line search, and halving.
+//
+//     q_t = q_{t-1} ⊕ h v_t
+//     g(v_t) = M(q_t) (v_t − v*) + h (C(q_t, v_t) − f(q_t, v_t, u)) = 0,   BDF1: v* = v_{t-1}
+//
+// written as g = h · (inverse dynamics of (q_t, v_t, (v_t − v*)/h) − f), and solved for v_t.
+#pragma once
+
+#include <algorithm>
+
+#include "contact.hpp"
+#include "dynamics.hpp"
+#include "tactile.hpp"
+
+namespace gelflow {
+
+enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
+
+// The state of one environment. Anchors live in the frame of the shape that they touch.
+template <class T>
+struct StateView {
+  T* q;
+  T* v;
+  V3<T>* anchors;
+  std::uint8_t* anchored;
+};
+
+struct StepReport {
+  Status status = Status::ok;
+  int iterations = 0;  // Newton iterations, substeps included
+  int halvings = 0;    // the step was taken as 2^halvings substeps
+};
+
+// Joint-space forces: damping, springs, limits, actuators. Adds −h f and its derivatives to the residual.
+template <bool derivatives, class T>
+void subtract_joint_forces(const Model& m, const T* params, const T& h, const T* q, const T* v, const T* u, bool scale,
+                           Workspace<T>& w) {
+  using std::abs;
+  for (const Joint& joint : m.joints) {
+    const T* p = params + joint.param;
+    const T damping = p[0], armature = p[1], stiffness = p[2], rest = p[3], lower = p[4], upper = p[5];
+    for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
+      w.residual[k] += h * damping * v[k];
+      if constexpr (derivatives) w.by_v(k, k) += h * damping;
+      if (armature != T(0)) {
+        w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
+        if constexpr (derivatives) {
+          w.by_v(k, k) += armature;
+          w.mass(k, k) += armature;
+        }
+      }
+    }
+    if (joint.type == JointType::free) continue;
+    const int k = joint.v;
+    const T value = q[joint.q];
+    w.residual[k] += h * stiffness * (value - rest);
+    if constexpr (derivatives) w.by_q(k, k) += h * stiffness;
+    // A limit pushes back like a damped spring and never pulls.
+    const bool above = value > upper, below = value < lower;
+    if (above || below) {
+      const T force = p[6] * (value - (above ? upper : lower)) + p[7] * v[k];
+      if (above ? force > T(0) : force < T(0)) {
+        w.residual[k] += h * force;
+        if constexpr (derivatives) {
+          w.by_q(k, k) += h * p[6];
+          w.by_v(k, k) += h * p[7];
+        }
+      }
+    }
+  }
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) {
+    const Actuator& actuator = m.actuators[a];
+    const T* p = params + actuator.param;
+    const T gear = p[0], kp = p[1], kd = p[2];
+    const bool servo = actuator.kind == ActuatorKind::position;
+    const int k = actuator.dof;
+    // The gear carries forces to the joint and lengths to the actuator.
+    T force = servo ? T(kp * (u[a] - gear * q[actuator.q]) - kd * gear * v[k]) : T(u[a]);
+    const bool clipped = force < p[3] || force > p[4];
+    if (clipped) force = force < p[3] ? p[3] : p[4];
+    w.residual[k] -= h * gear * force;
+    if (scale) w.scale[k] += h * abs(gear * force);
+    if constexpr (derivatives) {
+      w.by_u[a] = clipped ? T(0) : T(-h * gear * (servo ? kp : T(1)));
+      if (servo && !clipped) {
+        w.by_q(k, k) += h * gear * gear * kp;
+        w.by_v(k, k) += h * gear * gear * kd;
+      }
+    }
+  }
+}
+
+// Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.scale, the size of
+// the forces at work, which Newton's tolerance refers to.
+template <bool derivatives, class T>
+void evaluate(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
+              const std::uint8_t* anchored, const T* u, const T* v, bool scale, Workspace<T>& w) {
+  integrate<T>(m, q0, v, h, w.q.data());
+  for (int k = 0; k < m.nv; ++k) w.trial[k] = v[k] - v_star[k];
+  w.update = w.trial / h;  // accelerations
+  forward_positions<T>(m, params, w.q.data(), w);
+  forward_velocities<T>(m, params, v, w.update.data(), w);
+  w.residual.setZero();
+  if constexpr (derivatives) {
+    w.by_q.setZero();
+    w.by_v.setZero();
+    w.mass.setZero();
+  }
+  add_inverse_dynamics<derivatives, T>(m, params, h, w);
+  if constexpr (derivatives) w.by_v += w.mass;
+  if (scale) {
+    for (int k = 0; k < m.nv; ++k) w.scale[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
+  }
+  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, u, scale, w);
+  subtract_contact_forces<derivatives, T>(m, params, h, anchors, anchored, scale, w);
+  if constexpr (derivatives) {
+    w.tangent = w.by_q;
+    times_position_by_velocity<T>(m, v, h, w.tangent);
+    w.tangent += w.by_v;
+  }
+}
+
+template <class T>
+double merit(const Workspace<T>& w) {
+  double worst = 0;
+  for (Eigen::Index k = 0; k < w.residual.size(); ++k) {
+    const double value = real_part(w.residual[k]) / std::max<double>(real_part(w.scale[k]), 1e-30);
+    if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
+    worst += value * value;
+  }
+  return std::sqrt(worst);
+}
+
+// Solves one substep; on success `v` is v_t, and w holds residual, derivatives and kinematics at (w.q, v).
+// `polish` more Newton updates follow convergence (dual numbers need two for their derivative part).
+template <class T>
+Status newton(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
+              const std::uint8_t* anchored, const T* u, int polish, VX<T>& v, int& iterations, Workspace<T>& w) {
+  // Below this the residual is made of rounding errors alone: progress may stop there.
+  const double floor = 1e4 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon()));
+  const double tolerance = std::max(m.tolerance, floor * 1e-2);
+  evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), true, w);
+  double size = merit(w);
+  for (int k = 0; k < m.max_iterations; ++k) {
+    if (!std::isfinite(size)) return Status::not_finite;
+    const bool converged = size <= tolerance;
+    if (converged && polish-- <= 0) return Status::ok;
+    w.lu.compute(w.tangent);
+    w.direction = w.lu.solve(w.residual);
+    w.start = v;
+    ++iterations;
+    const double before = size;
+    double fraction = 1;
+    for (int tries = 0;; ++tries) {
+      v = w.start - w.direction * T(fraction);
+      evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), false, w);
+      size = merit(w);
+      if (converged || size <= (1 - 1e-4 * fraction) * before) break;
+      if (tries == 12) {  // no progress: at the rounding floor, or at a kink that Newton can not cross
+        v = w.start;
+        evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), false, w);
+        return before <= std::max(100 * tolerance, floor) ? Status::ok : Status::newton;
+      }
+      fraction *= 0.5;
+    }
+  }
+  return size <= tolerance ? Status::ok : Status::newton;
+}
+
+// One environment's memory for steps: the state to fall back on, and the state in the making.
+template <class T>
+struct StepMemory {
+  explicit StepMemory(const Model& m)
+      : work(m), q(m.nq), v(m.nv), v_new(m.nv), anchors(m.na), anchored(m.na) {}
+  Workspace<T> work;
+  VX<T> q, v, v_new;
+  std::vector<V3<T>> anchors;
+  std::vector<std::uint8_t> anchored;
+};
+
+// Called after each accepted substep with (h, state before it, v_t); memory.work holds the accepted evaluation.
+struct NoObserver {
+  template <class... A>
+  void operator()(const A&...) const {}
+};
+
+// Takes `count` substeps of length h. On failure the state is left in the middle: the caller restores it.
+template <class T, class Observer>
+Status substeps(const Model& m, const T* params, const T& h, int count, const T* u, int polish, const StateView<T>& s,
+                StepMemory<T>& memory, int& iterations, Observer&& accepted) {
+  for (int i = 0; i < count; ++i) {
+    memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
+    const Status status = newton<T>(m, params, h, s.q, s.v, s.anchors, s.anchored, u, polish, memory.v_new, iterations,
+                                    memory.work);
+    if (status != Status::ok) return status;
+    accepted(h, s, memory);
+    advance_contact_anchors<T>(m, params, h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    advance_marker_anchors<T>(m, params, h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    std::copy(memory.work.q.data(), memory.work.q.data() + m.nq, s.q);
+    std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
+  }
+  return Status::ok;
+}
+
+// One step of length m.step. Where Newton does not converge the step is taken as 2, 4, … substeps; where even the
+// shortest fail, the state is left as it was and the report says why.
+template <class T, class Observer = NoObserver>
+StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
+                Observer&& accepted = {}) {
+  StepReport report;
+  memory.q = Eigen::Map<const VX<T>>(s.q, m.nq);
+  memory.v = Eigen::Map<const VX<T>>(s.v, m.nv);
+  std::copy(s.anchors, s.anchors + m.na, memory.anchors.begin());
+  std::copy(s.anchored, s.anchored + m.na, memory.anchored.begin());
+  for (; report.halvings <= m.max_halvings; ++report.halvings) {
+    const int count = 1 << report.halvings;
+    report.status = substeps<T>(m, params, T(m.step / count), count, u, polish, s, memory, report.iterations, accepted);
+    if (report.status == Status::ok) return report;
+    std::copy(memory.q.data(), memory.q.data() + m.nq, s.q);
+    std::copy(memory.v.data(), memory.v.data() + m.nv, s.v);
+    std::copy(memory.anchors.begin(), memory.anchors.end(), s.anchors);
+    std::copy(memory.anchored.begin(), memory.anchored.end(), s.anchored);
+  }
+  --report.halvings;
+  return report;
+}
+
+}  // namespace gelflow
