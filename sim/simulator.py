@@ -1,0 +1,276 @@
+"""The simulator's handle: N copies of a scene that step together, with NumPy arrays in and out."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gelflow.errors import SimulationError, UsageError
+from gelflow.sim import _core
+
+STATUS = {0: "ok", 1: "Newton's method did not converge, even with the shortest substeps", 2: "a force overflowed"}
+
+
+class Buildable(Protocol):
+    """Anything that makes a core model: a `gelflow.sim.scene.Scene`."""
+
+    def build(self) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A recorded rollout; arrays have time first, then environment."""
+
+    q: NDArray[Any]  # (steps + 1, N, nq)
+    v: NDArray[Any]  # (steps + 1, N, nv)
+    anchors: NDArray[Any]  # (steps + 1, N, na, 3), in the frames of the shapes that are touched [m]
+    anchored: NDArray[np.uint8]  # (steps + 1, N, na)
+    u: NDArray[Any]  # (steps, N, nu)
+    tactile: NDArray[Any]  # (reads, N, markers, 3): shear x, shear y, normal [N]
+    read_after: NDArray[np.int32]  # markers were read after that many steps
+    halvings: NDArray[np.int8]  # (steps, N): the step was taken as 2^halvings substeps
+    status: NDArray[np.int32]  # (N): 0, or why the environment stopped (`STATUS`)
+
+
+@dataclass(frozen=True)
+class TrajectoryGradient:
+    """Gradient of a scalar with respect to what a rollout was given. A quaternion's gradient is its tangent gradient."""
+
+    u: NDArray[Any]  # (steps, N, nu)
+    q: NDArray[Any]  # (N, nq)
+    v: NDArray[Any]  # (N, nv)
+    anchors: NDArray[Any]  # (N, na, 3)
+
+
+class Simulator:
+    """N environments of one scene.
+
+    Parameters
+    ----------
+    scene: a `Scene` (or a core model)
+    num_envs: how many copies
+    threads: at most this many threads; all cores when None. Results do not depend on it.
+    precision: "double" or "single"
+
+    `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        num_envs: int = 1,
+        threads: int | None = None,
+        precision: Literal["double", "single"] = "double",
+    ) -> None:
+        if num_envs < 1:
+            raise UsageError(f"num_envs must be at least 1, got {num_envs}")
+        if precision not in ("double", "single"):
+            raise UsageError(f"precision must be 'double' or 'single', got {precision!r}")
+        self.scene = scene
+        self.model = scene if isinstance(scene, _core.Model) else scene.build()
+        self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
+        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = max(1, min(num_envs, threads or available))
+        batch = _core.Batch if precision == "double" else _core.BatchFloat
+        self._batch = batch(self.model, num_envs, workers)
+        self.num_envs = num_envs
+        self.q: NDArray[Any] = self._batch.q
+        self.v: NDArray[Any] = self._batch.v
+        self.params: NDArray[Any] = self._batch.params
+        self.anchors: NDArray[Any] = self._batch.anchors
+        self.anchored: NDArray[np.uint8] = self._batch.anchored
+        self.status: NDArray[np.int32] = self._batch.status
+        self.iterations: NDArray[np.int64] = self._batch.iterations
+        self.halved: NDArray[np.int64] = self._batch.halved
+        self._tactile = np.zeros((num_envs, self.model.markers, 3), self.dtype)
+
+    @cached_property
+    def _param_index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.model.param_names)}
+
+    def param(self, name: str) -> NDArray[Any]:
+        """The column of one parameter, such as "pad_box.kn": a view of shape (N,) to read and write.
+
+        Raises UsageError for a name that the scene does not have.
+        """
+        if name not in self._param_index:
+            owner = name.split(".")[0]
+            near = [n for n in self._param_index if n.startswith(owner + ".")] or sorted(
+                {n.split(".")[0] for n in self._param_index}
+            )
+            raise UsageError(f"no parameter {name!r}; there are {', '.join(near)}")
+        column: NDArray[Any] = self.params[:, self._param_index[name]]
+        return column
+
+    def reset(self, which: ArrayLike | None = None) -> None:
+        """Reference positions, rest and no memory of contact, for environments where `which` (N,) is true, or all.
+
+        Parameters keep their values.
+        """
+        self._batch.reset(None if which is None else np.ascontiguousarray(which, dtype=np.uint8))
+
+    def forget_contact(self, which: ArrayLike | None = None) -> None:
+        """Clear the anchors of the elastic law, after a state was written by hand."""
+        chosen = slice(None) if which is None else np.asarray(which, dtype=bool)
+        self.anchored[chosen] = 0
+
+    def step(self, u: ArrayLike, steps: int = 1) -> None:
+        """Take `steps` steps under controls u (N, nu), or (nu,) for all environments alike.
+
+        An environment that fails keeps its last good state and gets a `status` other than 0 (see `STATUS`); it stays
+        still until `reset`. Raises UsageError when a control or the state is not finite.
+        """
+        try:
+            self._batch.step(self._controls(u), steps)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+    def _controls(self, u: ArrayLike) -> NDArray[Any]:
+        array = np.asarray(u, dtype=self.dtype)
+        if array.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
+            raise UsageError(
+                f"u must have shape ({self.num_envs}, {self.model.nu}) or ({self.model.nu},), got {array.shape}"
+            )
+        return np.ascontiguousarray(np.broadcast_to(array, (self.num_envs, self.model.nu)))
+
+    def check(self) -> None:
+        """Raises SimulationError when an environment has failed, naming the first."""
+        failed = np.flatnonzero(self.status)
+        if len(failed):
+            raise SimulationError(f"environment {failed[0]}: {STATUS[int(self.status[failed[0]])]}")
+
+    def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Marker readings now, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
+
+        Without `out` the array is the simulator's own and is overwritten by the next call.
+        """
+        target = self._tactile if out is None else out
+        self._batch.tactile(target)
+        return target
+
+    def pad(self, name: str) -> slice:
+        """The markers of one pad, as a slice of the markers' axis."""
+        names = list(self.model.pad_names)
+        if name not in names:
+            raise UsageError(f"no pad {name!r}; there are {', '.join(names)}")
+        first, count = self.model.pad_markers[names.index(name)]
+        return slice(first, first + count)
+
+    def joint_q(self, name: str) -> int:
+        """Index into q of a joint's first position."""
+        return self._joint(name, self.model.joint_q)
+
+    def joint_v(self, name: str) -> int:
+        """Index into v of a joint's first velocity."""
+        return self._joint(name, self.model.joint_v)
+
+    def _joint(self, name: str, indices: Sequence[int]) -> int:
+        names = list(self.model.joint_names)
+        if name not in names:
+            raise UsageError(f"no joint {name!r}; there are {', '.join(names)}")
+        return int(indices[names.index(name)])
+
+    def poses(self) -> NDArray[Any]:
+        """Poses of the moving bodies in the world, (N, bodies, 7): position [m], quaternion w x y z."""
+        out = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype)
+        self._batch.poses(out)
+        return out
+
+    def wrenches(self) -> NDArray[Any]:
+        """Per contact, on its first body, about the world's origin, (N, contacts, 6): moment [N m], force [N]."""
+        out = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype)
+        self._batch.wrenches(out)
+        return out
+
+    def mass_matrix(self) -> NDArray[Any]:
+        """Joint-space mass matrices M(q), (N, nv, nv)."""
+        out = np.empty((self.num_envs, self.model.nv, self.model.nv), self.dtype)
+        self._batch.mass_matrix(out)
+        return out
+
+    def bias(self) -> NDArray[Any]:
+        """Coriolis, centrifugal and gravity forces C(q, v), (N, nv)."""
+        out = np.empty((self.num_envs, self.model.nv), self.dtype)
+        self._batch.bias(out)
+        return out
+
+    def rollout(
+        self,
+        u: ArrayLike,
+        *,
+        q: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        anchors: ArrayLike | None = None,
+        anchored: ArrayLike | None = None,
+        read_after: Sequence[int] = (),
+    ) -> Trajectory:
+        """Steps under controls u (steps, N, nu), from the given state or the present one, which is not changed.
+
+        Markers are read after the steps named in `read_after` (0 = the start). Raises UsageError on wrong shapes and
+        on controls that are not finite.
+        """
+        controls = np.ascontiguousarray(u, dtype=self.dtype)
+        if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
+            raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
+        steps, n = controls.shape[0], self.num_envs
+
+        def along_time(start: ArrayLike | None, own: NDArray[Any]) -> NDArray[Any]:
+            array = np.empty((steps + 1, *own.shape), own.dtype)
+            array[0] = own if start is None else start
+            return array
+
+        reads = np.asarray(read_after, dtype=np.int32)
+        result = Trajectory(
+            q=along_time(q, self.q),
+            v=along_time(v, self.v),
+            anchors=along_time(anchors, self.anchors),
+            anchored=along_time(anchored, self.anchored),
+            u=controls,
+            tactile=np.empty((len(reads), n, self.model.markers, 3), self.dtype),
+            read_after=reads,
+            halvings=np.zeros((steps, n), np.int8),
+            status=np.zeros(n, np.int32),
+        )
+        for name, start in (("q", result.q[0]), ("v", result.v[0])):
+            if not np.isfinite(start).all():
+                raise UsageError(f"{name}{np.argwhere(~np.isfinite(start))[0].tolist()} is not finite")
+        try:
+            self._batch.rollout(*self._arguments(result))
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        return result
+
+    @staticmethod
+    def _arguments(t: Trajectory) -> tuple[NDArray[Any], ...]:
+        return (t.u, t.q, t.v, t.anchors, t.anchored, t.halvings, t.status, t.read_after, t.tactile)
+
+    def rollout_gradient(
+        self,
+        trajectory: Trajectory,
+        *,
+        q: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        tactile: ArrayLike | None = None,
+        anchors_end: ArrayLike | None = None,
+    ) -> TrajectoryGradient:
+        """The reverse pass: gradients with respect to the trajectory's q, v, tactile (shaped as there) in, gradients
+        with respect to controls and initial state out. Environments that failed have gradient zero."""
+
+        def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
+            if value is None:
+                return np.zeros(like.shape, self.dtype)
+            return np.ascontiguousarray(np.broadcast_to(np.asarray(value, self.dtype), like.shape))
+
+        gradients = self._batch.rollout_transposed(
+            *self._arguments(trajectory),
+            shaped(q, trajectory.q),
+            shaped(v, trajectory.v),
+            shaped(anchors_end, trajectory.anchors[0]),
+            shaped(tactile, trajectory.tactile),
+        )
+        return TrajectoryGradient(*gradients)
