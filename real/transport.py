@@ -1,0 +1,226 @@
+"""Byte transports for devices that speak over a stream: a serial line (or pty) and TCP.
+
+Each operation has a time-out in robot time. A transport never connects again by itself: what was sent before a
+break must not be sent twice, so a new connection is the caller's decision. Every frame goes out in one write.
+"""
+
+import contextlib
+import errno
+import socket
+import time
+from typing import Protocol
+from urllib.parse import urlsplit
+
+import serial
+
+from gelflow.clock import Clock
+from gelflow.errors import PeerError, PeerTimeout, UsageError
+
+# A peer on the same machine with a fast clock still needs the scheduler's time: no wait is shorter than this.
+SHORTEST_WALL_TIMEOUT = 0.1  # [s]
+_READ_SIZE = 4096  # bytes
+
+
+class Transport(Protocol):
+    """A stream of bytes to one device."""
+
+    @property
+    def address(self) -> str:
+        """Where the peer is, for messages."""
+        ...
+
+    def open(self) -> None:
+        """Connect. Raises PeerTimeout or PeerError when nobody answers."""
+        ...
+
+    def read(self, timeout: float) -> bytes:
+        """Bytes that came within `timeout` [s, robot time], empty when none did. Raises PeerError on a broken link."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data` in one write. Raises PeerTimeout when the peer takes nothing, PeerError on a break."""
+        ...
+
+    def close(self) -> None:
+        """Close; may be called twice, raises nothing."""
+        ...
+
+
+class TcpTransport:
+    """A TCP connection."""
+
+    def __init__(
+        self, host: str, port: int, *, clock: Clock, connect_timeout: float = 2.0, write_timeout: float = 0.5
+    ) -> None:
+        if not host or not 0 < port < 65536:
+            raise UsageError(f"a TCP address needs a host and a port of 1 to 65535, got {host!r} and {port}")
+        self._peer = host, port
+        self._clock = clock
+        self._connect_timeout = connect_timeout
+        self._write_timeout = write_timeout
+        self._socket: socket.socket | None = None
+
+    @property
+    def address(self) -> str:
+        return f"tcp://{self._peer[0]}:{self._peer[1]}"
+
+    def open(self) -> None:
+        if self._socket is not None:
+            raise UsageError(f"{self.address} is already open")
+        try:
+            connection = socket.create_connection(self._peer, _wall(self._clock, self._connect_timeout))
+        except TimeoutError:
+            raise PeerTimeout(
+                f"nothing answered at {self.address} within {self._connect_timeout} s: is it on, is the address right?"
+            ) from None
+        except OSError as error:
+            raise PeerError(
+                f"no connection to {self.address} ({error.strerror or error}): is it on, is the address right?"
+            ) from None
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connection
+
+    def read(self, timeout: float) -> bytes:
+        connection = self._connected()
+        try:
+            connection.settimeout(max(self._clock.wall(timeout), 1e-3))
+            data = connection.recv(_READ_SIZE)
+        except TimeoutError:
+            return b""
+        except OSError as error:
+            raise PeerError(f"the connection to {self.address} broke ({error.strerror or error})") from None
+        if not data:
+            raise PeerError(f"{self.address} closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        connection = self._connected()
+        try:
+            # Reader and writer are different threads that share the socket's time-out: poll instead of setting it.
+            deadline = time.monotonic() + _wall(self._clock, self._write_timeout)
+            view = memoryview(data)
+            while view:
+                sent = _send_some(connection, view)
+                view = view[sent:]
+                if view and time.monotonic() > deadline:
+                    raise PeerTimeout(f"{self.address} took no data for {self._write_timeout} s")
+                if not sent:
+                    time.sleep(1e-3)
+        except OSError as error:
+            raise PeerError(f"the connection to {self.address} broke ({error.strerror or error})") from None
+
+    def close(self) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            self._socket = None
+
+    def _connected(self) -> socket.socket:
+        if self._socket is None:
+            raise UsageError(f"{self.address} is not open")
+        return self._socket
+
+
+class SerialTransport:
+    """A serial line, 8N1, or the path of a pty."""
+
+    def __init__(self, path: str, *, clock: Clock, baudrate: int = 115200, write_timeout: float = 0.5) -> None:
+        if not path or baudrate <= 0:
+            raise UsageError(f"a serial line needs a path and a baud rate above 0, got {path!r} and {baudrate}")
+        self._path = path
+        self._clock = clock
+        self._baudrate = baudrate
+        self._write_timeout = write_timeout
+        self._serial: serial.Serial | None = None
+
+    @property
+    def address(self) -> str:
+        return self._path
+
+    def open(self) -> None:
+        if self._serial is not None:
+            raise UsageError(f"{self.address} is already open")
+        try:
+            # Opening also throws away what the line holds from before.
+            self._serial = serial.Serial(
+                self._path,
+                self._baudrate,
+                timeout=0.05,
+                write_timeout=_wall(self._clock, self._write_timeout),
+                exclusive=True,  # two programs on one line would read each other's replies
+            )
+        except (serial.SerialException, OSError, ValueError) as error:
+            raise PeerError(f"no connection to {self._path} ({_serial_reason(error)})") from None
+
+    def read(self, timeout: float) -> bytes:
+        line = self._connected()
+        try:
+            wall = max(self._clock.wall(timeout), 1e-3)
+            if line.timeout != wall:  # setting it configures the whole port again
+                line.timeout = wall
+            return bytes(line.read(1)) + bytes(line.read(line.in_waiting))
+        except (serial.SerialException, OSError, TypeError) as error:
+            raise PeerError(f"the line {self._path} broke ({_serial_reason(error)})") from None
+
+    def write(self, data: bytes) -> None:
+        line = self._connected()
+        try:
+            line.write(data)
+        except serial.SerialTimeoutException:
+            raise PeerTimeout(f"{self._path} took no data for {self._write_timeout} s") from None
+        except (serial.SerialException, OSError, TypeError) as error:
+            raise PeerError(f"the line {self._path} broke ({_serial_reason(error)})") from None
+
+    def close(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(serial.SerialException, OSError):
+                self._serial.close()
+            self._serial = None
+
+    def _connected(self) -> serial.Serial:
+        if self._serial is None:
+            raise UsageError(f"{self._path} is not open")
+        return self._serial
+
+
+def transport_for(address: str, *, clock: Clock, baudrate: int = 115200) -> Transport:
+    """The transport of an address: `tcp://HOST:PORT`, or the path of a serial device such as /dev/ttyUSB0.
+
+    Raises UsageError when the address is neither.
+    """
+    if "://" not in address:
+        if address.startswith("/"):
+            return SerialTransport(address, clock=clock, baudrate=baudrate)
+        raise UsageError(f"address {address!r} is neither tcp://HOST:PORT nor an absolute path such as /dev/ttyUSB0")
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if parts.scheme != "tcp" or not host or not port or parts.path.strip("/") or parts.query:
+        raise UsageError(f"address {address!r} is neither tcp://HOST:PORT nor an absolute path such as /dev/ttyUSB0")
+    return TcpTransport(host, port, clock=clock)
+
+
+def _wall(clock: Clock, seconds: float) -> float:
+    return max(clock.wall(seconds), SHORTEST_WALL_TIMEOUT)
+
+
+def _send_some(connection: socket.socket, data: memoryview) -> int:
+    try:
+        return connection.send(data, socket.MSG_DONTWAIT)
+    except (BlockingIOError, InterruptedError, TimeoutError):
+        return 0
+
+
+def _serial_reason(error: Exception) -> str:
+    """One line of what went wrong, without pyserial's nesting."""
+    number = getattr(error, "errno", None)
+    if number == errno.ENOENT:
+        return "there is no such device: is it plugged in?"
+    if number == errno.EACCES:
+        return "permission denied: is this user in the group of serial devices (dialout)?"
+    if number in (errno.EAGAIN, errno.EBUSY):
+        return "another program has it open"
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
