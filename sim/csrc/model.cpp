@@ -150,8 +150,7 @@ int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& p
   body.name = name;
   body.parent = parent;
   body.quat = quat.normalized();
-  body.joint_begin = body.joint_end = next_index(model_.joints);
-  if (parent != world) body.dofs = model_.bodies[parent].dofs;
+  body.joint_begin = body.joint_end = 0;
   body.mass = add_params(name,
                          {"mass", "com.x", "com.y", "com.z", "inertia.xx", "inertia.yy", "inertia.zz", "inertia.xy",
                           "inertia.xz", "inertia.yz"},
@@ -166,8 +165,8 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
                          const V3<double>& axis, double damping, double armature, double stiffness, double springref,
                          double lower, double upper, double limit_stiffness, double limit_damping) {
   check_body("joint '" + name + "'", body, false);
-  if (body != next_index(model_.bodies) - 1) {
-    refuse("joint '" + name + "': joints must follow their body, before the next body is added");
+  if (!model_.joints.empty() && body < model_.joints.back().body) {
+    refuse("joint '" + name + "': joints must be added in the order of their bodies");
   }
   Joint joint;
   joint.name = name;
@@ -187,7 +186,8 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
   }
   const bool free = joint.type == JointType::free;
   Body& owner = model_.bodies[body];
-  if (free && (owner.parent != world || owner.joint_begin != owner.joint_end)) {
+  if (owner.joint_begin == owner.joint_end) owner.joint_begin = next_index(model_.joints);
+  if (free && (owner.parent != world || owner.joint_begin != next_index(model_.joints))) {
     refuse("joint '" + name + "': a free joint must be the only joint of a body whose parent is the world");
   }
   if (!free) {
@@ -208,7 +208,6 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
     model_.group_begin.push_back(turning ? model_.nv + 3 : k);
     model_.group_end.push_back(turning ? model_.nv + 6 : k + 1);
     model_.angular.push_back(turning || joint.type == JointType::hinge ? 1 : 0);
-    owner.dofs.push_back(k);
   }
   if (free) {
     const double* p = &model_.param_defaults[owner.pos];
@@ -363,6 +362,13 @@ Model ModelSpec::build() const {
   model.max_iterations = max_iterations;
   model.max_halvings = max_halvings;
   const int nv = model.nv;
+  for (Body& body : model.bodies) {  // parents come first, so their dofs are complete
+    if (body.joint_begin == body.joint_end) refuse("body '" + body.name + "' has no joint: merge it into its parent");
+    if (body.parent != world) body.dofs = model.bodies[body.parent].dofs;
+    for (int j = body.joint_begin; j < body.joint_end; ++j) {
+      for (int i = 0; i < model.joints[j].dofs; ++i) body.dofs.push_back(model.joints[j].v + i);
+    }
+  }
   model.carries_.assign(static_cast<std::size_t>(nv) * nv, 0);
   for (int k = 0; k < nv; ++k) {
     for (const int j : model.bodies[model.dof_body[k]].dofs) {
