@@ -1,0 +1,53 @@
+# make demo and make test do all set-up themselves: Python 3.11 or newer, a C++20 compiler and make are enough.
+#   make demo    the main job on the mock robot
+#   make test    all tests
+#   make check   lint, format, types, import rules
+#   make core    rebuild the C++ core after a change
+#   make clean   remove what was built (the environment .venv stays; delete it by hand to start afresh)
+# Variables: PYTHON=python3.12 names another Python for the environment; TORCH_INDEX=URL adds an index for torch
+# alone (see the README: CPU builds).
+
+PYTHON ?= python3
+TORCH_INDEX ?=
+
+PIP := .venv/bin/python -m pip --disable-pip-version-check
+BUILD := build/editable
+BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
+SETUP := .venv/.gelflow-setup
+CXX_FILES = $(wildcard sim/csrc/*.cpp sim/csrc/*.hpp)
+
+.PHONY: demo test check core setup clean
+
+demo: core
+	@.venv/bin/gelflow demo
+
+test: core
+	@.venv/bin/python -m pytest
+
+check: core
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	$(if $(CXX_FILES),.venv/bin/clang-format --dry-run -Werror $(CXX_FILES))
+	.venv/bin/mypy
+	.venv/bin/lint-imports --no-logo
+
+# The editable install leaves a configured build behind: from then on only what changed is compiled.
+core: setup
+	@.venv/bin/cmake --build $(BUILD) > $(BUILD)/build.log 2>&1 || { cat $(BUILD)/build.log; exit 1; }
+
+setup: $(SETUP)
+
+# Build isolation is off so that the build tools too have pinned versions, and a rebuild finds them again.
+$(SETUP): pyproject.toml constraints.txt sim/csrc/CMakeLists.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "expected Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.12" >&2; exit 1; }
+	@echo "setting up .venv (once): build tools, torch, the other dependencies, the C++ core"
+	@$(PYTHON) -m venv .venv
+	@$(PIP) install -q -c constraints.txt $(BUILD_TOOLS)
+	@$(PIP) install -q -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
+	@$(PIP) install -q -c constraints.txt --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf build dist sim/_core*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP)
+	find sim perception policies real hardware_mocks src tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
