@@ -120,25 +120,11 @@ class Scene:
         """Tell a model builder (gelflow.sim._core.ModelSpec) every part of this scene; returns it."""
         spec.gravity = tuple(self.gravity)
         spec.step = self.step
-        for body in self.bodies:
+        for index, body in enumerate(self.bodies):
             spec.add_body(body.name, body.parent, body.pose.pos, body.pose.quat, body.mass, body.com, body.inertia)
-        for joint, limit in zip(self.joints, self.limits, strict=True):
-            low, high = joint.range or (-np.inf, np.inf)
-            spec.add_joint(
-                joint.name,
-                joint.body,
-                joint.type,
-                joint.pos,
-                joint.axis,
-                damping=joint.damping,
-                armature=joint.armature,
-                stiffness=joint.stiffness,
-                springref=joint.springref,
-                lower=low,
-                upper=high,
-                limit_stiffness=limit.stiffness,
-                limit_damping=limit.damping,
-            )
+            for joint, limit in zip(self.joints, self.limits, strict=True):
+                if joint.body == index:
+                    _tell_joint(spec, joint, limit)
         shapes = {
             shape.name: spec.add_shape(shape.name, shape.body, shape.kind, shape.pose.pos, shape.pose.quat, shape.size)
             for shape in self.shapes
@@ -180,6 +166,25 @@ class Scene:
 
     def _joint(self, name: str) -> JointDef:
         return self.joints[_index("joint", name, [j.name for j in self.joints])]
+
+
+def _tell_joint(spec: Any, joint: JointDef, limit: Limit) -> None:
+    low, high = joint.range or (-np.inf, np.inf)
+    spec.add_joint(
+        joint.name,
+        joint.body,
+        joint.type,
+        joint.pos,
+        joint.axis,
+        damping=joint.damping,
+        armature=joint.armature,
+        stiffness=joint.stiffness,
+        springref=joint.springref,
+        lower=low,
+        upper=high,
+        limit_stiffness=limit.stiffness,
+        limit_damping=limit.damping,
+    )
 
 
 def scene_names() -> tuple[str, ...]:

@@ -138,7 +138,7 @@ def read_contacts(
 
 
 def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str) -> tuple[PadDef, ...]:
-    """The pads: a grid of markers at a site of the model; its z is the pad's outward normal, its x points to the tip."""
+    """The pads: a grid of markers at a site of the model; z is its outward normal, x points to the tip."""
     geoms = {geom.name: geom for geom in mechanics.geoms}
     keys = ("site", "rows", "cols", "pitch", "size", "center", "against", "stiffness", "law", *LAWS, *_NUMBERS)
     pads = []

@@ -66,5 +66,30 @@ class InsertionTask:
         """A policy's output in ±1 as (dx [m], dy [m], dyaw [rad]) in the gripper's frame; clipped to ±1."""
         return np.clip(np.asarray(action, dtype=float), -1, 1) * np.asarray(self.action_scale)
 
+    def corrected(self, pose: NDArray[np.float64], correction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The pose after a correction, limited to the workspace: one rule for simulation and robot.
+
+        `pose` is (x [m], y [m], yaw [rad]) of the gripper in the hole's frame, shape (…, 3): z up, yaw about it.
+        `correction` is (dx, dy, dyaw) in the gripper's frame, whose x runs from the left finger to the right one and
+        whose z is the hole's. Where a correction would leave the workspace, each of x, y, yaw stops at its limit.
+        """
+        pose, correction = np.asarray(pose, dtype=float), np.asarray(correction, dtype=float)
+        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        moved = np.stack(
+            [
+                pose[..., 0] + cos * correction[..., 0] - sin * correction[..., 1],
+                pose[..., 1] + sin * correction[..., 0] + cos * correction[..., 1],
+                pose[..., 2] + correction[..., 2],
+            ],
+            axis=-1,
+        )
+        limit = np.asarray(self.workspace)
+        return np.clip(moved, -limit, limit)
+
+    def draw_misalignment(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Where `count` episodes start: (x [m], y [m], yaw [rad]) in the hole's frame, shape (count, 3)."""
+        limit = np.asarray(self.misalignment)
+        return rng.uniform(-limit, limit, (count, 3))
+
 
 INSERTION = InsertionTask()
