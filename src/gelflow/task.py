@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
 
+_POLICY_GRID = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))
+
 
 @dataclass(frozen=True)
 class InsertionTask:
@@ -23,7 +25,7 @@ class InsertionTask:
     format: int = 1
     name: str = "insertion"
     sensors: int = 2  # tactile pads; 0 is the left finger
-    grid: Grid = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))  # what the policy sees of each pad [mm]
+    grid: Grid = _POLICY_GRID  # what the policy sees of each pad [mm]
     # Frames are picked by depth below the start of an attempt, never by time: simulation descends faster.
     reference_depth: float = 0.0  # the frame that all others are compared with
     frame_depths: tuple[float, ...] = (1.1e-3,)  # the frames that make the observation
@@ -48,9 +50,11 @@ class InsertionTask:
         known = {field.name for field in dataclasses.fields(cls)}
         if unknown := set(data) - known:
             raise UsageError(f"task description has unknown keys {sorted(unknown)}; known are {sorted(known)}")
-        values = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
-        if isinstance(values.get("grid"), dict):
-            values["grid"] = Grid(**{**values["grid"], "center": tuple(values["grid"]["center"])})
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        if isinstance(grid := values.get("grid"), dict):
+            values["grid"] = Grid(**{**grid, "center": tuple(grid["center"])})
         return cls(**values)
 
     def digest(self) -> str:
@@ -64,7 +68,7 @@ class InsertionTask:
 
     def correction(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """A policy's output in ±1 as (dx [m], dy [m], dyaw [rad]) in the gripper's frame; clipped to ±1."""
-        return np.clip(np.asarray(action, dtype=float), -1, 1) * np.asarray(self.action_scale)
+        return np.asarray(np.clip(np.asarray(action, dtype=float), -1, 1) * np.asarray(self.action_scale))
 
     def corrected(self, pose: NDArray[np.float64], correction: NDArray[np.float64]) -> NDArray[np.float64]:
         """The pose after a correction, limited to the workspace: one rule for simulation and robot.
@@ -84,7 +88,7 @@ class InsertionTask:
             axis=-1,
         )
         limit = np.asarray(self.workspace)
-        return np.clip(moved, -limit, limit)
+        return np.asarray(np.clip(moved, -limit, limit))
 
     def draw_misalignment(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Where `count` episodes start: (x [m], y [m], yaw [rad]) in the hole's frame, shape (count, 3)."""
