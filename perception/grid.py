@@ -1,0 +1,200 @@
+"""The grid of markers in a first image, with nothing known but, perhaps, how many lines and columns it has."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError, UsageError
+from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots
+from gelflow.perception.lattice import Lattice, fill, grow
+
+Polarity = Literal["auto", "dark", "bright"]
+
+_RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of dots that are looked for [px], in an image of about _SEARCH px
+_SEARCH = 480
+_MOST = 2500  # dots beyond these, in order of contrast, are texture
+_UNEVEN = 0.12  # a grid whose nodes are further from the middle of their neighbours (share of spacing) is chance
+
+
+@dataclass(frozen=True)
+class Found:
+    """A grid of markers at rest, as the first image shows it. Lines run downwards, columns to the right."""
+
+    look: Look
+    radius: float  # of a dot [px]
+    spacing: float  # between neighbours [px]
+    positions: NDArray[np.float64]  # (right, down) [px], shape (lines, columns, 2); unseen ones are interpolated
+    seen: NDArray[np.bool_]  # shape (lines, columns)
+    areas: NDArray[np.float64]  # of each dot [px²], shape (lines, columns)
+    peak: float  # median contrast of a dot
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.seen.shape[0], self.seen.shape[1]
+
+
+def surroundings(spacing: float) -> int:
+    """Side of the box [px] that a dot is compared with: one period, so that a regular grid leaves no ripple."""
+    return max(round(spacing), 3) | 1
+
+
+def find_grid(
+    image: NDArray[np.uint8],
+    *,
+    rows: int | None = None,
+    cols: int | None = None,
+    either_way: bool = True,
+    polarity: Polarity = "auto",
+) -> Found:
+    """Finds the grid of markers in `image` (B G R).
+
+    With `rows` and `cols` the grid has that many lines and columns (with `either_way`, or the other way round);
+    lines beyond, which the image's border cuts, are left out. Without, every line that is mostly there counts.
+    Raises PeerError when there is no grid, UsageError when it has other rows and columns than asked for.
+    """
+    looks = {"dark": DARK, "bright": BRIGHT, "auto": DARK + BRIGHT}[polarity]
+    shrink = max(1, round(max(image.shape[:2]) / _SEARCH))
+    small = image
+    if shrink > 1:
+        size = (image.shape[1] // shrink, image.shape[0] // shrink)
+        small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    wanted = _wanted(rows, cols, either_way)
+    best = _search(small, looks)
+    if best is None:
+        raise PeerError(f"no grid of markers found in the image{_hint(polarity)}")
+    look, radius, spacing = best[0], best[1] * shrink, best[2] * shrink
+    # Once more at full size, now that radius and spacing are known: what tracking will do in every image.
+    dots = _likely(find_dots(contrast(image, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
+    lattice = grow(dots.centers)
+    if lattice is None or lattice.unevenness > _UNEVEN:
+        raise PeerError(f"no regular grid of markers found in the image{_hint(polarity)}")
+    lattice = _window(lattice, dots, rows, cols, wanted)
+    return _found(look, lattice, dots)
+
+
+def _hint(polarity: Polarity) -> str:
+    other = {"dark": " (looked for dark dots only)", "bright": " (looked for bright dots only)", "auto": ""}
+    return f"{other[polarity]}: at least 3 × 3 dots in lines are needed; check light, focus and that it shows a gel"
+
+
+def _wanted(rows: int | None, cols: int | None, either_way: bool) -> list[tuple[int, int]]:
+    if rows is None and cols is None:
+        return []
+    if rows is None or cols is None:
+        raise UsageError("give both rows and cols of the grid of markers, or neither")
+    if min(rows, cols) < 3 or max(rows, cols) > 200:
+        raise UsageError(f"a grid of markers has 3 to 200 rows and columns, got {rows} × {cols}")
+    return [(rows, cols), (cols, rows)] if either_way and rows != cols else [(rows, cols)]
+
+
+def _likely(dots: Dots) -> Dots:
+    """Without slivers and blots, and not more than can be meant."""
+    if len(dots) > _MOST:
+        dots = dots.only(np.sort(np.argsort(-dots.peaks, kind="stable")[:_MOST]))
+    if len(dots) < 9:
+        return dots
+    middle = np.median(dots.areas)
+    return dots.only((dots.areas > 0.3 * middle) & (dots.areas < 3 * middle))
+
+
+def _radius(dots: Dots, lattice: Lattice) -> float:
+    return float(np.sqrt(np.median(dots.areas[lattice.dots[lattice.dots >= 0]]) / np.pi))
+
+
+def _full(lattice: Lattice, dots: Dots) -> NDArray[np.float64]:
+    """1 at nodes with a whole dot, a little at nodes with a cut one, 0 elsewhere, shape (lines, columns)."""
+    there = lattice.dots >= 0
+    return np.where(there, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
+
+
+def _search(image: NDArray[np.uint8], looks: tuple[Look, ...]) -> tuple[Look, float, float] | None:
+    """The look, radius and spacing [px] that give the best grid: many dots, few gaps, even steps, clear dots."""
+    best, best_score = None, 0.0
+    for look in looks:
+        for radius in _RADII:
+            response = contrast(image, look, round(5 * radius))
+            dots = _likely(find_dots(response, radius=radius, apart=1.5 * radius))
+            lattice = grow(dots.centers)
+            if lattice is None or lattice.unevenness > _UNEVEN:
+                continue
+            full = _full(lattice, dots)
+            top, bottom, left, right = _trim(full)
+            inner = full[top:bottom, left:right]
+            texture = 1.5 * float(np.median(np.abs(response))) + 1e-3
+            clear = float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) / texture
+            share = float(inner.mean())
+            score = float(inner.sum()) * share * (1 - lattice.unevenness / _UNEVEN) * clear / (clear + 4)
+            if score > best_score:
+                best, best_score = (look, _radius(dots, lattice), lattice.spacing), score
+            # The gaps between dots form a grid as well, but never one that stands out like this.
+            if clear > 4 and share > 0.85 and lattice.unevenness < 0.5 * _UNEVEN and inner.sum() > 0.8 * len(dots):
+                return best
+    return best
+
+
+def _trim(full: NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """The part of the grid whose outer lines are mostly there: top, bottom, left, right."""
+    top, bottom, left, right = 0, full.shape[0], 0, full.shape[1]
+    while bottom - top >= 3 and right - left >= 3:
+        part = full[top:bottom, left:right]
+        lines, columns = part.mean(axis=1), part.mean(axis=0)
+        edges = (lines[0], lines[-1], columns[0], columns[-1])
+        worst = int(np.argmin(edges))
+        if edges[worst] >= 0.6:
+            break
+        top, bottom = top + (worst == 0), bottom - (worst == 1)
+        left, right = left + (worst == 2), right - (worst == 3)
+    return top, bottom, left, right
+
+
+def _best(full: NDArray[np.float64], rows: int, cols: int) -> tuple[float, int, int, float]:
+    """Most dots in a window of rows × cols: (how many, its top, its left, how many in the next best)."""
+    if rows > full.shape[0] or cols > full.shape[1]:
+        return 0.0, 0, 0, 0.0
+    total = np.pad(full.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
+    top, left = np.unravel_index(int(sums.argmax()), sums.shape)
+    others = np.delete(sums.reshape(-1), int(sums.argmax()))
+    return float(sums.max()), int(top), int(left), float(others.max()) if len(others) else 0.0
+
+
+def _window(lattice: Lattice, dots: Dots, rows: int | None, cols: int | None, wanted: list[tuple[int, int]]) -> Lattice:
+    """The part of `lattice` that is the printed grid."""
+    full = _full(lattice, dots)
+    top, bottom, left, right = _trim(full)
+    if not wanted:
+        if bottom - top < 3 or right - left < 3:
+            raise PeerError("the grid of markers in the image has fewer than 3 × 3 whole dots")
+        return Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.unevenness)
+    size, window = max(((size, _best(full, *size)) for size in wanted), key=lambda choice: choice[1][0])
+    count, top_best, left_best, second = window
+    seen = f"the image shows {bottom - top} lines of {right - left} whole markers, not the {rows} × {cols} asked for"
+    if count < 0.7 * size[0] * size[1]:
+        raise UsageError(f"{seen}: correct rows and columns, or leave them out to have them found")
+    if count - second < 0.25 * min(size):
+        raise UsageError(f"{seen}, and which lines to leave out is not clear: correct rows and columns")
+    part = lattice.dots[top_best : top_best + size[0], left_best : left_best + size[1]]
+    return Lattice(part, lattice.spacing, lattice.unevenness)
+
+
+def _found(look: Look, lattice: Lattice, dots: Dots) -> Found:
+    number = lattice.dots
+    middle = float(np.median(dots.areas[number[number >= 0]]))
+    area = dots.areas[number]
+    seen = (number >= 0) & dots.inside[number] & (area > 0.4 * middle) & (area < 2.0 * middle)
+    positions = _interpolate(dots.centers[number], number >= 0)
+    radius = float(np.sqrt(middle / np.pi))
+    areas = np.where(seen, area, middle)
+    return Found(look, radius, lattice.spacing, positions, seen, areas, float(np.median(dots.peaks[number[seen]])))
+
+
+def _interpolate(positions: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Fills in unknown nodes: the plane through all nodes, corrected by how the known neighbours deviate from it."""
+    line, column = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij")
+    terms = np.stack([np.ones_like(line), line, column, line * column], axis=-1)
+    plane = terms @ np.linalg.lstsq(terms[known], positions[known], rcond=None)[0]
+    off = fill(positions - plane, known)
+    return np.where(known[..., None], positions, plane + off)
