@@ -58,11 +58,11 @@ class SessionRecorder:
 
     def open(self) -> "SessionRecorder":
         """Create the file (it must not exist) and start writing. Raises UsageError when it cannot be created."""
+        if self.path.exists():
+            raise UsageError(f"{self.path} exists; a recording never overwrites: name a new file")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             stream = self.path.open("xb")
-        except FileExistsError as error:
-            raise UsageError(f"{self.path} exists; a recording never overwrites: name a new file") from error
         except OSError as error:
             raise UsageError(f"cannot create {self.path}: {error.strerror}; name a file one can write") from error
         # Held as long as the recorder lives, so that nobody takes a session in progress for a crashed one.
@@ -164,10 +164,11 @@ class SessionRecorder:
         if self._thread is None:
             return
         thread, self._thread = self._thread, None
-        try:
-            self._queue.put(None, timeout=PATIENCE)
-        except queue.Full:
-            self._fail("the disk is too slow")
+        if self._failure is None:
+            try:
+                self._queue.put(None, timeout=PATIENCE)
+            except queue.Full:
+                self._fail("the disk is too slow")
         thread.join(PATIENCE)
         self._check()
         if not self._finished:

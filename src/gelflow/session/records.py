@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from gelflow.task import InsertionTask
 FORMAT = 1
 SENSORS = ("left", "right")  # topic names of sensor 0 and 1
 VERSIONED = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
-Number = float | Literal["NaN", "Infinity", "-Infinity"]
+Record = TypeVar("Record")
 
 
 def plain(value: Any) -> Any:
@@ -53,6 +53,26 @@ def plain(value: Any) -> Any:
 def to_json(value: Any) -> bytes:
     """`plain` data as UTF-8 JSON. Raises UsageError on types that JSON cannot hold."""
     return json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode()
+
+
+def restore(kind: type[Record], data: Any, *, what: str) -> Record:
+    """A dataclass from its `plain` form; lists become tuples.
+
+    Raises UsageError when `data` does not fit: it was then written by another version.
+    """
+    names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(data, Mapping) or set(data) - names:
+        extra = f"unknown keys {sorted(set(data) - names)}" if isinstance(data, Mapping) else f"{data!r}"
+        known = ", ".join(sorted(names))
+        raise UsageError(f"{what}: expected the keys {known}, got {extra}; is it of another version?")
+    try:
+        return kind(**{key: _tuples(value) for key, value in data.items()})
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{what}: {error}") from error
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True)
@@ -140,17 +160,20 @@ def software_versions() -> dict[str, str]:
 def describe_session(
     *,
     task: InsertionTask,
-    tracker: Mapping[str, Any],
-    mounts: Sequence[Mapping[str, Any]],
+    trackers: Sequence[Any],
+    mounts: Sequence[Any],
     checkpoint: str | Path | None = None,
-    lab: Mapping[str, Any] | None = None,
+    lab: Any = None,
     **more: Any,
 ) -> dict[str, Any]:
     """The description that `SessionRecorder.metadata` takes: what a replay needs, and what a reader will ask for.
 
-    `tracker` and `mounts` are the tracker's configuration and the cameras' mounts as plain data; `checkpoint` is the
-    policy's file, stored by path and digest; `lab` the lab configuration; anything else is kept as it is.
+    `trackers` and `mounts` are per sensor the tracker's configuration and the camera's mount (dataclasses or plain
+    data); `checkpoint` is the policy's file, stored by path and digest; `lab` the lab configuration; anything else
+    (clock factor, seed, who presents the parts) is kept as it is.
     """
+    if not len(trackers) == len(mounts) == task.sensors:
+        raise UsageError(f"expected {task.sensors} trackers and mounts, got {len(trackers)} and {len(mounts)}")
     policy = None
     if checkpoint is not None:
         policy = {"path": str(Path(checkpoint).resolve()), "digest": file_digest(checkpoint)}
@@ -159,9 +182,9 @@ def describe_session(
         "task": task.to_json(),
         "task_digest": task.digest(),
         "checkpoint": policy,
-        "tracker": tracker,
+        "trackers": trackers,
         "mounts": mounts,
-        "lab": lab or {},
+        "lab": {} if lab is None else lab,
         "versions": software_versions(),
         **more,
     }

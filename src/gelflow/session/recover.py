@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.reader import DAMAGE, is_being_recorded, open_recording
+from gelflow.session.reader import DAMAGE, SessionReader, is_being_recorded, open_recording
 from gelflow.session.recorder import CHUNK
 
 
@@ -42,6 +42,7 @@ def recover(source: str | Path, target: str | Path) -> Salvage:
     if target.exists():
         raise UsageError(f"{target} exists; name another file with --output")
     partial = target.with_name(target.name + ".part")
+    _refuse_whole(source)
     with open_recording(source) as stream:
         if is_being_recorded(stream):
             raise UsageError(f"{source} is still being recorded; wait until the recorder has closed it")
@@ -53,8 +54,6 @@ def recover(source: str | Path, target: str | Path) -> Salvage:
                 copy.finish(source)
             if copy.messages == 0:
                 raise PeerError(f"{source} holds not one whole message; there is nothing to salvage")
-            if copy.finished and copy.damaged == 0:
-                raise UsageError(f"{source} is finished and whole; there is nothing to salvage, read it as it is")
             partial.replace(target)
         except OSError as error:
             raise UsageError(f"cannot write {target}: {error.strerror}; name a file one can write") from error
@@ -63,6 +62,16 @@ def recover(source: str | Path, target: str | Path) -> Salvage:
                 partial.unlink(missing_ok=True)
     span = (copy.last - copy.first) / 1e9
     return Salvage(target, copy.messages, span, copy.lost, copy.damaged)
+
+
+def _refuse_whole(source: Path) -> None:
+    try:
+        with SessionReader(source) as session:
+            for _ in session.records():
+                pass
+    except PeerError:
+        return
+    raise UsageError(f"{source} is finished and whole; there is nothing to salvage, read it as it is")
 
 
 class _Copy:
@@ -76,7 +85,6 @@ class _Copy:
         self._channels: dict[int, int] = {}
         self.messages = self.damaged = self.lost = 0
         self.first = self.last = 0
-        self.finished = False
 
     def take(self, opcode: int, data: bytes) -> None:
         """One top-level record. What cannot be read is counted as damaged."""
@@ -94,8 +102,6 @@ class _Copy:
             elif opcode == Opcode.METADATA:
                 metadata = Metadata.read(stream)
                 self._writer.add_metadata(metadata.name, metadata.metadata)
-            elif opcode == Opcode.FOOTER:
-                self.finished = True
             for record in records:
                 self._put(record)
         except DAMAGE:

@@ -1,0 +1,50 @@
+"""A picture of what the policy saw in each attempt, and what it answered."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gelflow.errors import UsageError
+from gelflow.observation import Grid
+from gelflow.session.records import SENSORS, Decision
+
+MOST = 40  # decisions in one picture
+
+
+def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) -> None:
+    """One line per decision: the flow map of each pad and frame as arrows, and the correction in words.
+
+    Pads are seen from outside with the fingertip down, so x points down and y to the right. At most the first 40
+    decisions are drawn. Raises UsageError when the picture cannot be written.
+    """
+    from matplotlib.figure import Figure  # here: slow to import
+
+    shown = list(decisions[:MOST])
+    columns = shown[0].flow.shape[0] // 2
+    sensors = len(shown[0].tracked)
+    positions = grid.positions()
+    figure = Figure(figsize=(2.4 * columns + 1.6, 2.6 * len(shown)), layout="constrained")
+    axes = figure.subplots(len(shown), columns, squeeze=False)
+    for line, decision in zip(axes, shown, strict=True):
+        flow = decision.flow.reshape(columns, 2, -1)
+        dx, dy, turn = decision.action * (1e3, 1e3, 180 / np.pi)
+        for column, axis in enumerate(line):
+            down, right = flow[column] * grid.pitch * 1.6
+            longest = np.hypot(*flow[column])
+            axis.quiver(
+                positions[:, 1], positions[:, 0], right, down, longest,
+                angles="xy", scale_units="xy", scale=1, cmap="viridis", clim=(0, 1), width=0.008,
+            )  # fmt: skip
+            axis.set(aspect="equal", xticks=[], yticks=[])
+            axis.invert_yaxis()
+            axis.margins(0.12)
+            axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=8)
+        line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=8)
+        felt = f"longest arrow\n{decision.divisor:.3g} {decision.unit}"
+        said = f"{felt}\n\ncorrection\nx {dx:+.2f} mm\ny {dy:+.2f} mm\nyaw {turn:+.1f}°"
+        line[-1].text(1.06, 0.5, said, transform=line[-1].transAxes, fontsize=8, va="center")
+    try:
+        figure.savefig(path, dpi=100)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot write the picture {path}: {error}; name a .png in a writable folder") from error

@@ -1,0 +1,156 @@
+"""What is left of a session whose recorder was killed, or whose disk has lied."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError, UsageError
+from gelflow.protocols import CameraImage
+from gelflow.session.reader import SessionReader
+from gelflow.session.recorder import SessionRecorder
+from gelflow.session.recover import recover
+
+CLOCK = ScaledClock(1.0)
+
+KILLED = """
+import os, signal, sys
+from gelflow.clock import ScaledClock
+from gelflow.protocols import CameraImage
+from gelflow.session.recorder import SessionRecorder
+clock = ScaledClock(float(sys.argv[2]))
+recorder = SessionRecorder(sys.argv[1], clock).open()
+recorder.metadata({"who": "killed"})
+for number in range(1, 501):
+    clock.sleep(0.004)
+    recorder.image(number % 2, CameraImage(os.urandom(5000), clock.now(), number))
+print(clock.now(), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("factor", ["1", "5"])
+def test_a_kill_at_message_500_loses_at_most_half_a_second(tmp_path: Path, factor: str) -> None:
+    path = tmp_path / "killed.mcap"
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path), factor], capture_output=True, text=True, timeout=60)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    with pytest.raises(PeerError, match=r"was not finished.*gelflow recover .*killed\.mcap"):
+        SessionReader(path).open()
+    salvage = recover(path, tmp_path / "saved.mcap")
+    with SessionReader(salvage.path) as reader:
+        assert reader.description()["who"] == "killed"
+        images = list(reader.records(["/left/image", "/right/image"]))
+    assert [record.value.sequence for record in images] == list(range(1, len(images) + 1))
+    assert all(len(record.value.data) == 5000 for record in images)
+    assert float(done.stdout) - images[-1].stamp <= 0.5
+    assert salvage.messages == len(images) + 1 and salvage.damaged_chunks == 0
+
+
+def make(path: Path, messages: int = 40) -> Path:
+    with SessionRecorder(path, CLOCK) as recorder:
+        recorder.metadata({"who": "test"})
+        for number in range(messages):
+            recorder.image(0, CameraImage(np.random.default_rng(number).bytes(9000), 1.0 * number, number))
+    return path
+
+
+def test_any_cut_leaves_a_readable_beginning(tmp_path: Path) -> None:
+    whole = make(tmp_path / "whole.mcap").read_bytes()
+    cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
+    found = []
+    for length in np.linspace(8, len(whole) - 1, 60).astype(int):
+        cut.write_bytes(whole[:length])
+        saved.unlink(missing_ok=True)
+        try:
+            salvage = recover(cut, saved)
+        except PeerError as error:
+            assert "not one whole message" in str(error)
+            assert not saved.exists()
+            found.append(0)
+            continue
+        with SessionReader(saved) as reader:
+            records = list(reader.records())
+        assert len(records) == salvage.messages
+        assert [r.value.sequence for r in records[1:]] == list(range(len(records) - 1))
+        found.append(len(records))
+    assert found == sorted(found) and found[0] == 0 and found[-1] == 41
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_damage_within_a_finished_file_is_told_and_the_rest_is_salvaged(tmp_path: Path) -> None:
+    path = make(tmp_path / "session.mcap")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with SessionReader(path) as reader, pytest.raises(PeerError, match=r"is damaged.*gelflow recover") as caught:
+        list(reader.records())
+    assert "\n" not in str(caught.value)
+    salvage = recover(path, tmp_path / "saved.mcap")
+    assert salvage.damaged_chunks == 1 and 25 < salvage.messages < 41
+    with SessionReader(salvage.path) as reader:
+        assert len(list(reader.records())) == salvage.messages
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = make(tmp_path / "session.mcap", messages=12)
+    data = bytearray(path.read_bytes())
+    for place in rng.integers(8, len(data), 3):
+        data[place : place + 8] = rng.bytes(8)
+    path.write_bytes(data[: len(data) if seed % 2 else rng.integers(9, len(data))])
+    try:
+        with SessionReader(path) as reader:
+            list(reader.records())
+    except (PeerError, UsageError):
+        pass
+    try:
+        recover(path, tmp_path / "saved.mcap")
+    except (PeerError, UsageError):
+        return
+    with SessionReader(tmp_path / "saved.mcap") as reader:
+        list(reader.records())
+
+
+def test_recover_refuses_what_needs_no_help(tmp_path: Path) -> None:
+    path = make(tmp_path / "session.mcap", messages=3)
+    with pytest.raises(UsageError, match="nothing to salvage"):
+        recover(path, tmp_path / "saved.mcap")
+    (tmp_path / "saved.mcap").touch()
+    with pytest.raises(UsageError, match="--output"):
+        recover(path, tmp_path / "saved.mcap")
+    (tmp_path / "text").write_text("text")
+    with pytest.raises(UsageError, match="is not an MCAP file"):
+        recover(tmp_path / "text", tmp_path / "new.mcap")
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(UsageError, match="cannot write"):
+        recover(path, tmp_path / "no folder" / "new.mcap")
+    with pytest.raises(UsageError, match="cannot write"):
+        recover(path, tmp_path / "text" / "new.mcap")
+
+
+def test_a_session_in_progress_is_left_alone(tmp_path: Path) -> None:
+    with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
+        recorder.attempt_end({"insertion": 0})
+        with pytest.raises(PeerError, match="still being recorded"):
+            SessionReader(tmp_path / "a.mcap").open()
+        with pytest.raises(UsageError, match="still being recorded"):
+            recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = make(tmp_path / "session.mcap", messages=20)
+    assert main(["recover", str(path)]) == 2
+    assert "nothing to salvage" in capsys.readouterr().err
+    path.write_bytes(path.read_bytes()[:-5000])
+    assert main(["recover", str(path)]) == 0
+    assert "21 records" in (out := capsys.readouterr().out) and "bytes" in out
+    with SessionReader(tmp_path / "session.recovered.mcap") as reader:
+        assert reader.counts() == {"/session": 1, "/left/image": 20}
+    assert main(["recover", str(tmp_path / "none.mcap")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
