@@ -96,6 +96,13 @@ class MockWsg:
         self._device.stop(fast=True)
 
     @property
+    def addresses(self) -> tuple[str, ...]:
+        """Where it is served, as a driver takes it: `serial:PATH`, `tcp:HOST:PORT`, or both."""
+        line = (f"serial:{self.serial_path}",) if self._serial else ()
+        port = ("tcp:{}:{}".format(*self.tcp_address),) if self._wanted else ()
+        return line + port
+
+    @property
     def fast_stopped(self) -> bool:
         """Whether the device is in FAST STOP."""
         return self._device.fingers.fast_stopped
@@ -159,6 +166,7 @@ class MockWsg:
             client, _ = self._listener.accept()
         except OSError:
             return  # it went away before it was accepted
+        self._read_client()  # the end of the client before may wait to be read
         if self._client is not None:
             client.close()
             return
@@ -168,17 +176,17 @@ class MockWsg:
         self._selector.register(client, selectors.EVENT_READ, self._read_client)
 
     def _read_client(self) -> None:
-        assert self._client is not None and self._client_session is not None
-        try:
-            data = self._client.recv(_READ_SIZE)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if data:
-            self._client_session.receive(data)
-        else:
-            self._drop_client()
+        while self._client is not None and self._client_session is not None:
+            try:
+                data = self._client.recv(_READ_SIZE)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if data:
+                self._client_session.receive(data)
+            else:
+                self._drop_client()
 
     def _flush(self) -> None:
         assert self._client is not None

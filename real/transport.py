@@ -9,7 +9,6 @@ import errno
 import socket
 import time
 from typing import Protocol
-from urllib.parse import urlsplit
 
 import serial
 
@@ -62,7 +61,7 @@ class TcpTransport:
 
     @property
     def address(self) -> str:
-        return f"tcp://{self._peer[0]}:{self._peer[1]}"
+        return f"tcp:{self._peer[0]}:{self._peer[1]}"
 
     def open(self) -> None:
         if self._socket is not None:
@@ -136,7 +135,7 @@ class SerialTransport:
 
     @property
     def address(self) -> str:
-        return self._path
+        return f"serial:{self._path}"
 
     def open(self) -> None:
         if self._serial is not None:
@@ -185,22 +184,17 @@ class SerialTransport:
 
 
 def transport_for(address: str, *, clock: Clock, baudrate: int = 115200) -> Transport:
-    """The transport of an address: `tcp://HOST:PORT`, or the path of a serial device such as /dev/ttyUSB0.
+    """The transport of an address: `tcp:HOST:PORT`, or `serial:PATH` such as serial:/dev/ttyUSB0.
 
     Raises UsageError when the address is neither.
     """
-    if "://" not in address:
-        if address.startswith("/"):
-            return SerialTransport(address, clock=clock, baudrate=baudrate)
-        raise UsageError(f"address {address!r} is neither tcp://HOST:PORT nor an absolute path such as /dev/ttyUSB0")
-    try:
-        parts = urlsplit(address)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if parts.scheme != "tcp" or not host or not port or parts.path.strip("/") or parts.query:
-        raise UsageError(f"address {address!r} is neither tcp://HOST:PORT nor an absolute path such as /dev/ttyUSB0")
-    return TcpTransport(host, port, clock=clock)
+    kind, _, rest = address.partition(":")
+    if kind == "serial" and rest:
+        return SerialTransport(rest, clock=clock, baudrate=baudrate)
+    host, _, port = rest.rpartition(":")
+    if kind == "tcp" and host and port.isascii() and port.isdigit():
+        return TcpTransport(host.removeprefix("[").removesuffix("]"), int(port), clock=clock)
+    raise UsageError(f"address {address!r} is neither tcp:HOST:PORT nor serial:PATH such as serial:/dev/ttyUSB0")
 
 
 def _wall(clock: Clock, seconds: float) -> float:

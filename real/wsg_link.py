@@ -20,7 +20,7 @@ from gelflow.real.wsg_tables import STATE_COMMANDS, Command, Status
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # a driver prints nothing unless its program asks for it
 _POLL = 0.05  # how long the reader waits for bytes before it looks around [s]
-_HALF_FRAME = 0.2  # a frame whose rest does not come in this time is given up [s]
+_HALF_FRAME = 0.5  # a frame whose rest does not come in this time is given up [s]; TCP may resend for 0.2 s
 
 
 class WsgRefused(PeerRefused):
@@ -186,16 +186,17 @@ class WsgLink:
 
     def _read_until_closed(self) -> None:
         try:
-            progress = self._clock.now()
+            patience = max(self._clock.wall(_HALF_FRAME), SHORTEST_WALL_TIMEOUT)
+            progress = time.monotonic()
             while not self._ending.is_set() and self._failure is None:
                 data = self._read()
                 stamp = self._clock.now()
                 events = self._decoder.feed(data)
-                if not events and self._decoder.waiting and stamp - progress > _HALF_FRAME:
+                if not events and self._decoder.waiting and time.monotonic() - progress > patience:
                     events = self._decoder.expire()
-                    progress = stamp
+                    progress = time.monotonic()
                 if events or not self._decoder.waiting:
-                    progress = stamp
+                    progress = time.monotonic()
                 for event in events:
                     self._sort(event, stamp)
         except GelflowError as error:
