@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -103,9 +104,9 @@ def _tell_differences(console: Console, description: Mapping[str, Any], checkpoi
 
 
 def _table(comparisons: Sequence[Comparison]) -> Table:
-    table = Table(title="Decisions, recorded and made again")
-    for name in ("insertion", "attempt", "images", "x [mm]", "y [mm]", "yaw [°]", "Δ action", "Δ flow map"):
-        table.add_column(name, justify="right")
+    table = Table(title="Decisions as recorded, and how far those made again differ (Δ)", box=SIMPLE_HEAD)
+    for name in ("insertion", "attempt", "images", "x mm", "y mm", "yaw °", "Δ action", "Δ map"):
+        table.add_column(name, justify="right", no_wrap=True)
     for made in comparisons:
         one = made.recorded
         dx, dy, turn = one.action * (1e3, 1e3, 180 / np.pi)

@@ -24,13 +24,13 @@ def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) 
     columns = shown[0].flow.shape[0] // 2
     sensors = len(shown[0].tracked)
     positions = grid.positions()
-    figure = Figure(figsize=(2.4 * columns + 1.6, 2.6 * len(shown)), layout="constrained")
+    figure = Figure(figsize=(2.1 * columns + 1.6, 2.6 * len(shown)), layout="constrained")
     axes = figure.subplots(len(shown), columns, squeeze=False)
     for line, decision in zip(axes, shown, strict=True):
         flow = decision.flow.reshape(columns, 2, -1)
         dx, dy, turn = decision.action * (1e3, 1e3, 180 / np.pi)
         for column, axis in enumerate(line):
-            down, right = flow[column] * grid.pitch * 1.6
+            down, right = flow[column] * grid.pitch * 1.4
             longest = np.hypot(*flow[column])
             axis.quiver(
                 positions[:, 1], positions[:, 0], right, down, longest,
@@ -38,7 +38,7 @@ def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) 
             )  # fmt: skip
             axis.set(aspect="equal", xticks=[], yticks=[])
             axis.invert_yaxis()
-            axis.margins(0.12)
+            axis.margins(0.18)
             axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=8)
         line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=8)
         felt = f"longest arrow\n{decision.divisor:.3g} {decision.unit}"
