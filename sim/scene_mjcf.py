@@ -201,9 +201,7 @@ def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[
             inertia += rotation @ np.diag(model.body_inertia[b]) @ rotation.T
             inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         parent = model.body_parentid[root]
-        free = model.jnt_type[model.body_jntadr[root]] == mujoco.mjtJoint.mjJNT_FREE
-        # A free body's coordinates are its pose in the world: its place in the file is only where it starts.
-        pose = Pose() if free else poses[parent] @ Pose(model.body_pos[root].copy(), model.body_quat[root].copy())
+        pose = poses[parent] @ Pose(model.body_pos[root].copy(), model.body_quat[root].copy())
         packed = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         bodies.append(BodyDef(model.body(root).name or f"body{root}", int(carrier[parent]), pose, mass, com, packed))
     return tuple(bodies)
