@@ -24,11 +24,11 @@ void for_touching_points(const Model& m, const Contact& contact, const T* params
         const V3<T> c = frame.point(set.cloud.points[i]);
         V3<T> x = c;
         if (numbers.rolling) x[2] -= T(set.radius);  // planes only: n = z
-        distance<T>(frame.kind, frame.size, x, at);
-        if (!(at.d < T(0))) {
+        if (!(distance_only<T>(frame.kind, frame.size, x) < T(0))) {
           outside(i, i + 1);
           return;
         }
+        distance<T>(frame.kind, frame.size, x, at);
         const PointLaw<T> law = weighted<T>(numbers, set.cloud.weights[i]);
         const V3<T> v = frame.velocity(x);
         const bool remembers = numbers.elastic && anchored[contact.anchor + i];
@@ -52,10 +52,11 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     const int first = m.point_sets[contact.points].body;
     const PairFrame<T> frame = pair_frame<T>(m, params, first, shape, w);
     V6<T> wrench = V6<T>::Zero();
-    M6<T> k = M6<T>::Zero(), d = M6<T>::Zero();
+    // The blocks of K and D: rows moment, force; columns turn, shift.
+    M3<T> k_mm = M3<T>::Zero(), k_mf = k_mm, k_fm = k_mm, k_ff = k_mm;
+    M3<T> d_mm = k_mm, d_mf = k_mm, d_fm = k_mm, d_ff = k_mm;
     PointForce<T> force;
     bool touching = false;
-    const M3<T> spin = skew<T>(frame.angular);
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
         [&](int, const V3<T>& x, const V3<T>& center, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
@@ -64,18 +65,17 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
           point_force<derivatives ? 1 : 0, T>(law, at, v, e, remembers, force);
           wrench += stack<T>(cross<T>(x, force.force), force.force);
           if constexpr (derivatives) {
-            const M3<T> sx = skew<T>(x), sc = skew<T>(center);
-            const M3<T> a = force.by_x + force.by_v * spin;
-            const M3<T> moment = sx * a - skew<T>(force.force);
-            k.template topLeftCorner<3, 3>() -= moment * sc;
-            k.template topRightCorner<3, 3>() += moment;
-            k.template bottomLeftCorner<3, 3>() -= a * sc;
-            k.template bottomRightCorner<3, 3>() += a;
-            const M3<T> moment_v = sx * force.by_v;
-            d.template topLeftCorner<3, 3>() -= moment_v * sx;
-            d.template topRightCorner<3, 3>() += moment_v;
-            d.template bottomLeftCorner<3, 3>() -= force.by_v * sx;
-            d.template bottomRightCorner<3, 3>() += force.by_v;
+            const M3<T> a = force.by_x + cross_rows<T>(force.by_v, frame.angular);
+            const M3<T> moment = cross_columns<T>(x, a) - skew<T>(force.force);
+            const M3<T> moment_v = cross_columns<T>(x, force.by_v);
+            k_mm -= cross_rows<T>(moment, center);
+            k_mf += moment;
+            k_fm -= cross_rows<T>(a, center);
+            k_ff += a;
+            d_mm -= cross_rows<T>(moment_v, x);
+            d_mf += moment_v;
+            d_fm -= cross_rows<T>(force.by_v, x);
+            d_ff += force.by_v;
           }
         },
         ignore);
@@ -87,6 +87,9 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
       if (scale) w.scale[contact.pair.dof[i]] += h * abs(force_i);
     }
     if constexpr (derivatives) {
+      M6<T> k, d;
+      k << k_mm, k_mf, k_fm, k_ff;
+      d << d_mm, d_mf, d_fm, d_ff;
       for (int i = 0; i < c.n; ++i) {  // column: displacement of dof j
         const int j = contact.pair.dof[i];
         const bool j_first = contact.pair.first[i];

@@ -36,14 +36,14 @@ struct PointForce {
 };
 
 template <class T>
-V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor, bool anchored) {
+GELFLOW_INLINE V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor, bool anchored) {
   if (!law.elastic || !anchored) return V3<T>::Zero();
   return law.rolling ? V3<T>(anchor + law.h * v) : V3<T>(x - anchor);
 }
 
 // `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
 template <int derivatives, class T>
-void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e, bool anchored,
+GELFLOW_INLINE void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e, bool anchored,
                  PointForce<T>& out) {
   using std::sqrt;
   const V3<T>& n = at.n;
@@ -78,38 +78,48 @@ void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, 
   out.slip = slip;
   out.force = normal * n + out.friction;
   if constexpr (derivatives > 0) {
-    const M3<T> project = M3<T>::Identity() - n * n.transpose();
+    // d f* = −(k_t + k_s ev) (1 − n nᵀ) dv − k_s ex (1 − n nᵀ) dx + curvature, and
+    // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
     const T ex = memory && !law.rolling ? T(1) : T(0);
     const T ev = memory && law.rolling ? law.h : T(0);
+    const V3<T> direction = out.slips ? V3<T>(wanted / length) : V3<T>(V3<T>::Zero());
+    const T mu = out.slips ? law.mu : T(0);
     V3<T> normal_by_x = by_d * n;
     const V3<T> normal_by_v = by_rate * n;
-    M3<T> wanted_by_x = (-law.ks * ex) * project;
-    const M3<T> wanted_by_v = (-law.kt - law.ks * ev) * project;
+    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ), as t is tangential.
+    M3<T> project;
+    for (int j = 0; j < 3; ++j) {
+      for (int i = 0; i < 3; ++i) {
+        project(i, j) = ratio * ((i == j ? T(1) : T(0)) - n[i] * n[j] - direction[i] * direction[j]);
+      }
+    }
+    const V3<T> lever = mu * direction;
+    M3<T> friction_by_x = (-law.ks * ex) * project;
+    M3<T> friction_by_v = (-law.kt - law.ks * ev) * project;
     if (at.curved) {
       const V3<T> hv = at.hessian * v;
       normal_by_x += by_rate * hv;
-      wanted_by_x += law.kt * (n * hv.transpose() + rate * at.hessian);
+      M3<T> wanted_by_x = law.kt * (n * hv.transpose() + rate * at.hessian);
       if (memory) wanted_by_x += law.ks * (n * (at.hessian * e).transpose() + along * at.hessian);
+      friction_by_x += ratio * (wanted_by_x - direction * (direction.transpose() * wanted_by_x));
+      out.by_x = normal * at.hessian;
+    } else {
+      out.by_x.setZero();
     }
-    // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
-    V3<T> direction = V3<T>::Zero();
-    M3<T> through = M3<T>::Identity();
-    T mu = T(0);
-    if (out.slips) {
-      direction = wanted / length;
-      through = ratio * (M3<T>::Identity() - direction * direction.transpose());
-      mu = law.mu;
+    for (int j = 0; j < 3; ++j) {
+      for (int i = 0; i < 3; ++i) {
+        friction_by_x(i, j) += lever[i] * normal_by_x[j];
+        friction_by_v(i, j) += lever[i] * normal_by_v[j];
+        out.by_x(i, j) += friction_by_x(i, j) + n[i] * normal_by_x[j];
+        out.by_v(i, j) = friction_by_v(i, j) + n[i] * normal_by_v[j];
+      }
     }
-    const V3<T> lever = n + mu * direction;
-    out.by_x.noalias() = through * wanted_by_x + lever * normal_by_x.transpose();
-    if (at.curved) out.by_x += normal * at.hessian;
-    out.by_v.noalias() = through * wanted_by_v + lever * normal_by_v.transpose();
     if constexpr (derivatives > 1) {
       const T sign = law.rolling ? T(-1) : T(1);  // ∂f*/∂X = sign k_s (1 − n nᵀ)
-      out.by_anchor = memory ? M3<T>((sign * law.ks) * (through * project)) : M3<T>(M3<T>::Zero());
-      out.friction_by_x = through * wanted_by_x + mu * direction * normal_by_x.transpose();
-      out.friction_by_v = through * wanted_by_v + mu * direction * normal_by_v.transpose();
-      out.slip_by_v = project;
+      out.by_anchor = memory ? M3<T>((sign * law.ks) * project) : M3<T>(M3<T>::Zero());
+      out.friction_by_x = friction_by_x;
+      out.friction_by_v = friction_by_v;
+      out.slip_by_v = M3<T>::Identity() - n * n.transpose();
       out.slip_by_x = M3<T>::Zero();
       if (at.curved) out.slip_by_x = -(n * (at.hessian * v).transpose() + rate * at.hessian);
     }

@@ -61,14 +61,18 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace
   for (int k = 0; k < m.nv; ++k) w.residual[k] += h * w.axis[k].dot(w.force[m.dof_body[k]]);
   if constexpr (derivatives) {
     for (int j = 0; j < m.nv; ++j) {
-      const int body = m.dof_body[j];
       const V6<T>& s = w.axis[j];
-      const V6<T> p = cross_motion<T>(w.twist_before[j], s);
-      const V6<T> q = -cross_motion<T>(s, w.acceleration_before[j]) - cross_motion<T>(p, w.twist_before[j]);
-      const V6<T> o = p - cross_motion<T>(s, w.twist_after[j]);
+      w.p[j] = cross_motion<T>(w.twist_before[j], s);
+      w.q_missing[j] = -cross_motion<T>(s, w.acceleration_before[j]) - cross_motion<T>(w.p[j], w.twist_before[j]);
+      w.v_missing[j] = w.p[j] - cross_motion<T>(s, w.twist_after[j]);
+    }
+    for (int j = 0; j < m.nv; ++j) {
+      const int body = m.dof_body[j];
+      const V6<T>&s = w.axis[j], &p = w.p[j], &q = w.q_missing[j], &o = w.v_missing[j];
       const V6<T> force_q = w.inertia[body] * q + w.rate[body] * p;
       const V6<T> force_v = w.inertia[body] * o + w.rate[body] * s;
       const V6<T> force_a = w.inertia[body] * s;
+      const V6<T> rate_s = w.rate[body].transpose() * s;
       const V6<T> carried = cross_force<T>(s, w.force[body]);
       for (const int k : m.bodies[body].dofs) {  // k before j, or in its group
         if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
@@ -79,13 +83,9 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace
         w.mass(k, j) = sk.dot(force_a);
         if (same) continue;
         // The transposed entry: dof j's force when the earlier dof k is displaced; the shared subtree is j's.
-        const V6<T> pk = cross_motion<T>(w.twist_before[k], sk);
-        const V6<T> qk = -cross_motion<T>(sk, w.acceleration_before[k]) - cross_motion<T>(pk, w.twist_before[k]);
-        const V6<T> ok = pk - cross_motion<T>(sk, w.twist_after[k]);
-        const V6<T> inertia_s = force_a;  // I is symmetric
-        const V6<T> rate_s = w.rate[body].transpose() * s;
-        w.by_q(j, k) += h * (inertia_s.dot(qk) + rate_s.dot(pk));
-        w.by_v(j, k) += h * (inertia_s.dot(ok) + rate_s.dot(sk));
+        // I is symmetric: Sⱼᵀ I = (I Sⱼ)ᵀ.
+        w.by_q(j, k) += h * (force_a.dot(w.q_missing[k]) + rate_s.dot(w.p[k]));
+        w.by_v(j, k) += h * (force_a.dot(w.v_missing[k]) + rate_s.dot(sk));
         w.mass(j, k) = w.mass(k, j);
       }
     }

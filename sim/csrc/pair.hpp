@@ -24,9 +24,9 @@ struct PairFrame {
   const T* size;
   ShapeKind kind;
 
-  V3<T> point(const V3<double>& local) const { return rotation * local.template cast<T>() + offset; }
-  V3<T> velocity(const V3<T>& x) const { return linear + cross<T>(angular, x); }
-  V6<T> motion(const V6<T>& in_world) const {
+  GELFLOW_INLINE V3<T> point(const V3<double>& local) const { return rotation * local.template cast<T>() + offset; }
+  GELFLOW_INLINE V3<T> velocity(const V3<T>& x) const { return linear + cross<T>(angular, x); }
+  GELFLOW_INLINE V6<T> motion(const V6<T>& in_world) const {
     const V3<T> w = top(in_world), v = bottom(in_world);
     return stack<T>(to_world.transpose() * w, to_world.transpose() * (v + cross<T>(w, origin)));
   }
@@ -58,7 +58,7 @@ PairFrame<T> pair_frame(const Model& m, const T* params, int first, const Shape&
 
 // Calls visit(i) for every point that may be inside the shape, skip(begin, end) for runs that can not be.
 template <class T, class Visit, class Skip>
-void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, Visit&& visit, Skip&& skip) {
+GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, Visit&& visit, Skip&& skip) {
   for (const auto& group : cloud.groups) {
     const int first = cloud.leaves[group.begin].begin, last = cloud.leaves[group.end - 1].end;
     if (cloud.groups.size() > 1 &&

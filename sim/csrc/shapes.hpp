@@ -17,14 +17,14 @@ struct Distance {
 };
 
 template <class T>
-void plane_distance(const V3<T>& x, Distance<T>& out) {  // the half space z < 0
+GELFLOW_INLINE void plane_distance(const V3<T>& x, Distance<T>& out) {  // the half space z < 0
   out.d = x[2];
   out.n = V3<T>(T(0), T(0), T(1));
   out.curved = false;
 }
 
 template <class T>
-void sphere_distance(const V3<T>& x, const T& radius, Distance<T>& out) {
+GELFLOW_INLINE void sphere_distance(const V3<T>& x, const T& radius, Distance<T>& out) {
   using std::sqrt;
   const T squared = x.squaredNorm();
   if (real_part(squared) < 1e-30) {
@@ -71,7 +71,7 @@ void box_distance(const V3<T>& x, const V3<T>& half, Distance<T>& out) {
 }
 
 template <class T>
-void distance(ShapeKind kind, const T* size, const V3<T>& x, Distance<T>& out) {
+GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const V3<T>& x, Distance<T>& out) {
   if (kind == ShapeKind::box) {
     box_distance<T>(x, V3<T>(size[0], size[1], size[2]), out);
   } else if (kind == ShapeKind::sphere) {
@@ -83,7 +83,7 @@ void distance(ShapeKind kind, const T* size, const V3<T>& x, Distance<T>& out) {
 
 // The distance alone, for culling.
 template <class T>
-T distance_only(ShapeKind kind, const T* size, const V3<T>& x) {
+GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const V3<T>& x) {
   using std::sqrt;
   if (kind == ShapeKind::plane) return x[2];
   if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];

@@ -10,6 +10,9 @@
 
 #include "dual.hpp"
 
+// The small functions of the inner loops: left alone, the compiler calls them.
+#define GELFLOW_INLINE __attribute__((always_inline)) inline
+
 namespace gelflow {
 
 template <class T>
@@ -28,28 +31,50 @@ template <class T>
 using MX = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 
 template <class T>
-V3<T> cross(const V3<T>& a, const V3<T>& b) {
+GELFLOW_INLINE V3<T> cross(const V3<T>& a, const V3<T>& b) {
   return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
 }
 
 // [a]× with [a]× b = a × b.
 template <class T>
-M3<T> skew(const V3<T>& a) {
+GELFLOW_INLINE M3<T> skew(const V3<T>& a) {
   M3<T> m;
   m << T(0), -a[2], a[1], a[2], T(0), -a[0], -a[1], a[0], T(0);
   return m;
 }
 
+// [x]× A and A [x]×, without the zeros.
 template <class T>
-V3<T> top(const V6<T>& x) {
+GELFLOW_INLINE M3<T> cross_columns(const V3<T>& x, const M3<T>& a) {
+  M3<T> r;
+  for (int j = 0; j < 3; ++j) {
+    r(0, j) = x[1] * a(2, j) - x[2] * a(1, j);
+    r(1, j) = x[2] * a(0, j) - x[0] * a(2, j);
+    r(2, j) = x[0] * a(1, j) - x[1] * a(0, j);
+  }
+  return r;
+}
+template <class T>
+GELFLOW_INLINE M3<T> cross_rows(const M3<T>& a, const V3<T>& x) {
+  M3<T> r;
+  for (int i = 0; i < 3; ++i) {
+    r(i, 0) = a(i, 1) * x[2] - a(i, 2) * x[1];
+    r(i, 1) = a(i, 2) * x[0] - a(i, 0) * x[2];
+    r(i, 2) = a(i, 0) * x[1] - a(i, 1) * x[0];
+  }
+  return r;
+}
+
+template <class T>
+GELFLOW_INLINE V3<T> top(const V6<T>& x) {
   return x.template head<3>();
 }
 template <class T>
-V3<T> bottom(const V6<T>& x) {
+GELFLOW_INLINE V3<T> bottom(const V6<T>& x) {
   return x.template tail<3>();
 }
 template <class T>
-V6<T> stack(const V3<T>& a, const V3<T>& b) {
+GELFLOW_INLINE V6<T> stack(const V3<T>& a, const V3<T>& b) {
   V6<T> x;
   x << a, b;
   return x;
@@ -57,14 +82,14 @@ V6<T> stack(const V3<T>& a, const V3<T>& b) {
 
 // Motion × motion: the rate of change of y when it is carried along by x.
 template <class T>
-V6<T> cross_motion(const V6<T>& x, const V6<T>& y) {
+GELFLOW_INLINE V6<T> cross_motion(const V6<T>& x, const V6<T>& y) {
   const V3<T> w = top(x), v = bottom(x), yw = top(y), yv = bottom(y);
   return stack<T>(cross(w, yw), cross(w, yv) + cross(v, yw));
 }
 
 // Motion ×* force: the rate of change of f when it is carried along by x.
 template <class T>
-V6<T> cross_force(const V6<T>& x, const V6<T>& f) {
+GELFLOW_INLINE V6<T> cross_force(const V6<T>& x, const V6<T>& f) {
   const V3<T> w = top(x), v = bottom(x), n = top(f), l = bottom(f);
   return stack<T>(cross(w, n) + cross(v, l), cross(w, l));
 }
@@ -90,7 +115,7 @@ M6<T> cross_with_force_matrix(const V6<T>& force) {
 }
 
 template <class T>
-M3<T> rotation_of(const V4<T>& q) {  // unit quaternion w x y z
+GELFLOW_INLINE M3<T> rotation_of(const V4<T>& q) {  // unit quaternion w x y z
   const T w = q[0], x = q[1], y = q[2], z = q[3];
   M3<T> r;
   r << T(1) - T(2) * (y * y + z * z), T(2) * (x * y - w * z), T(2) * (x * z + w * y),  //

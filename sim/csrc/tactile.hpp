@@ -20,11 +20,11 @@ void for_touched_markers(const Pad& pad, int s, const T* params, const T& h, con
       frame, pad.cloud,
       [&](int i) {
         const V3<T> x = frame.point(pad.cloud.points[i]);
-        distance<T>(frame.kind, frame.size, x, at);
-        if (!(at.d < T(0))) {
+        if (!(distance_only<T>(frame.kind, frame.size, x) < T(0))) {
           outside(i, i + 1);
           return;
         }
+        distance<T>(frame.kind, frame.size, x, at);
         const PointLaw<T> law = weighted<T>(numbers, pad.cloud.weights[i]);
         const V3<T> v = frame.velocity(x);
         const bool remembers = numbers.elastic && anchored[slot + i];

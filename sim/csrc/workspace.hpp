@@ -22,6 +22,9 @@ struct Workspace {
         twist_before(m.nv),
         twist_after(m.nv),
         acceleration_before(m.nv),
+        p(m.nv),
+        q_missing(m.nv),
+        v_missing(m.nv),
         residual(m.nv),
         scale(m.nv),
         update(m.nv),
@@ -43,6 +46,8 @@ struct Workspace {
   std::vector<M6<T>> inertia, rate;  // composite over the subtree: I and B (dynamics.hpp)
   std::vector<V6<T>> axis;           // S_k per dof
   std::vector<V6<T>> twist_before, twist_after, acceleration_before;  // around the dof's group
+
+  std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
 
   // The step's residual g and its derivatives.
   VX<T> residual, scale;
