@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics of the ABB IRB 120, in plain floats: called once per 4 ms cycle, arrays would cost more.
+"""Forward and inverse kinematics of the ABB IRB 120, in plain floats: used every 4 ms, where arrays would cost more.
 
 Poses are those of the flange (tool0) in the robot's base frame: position [m] and quaternion w x y z. Angles are the
 controller's joint angles [rad]; all zero is the home pose with the flange at (0.374, 0, 0.630) m.
@@ -39,6 +39,8 @@ _FLANGE = DH[5][1]
 _TWIST = tuple((math.sin(row[3]), math.cos(row[3])) for row in DH)
 # Below this the axes of joints 4 and 6 are one line, and only their sum is defined.
 _SINGULAR = 1e-9
+# A solution this close to where the arm is goes on with its motion: other solutions are further away [rad²].
+_SAME_BRANCH = 0.01
 _RANGE_SLACK = 1e-9  # rounding at the end of a range is not out of range [rad]
 
 
@@ -155,12 +157,14 @@ def inverse(position: Sequence[float], orientation: Quaternion, *, near: Sequenc
     axis = matrix[2]
     wrist = tuple(p - _FLANGE * z for p, z in zip(position, axis, strict=True))
     best, best_distance, refused, refused_distance = None, math.inf, None, math.inf
-    for arm in _arm_solutions(wrist):
+    for arm in sorted(_arm_solutions(wrist), key=lambda arm: sum(abs(a - b) for a, b in zip(arm, near, strict=False))):
         for joints in _wrist_solutions(arm, matrix, near[3]):
             turned = _closest_turn(joints, near)
             distance = sum((a - b) * (a - b) for a, b in zip(turned, near, strict=True))
             if distance < best_distance and not outside(turned):
                 best, best_distance = turned, distance
+                if distance < _SAME_BRANCH:
+                    return best
             elif distance < refused_distance:
                 refused, refused_distance = turned, distance
     if best is not None:

@@ -12,7 +12,14 @@ from gelflow.real import kinematics as k
 def matrix(joints: k.Joints) -> np.ndarray:
     """The textbook product of 4 × 4 DH matrices, an independent route."""
     total = np.eye(4)
-    table = [(0, 0.29, 0, -90), (-90, 0, 0.27, 0), (0, 0, 0.07, -90), (0, 0.302, 0, 90), (0, 0, 0, -90), (180, 0.072, 0, 0)]
+    table = [
+        (0, 0.29, 0, -90),
+        (-90, 0, 0.27, 0),
+        (0, 0, 0.07, -90),
+        (0, 0.302, 0, 90),
+        (0, 0, 0, -90),
+        (180, 0.072, 0, 0),
+    ]
     for angle, (offset, d, a, alpha) in zip(joints, table, strict=True):
         t, u = angle + math.radians(offset), math.radians(alpha)
         ct, st, cu, su = math.cos(t), math.sin(t), math.cos(u), math.sin(u)
