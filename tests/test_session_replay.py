@@ -165,6 +165,31 @@ def test_a_missing_image_is_named(tmp_path: Path) -> None:
         replayed(tmp_path / "a.mcap")
 
 
+class FussyTracker(SumTracker):
+    """Refuses one image, and keeps its state then."""
+
+    refused = b""
+
+    def track(self, data: bytes) -> NDArray[np.float64]:
+        if data == self.refused:
+            raise PeerError("no markers")
+        return super().track(data)
+
+
+def test_an_image_that_the_tracker_refuses_matters_only_where_it_was_needed(tmp_path: Path) -> None:
+    with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
+        run_live(recorder)
+    with SessionReader(tmp_path / "a.mcap") as session:
+        data = {record.value.sequence: record.value.data for record in session.records(["/left/image"])}
+        first = next(session.decisions())
+    fussy = Perception(FussyTracker, sum_frame)
+    FussyTracker.refused = data[first.tracked[0][1]]
+    assert not replayed(tmp_path / "a.mcap", perception=fussy)[0].identical
+    FussyTracker.refused = data[first.frames[0][0]]
+    with pytest.raises(PeerError, match="no markers"):
+        replayed(tmp_path / "a.mcap", perception=fussy)
+
+
 def test_differences() -> None:
     assert difference(np.array([1.0, 2.0]), np.array([1.0, 2.5])) == 0.5
     assert difference(np.array([np.nan]), np.array([np.nan])) == np.inf
@@ -197,9 +222,7 @@ def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = MOUNT.tracker_config()
     with SessionRecorder(folder / "session.mcap", CLOCK) as recorder:
         recorder.metadata(
-            describe_session(
-                task=INSERTION, trackers=[config, config], mounts=[MOUNT, MOUNT], checkpoint=policy_file
-            )
+            describe_session(task=INSERTION, trackers=[config, config], mounts=[MOUNT, MOUNT], checkpoint=policy_file)
         )
         sequence = 0
         for insertion, attempt in [(0, 0), (0, 1), (1, 0)]:

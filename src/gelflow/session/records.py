@@ -1,6 +1,7 @@
 """What a session holds: topics, the decision record, and how our values become plain JSON and back."""
 
 import dataclasses
+import datetime
 import hashlib
 import json
 import math
@@ -179,6 +180,7 @@ def describe_session(
         policy = {"path": str(Path(checkpoint).resolve()), "digest": file_digest(checkpoint)}
     described = {
         "format": FORMAT,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),  # robot time has no date
         "task": task.to_json(),
         "task_digest": task.digest(),
         "checkpoint": policy,
