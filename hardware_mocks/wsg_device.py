@@ -8,6 +8,7 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from gelflow.clock import Clock
 from gelflow.hardware_mocks.plant import GripperPlant
@@ -133,8 +134,8 @@ class WsgSession:
         self.announced = False  # the client said that it will disconnect
         self._handlers = self._table()
 
-    def _table(self) -> dict[Command, Callable[[Command, tuple[float, ...]], Reply]]:
-        groups: dict[tuple[Command, ...], Callable[[Command, tuple[float, ...]], Reply]] = {
+    def _table(self) -> dict[Command, Callable[[Command, tuple[Any, ...]], Reply]]:
+        groups: dict[tuple[Command, ...], Callable[[Command, tuple[Any, ...]], Reply]] = {
             (Command.DISCONNECT,): self._disconnect,
             MOTIONS: self._motion,
             (Command.STOP, Command.FAST_STOP): self._stop,
@@ -245,7 +246,7 @@ class WsgSession:
         self._device.stop(fast=command == Command.FAST_STOP)
         return reply(command, Status.SUCCESS)
 
-    def _acknowledge(self, command: Command, values: tuple[float, ...]) -> Reply:
+    def _acknowledge(self, command: Command, values: tuple[Any, ...]) -> Reply:
         (key,) = values
         if key != ACKNOWLEDGE_KEY:
             return reply(command, Status.INVALID_PARAMETER)

@@ -144,20 +144,20 @@ class Fingers:
 
     def flags(self) -> SystemFlag:
         """The system state."""
-        moving = self._motion is not None
-        return (
-            SystemFlag.REFERENCED * self.referenced
-            | SystemFlag.MOVING * moving
-            | SystemFlag.BLOCKED_MINUS * (self._blocked < 0)
-            | SystemFlag.BLOCKED_PLUS * (self._blocked > 0)
-            | SystemFlag.SOFT_LIMIT_MINUS * (self._at_limit < 0)
-            | SystemFlag.SOFT_LIMIT_PLUS * (self._at_limit > 0)
-            | SystemFlag.AXIS_STOPPED * self._stopped
-            | SystemFlag.TARGET_REACHED * self._reached
-            | SystemFlag.FORCE_CONTROL * (self.grasp == GraspState.HOLDING)
-            | SystemFlag.FAST_STOP * self.fast_stopped
-            | SystemFlag.CMD_FAILURE * self._failed
-        )
+        shown = {
+            SystemFlag.REFERENCED: self.referenced,
+            SystemFlag.MOVING: self._motion is not None,
+            SystemFlag.BLOCKED_MINUS: self._blocked < 0,
+            SystemFlag.BLOCKED_PLUS: self._blocked > 0,
+            SystemFlag.SOFT_LIMIT_MINUS: self._at_limit < 0,
+            SystemFlag.SOFT_LIMIT_PLUS: self._at_limit > 0,
+            SystemFlag.AXIS_STOPPED: self._stopped,
+            SystemFlag.TARGET_REACHED: self._reached,
+            SystemFlag.FORCE_CONTROL: self.grasp == GraspState.HOLDING,
+            SystemFlag.FAST_STOP: self.fast_stopped,
+            SystemFlag.CMD_FAILURE: self._failed,
+        }
+        return SystemFlag(sum(flag for flag, on in shown.items() if on))
 
     def _refusal(self, command: Command) -> Status | None:
         if self.fast_stopped:

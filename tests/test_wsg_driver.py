@@ -20,9 +20,9 @@ from gelflow.hardware_mocks.wsg_fingers import WsgDeviceConfig
 from gelflow.protocols import Gripper, GripperState
 from gelflow.real.transport import TcpTransport, transport_for
 from gelflow.real.wsg import WsgGripper
-from gelflow.real.wsg_codec import crc16
+from gelflow.real.wsg_codec import crc16, reply
 from gelflow.real.wsg_config import WsgConfig, WsgLimits
-from gelflow.real.wsg_tables import STATE_COMMANDS, Command
+from gelflow.real.wsg_tables import STATE_COMMANDS, Command, Status
 
 CLOCK = ScaledClock(5.0)
 PATIENT = 10.0  # a time-out that only a failing test reaches [s, wall]
@@ -519,6 +519,19 @@ def test_spoilt_bytes_do_not_disturb(spoil: Spoil) -> None:
         gripper.release(width=0.1, speed=0.4)
         gripper.move(width=0.08, speed=0.4)
         assert gripper.state().width == pytest.approx(0.08, abs=3e-4)
+
+
+def test_a_late_success_of_an_earlier_grasp_is_not_taken_for_this_one() -> None:
+    late = reply(Command.GRASP, Status.SUCCESS).encode()
+
+    def repeat(data: bytes) -> Iterable[bytes]:
+        pending = reply(Command.GRASP, Status.CMD_PENDING).encode()
+        return [data.replace(pending, late + pending)]
+
+    with relayed(repeat) as (gripper, _, _):
+        gripper.home()
+        with pytest.raises(PeerRefused, match="CMD_FAILED"):
+            gripper.grasp(width=0.040, speed=0.4, force=20)
 
 
 def test_a_bad_checksum_is_a_fault_until_acknowledged() -> None:
