@@ -51,8 +51,8 @@ def _misalignment(options: dict[str, Any] | None, count: int) -> NDArray[np.floa
 def _info(result: AttemptResult, attempts: InsertionAttempts, tries: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
     return {
         "attempts": tries.copy(),
-        "inserted": result.inserted,
-        "failed": result.failed,
+        "inserted": result.inserted.copy(),
+        "failed": result.failed.copy(),
         "pose": attempts.pose.copy(),
         "height": result.height,
         "divisor": result.divisor,
@@ -111,7 +111,7 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {key: values[0] for key, values in _info(result, self._attempts, self._tries).items()}
 
 
-class InsertionVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
+class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """Many parts side by side, on all cores; what training uses.
 
     A finished environment goes on with the next part within the same step (AutoresetMode.SAME_STEP): its observation
@@ -168,7 +168,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any
         return images, self._masked(info)
 
     def step(
-        self, actions: NDArray[np.float32]
+        self, actions: NDArray[Any]
     ) -> tuple[Observation, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Correct every pose by its action (±1, shape (num_envs, 3)) and attempt again."""
         attempts = self._attempts

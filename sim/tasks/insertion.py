@@ -22,7 +22,7 @@ from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
 
-STEPS = 45  # of an attempt: 1.1 mm in 225 ms, about ten times as fast as the robot
+STEPS = 45  # of an attempt, as published: 1.1 mm in 225 ms, about ten times as fast as the robot
 SETTLE_STEPS = 24  # until the part hangs still in the closed gripper
 ARMS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 PADS = ("left", "right")
@@ -66,6 +66,7 @@ class InsertionAttempts:
     scene: `insertion_scene(task)`, or one of the same make
     randomization: from what the physics of a part is drawn
     threads: of the simulator; all cores when None. Results do not depend on it.
+    steps: over which an attempt goes down
 
     `pose` (N, 3) is where each gripper is: x [m], y [m], yaw [rad] in the hole's frame. Write into it between attempts.
     Raises UsageError when task and scene do not fit together.
@@ -79,8 +80,12 @@ class InsertionAttempts:
         scene: Scene | None = None,
         randomization: Randomization = TABLE_7,
         threads: int | None = None,
+        steps: int = STEPS,
     ) -> None:
+        if steps < 1:
+            raise UsageError(f"steps must be at least 1, got {steps}")
         self.task = task
+        self._steps = steps
         self.scene = insertion_scene(task) if scene is None else scene
         self.randomization = randomization
         if [p.name for p in self.scene.pads] != list(PADS) or any(g != task.grid for g in self.scene.grids):
@@ -113,7 +118,7 @@ class InsertionAttempts:
         """After which step of an attempt the gripper's target is `depth` below its start."""
         if not 0 <= depth <= self.task.descent * (1 + 1e-9):
             raise UsageError(f"a frame at depth {depth} m can't be taken: an attempt goes down {self.task.descent} m")
-        return int(np.ceil(depth / self.task.descent * STEPS - 1e-6))
+        return int(np.ceil(depth / self.task.descent * self._steps - 1e-6))
 
     def draw(self, rng: np.random.Generator, *, misalignment: Array | None = None) -> None:
         """New parts everywhere: physics and grasp from the randomization, start from the task (or as given, (N, 3))."""
@@ -157,8 +162,8 @@ class InsertionAttempts:
         u = self._place(rng)
         start = u[:, z].copy()
         readings = {0: self._held["tactile"]}
-        for step in range(1, STEPS + 1):
-            u[:, z] = start - self.task.descent * step / STEPS
+        for step in range(1, self._steps + 1):
+            u[:, z] = start - self.task.descent * step / self._steps
             sim.step(u)
             if step == self._reference_at or step in self._frames:
                 readings[step] = sim.tactile()[..., :2].copy()

@@ -1,0 +1,225 @@
+"""What happens in a simulated insertion attempt."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import DEFAULT_FLOORS, TactileFrame, flow_map
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.randomization import NOMINAL, TABLE_7, Randomization
+from gelflow.task import INSERTION
+
+WEIGHT = 0.063 * 9.8  # of the part [N]
+SILENT = dataclasses.replace(NOMINAL, noise=(1e-30, 1e-30))
+
+
+def poses(*millimetres_degrees: tuple[float, float, float]) -> NDArray[np.float64]:
+    return np.array(millimetres_degrees) * [1e-3, 1e-3, np.pi / 180]
+
+
+def attempted(misalignment: NDArray[np.float64], **options: Any) -> tuple[InsertionAttempts, Any]:
+    rng = np.random.default_rng(0)
+    attempts = InsertionAttempts(len(misalignment), **{"randomization": SILENT, **options})
+    attempts.draw(rng, misalignment=misalignment)
+    return attempts, attempts.attempt(rng)
+
+
+def held(friction: str) -> tuple[Simulator, NDArray[np.float64], int]:
+    """A part at rest in the gripper, high above everything, the controls that hold it, and where its height stands."""
+    scene = insertion_scene(friction=friction)
+    attempts = InsertionAttempts(1, scene=scene, randomization=SILENT)
+    attempts.draw(np.random.default_rng(0))
+    return attempts.sim, attempts._u.copy(), scene.q("part").start + 2
+
+
+def test_a_held_part_stays_where_it_is_under_the_elastic_law() -> None:
+    sim, u, z = held("elastic")
+    before = sim.q[0].copy()
+    sim.step(u, 200)
+    assert abs(sim.q[0, z] - before[z]) < 1e-8  # in 1 s
+    np.testing.assert_allclose(sim.q[0], before, atol=1e-6)
+    assert (sim.status == 0).all()
+
+
+def test_a_held_part_creeps_as_the_viscous_law_says() -> None:
+    """66 points of 80 N s/m carry the weight: it sinks at m g / 5280 N s/m."""
+    sim, u, z = held("viscous")
+    before = sim.q[0, z]
+    sim.step(u, 100)
+    assert (before - sim.q[0, z]) / 0.5 == pytest.approx(WEIGHT / (66 * 80), rel=1e-3)
+
+
+@pytest.mark.parametrize("friction", ["viscous", "elastic"])
+def test_the_pads_carry_the_weight_and_the_grasp_force(friction: str) -> None:
+    sim, _, _ = held(friction)
+    names = list(sim.model.contact_names)
+    left, right = (sim.wrenches()[0, names.index(f"pad_{side}"), 3:] for side in ("left", "right"))
+    np.testing.assert_allclose(left, [-12, 0, -WEIGHT / 2], atol=2e-3)  # on the pads
+    np.testing.assert_allclose(right, [12, 0, -WEIGHT / 2], atol=2e-3)
+    reading = sim.tactile()[0]
+    assert (reading[..., 2] > 0).all()  # pressed
+    assert (reading[..., 0] > 0).all()  # the part pulls towards the tip, which is down
+    assert np.abs(reading[..., 1]).max() < 1e-3 * reading[..., 0].min()
+
+
+def test_an_aligned_part_goes_in_and_a_misaligned_one_does_not() -> None:
+    cases = poses((0, 0, 0), (2.1, 0, 0), (0, -2.1, 0), (0, 0, 4), (2.6, 0, 0), (0, -2.6, 0), (0, 0, 8), (6, 6, 10))
+    _, result = attempted(cases)
+    assert result.inserted.tolist() == [True] * 4 + [False] * 4
+    assert not result.failed.any()
+    np.testing.assert_allclose(result.height[0], 25.5e-3 - 1.1e-3, atol=5e-5)
+    assert (result.height[4:] > 24.7e-3).all()
+
+
+def test_insertion_agrees_with_geometry_under_randomized_physics() -> None:
+    """No part goes in that does not fit, beyond what the gels and walls give; every part that fits goes in."""
+    attempts = InsertionAttempts(48)
+    rng = np.random.default_rng(3)
+    blocked = fitting = 0
+    for _ in range(2):
+        attempts.draw(rng)
+        attempts.pose = rng.uniform(-1, 1, (48, 3)) * [4e-3, 4e-3, 0.12]
+        result = attempts.attempt(rng)
+        x, y, yaw = np.abs(attempts.pose.T)
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        margin = np.minimum(19.75e-3 - x - 17.5e-3 * cos - 25e-3 * sin, 27.25e-3 - y - 25e-3 * cos - 17.5e-3 * sin)
+        assert not result.failed.any()
+        assert not result.inserted[margin < -0.3e-3].any()
+        assert result.inserted[margin > 0].all()
+        blocked += int((margin < 0).sum())
+        fitting += int((margin > 0).sum())
+    assert blocked > 30 and fitting > 8
+
+
+def test_mirrored_misalignment_gives_the_mirrored_map() -> None:
+    """x → −x swaps the fingers; on the pads, y and the columns change sign. Fails when a pad's frame is turned."""
+    _, result = attempted(poses((1.5, 3, 4), (-1.5, 3, -4)))
+    maps = result.image.reshape(2, 2, 2, 13, 10)
+    mirrored = maps[1][::-1, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
+    np.testing.assert_allclose(maps[0], mirrored, atol=0.01)  # the left jaw is held, the right one pressed
+    assert np.abs(maps[0] - maps[1]).max() > 0.05
+
+
+def test_the_map_shows_where_the_part_is_caught() -> None:
+    """The rim pushes up: towards the base of the fingers. Caught at its back edge, the part turns under the pads."""
+    _, result = attempted(poses((0, 4, 0), (0, -4, 0)))
+    maps = result.image.reshape(2, 2, 2, 13, 10)
+    assert (maps[:, :, 0].mean((2, 3)) < 0).all()
+    left, right = maps[:, 0], maps[:, 1]
+    top, bottom = left[:, 1, :4].mean((1, 2)), left[:, 1, -4:].mean((1, 2))
+    assert top[0] < bottom[0] and top[1] > bottom[1]  # the shear across turns with the part
+    np.testing.assert_allclose(left[:, 1], -right[:, 1, :, ::-1], atol=0.01)
+
+
+def test_the_map_does_not_depend_on_the_speed_of_the_descent() -> None:
+    """Frames are picked by depth: a robot goes down ten times as slowly, and must see the same."""
+    cases = poses((3, 0, 0), (0, 4, 0), (2, 4, 8))
+    _, fast = attempted(cases)
+    _, slow = attempted(cases, steps=450)
+    assert np.linalg.norm(fast.image - slow.image) < 0.05 * np.linalg.norm(fast.image)
+    np.testing.assert_allclose(fast.divisor, slow.divisor, rtol=0.02)
+
+
+def test_the_observation_is_the_flow_map_of_the_frames() -> None:
+    """The batch's maps are those that the robot's side makes of the same frames."""
+    attempts, result = attempted(poses((2, 3, 5), (-3, 1, 0)))
+    grid = INSERTION.grid
+
+    def frame(reading: NDArray[Any], env: int) -> TactileFrame:
+        shear = reading[env, :, :2].reshape(2, -1, 2).astype(np.float32)
+        return TactileFrame(
+            shear=shear,
+            valid=np.ones(shear.shape[:2], dtype=bool),
+            positions=grid.positions().astype(np.float32),
+            stamp=0.0,
+            unit="N",
+            grid=grid,
+        )
+
+    last = attempts.sim.tactile().copy()
+    for env in range(2):
+        expected = flow_map([frame(last, env)], frame(attempts._held["tactile"], env), grid=grid)
+        np.testing.assert_allclose(result.image[env], expected.image, atol=1e-5)
+        assert result.divisor[env] == pytest.approx(expected.divisor, rel=1e-5)
+        assert result.divisor[env] > DEFAULT_FLOORS["N"]
+
+
+def test_frames_are_taken_at_the_depths_of_the_task() -> None:
+    task = dataclasses.replace(INSERTION, reference_depth=0.2e-3, frame_depths=(0.6e-3, 0.8e-3, 1.1e-3))
+    cases = poses((3, 0, 0), (0, 4, 0))
+    _, several = attempted(cases, task=task)
+    assert several.image.shape == (2, 12, 13, 10)
+    strength = np.abs(several.image.reshape(2, 3, -1)).sum(2)
+    assert (np.diff(strength, axis=1) > 0).all()  # the deeper, the stronger
+    with pytest.raises(UsageError, match=r"a frame at depth 0\.002 m can't be taken"):
+        attempted(cases, task=dataclasses.replace(INSERTION, frame_depths=(2e-3,)))
+
+
+def test_every_attempt_starts_from_the_same_grasp() -> None:
+    attempts, first = attempted(poses((2, 3, 5)))
+    again = attempts.attempt(np.random.default_rng(1))
+    np.testing.assert_allclose(again.image, first.image, atol=1e-6)
+    attempts.pose = poses((-4, 3, -2))
+    other = attempts.attempt(np.random.default_rng(1))
+    assert np.abs(other.image - first.image).max() > 0.05
+
+
+def test_results_depend_neither_on_the_batch_nor_on_threads() -> None:
+    cases = poses((2, 3, 5), (0, 4, 0), (5, -5, 3))
+    _, together = attempted(cases, threads=2)
+    for i, case in enumerate(cases):
+        _, alone = attempted(case[None], threads=1)
+        assert (alone.image[0] == together.image[i]).all()
+
+
+def test_a_part_can_move_to_another_batch() -> None:
+    rng = np.random.default_rng(5)
+    source, target = InsertionAttempts(3), InsertionAttempts(2)
+    source.draw(rng)
+    target.draw(rng)
+    source._noise[:] = 0
+    source.randomization = dataclasses.replace(TABLE_7, start_height=0.0)
+    target.randomization = source.randomization
+    expected = source.attempt(rng)
+    target.take(np.array([1]), source, np.array([2]))
+    moved = target.attempt(rng)
+    np.testing.assert_array_equal(moved.image[1], expected.image[2])
+    assert moved.height[1] == expected.height[2]
+
+
+@pytest.mark.parametrize("elastic", [True, False])
+def test_drawn_physics_lies_in_its_ranges(elastic: bool) -> None:
+    drawn = TABLE_7.draw(np.random.default_rng(0), 500, elastic=elastic)
+    for name, limits in {
+        "pad_left.kn": (2e3, 1.4e4),
+        "right.kd": (0, 100),
+        "arm_z.kp": (200, 2e4),
+        "part_hole/wall_back.kn": (2.5e3, 2e4),
+    }.items():
+        values = drawn.params[name]
+        assert limits[0] <= values.min() and values.max() <= limits[1]
+        assert values.max() - values.min() > 0.9 * (limits[1] - limits[0])
+    assert ("pad_left.ks" in drawn.params) == elastic
+    np.testing.assert_array_equal(drawn.params["pad_left.mu"], drawn.params["pad_right.mu"])
+    assert drawn.grasp_force.min() >= 2.5 and drawn.grasp_force.max() <= 16
+    with pytest.raises(UsageError, match=r"pad_mu must be \(low, high\)"):
+        Randomization(pad_mu=(2.0, 1.0))
+
+
+def test_every_drawn_parameter_exists_under_both_laws() -> None:
+    for friction in ("viscous", "elastic"):
+        attempts = InsertionAttempts(2, scene=insertion_scene(friction=friction))
+        attempts.draw(np.random.default_rng(0))
+        assert not attempts.attempt(np.random.default_rng(0)).failed.any()
+
+
+def test_a_scene_with_other_markers_is_refused() -> None:
+    task = dataclasses.replace(INSERTION, grid=dataclasses.replace(INSERTION.grid, rows=12))
+    assert InsertionAttempts(1, task=task).attempt(np.random.default_rng(0)).image.shape == (1, 4, 12, 10)
+    with pytest.raises(UsageError, match="the scene's pads must be left, right with the task's markers"):
+        InsertionAttempts(1, task=task, scene=insertion_scene(INSERTION))
