@@ -23,7 +23,7 @@ import os, signal, sys
 from gelflow.clock import ScaledClock
 from gelflow.protocols import CameraImage
 from gelflow.session.recorder import SessionRecorder
-clock = ScaledClock(float(sys.argv[2]))
+clock = ScaledClock()
 recorder = SessionRecorder(sys.argv[1], clock).open()
 recorder.metadata({"who": "killed"})
 for number in range(1, 501):
@@ -34,10 +34,9 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.parametrize("factor", ["1", "5"])
-def test_a_kill_at_message_500_loses_at_most_half_a_second(tmp_path: Path, factor: str) -> None:
+def test_a_kill_at_message_500_loses_at_most_half_a_second(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path), factor], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], capture_output=True, text=True, timeout=60)
     assert done.returncode == -signal.SIGKILL, done.stderr
     with pytest.raises(PeerError, match=r"was not finished.*gelflow recover .*killed\.mcap"):
         SessionReader(path).open()

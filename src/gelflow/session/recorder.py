@@ -5,7 +5,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -231,31 +231,78 @@ class SessionRecorder:
         writer.start(profile="", library=f"gelflow {__version__}")
         writer.add_metadata("gelflow", {"format": str(FORMAT), "version": __version__})
         channels = _register(writer)
-        _sync(writer, stream)
+        writer.flush()  # type: ignore[no-untyped-call]
+        with _Syncer(stream.fileno(), self._fail) as syncer:
+            finished = self._write_queue(writer, channels, syncer)
+        if finished and self._failure is None:
+            writer.finish()  # type: ignore[no-untyped-call]
+            stream.flush()
+            os.fsync(stream.fileno())
+            self._finished = True
+
+    def _write_queue(self, writer: Writer, channels: Mapping[str, int], syncer: "_Syncer") -> bool:
+        """Everything that is queued, until the recorder is closed (True) or fails (False)."""
         due = self._clock.now() + FLUSH_PERIOD
         dirty = False
         while self._failure is None:
+            item: _Item | threading.Event | None
             try:
                 item = self._queue.get(timeout=max(0.0, self._clock.wall(due - self._clock.now())))
             except queue.Empty:
-                item = ()  # type: ignore[assignment]
-            if item is None:
-                writer.finish()  # type: ignore[no-untyped-call]
-                stream.flush()
-                os.fsync(stream.fileno())
-                self._finished = True
-                return
-            if isinstance(item, tuple) and item:
+                item = None
+            else:
+                if item is None:
+                    return True
+            if isinstance(item, tuple):
                 topic, logged, published, sequence, data = item
                 writer.add_message(channels[topic], logged, data, published, sequence)
                 dirty = True
             if isinstance(item, threading.Event) or self._clock.now() >= due:
-                if dirty:
-                    _sync(writer, stream)
+                if dirty or isinstance(item, threading.Event):
+                    writer.flush()  # type: ignore[no-untyped-call]
+                    syncer.request(item if isinstance(item, threading.Event) else None)
                     dirty = False
                 due = self._clock.now() + FLUSH_PERIOD
-            if isinstance(item, threading.Event):
-                item.set()
+        return False
+
+
+class _Syncer:
+    """Has the disk store what was written, in a thread of its own: a slow disk must not keep records from the file,
+    where they survive the end of this program if not that of the computer."""
+
+    def __init__(self, descriptor: int, fail: Callable[[str], None]) -> None:
+        self._descriptor = descriptor
+        self._fail = fail
+        self._requests: queue.Queue[threading.Event | None] = queue.Queue()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="recorder sync", daemon=True)
+
+    def request(self, done: threading.Event | None) -> None:
+        """Store all that was written; `done` is set when it is."""
+        self._requests.put(done)
+
+    def __enter__(self) -> "_Syncer":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending = True
+        self._requests.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ending:
+            waiting = [self._requests.get()]
+            while not self._requests.empty():
+                waiting.append(self._requests.get())
+            try:
+                os.fsync(self._descriptor)
+            except OSError as error:
+                self._fail(error.strerror or "the disk failed")
+                return
+            for done in waiting:
+                if done is not None:
+                    done.set()
 
 
 def _fill(message: Any, names: str, values: ArrayLike) -> None:
@@ -279,8 +326,3 @@ def _register(writer: Writer) -> dict[str, int]:
         schema = writer.register_schema(channel.name, "jsonschema", channel.schema())
         channels[topic] = writer.register_channel(topic, "json", schema)
     return channels
-
-
-def _sync(writer: Writer, stream: BinaryIO) -> None:
-    writer.flush()  # type: ignore[no-untyped-call]
-    os.fsync(stream.fileno())
