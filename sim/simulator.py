@@ -245,6 +245,14 @@ class Simulator:
             raise UsageError(str(error)) from None
         return result
 
+    def branches(self, trajectory: Trajectory) -> NDArray[np.uint64]:
+        """Signature of the branches that each step took (touching, sliding, clipped), (steps, N).
+
+        Two runs with equal signatures lie on one smooth piece of the dynamics; markers count where they were read.
+        """
+        result: NDArray[np.uint64] = self._batch.branches(*self._arguments(trajectory))
+        return result
+
     @staticmethod
     def _arguments(t: Trajectory) -> tuple[NDArray[Any], ...]:
         return (t.u, t.q, t.v, t.anchors, t.anchored, t.halvings, t.status, t.read_after, t.tactile)

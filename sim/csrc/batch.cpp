@@ -2,6 +2,8 @@
 
 #include <stdexcept>
 
+#include "branches.hpp"
+
 namespace gelflow {
 
 ThreadPool::ThreadPool(int threads) {
@@ -241,6 +243,25 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, 0, next, memory);
       r.status[e] = static_cast<std::int32_t>(report.status);
       r.halvings[t * N + e] = static_cast<std::int8_t>(report.halvings);
+    }
+  });
+}
+
+template <class T>
+void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
+  const Model& m = *model;
+  const std::size_t N = n;
+  pool_.run(n, [&](int env, int thread) {
+    const std::size_t e = env;
+    for (int t = 0; t < r.steps; ++t) {
+      const std::size_t before = t * N + e, after = before + N;
+      const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
+      Signature hash;
+      hash.add(branch_signature<T>(m, params_of(env), r.q + after * m.nq, r.v + after * m.nv,
+                                   reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na, r.anchored + before * m.na,
+                                   r.u + before * m.actuators.size(), read, memory_[thread].work));
+      hash.add(static_cast<std::uint64_t>(r.halvings[before]));
+      out[before] = hash.value();
     }
   });
 }

@@ -79,6 +79,8 @@ class Batch {
   void mass_matrix(T* out);                  // (N, nv, nv)
   void bias(T* out);                         // (N, nv): Coriolis and gravity forces
   void rollout(const Rollout<T>& r);
+  // Signature of the branches that each step took, (steps, N).
+  void branches(const Rollout<T>& r, std::uint64_t* out);
   void rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g);
 
  private:

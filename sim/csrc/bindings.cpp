@@ -152,6 +152,14 @@ void bind_batch(py::module_& module, const char* name) {
              const py::gil_scoped_release release;
              b.rollout(r);
            })
+      .def("branches",
+           [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
+              py::array halvings, py::array status, const Array<int>& read_after, py::array tactile) {
+             const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, halvings, status, read_after, tactile);
+             py::array_t<std::uint64_t> out({static_cast<py::ssize_t>(r.steps), static_cast<py::ssize_t>(b.n)});
+             b.branches(r, out.mutable_data());
+             return out;
+           })
       .def("rollout_transposed",
            [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
               py::array halvings, py::array status, const Array<int>& read_after, py::array tactile,

@@ -1,0 +1,82 @@
+// Which branches a step took: touching or not, stick or slip, clipped or not. Two runs with equal signatures lie on the
+// same smooth piece of the simulator's function; a finite difference is only meaningful there.
+#pragma once
+
+#include "step.hpp"
+
+namespace gelflow {
+
+class Signature {
+ public:
+  void add(std::uint64_t value) { hash_ = (hash_ ^ (value + 0x9e3779b97f4a7c15ULL)) * 0x100000001b3ULL; }
+  std::uint64_t value() const { return hash_; }
+
+ private:
+  std::uint64_t hash_ = 0xcbf29ce484222325ULL;
+};
+
+// The face or edge of the shape that the point is nearest to, as told by the normal's zero pattern and signs.
+template <class T>
+std::uint64_t face(const Distance<T>& at) {
+  std::uint64_t code = at.curved ? 1 : 0;
+  for (int a = 0; a < 3; ++a) code = code * 3 + (at.n[a] > T(0) ? 1 : at.n[a] < T(0) ? 2 : 0);
+  return at.curved ? 1 : code;
+}
+
+// Signature of the step that ended in (q, v), with the anchors from before it. Markers count where `markers` is true
+// or where they carry memory.
+template <class T>
+std::uint64_t branch_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
+                               const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
+  Signature hash;
+  const T h = T(m.step);
+  w.update.setZero();
+  forward_positions<T>(m, params, q, w);
+  forward_velocities<T>(m, params, v, w.update.data(), w);
+  PointForce<T> force;
+  int pair = 0;
+  const auto visit = [&](int i, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity, const V3<T>& e,
+                         bool remembers) {
+    point_force<0, T>(law, at, velocity, e, remembers, force);
+    const bool pulls = force.force.dot(at.n) <= T(0);
+    hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
+    hash.add(face(at) * 8 + (force.slips ? 4 : 0) + (remembers ? 2 : 0) + (pulls ? 1 : 0));
+  };
+  for (const Contact& contact : m.contacts) {
+    ++pair;
+    const PairFrame<T> frame =
+        pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    for_touching_points<T>(
+        m, contact, params, h, frame, anchors, anchored,
+        [&](int i, const V3<T>&, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,
+            const V3<T>& e, const V3<T>&, bool remembers) { visit(i, law, at, velocity, e, remembers); },
+        ignore);
+  }
+  for (const Pad& pad : m.pads) {
+    for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
+      ++pair;
+      if (!markers && pad.anchor < 0) continue;
+      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      for_touched_markers<T>(
+          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
+          [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,
+              const V3<T>& e, const V3<T>&, bool remembers) { visit(i, law, at, velocity, e, remembers); },
+          ignore);
+    }
+  }
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) {
+    const T* p = params + m.actuators[a].param;
+    const T force_a = m.actuators[a].kind == ActuatorKind::position
+                          ? T(p[1] * (u[a] - p[0] * q[m.actuators[a].q]) - p[2] * p[0] * v[m.actuators[a].dof])
+                          : u[a];
+    hash.add(force_a < p[3] ? 1 : force_a > p[4] ? 2 : 0);
+  }
+  for (const Joint& joint : m.joints) {
+    if (joint.type == JointType::free) continue;
+    const T* p = params + joint.param;
+    hash.add(q[joint.q] < p[4] ? 1 : q[joint.q] > p[5] ? 2 : 0);
+  }
+  return hash.value();
+}
+
+}  // namespace gelflow

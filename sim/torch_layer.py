@@ -1,0 +1,114 @@
+"""The simulator as a layer of a PyTorch graph (eq. 18): one step, or a whole rollout, with exact gradients.
+
+Tensors are on the CPU and in the simulator's precision. The state is explicit, so that graphs may branch: nothing here
+changes the simulator's own state. A quaternion's gradient is its tangent gradient mapped back.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch.autograd.function import once_differentiable
+
+from gelflow.errors import UsageError
+from gelflow.sim.simulator import Simulator, Trajectory
+
+
+@dataclass(frozen=True)
+class TorchState:
+    """State of all environments. `anchors` is the memory of the elastic friction law; empty under the viscous one."""
+
+    q: torch.Tensor  # (N, nq)
+    v: torch.Tensor  # (N, nv)
+    anchors: torch.Tensor  # (N, na, 3)
+    anchored: torch.Tensor  # (N, na) uint8: no gradient
+
+
+@dataclass(frozen=True)
+class TorchRollout:
+    """What a rollout gives back; `ok` (N) is False where an environment failed, and its gradient is then zero."""
+
+    q: torch.Tensor  # (steps + 1, N, nq)
+    v: torch.Tensor  # (steps + 1, N, nv)
+    tactile: torch.Tensor  # (reads, N, markers, 3) [N]
+    end: TorchState
+    ok: torch.Tensor
+
+
+def state_of(sim: Simulator) -> TorchState:
+    """The simulator's present state as tensors (copies)."""
+    return TorchState(*(torch.from_numpy(np.array(array)) for array in (sim.q, sim.v, sim.anchors, sim.anchored)))
+
+
+def rollout(sim: Simulator, state: TorchState, u: torch.Tensor, *, read_after: Sequence[int] = ()) -> TorchRollout:
+    """Steps under controls u (steps, N, nu) from `state`; markers are read after the steps in `read_after`.
+
+    Differentiable in u, state.q, state.v and state.anchors. Raises UsageError on wrong shapes, another precision than
+    the simulator's, and numbers that are not finite.
+    """
+    expected = torch.float64 if sim.dtype is np.float64 else torch.float32
+    for name, tensor in (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors)):
+        if tensor.dtype != expected or tensor.device.type != "cpu":
+            raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
+    outputs = _Rollout.apply(u, state.q, state.v, state.anchors, state.anchored, sim, tuple(read_after))
+    q, v, tactile, anchors, anchored, ok = outputs
+    return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored), ok)
+
+
+def step(sim: Simulator, state: TorchState, u: torch.Tensor) -> tuple[TorchState, torch.Tensor]:
+    """One step under controls u (N, nu): the state after it, and what the markers then feel (N, markers, 3) [N]."""
+    result = rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else ())
+    tactile = result.tactile[0] if sim.model.markers else result.q.new_zeros((sim.num_envs, 0, 3))
+    return result.end, tactile
+
+
+class _Rollout(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        u: torch.Tensor,
+        q: torch.Tensor,
+        v: torch.Tensor,
+        anchors: torch.Tensor,
+        anchored: torch.Tensor,
+        sim: Simulator,
+        read_after: tuple[int, ...],
+    ) -> tuple[torch.Tensor, ...]:
+        trajectory = sim.rollout(
+            u.detach().numpy(),
+            q=q.detach().numpy(),
+            v=v.detach().numpy(),
+            anchors=anchors.detach().numpy(),
+            anchored=anchored.numpy(),
+            read_after=read_after,
+        )
+        ctx.sim = sim
+        ctx.trajectory = trajectory
+        # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
+        ctx.params = sim.params.copy()
+        end = torch.from_numpy(trajectory.anchors[-1].copy())
+        set_at_end = torch.from_numpy(trajectory.anchored[-1].copy())
+        ok = torch.from_numpy(trajectory.status == 0)
+        ctx.mark_non_differentiable(set_at_end, ok)
+        arrays = (trajectory.q, trajectory.v, trajectory.tactile)
+        return (*(torch.from_numpy(array.copy()) for array in arrays), end, set_at_end, ok)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any, by_q: torch.Tensor, by_v: torch.Tensor, by_tactile: torch.Tensor, by_end: torch.Tensor, *_: Any
+    ) -> tuple[torch.Tensor | None, ...]:
+        sim: Simulator = ctx.sim
+        trajectory: Trajectory = ctx.trajectory
+        kept = sim.params.copy()
+        sim.params[:] = ctx.params
+        try:
+            gradient = sim.rollout_gradient(
+                trajectory, q=by_q.numpy(), v=by_v.numpy(), tactile=by_tactile.numpy(), anchors_end=by_end.numpy()
+            )
+        finally:
+            sim.params[:] = kept
+        arrays = (gradient.u, gradient.q, gradient.v, gradient.anchors)
+        return (*(torch.from_numpy(array) for array in arrays), None, None, None)
