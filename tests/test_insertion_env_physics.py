@@ -198,7 +198,7 @@ def test_drawn_physics_lies_in_its_ranges(elastic: bool) -> None:
     for name, limits in {
         "pad_left.kn": (2e3, 1.4e4),
         "right.kd": (0, 100),
-        "arm_z.kp": (200, 2e4),
+        "arm_z.kp": (200, 1e5),
         "part_hole/wall_back.kn": (2.5e3, 2e4),
     }.items():
         values = drawn.params[name]

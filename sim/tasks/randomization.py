@@ -48,8 +48,8 @@ class Randomization:
     marker_ks: Range = (50.0, 450.0)  # elastic law, log [N/m]
     hole_kn: Range = (2.5e3, 2e4)  # part against hole, log [N/m]: how hard both are
     hole_mu: Range = (0.3, 1.5)  # printed plastic is smoother than the 1.5 of the published scene
-    # A servo of 200 N/m is the published arm; a robot yields a hundred times less. Log [N/m].
-    arm_stiffness: Range = (200.0, 2e4)
+    # A servo of 200 N/m is the published arm; a robot yields hundreds of times less. Log [N/m].
+    arm_stiffness: Range = (200.0, 1e5)
     noise: Range = (1e-5, 1e-3)  # of a marker's force, log [N]: from the published 1e-5 to a tracked image's
 
     def __post_init__(self) -> None:
@@ -104,6 +104,6 @@ NOMINAL = Randomization(
     marker_ks=(150.0, 150.0),
     hole_kn=(5e3, 5e3),
     hole_mu=(1.5, 1.5),
-    arm_stiffness=(2e4, 2e4),
+    arm_stiffness=(1e5, 1e5),
     noise=(1e-5, 1e-5),
 )
