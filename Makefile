@@ -10,7 +10,8 @@
 PYTHON ?= python3
 TORCH_INDEX ?=
 
-PIP := .venv/bin/python -m pip --disable-pip-version-check
+# Python compiles what it imports; compiling all of torch and SymPy beforehand takes longer than the rest.
+INSTALL := .venv/bin/python -m pip --disable-pip-version-check install -q --no-compile -c constraints.txt
 BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
@@ -43,9 +44,9 @@ $(SETUP): pyproject.toml constraints.txt sim/csrc/CMakeLists.txt
 	  { echo "expected Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up .venv (once): build tools, torch, the other dependencies, the C++ core"
 	@$(PYTHON) -m venv .venv
-	@$(PIP) install -q -c constraints.txt $(BUILD_TOOLS)
-	@$(PIP) install -q -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
-	@$(PIP) install -q -c constraints.txt --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[dev]'
+	@$(INSTALL) $(BUILD_TOOLS)
+	@$(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
+	@$(INSTALL) --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[dev]'
 	@touch $@
 
 clean:

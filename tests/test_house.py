@@ -38,8 +38,8 @@ def test_the_tests_run_what_is_in_the_tree() -> None:
 @pytest.mark.parametrize("form", ["import {0}", "import {0}.thing as thing", "from {0} import thing"])
 def test_a_bare_import_is_a_lint_error(folder: str, form: str) -> None:
     source = form.format(folder) + "\n"
-    command = [TOOLS / "ruff", "check", "--select=TID", "--output-format=concise", "--stdin-filename=tests/x.py", "-"]
-    result = subprocess.run(command, input=source, cwd=ROOT, capture_output=True, text=True)
+    command = [str(TOOLS / "ruff"), "check", "--select=TID", "--output-format=concise", "--stdin-filename=tests/x.py"]
+    result = subprocess.run([*command, "-"], input=source, cwd=ROOT, capture_output=True, text=True)
     assert result.returncode == 1
     assert f"TID251 `{folder}` is banned: write gelflow.{folder}" in result.stdout
 
