@@ -132,6 +132,11 @@ def read_contacts(
                 raise UsageError(
                     f"{table.where}: the one exact point of a sphere touches planes; let {shape!r} be the sampled side"
                 )
+            if sampled.radius > 0 and law == "elastic":
+                raise UsageError(
+                    f"{table.where}: the exact point of {sampled.geom!r} moves over the sphere as it rolls and can't "
+                    'keep an anchor; set law = "viscous" for this contact'
+                )
             name = group if len(against) == 1 else f"{group}/{shape}"
             contacts.append(ContactDef(name, group, sampled.name, shape, law, damping, numbers))
     return tuple(contacts)

@@ -210,6 +210,13 @@ def test_the_law_chooses_its_own_numbers() -> None:
     assert {c.name: c.law for c in rolling.contacts} == {"pad_ball": "elastic", "ball_ground": "viscous"}
 
 
+def test_a_rolling_point_keeps_no_anchor() -> None:
+    with pytest.raises(UsageError, match='set law = "viscous" for this contact'):
+        load_scene("rolling", overrides={"contacts.ball_ground.law": "elastic", "contacts.ball_ground.ks": 1.0})
+    with pytest.raises(UsageError, match="touches planes; let 'pad' be the sampled side"):
+        load_scene("rolling", overrides={"contacts.ball_ground.against": "pad"})
+
+
 def test_overrides_replace_values_and_are_checked() -> None:
     scene = load_scene("rolling", overrides={"pads.pad.rows": 50, "pads.pad.cols": 50, "step": 1e-3})
     assert scene.markers == 2500
