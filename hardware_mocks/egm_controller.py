@@ -4,10 +4,9 @@ import gc
 import math
 import os
 import random
-import select
 import socket
 import sys
-from collections.abc import Sequence
+from collections import deque
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -19,7 +18,6 @@ from gelflow.real.egm_codec import EgmFeedback, EgmReference, decode_sensor, enc
 from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, compose, forward, inverse, invert
 
 _IDENTITY: Frame = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-_PARENT_CHECK = 0.1  # [s, wall]
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,8 @@ class Controller:
         self.pose = pose  # of the plant, as last heard
         self._joints = joints_of(config, pose, config.near)  # of the controller's own motion
         self._wanted = self._joints  # of the newest reference
-        self._shown = self._joints  # of the plant's pose
+        self._shown, self._shown_at = self._joints, pose  # of the plant's pose
+        self._way: deque[tuple[Frame, Joints]] = deque(maxlen=4)  # where the plant was sent last
         self._reference: EgmReference | None = None
         self._motors = self._rapid = True
         self._random = random.Random(0)
@@ -189,13 +188,12 @@ class Controller:
         scale = min(1.0, self._config.joint_speed * elapsed / largest)
         a, b, c, d, e, f = (q + scale * d for q, d in zip(self._joints, change, strict=True))
         self._joints = (a, b, c, d, e, f)
-        return compose(forward(self._joints), self._config.tool)
+        frame = compose(forward(self._joints), self._config.tool)
+        self._way.append((frame, self._joints))
+        return frame
 
     def _feedback(self, elapsed: float) -> EgmFeedback:
-        try:
-            self._shown = joints_of(self._config, self.pose, self._shown)
-        except SafetyError as error:
-            self._end(f"the arm is out of range: {error}")
+        self._look()
         running = self.report.state == "running"
         self._settled = self._settled + elapsed if running and self._near() else 0.0
         return EgmFeedback(
@@ -209,6 +207,20 @@ class Controller:
             rapid="running" if self._rapid else "stopped",
             converged=self._settled >= self._config.convergence[2],
         )
+
+    def _look(self) -> None:
+        """Joints of the plant's pose: known where it is on the way that it was sent, else computed."""
+        if self.pose == self._shown_at:
+            return
+        self._shown_at = self.pose
+        for frame, joints in self._way:
+            if frame == self.pose:
+                self._shown = joints
+                return
+        try:
+            self._shown = joints_of(self._config, self.pose, self._shown)
+        except SafetyError as error:
+            self._end(f"the arm is out of range: {error}")
 
     def _near(self) -> bool:
         if self._reference is None:
@@ -233,15 +245,12 @@ class _Loop:
         self._udp.setblocking(False)
 
     def run(self) -> None:
+        """As the controller does, it looks once a cycle at what has come."""
         grandparent = os.getppid()
-        sources: list[socket.socket | Messages] = [self._udp, self._parent]
         due = self._clock.now()
         while not self._parent.closed and os.getppid() == grandparent:
-            wait = self._clock.wall(due - self._clock.now())
-            if wait > 0:
-                self._listen(select.select(sources, (), (), min(wait, _PARENT_CHECK))[0])
-                continue
-            self._listen(sources)
+            self._clock.sleep(due - self._clock.now())
+            self._listen()
             # The controller's time goes on, whatever this computer does: what was missed is skipped, not made up for.
             missed = int((self._clock.now() - due) / self._config.period)
             due += (1 + missed) * self._config.period
@@ -253,21 +262,19 @@ class _Loop:
                 self._parent.send(["cycle", self._move])
                 self._asked, self._move = True, None
 
-    def _listen(self, readable: Sequence[socket.socket | Messages]) -> None:
-        if self._parent in readable:
-            for kind, *values in self._parent.read():
-                if kind == "pose":
-                    position, quaternion = values
-                    self._controller.pose = (tuple(position), tuple(quaternion))
-                    self._asked = False
-                else:
-                    self._obey(*values)
-        if self._udp in readable:
-            with suppress(BlockingIOError):
-                while True:
-                    data, sender = self._udp.recvfrom(4096)
-                    if sender[1] == self._config.port:
-                        self._controller.hear(data)
+    def _listen(self) -> None:
+        for kind, *values in self._parent.read():
+            if kind == "pose":
+                position, quaternion = values
+                self._controller.pose = (tuple(position), tuple(quaternion))
+                self._asked = False
+            else:
+                self._obey(*values)
+        with suppress(BlockingIOError):
+            while True:
+                data, sender = self._udp.recvfrom(4096)
+                if sender[1] == self._config.port:
+                    self._controller.hear(data)
 
     def _obey(self, number: int, name: str, *values: Any) -> None:
         if name != "report":

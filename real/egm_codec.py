@@ -82,11 +82,12 @@ def encode_robot(feedback: EgmFeedback) -> bytes:
     header = message.header
     header.seqno, header.tm, header.mtype = feedback.sequence & _COUNTER, _milliseconds(feedback.time), _DATA
     degrees = [math.degrees(angle) for angle in feedback.joints]
+    roll, pitch, yaw = (math.degrees(angle) for angle in _to_euler(feedback.quaternion))
     for part in (message.feedBack, message.planned):
         part.joints.joints.extend(degrees)
         _fill_pose(part.cartesian, feedback.position, feedback.quaternion)
         euler = part.cartesian.euler
-        euler.x, euler.y, euler.z = (math.degrees(a) for a in _to_euler(feedback.quaternion))
+        euler.x, euler.y, euler.z = roll, pitch, yaw
     message.motorState.state = _MOTORS.index(feedback.motors)
     message.mciState.state = _MCI.index(feedback.mci)
     message.rapidExecState.state = _RAPID.index(feedback.rapid)

@@ -39,8 +39,9 @@ _FLANGE = DH[5][1]
 _TWIST = tuple((math.sin(row[3]), math.cos(row[3])) for row in DH)
 # Below this the axes of joints 4 and 6 are one line, and only their sum is defined.
 _SINGULAR = 1e-9
-# A solution this close to where the arm is goes on with its motion: other solutions are further away [rad²].
-_SAME_BRANCH = 0.01
+# A solution this close to where the arm is goes on with its motion: other solutions are further away [rad].
+_SAME_BRANCH = 0.1
+_BRANCHES = tuple((behind, elbow, flip) for behind in (False, True) for elbow in (1, -1) for flip in (1, -1))
 _RANGE_SLACK = 1e-9  # rounding at the end of a range is not out of range [rad]
 
 
@@ -154,19 +155,22 @@ def inverse(position: Sequence[float], orientation: Quaternion, *, near: Sequenc
     Raises SafetyError when the pose is out of reach, or when every solution has a joint out of its range.
     """
     matrix = columns(orientation)
-    axis = matrix[2]
-    wrist = tuple(p - _FLANGE * z for p, z in zip(position, axis, strict=True))
+    zx, zy, zz = matrix[2]
+    px, py, pz = position
+    wrist = (px - _FLANGE * zx, py - _FLANGE * zy, pz - _FLANGE * zz)
+    likely = _likely_branch(wrist, near)
     best, best_distance, refused, refused_distance = None, math.inf, None, math.inf
-    for arm in sorted(_arm_solutions(wrist), key=lambda arm: sum(abs(a - b) for a, b in zip(arm, near, strict=False))):
-        for joints in _wrist_solutions(arm, matrix, near[3]):
-            turned = _closest_turn(joints, near)
-            distance = sum((a - b) * (a - b) for a, b in zip(turned, near, strict=True))
-            if distance < best_distance and not outside(turned):
-                best, best_distance = turned, distance
-                if distance < _SAME_BRANCH:
-                    return best
-            elif distance < refused_distance:
-                refused, refused_distance = turned, distance
+    for branch in (likely, *(other for other in _BRANCHES if other != likely)):
+        joints = _solution(wrist, matrix, branch, near)
+        if joints is None:
+            continue
+        distance = math.dist(joints, near)
+        if distance < best_distance and not outside(joints):
+            best, best_distance = joints, distance
+            if distance < _SAME_BRANCH:
+                return joints
+        elif distance < refused_distance:
+            refused, refused_distance = joints, distance
     if best is not None:
         return best
     where = ", ".join(f"{p:.3f}" for p in position)
@@ -179,26 +183,27 @@ def inverse(position: Sequence[float], orientation: Quaternion, *, near: Sequenc
     )
 
 
-def _arm_solutions(wrist: Sequence[float]) -> list[tuple[float, float, float]]:
+def _likely_branch(wrist: Vector, near: Sequence[float]) -> tuple[bool, int, int]:
+    """The branch that `near` is on: an arm in motion stays there, so it is tried first."""
+    turned = _wrap(near[0] - math.atan2(wrist[1], wrist[0]))
+    return abs(turned) > math.pi / 2, 1 if near[2] + _ELBOW >= 0 else -1, 1 if near[4] >= 0 else -1
+
+
+def _solution(wrist: Vector, matrix: Columns, branch: tuple[bool, int, int], near: Sequence[float]) -> Joints | None:
+    """Joint angles of one branch (shoulder behind, sign of the elbow's bend, sign of joint 5); None: out of reach."""
+    behind, elbow, flip = branch
     x, y, z = wrist
     radius, height = math.hypot(x, y), z - _SHOULDER
-    bend = (radius * radius + height * height - _UPPER * _UPPER - _FOREARM * _FOREARM) / (2 * _UPPER * _FOREARM)
+    cosine = (radius * radius + height * height - _UPPER * _UPPER - _FOREARM * _FOREARM) / (2 * _UPPER * _FOREARM)
     # A stretched arm rounds to slightly more than 1.
-    if not abs(bend) <= 1 + 1e-12:
-        return []
-    bend = math.acos(max(-1.0, min(1.0, bend)))
-    front = math.atan2(y, x)
-    solutions = []
-    for first, reach in ((front, radius), (_wrap(front + math.pi), -radius)):
-        for elbow in (bend, -bend):
-            second = math.atan2(reach, height) - math.atan2(
-                _FOREARM * math.sin(elbow), _UPPER + _FOREARM * math.cos(elbow)
-            )
-            solutions.append((first, _wrap(second), _wrap(elbow - _ELBOW)))
-    return solutions
-
-
-def _wrist_solutions(arm: tuple[float, float, float], matrix: Columns, fourth: float) -> list[Joints]:
+    if not abs(cosine) <= 1 + 1e-12:
+        return None
+    bend = elbow * math.acos(max(-1.0, min(1.0, cosine)))
+    first = math.atan2(y, x)
+    if behind:
+        first, radius = _wrap(first + math.pi), -radius
+    lean = math.atan2(_FOREARM * math.sin(bend), _UPPER + _FOREARM * math.cos(bend))
+    arm = (first, _wrap(math.atan2(radius, height) - lean), _wrap(bend - _ELBOW))
     _, (x3, y3, z3) = _chain(arm, 3)
     # The flange's axes in the frame of joint 3: z6 = (−s5 c4, −s5 s4, c5), and along z3: x6 = s5 c6, y6 = −s5 s6,
     # with the DH offset of 180° still in joint 6.
@@ -207,30 +212,20 @@ def _wrist_solutions(arm: tuple[float, float, float], matrix: Columns, fourth: f
     sine = math.hypot(zx, zy)
     if sine < _SINGULAR and zz > 0:
         total = math.atan2(_dot(y3, tool_x), _dot(x3, tool_x))
-        return [(*arm, fourth, 0.0, _wrap(total - fourth - math.pi))]
-    along_x, along_y = _dot(z3, tool_x), _dot(z3, tool_y)
-    solutions: list[Joints] = []
-    for sign in (1.0, -1.0):
-        solutions.append(
-            (
-                *arm,
-                math.atan2(-sign * zy, -sign * zx),
-                math.atan2(sign * sine, zz),
-                _wrap(math.atan2(-sign * along_y, sign * along_x) - math.pi),
-            )
-        )
-    return solutions
+        fourth, fifth, sixth = near[3], 0.0, total - near[3]
+    else:
+        fourth, fifth = math.atan2(-flip * zy, -flip * zx), math.atan2(flip * sine, zz)
+        sixth = math.atan2(-flip * _dot(z3, tool_y), flip * _dot(z3, tool_x))
+    return (*arm, fourth, fifth, _closest_turn(_wrap(sixth - math.pi), near[5]))
 
 
-def _closest_turn(joints: Joints, near: Sequence[float]) -> Joints:
-    """Joint 6 can turn more than once: take the turn closest to `near`, within its range."""
+def _closest_turn(angle: float, near: float) -> float:
+    """Joint 6 can turn more than once: the turn closest to `near`, within its range [rad]."""
     low, high = LIMITS[5]
-    last = joints[5] + 2 * math.pi * round((near[5] - joints[5]) / (2 * math.pi))
-    if last > high:
-        last -= 2 * math.pi
-    elif last < low:
-        last += 2 * math.pi
-    return (*joints[:5], last)
+    angle += 2 * math.pi * round((near - angle) / (2 * math.pi))
+    if angle > high:
+        return angle - 2 * math.pi
+    return angle + 2 * math.pi if angle < low else angle
 
 
 def _dot(a: Vector, b: Vector) -> float:

@@ -37,7 +37,8 @@ MOCK = MockEgmConfig(joint_speed=math.radians(30), comm_timeout=2.0)
 
 def beside(x: float, y: float, z: float) -> np.ndarray:
     """A place near the start [m]."""
-    return np.add(START, (x, y, z))
+    there: np.ndarray = START + np.array([x, y, z])
+    return there
 
 
 def free_port() -> int:
@@ -208,6 +209,23 @@ def test_wrong_targets_are_refused_in_the_caller(
 def shared() -> Iterator[Cell]:
     with Cell() as cell:
         yield cell
+
+
+def test_wrong_targets_are_refused_once_more_in_the_process(cell: Cell) -> None:
+    """A caller that goes round the checks: the process refuses and holds."""
+    cell.arm.target(beside(0.04, 0, 0), DOWN, lifetime=1.0)
+    cell.arm._send("target", (0.9, 0.0, 0.3), DOWN.tolist(), cell.clock.now() + 1.0, 0.02, 0.1)
+    refused: list[str] = []
+
+    def said() -> bool:
+        refused.extend(e.text for e in cell.arm.drain_events() if e.kind == "refused")
+        return bool(refused)
+
+    cell.until(said, "a refusal")
+    assert "x = 0.900000 m is outside the workspace" in refused[0]
+    first, _ = cell.arm.reference()
+    cell.clock.sleep(0.05)
+    assert np.array_equal(cell.arm.reference()[0], first)
 
 
 def test_wrong_shapes_are_the_callers_mistake(shared: Cell) -> None:
