@@ -32,8 +32,8 @@ template <class T>
 void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
                         StepMemory<T>& memory) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.h, r.q0.data(), r.v0.data(), r.anchors.data(), r.anchored.data(), u, r.v1.data(), false,
-                    w);
+  evaluate<true, T>(m, params, r.h, r.q0.data(), r.v0.data(), r.anchors.data(), r.anchored.data(), u, r.v1.data(),
+                    false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,

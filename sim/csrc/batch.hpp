@@ -15,7 +15,7 @@
 namespace gelflow {
 
 class ThreadPool {
- public:
+public:
   explicit ThreadPool(int threads);
   ~ThreadPool();
   ThreadPool(const ThreadPool&) = delete;
@@ -24,7 +24,7 @@ class ThreadPool {
   // work(item, thread) for every item below `items`; returns when all are done.
   void run(int items, const std::function<void(int, int)>& work);
 
- private:
+private:
   void loop(int thread);
   void take(int thread);
   std::vector<std::thread> threads_;
@@ -41,25 +41,25 @@ class ThreadPool {
 template <class T>
 struct Rollout {
   int steps, reads;
-  const T* u;               // (steps, N, nu)
-  T *q, *v, *anchors;       // (steps + 1, N, ·); the first entry is the start
-  std::uint8_t* anchored;   // (steps + 1, N, na)
-  std::int8_t* halvings;    // (steps, N)
-  std::int32_t* status;     // (N): 0, or why the environment stopped
-  const int* read_after;    // (reads): markers are read after that many steps, increasing
-  T* tactile;               // (reads, N, markers, 3)
+  const T* u;              // (steps, N, nu)
+  T *q, *v, *anchors;      // (steps + 1, N, ·); the first entry is the start
+  std::uint8_t* anchored;  // (steps + 1, N, na)
+  std::int8_t* halvings;   // (steps, N)
+  std::int32_t* status;    // (N): 0, or why the environment stopped
+  const int* read_after;   // (reads): markers are read after that many steps, increasing
+  T* tactile;              // (reads, N, markers, 3)
 };
 template <class T>
 struct RolloutGradient {
-  const T *q, *v;          // in: of the trajectory, shaped as there
-  const T* anchors_end;    // in: (N, na, 3), of the anchors at the end
-  const T* tactile;        // in: (reads, N, markers, 3)
+  const T *q, *v;             // in: of the trajectory, shaped as there
+  const T* anchors_end;       // in: (N, na, 3), of the anchors at the end
+  const T* tactile;           // in: (reads, N, markers, 3)
   T *u, *q0, *v0, *anchors0;  // out
 };
 
 template <class T>
 class Batch {
- public:
+public:
   Batch(std::shared_ptr<const Model> model, int environments, int threads);
 
   const std::shared_ptr<const Model> model;
@@ -67,25 +67,27 @@ class Batch {
   std::vector<T> q, v, params;  // (N, nq), (N, nv), (N, params)
   std::vector<V3<T>> anchors;   // (N, na)
   std::vector<std::uint8_t> anchored;
-  std::vector<std::int32_t> status;        // (N)
+  std::vector<std::int32_t> status;              // (N)
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
   int threads() const { return pool_.size(); }
-  void reset(const std::uint8_t* which);     // null: all; parameters stay
-  void step(const T* u, int steps);          // u (N, nu), held for all steps
-  void tactile(T* out);                      // (N, markers, 3)
-  void wrenches(T* out);                     // (N, contacts, 6)
-  void poses(T* out);                        // (N, bodies, 7): position, quaternion
-  void mass_matrix(T* out);                  // (N, nv, nv)
-  void bias(T* out);                         // (N, nv): Coriolis and gravity forces
+  void reset(const std::uint8_t* which);  // null: all; parameters stay
+  void step(const T* u, int steps);       // u (N, nu), held for all steps
+  void tactile(T* out);                   // (N, markers, 3)
+  void wrenches(T* out);                  // (N, contacts, 6)
+  void poses(T* out);                     // (N, bodies, 7): position, quaternion
+  void mass_matrix(T* out);               // (N, nv, nv)
+  void bias(T* out);                      // (N, nv): Coriolis and gravity forces
   void rollout(const Rollout<T>& r);
   // Signature of the branches that each step took, (steps, N).
   void branches(const Rollout<T>& r, std::uint64_t* out);
   void rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g);
 
- private:
+private:
   StateView<T> state(int env);
-  const T* params_of(int env) const { return params.data() + static_cast<std::size_t>(env) * model->param_names.size(); }
+  const T* params_of(int env) const {
+    return params.data() + static_cast<std::size_t>(env) * model->param_names.size();
+  }
   void kinematics(int env, Workspace<T>& w);
   void check_state() const;
   void check_controls(const T* u, int rows) const;
@@ -94,11 +96,14 @@ class Batch {
   ThreadPool pool_;
 };
 
+extern template class Batch<double>;
+extern template class Batch<float>;
+
 // Derivative of a rollout along one direction, by dual numbers through the whole core: the exact reference that the
 // analytic derivatives are checked against. One environment; tangents of q have nv entries.
 struct DirectionalRollout {
-  std::vector<double> q, v, anchors, tactile;          // at the end
-  std::vector<double> dq, dv, danchors, dtactile;      // their derivatives; dq as a tangent
+  std::vector<double> q, v, anchors, tactile;      // at the end
+  std::vector<double> dq, dv, danchors, dtactile;  // their derivatives; dq as a tangent
   std::vector<std::uint8_t> anchored;
   std::int32_t status = 0;
 };

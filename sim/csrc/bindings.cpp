@@ -97,11 +97,14 @@ void bind_batch(py::module_& module, const char* name) {
            py::arg("threads"))
       .def_readonly("environments", &B::n)
       .def_property_readonly("threads", &B::threads)
-      .def_property_readonly("q", self_view(&B::q, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->nq}; }))
-      .def_property_readonly("v", self_view(&B::v, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->nv}; }))
+      .def_property_readonly("q",
+                             self_view(&B::q, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->nq}; }))
+      .def_property_readonly("v",
+                             self_view(&B::v, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->nv}; }))
       .def_property_readonly("params", self_view(&B::params,
                                                  [](const B& b) {
-                                                   const auto np = static_cast<py::ssize_t>(b.model->param_names.size());
+                                                   const auto np =
+                                                       static_cast<py::ssize_t>(b.model->param_names.size());
                                                    return std::vector<py::ssize_t>{b.n, np};
                                                  }))
       .def_property_readonly("anchors",
@@ -114,20 +117,22 @@ void bind_batch(py::module_& module, const char* name) {
       .def_property_readonly("status", self_view(&B::status, per_env))
       .def_property_readonly("iterations", self_view(&B::iterations, per_env))
       .def_property_readonly("halved", self_view(&B::halved, per_env))
-      .def("reset",
-           [](B& b, const std::optional<Array<std::uint8_t>>& which) {
-             if (which) check_shape<std::uint8_t>(*which, {b.n}, "which");
-             b.reset(which ? which->data() : nullptr);
-           },
-           py::arg("which") = py::none())
-      .def("step",
-           [](B& b, const Array<T>& u, int steps) {
-             check_shape<T>(u, {b.n, static_cast<py::ssize_t>(b.model->actuators.size())}, "u");
-             const T* data = u.data();
-             const py::gil_scoped_release release;
-             b.step(data, steps);
-           },
-           py::arg("u"), py::arg("steps") = 1)
+      .def(
+          "reset",
+          [](B& b, const std::optional<Array<std::uint8_t>>& which) {
+            if (which) check_shape<std::uint8_t>(*which, {b.n}, "which");
+            b.reset(which ? which->data() : nullptr);
+          },
+          py::arg("which") = py::none())
+      .def(
+          "step",
+          [](B& b, const Array<T>& u, int steps) {
+            check_shape<T>(u, {b.n, static_cast<py::ssize_t>(b.model->actuators.size())}, "u");
+            const T* data = u.data();
+            const py::gil_scoped_release release;
+            b.step(data, steps);
+          },
+          py::arg("u"), py::arg("steps") = 1)
       .def("tactile",
            [](B& b, py::array out) {
              T* data = writable<T>(out, {b.n, b.model->markers, 3}, "out");
@@ -171,11 +176,12 @@ void bind_batch(py::module_& module, const char* name) {
              check_shape<T>(by_v, {r.steps + 1, n, m.nv}, "by_v");
              check_shape<T>(by_anchors_end, {n, m.na, 3}, "by_anchors_end");
              check_shape<T>(by_tactile, {r.reads, n, m.markers, 3}, "by_tactile");
-             py::array_t<T> by_u({static_cast<py::ssize_t>(r.steps), n, nu}), by_q0({n, static_cast<py::ssize_t>(m.nq)}),
-                 by_v0({n, static_cast<py::ssize_t>(m.nv)}), by_anchors0({n, static_cast<py::ssize_t>(m.na), py::ssize_t{3}});
-             const RolloutGradient<T> g{by_q.data(),          by_v.data(),          by_anchors_end.data(),
-                                        by_tactile.data(),    by_u.mutable_data(),  by_q0.mutable_data(),
-                                        by_v0.mutable_data(), by_anchors0.mutable_data()};
+             py::array_t<T> by_u({static_cast<py::ssize_t>(r.steps), n, nu}),
+                 by_q0({n, static_cast<py::ssize_t>(m.nq)}), by_v0({n, static_cast<py::ssize_t>(m.nv)}),
+                 by_anchors0({n, static_cast<py::ssize_t>(m.na), py::ssize_t{3}});
+             const RolloutGradient<T> g{
+                 by_q.data(),         by_v.data(),          by_anchors_end.data(), by_tactile.data(),
+                 by_u.mutable_data(), by_q0.mutable_data(), by_v0.mutable_data(),  by_anchors0.mutable_data()};
              {
                const py::gil_scoped_release release;
                b.rollout_transposed(r, g);
@@ -239,38 +245,39 @@ PYBIND11_MODULE(_core, module) {
            py::arg("limit_damping") = 0.)
       .def("add_shape", &ModelSpec::add_shape, py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"),
            py::arg("quat"), py::arg("size"))
-      .def("add_points",
-           [](ModelSpec& s, const std::string& name, int body, const Array<double>& points,
-              const std::vector<double>& weights, double radius) {
-             return s.add_points(name, body, points_of(points, "points"), weights, radius);
-           },
-           py::arg("name"), py::arg("body"), py::arg("points"), py::arg("weights"), py::arg("radius") = 0.)
-      .def("add_contact",
-           [](ModelSpec& s, const std::string& name, int points, int shape, const std::string& law,
-              const std::string& damping, double kn, double kt, double mu, double kd, double ks) {
-             return s.add_contact(name, points, shape, law, damping, {kn, kt, mu, kd, ks});
-           },
-           py::arg("name"), py::arg("points"), py::arg("shape"), py::arg("law") = "viscous",
-           py::arg("damping") = "depth", py::arg("kn"), py::arg("kt"), py::arg("mu"), py::arg("kd"),
-           py::arg("ks") = 0.)
-      .def("add_pad",
-           [](ModelSpec& s, const std::string& name, int body, const Array<double>& positions,
-              const Array<double>& axes_x, const Array<double>& axes_y, const Array<double>& axes_z,
-              const std::vector<int>& shapes, const std::string& law, double kn, double kt, double mu, double kd,
-              double ks, const std::optional<std::vector<double>>& weights) {
-             const auto p = points_of(positions, "positions");
-             const auto x = points_of(axes_x, "axes_x"), y = points_of(axes_y, "axes_y"), z = points_of(axes_z, "axes_z");
-             if (x.size() != p.size() || y.size() != p.size() || z.size() != p.size()) {
-               throw std::invalid_argument("pad '" + name + "': axes must have one row per marker");
-             }
-             std::vector<M3<double>> frames(p.size());
-             for (std::size_t i = 0; i < p.size(); ++i) frames[i] << x[i], y[i], z[i];
-             return s.add_pad(name, body, p, frames, shapes, law, {kn, kt, mu, kd, ks},
-                              weights ? *weights : std::vector<double>(p.size(), 1.0));
-           },
-           py::arg("name"), py::arg("body"), py::arg("positions"), py::arg("axes_x"), py::arg("axes_y"),
-           py::arg("axes_z"), py::arg("shapes"), py::arg("law") = "viscous", py::arg("kn"), py::arg("kt"),
-           py::arg("mu"), py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none())
+      .def(
+          "add_points",
+          [](ModelSpec& s, const std::string& name, int body, const Array<double>& points,
+             const std::vector<double>& weights,
+             double radius) { return s.add_points(name, body, points_of(points, "points"), weights, radius); },
+          py::arg("name"), py::arg("body"), py::arg("points"), py::arg("weights"), py::arg("radius") = 0.)
+      .def(
+          "add_contact",
+          [](ModelSpec& s, const std::string& name, int points, int shape, const std::string& law,
+             const std::string& damping, double kn, double kt, double mu, double kd,
+             double ks) { return s.add_contact(name, points, shape, law, damping, {kn, kt, mu, kd, ks}); },
+          py::arg("name"), py::arg("points"), py::arg("shape"), py::arg("law") = "viscous",
+          py::arg("damping") = "depth", py::arg("kn"), py::arg("kt"), py::arg("mu"), py::arg("kd"), py::arg("ks") = 0.)
+      .def(
+          "add_pad",
+          [](ModelSpec& s, const std::string& name, int body, const Array<double>& positions,
+             const Array<double>& axes_x, const Array<double>& axes_y, const Array<double>& axes_z,
+             const std::vector<int>& shapes, const std::string& law, double kn, double kt, double mu, double kd,
+             double ks, const std::optional<std::vector<double>>& weights) {
+            const auto p = points_of(positions, "positions");
+            const auto x = points_of(axes_x, "axes_x"), y = points_of(axes_y, "axes_y"),
+                       z = points_of(axes_z, "axes_z");
+            if (x.size() != p.size() || y.size() != p.size() || z.size() != p.size()) {
+              throw std::invalid_argument("pad '" + name + "': axes must have one row per marker");
+            }
+            std::vector<M3<double>> frames(p.size());
+            for (std::size_t i = 0; i < p.size(); ++i) frames[i] << x[i], y[i], z[i];
+            return s.add_pad(name, body, p, frames, shapes, law, {kn, kt, mu, kd, ks},
+                             weights ? *weights : std::vector<double>(p.size(), 1.0));
+          },
+          py::arg("name"), py::arg("body"), py::arg("positions"), py::arg("axes_x"), py::arg("axes_y"),
+          py::arg("axes_z"), py::arg("shapes"), py::arg("law") = "viscous", py::arg("kn"), py::arg("kt"), py::arg("mu"),
+          py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none())
       .def("add_actuator", &ModelSpec::add_actuator, py::arg("name"), py::arg("joint"), py::arg("kind"),
            py::arg("gear") = 1., py::arg("kp") = 0., py::arg("kd") = 0., py::arg("force_lower") = -inf,
            py::arg("force_upper") = inf);
@@ -291,16 +298,18 @@ PYBIND11_MODULE(_core, module) {
       .def_property_readonly("contact_names", [](const Model& m) { return names(m.contacts); })
       .def_property_readonly("pad_names", [](const Model& m) { return names(m.pads); })
       .def_property_readonly("actuator_names", [](const Model& m) { return names(m.actuators); })
-      .def_property_readonly("joint_q", [](const Model& m) {
-        std::vector<int> r;
-        for (const auto& j : m.joints) r.push_back(j.q);
-        return r;
-      })
-      .def_property_readonly("joint_v", [](const Model& m) {
-        std::vector<int> r;
-        for (const auto& j : m.joints) r.push_back(j.v);
-        return r;
-      })
+      .def_property_readonly("joint_q",
+                             [](const Model& m) {
+                               std::vector<int> r;
+                               for (const auto& j : m.joints) r.push_back(j.q);
+                               return r;
+                             })
+      .def_property_readonly("joint_v",
+                             [](const Model& m) {
+                               std::vector<int> r;
+                               for (const auto& j : m.joints) r.push_back(j.v);
+                               return r;
+                             })
       .def_property_readonly("pad_markers", [](const Model& m) {
         std::vector<std::pair<int, int>> r;  // first marker, count
         for (const auto& p : m.pads) r.emplace_back(p.first_marker, p.cloud.size());

@@ -7,11 +7,11 @@
 namespace gelflow {
 
 class Signature {
- public:
+public:
   void add(std::uint64_t value) { hash_ = (hash_ ^ (value + 0x9e3779b97f4a7c15ULL)) * 0x100000001b3ULL; }
   std::uint64_t value() const { return hash_; }
 
- private:
+private:
   std::uint64_t hash_ = 0xcbf29ce484222325ULL;
 };
 
@@ -40,12 +40,11 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     point_force<0, T>(law, at, velocity, e, remembers, force);
     const bool pulls = force.force.dot(at.n) <= T(0);
     hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
-    hash.add(face(at) * 8 + (force.slips ? 4 : 0) + (remembers ? 2 : 0) + (pulls ? 1 : 0));
+    hash.add(face(at) * 16 + (at.d < T(-1e-6) ? 8 : 0) + (force.slips ? 4 : 0) + (remembers ? 2 : 0) + (pulls ? 1 : 0));
   };
   for (const Contact& contact : m.contacts) {
     ++pair;
-    const PairFrame<T> frame =
-        pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
         [&](int i, const V3<T>&, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,

@@ -9,7 +9,6 @@
 
 namespace gelflow {
 
-
 // Calls f(i, x, c, law, distance, v, e, anchored) for every point of the contact that is inside the shape.
 template <class T, class F, class Skip>
 void for_touching_points(const Model& m, const Contact& contact, const T* params, const T& h, const PairFrame<T>& frame,
@@ -119,8 +118,7 @@ void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* 
   PointForce<T> force;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
-    const PairFrame<T> frame =
-        pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     V6<T> wrench = V6<T>::Zero();
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
@@ -143,8 +141,7 @@ void advance_contact_anchors(const Model& m, const T* params, const T& h, const 
   PointForce<T> force;
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
-    const PairFrame<T> frame =
-        pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
         [&](int i, const V3<T>& x, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
@@ -181,8 +178,7 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
             const V3<T>& e, const V3<T>&, bool remembers) {
           point_force<2, T>(law, at, v, e, remembers, force);
           if constexpr (from_next) {
-            const AnchorGradient<T> g =
-                next_anchor_transposed<T>(law, force, remembers, by_next[contact.anchor + i]);
+            const AnchorGradient<T> g = next_anchor_transposed<T>(law, force, remembers, by_next[contact.anchor + i]);
             const V3<T> by_point = g.x - cross<T>(frame.angular, g.v);
             by_pose += stack<T>(cross<T>(center, by_point), by_point);
             by_twist += stack<T>(cross<T>(x, g.v), g.v);

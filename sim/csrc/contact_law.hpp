@@ -3,7 +3,8 @@
 // In the shape's frame, x the point, v its velocity relative to the shape, d, n, H the distance there (d < 0 inside),
 // ḋ = n·v, v_t = v − ḋ n:
 //     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8, which has no max and can pull)
-//                 N = max(−k_n d − k_d ḋ, 0)            plain damping, for grounds
+//                 N = max(−k_n d − r k_d ḋ, 0)          plain damping, for grounds, r = min(−d / 1 µm, 1): switched on
+//                                                       at once, a light body that arrives fast would find no solution
 //     wanted      f* = −k_t v_t                         viscous friction
 //                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
 //     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch: no division there
@@ -31,20 +32,21 @@ struct PointForce {
   V3<T> force;
   M3<T> by_x, by_v, by_anchor;  // ∂force/∂(x, v, X); the anchor moves the friction alone
   bool slips;
-  V3<T> friction, slip;          // f_t, v_t
+  V3<T> friction, slip;  // f_t, v_t
   M3<T> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
 };
 
 template <class T>
-GELFLOW_INLINE V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor, bool anchored) {
+GELFLOW_INLINE V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor,
+                                   bool anchored) {
   if (!law.elastic || !anchored) return V3<T>::Zero();
   return law.rolling ? V3<T>(anchor + law.h * v) : V3<T>(x - anchor);
 }
 
 // `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
 template <int derivatives, class T>
-GELFLOW_INLINE void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e, bool anchored,
-                 PointForce<T>& out) {
+GELFLOW_INLINE void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e,
+                                bool anchored, PointForce<T>& out) {
   using std::sqrt;
   const V3<T>& n = at.n;
   const T rate = n.dot(v);
@@ -56,11 +58,14 @@ GELFLOW_INLINE void point_force(const PointLaw<T>& law, const Distance<T>& at, c
     by_d = pushes ? -stiffness : T(0);
     by_rate = pushes ? law.kd * at.d : T(0);
   } else {
-    const T push = -law.kn * at.d - law.kd * rate;
+    constexpr double ramp = 1e-6;  // [m]
+    const bool full = at.d < T(-ramp);
+    const T r = full ? T(1) : T(-at.d / T(ramp));
+    const T push = -law.kn * at.d - r * law.kd * rate;
     const bool pushes = push > T(0);
     normal = pushes ? push : T(0);
-    by_d = pushes ? -law.kn : T(0);
-    by_rate = pushes ? -law.kd : T(0);
+    by_d = pushes ? T((full ? T(0) : T(law.kd * rate / T(ramp))) - law.kn) : T(0);
+    by_rate = pushes ? T(-r * law.kd) : T(0);
   }
   const V3<T> slip = v - rate * n;
   V3<T> wanted = -law.kt * slip;

@@ -62,6 +62,14 @@ struct NumTraits<gelflow::Dual> : NumTraits<double> {
   using NonInteger = gelflow::Dual;
   using Nested = gelflow::Dual;
   using Literal = gelflow::Dual;
-  enum { IsComplex = 0, IsInteger = 0, IsSigned = 1, RequireInitialization = 1, ReadCost = 2, AddCost = 2, MulCost = 6 };
+  enum {
+    IsComplex = 0,
+    IsInteger = 0,
+    IsSigned = 1,
+    RequireInitialization = 1,
+    ReadCost = 2,
+    AddCost = 2,
+    MulCost = 6
+  };
 };
 }  // namespace Eigen

@@ -138,8 +138,8 @@ void ModelSpec::check_body(const std::string& what, int body, bool world_allowed
   }
 }
 
-int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat,
-                        double mass, const V3<double>& com, const V6<double>& inertia) {
+int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat, double mass,
+                        const V3<double>& com, const V6<double>& inertia) {
   check_body("body '" + name + "'", parent, true);
   check_finite("body '" + name + "'", "pos", pos.data(), 3);
   check_finite("body '" + name + "'", "com", com.data(), 3);
@@ -151,11 +151,11 @@ int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& p
   body.parent = parent;
   body.quat = quat.normalized();
   body.joint_begin = body.joint_end = 0;
-  body.mass = add_params(name,
-                         {"mass", "com.x", "com.y", "com.z", "inertia.xx", "inertia.yy", "inertia.zz", "inertia.xy",
-                          "inertia.xz", "inertia.yz"},
-                         {mass, com[0], com[1], com[2], inertia[0], inertia[1], inertia[2], inertia[3], inertia[4],
-                          inertia[5]});
+  body.mass = add_params(
+      name,
+      {"mass", "com.x", "com.y", "com.z", "inertia.xx", "inertia.yy", "inertia.zz", "inertia.xy", "inertia.xz",
+       "inertia.yz"},
+      {mass, com[0], com[1], com[2], inertia[0], inertia[1], inertia[2], inertia[3], inertia[4], inertia[5]});
   body.pos = add_params(name, {"pos.x", "pos.y", "pos.z"}, {pos[0], pos[1], pos[2]});
   model_.bodies.push_back(body);
   return next_index(model_.bodies) - 1;
@@ -197,8 +197,7 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
   }
   joint.dofs = free ? 6 : 1;
   joint.param = add_params(
-      name,
-      {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping"},
+      name, {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping"},
       {damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping});
   for (int i = 0; i < joint.dofs; ++i) {
     const int k = model_.nv + i;
@@ -342,8 +341,8 @@ int ModelSpec::add_actuator(const std::string& name, int joint, const std::strin
   }
   actuator.dof = model_.joints[joint].v;
   actuator.q = model_.joints[joint].q;
-  actuator.param = add_params(name, {"gear", "kp", "kd", "force_lower", "force_upper"},
-                              {gear, kp, kd, force_lower, force_upper});
+  actuator.param =
+      add_params(name, {"gear", "kp", "kd", "force_lower", "force_upper"}, {gear, kp, kd, force_lower, force_upper});
   model_.actuators.push_back(actuator);
   return next_index(model_.actuators) - 1;
 }
@@ -351,7 +350,8 @@ int ModelSpec::add_actuator(const std::string& name, int joint, const std::strin
 Model ModelSpec::build() const {
   Model model = model_;
   if (model.nv == 0) refuse("the scene has no joint: nothing can move");
-  if (model.nv > 64) refuse("the scene has " + std::to_string(model.nv) + " degrees of freedom; at most 64 are supported");
+  if (model.nv > 64)
+    refuse("the scene has " + std::to_string(model.nv) + " degrees of freedom; at most 64 are supported");
   model.gravity = next_index(model.param_names);
   for (const char* axis : {"gravity.x", "gravity.y", "gravity.z"}) model.param_names.emplace_back(axis);
   for (int i = 0; i < 3; ++i) model.param_defaults.push_back(gravity[i]);

@@ -22,8 +22,8 @@ constexpr int world = -1;
 
 struct Body {
   std::string name;
-  int parent;             // moving body, or world
-  V4<double> quat;        // of the frame in the parent's frame at q = 0
+  int parent;       // moving body, or world
+  V4<double> quat;  // of the frame in the parent's frame at q = 0
   int joint_begin, joint_end;
   int mass, pos;          // offsets in Params: mass, com (3), inertia (6); pos (3)
   std::vector<int> dofs;  // all dofs that move this body, root first
@@ -96,9 +96,9 @@ struct Pad {
   std::vector<M3<double>> frames;  // sorted like the cloud; columns x, y, z
   std::vector<int> shapes;
   FrictionLaw law;
-  int param;         // kn, kt, mu, kd, ks
-  int anchor;        // first anchor slot; shape s, marker i is at anchor + s * markers + i
-  int first_marker;  // in the tactile output
+  int param;                    // kn, kt, mu, kd, ks
+  int anchor;                   // first anchor slot; shape s, marker i is at anchor + s * markers + i
+  int first_marker;             // in the tactile output
   std::vector<PairDofs> pairs;  // one per shape
 };
 
@@ -143,7 +143,7 @@ struct Model {
 
 // Collects a scene piece by piece, checks each, and hands out the Model.
 class ModelSpec {
- public:
+public:
   V3<double> gravity{0, 0, -9.8};
   double step = 5e-3;
   double tolerance = 1e-9;
@@ -170,7 +170,7 @@ class ModelSpec {
                    double force_lower, double force_upper);
   Model build() const;
 
- private:
+private:
   Model model_;
   int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
   void check_body(const std::string& what, int body, bool world_allowed) const;

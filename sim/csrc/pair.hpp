@@ -16,10 +16,10 @@ namespace gelflow {
 
 template <class T>
 struct PairFrame {
-  M3<T> rotation;   // first body → shape
-  V3<T> offset;     // origin of the first body, in the shape's frame
-  M3<T> to_world;   // shape → world
-  V3<T> origin;     // of the shape, in the world
+  M3<T> rotation;         // first body → shape
+  V3<T> offset;           // origin of the first body, in the shape's frame
+  M3<T> to_world;         // shape → world
+  V3<T> origin;           // of the shape, in the world
   V3<T> angular, linear;  // V, at the shape's origin
   const T* size;
   ShapeKind kind;
@@ -61,8 +61,7 @@ template <class T, class Visit, class Skip>
 GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, Visit&& visit, Skip&& skip) {
   for (const auto& group : cloud.groups) {
     const int first = cloud.leaves[group.begin].begin, last = cloud.leaves[group.end - 1].end;
-    if (cloud.groups.size() > 1 &&
-        distance_only<T>(f.kind, f.size, f.point(group.center)) >= T(group.radius)) {
+    if (cloud.groups.size() > 1 && distance_only<T>(f.kind, f.size, f.point(group.center)) >= T(group.radius)) {
       skip(first, last);
       continue;
     }
@@ -113,8 +112,8 @@ void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, const 
 
 // Gradients with respect to the relative pose and twist, carried to the joints.
 template <class T>
-void pull_back(const PairDofs& pair, const PairColumns<T>& c, const V6<T>& by_pose, const V6<T>& by_twist,
-               VX<T>& by_q, VX<T>& by_v) {
+void pull_back(const PairDofs& pair, const PairColumns<T>& c, const V6<T>& by_pose, const V6<T>& by_twist, VX<T>& by_q,
+               VX<T>& by_v) {
   for (int i = 0; i < c.n; ++i) {
     by_q[pair.dof[i]] += c.s[i].dot(by_pose) + c.y[i].dot(by_twist);
     by_v[pair.dof[i]] += c.s[i].dot(by_twist);

@@ -131,19 +131,44 @@ double merit(const Workspace<T>& w) {
   return std::sqrt(worst);
 }
 
+// Whether the residual may be rounding errors alone: those of the forces that displacements of one rounding unit make.
+template <class T>
+bool at_rounding_floor(const Model& m, const Workspace<T>& w) {
+  using std::abs;
+  const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
+  double reach = 0;
+  for (const T& x : w.q) reach = std::max(reach, std::abs(real_part(x)));
+  for (int i = 0; i < m.nv; ++i) {
+    double stiffness = 0;
+    for (int j = 0; j < m.nv; ++j) stiffness += std::abs(real_part(w.by_q(i, j)));
+    const double bound = unit * (stiffness * reach + real_part(w.scale[i]));
+    if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
+  }
+  return true;
+}
+
 // Solves one substep; on success `v` is v_t, and w holds residual, derivatives and kinematics at (w.q, v).
 // `polish` more Newton updates follow convergence (dual numbers need two for their derivative part).
+//
+// The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
+// close to piecewise linear, and a full step into the right piece often makes the residual larger before the next one
+// solves it, while a search along the line would stop at the first edge. Where that does not lead home, the search
+// starts from the best point seen.
 template <class T>
 Status newton(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
               const std::uint8_t* anchored, const T* u, int polish, VX<T>& v, int& iterations, Workspace<T>& w) {
-  // Below this the residual is made of rounding errors alone: progress may stop there.
-  const double floor = 1e4 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon()));
-  const double tolerance = std::max(m.tolerance, floor * 1e-2);
-  evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), true, w);
-  double size = merit(w);
+  constexpr int full_steps = 8;
+  const double tolerance = std::max(m.tolerance, 100 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  const auto at = [&](const VX<T>& velocity, bool scale) {
+    evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, velocity.data(), scale, w);
+    return merit(w);
+  };
+  double size = at(v, true), best = size;
+  if (!std::isfinite(size)) return Status::not_finite;
+  w.best = v;
+  bool settled = false;  // no better residual can be had
   for (int k = 0; k < m.max_iterations; ++k) {
-    if (!std::isfinite(size)) return Status::not_finite;
-    const bool converged = size <= tolerance;
+    const bool converged = settled || size <= tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     w.lu.compute(w.tangent);
     w.direction = w.lu.solve(w.residual);
@@ -153,25 +178,31 @@ Status newton(const Model& m, const T* params, const T& h, const T* q0, const T*
     double fraction = 1;
     for (int tries = 0;; ++tries) {
       v = w.start - w.direction * T(fraction);
-      evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), false, w);
-      size = merit(w);
+      size = at(v, false);
       if (converged || size <= (1 - 1e-4 * fraction) * before) break;
-      if (tries == 12) {  // no progress: at the rounding floor, or at a kink that Newton can not cross
-        v = w.start;
-        evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), false, w);
-        return before <= std::max(100 * tolerance, floor) ? Status::ok : Status::newton;
+      if (std::isfinite(size) && at_rounding_floor<T>(m, w)) {
+        settled = true;
+        break;
       }
+      if (std::isfinite(size) && k < full_steps) break;
+      if (tries == 12) return Status::newton;  // a kink that Newton can not cross
       fraction *= 0.5;
     }
+    if (size < best) {
+      best = size;
+      w.best = v;
+    } else if (k + 1 == full_steps && !settled && size > tolerance) {
+      v = w.best;
+      size = at(v, false);
+    }
   }
-  return size <= tolerance ? Status::ok : Status::newton;
+  return settled || size <= tolerance ? Status::ok : Status::newton;
 }
 
 // One environment's memory for steps: the state to fall back on, and the state in the making.
 template <class T>
 struct StepMemory {
-  explicit StepMemory(const Model& m)
-      : work(m), q(m.nq), v(m.nv), v_new(m.nv), anchors(m.na), anchored(m.na) {}
+  explicit StepMemory(const Model& m) : work(m), q(m.nq), v(m.nv), v_new(m.nv), anchors(m.na), anchored(m.na) {}
   Workspace<T> work;
   VX<T> q, v, v_new;
   std::vector<V3<T>> anchors;
@@ -190,8 +221,8 @@ Status substeps(const Model& m, const T* params, const T& h, int count, const T*
                 StepMemory<T>& memory, int& iterations, Observer&& accepted) {
   for (int i = 0; i < count; ++i) {
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-    const Status status = newton<T>(m, params, h, s.q, s.v, s.anchors, s.anchored, u, polish, memory.v_new, iterations,
-                                    memory.work);
+    const Status status =
+        newton<T>(m, params, h, s.q, s.v, s.anchors, s.anchored, u, polish, memory.v_new, iterations, memory.work);
     if (status != Status::ok) return status;
     accepted(h, s, memory);
     advance_contact_anchors<T>(m, params, h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);

@@ -48,7 +48,8 @@ void read_markers(const Model& m, const T* params, const T& h, const V3<T>* anch
           [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e,
               const V3<T>&, bool remembers) {
             point_force<0, T>(law, at, v, e, remembers, force);
-            const V3<T> local = pad.frames[i].template cast<T>().transpose() * (frame.rotation.transpose() * force.force);
+            const V3<T> local =
+                pad.frames[i].template cast<T>().transpose() * (frame.rotation.transpose() * force.force);
             T* reading = out + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
             reading[0] += local[0];
             reading[1] += local[1];
@@ -100,11 +101,11 @@ void read_markers_transposed(const Model& m, const T* params, const T& h, const 
             const T* g = by_reading + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
             if (g[0] == T(0) && g[1] == T(0) && g[2] == T(0)) return;
             point_force<2, T>(law, at, v, e, remembers, force);
-            const V3<T> by_force =
-                frame.rotation * (pad.frames[i].template cast<T>() * V3<T>(g[0], g[1], -g[2]));
+            const V3<T> by_force = frame.rotation * (pad.frames[i].template cast<T>() * V3<T>(g[0], g[1], -g[2]));
             const V3<T> by_velocity = force.by_v.transpose() * by_force;
             const V3<T> by_point = force.by_x.transpose() * by_force - cross<T>(frame.angular, by_velocity);
-            by_pose += stack<T>(cross<T>(x, by_point) + cross<T>(by_force, force.force), by_point);  // the axes turn too
+            by_pose +=
+                stack<T>(cross<T>(x, by_point) + cross<T>(by_force, force.force), by_point);  // the axes turn too
             by_twist += stack<T>(cross<T>(x, by_velocity), by_velocity);
             if (remembers) by_anchor[slot] += force.by_anchor.transpose() * by_force;
           },

@@ -31,6 +31,7 @@ struct Workspace {
         trial(m.nv),
         direction(m.nv),
         start(m.nv),
+        best(m.nv),
         mass(m.nv, m.nv),
         by_q(m.nv, m.nv),
         by_v(m.nv, m.nv),
@@ -51,8 +52,8 @@ struct Workspace {
 
   // The step's residual g and its derivatives.
   VX<T> residual, scale;
-  VX<T> update, trial;      // accelerations; v_t − v*
-  VX<T> direction, start;   // Newton's
+  VX<T> update, trial;     // accelerations; v_t − v*
+  VX<T> direction, start, best;  // Newton's
   MX<T> mass, by_q, by_v;  // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
   VX<T> by_u;              // ∂g_dof/∂u per actuator
   MX<T> tangent;           // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t

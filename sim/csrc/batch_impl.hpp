@@ -1,61 +1,12 @@
-#include "batch.hpp"
+// The members of Batch, compiled once per precision: batch_double.cpp, batch_float.cpp.
+#pragma once
 
 #include <stdexcept>
 
+#include "batch.hpp"
 #include "branches.hpp"
 
 namespace gelflow {
-
-ThreadPool::ThreadPool(int threads) {
-  for (int i = 1; i < threads; ++i) threads_.emplace_back([this, i] { loop(i); });
-}
-
-ThreadPool::~ThreadPool() {
-  {
-    const std::lock_guard lock(mutex_);
-    stop_ = true;
-  }
-  start_.notify_all();
-  for (auto& thread : threads_) thread.join();
-}
-
-void ThreadPool::take(int thread) {
-  for (int item = next_.fetch_add(1); item < items_; item = next_.fetch_add(1)) (*work_)(item, thread);
-}
-
-void ThreadPool::loop(int thread) {
-  std::uint64_t seen = 0;
-  for (;;) {
-    {
-      std::unique_lock lock(mutex_);
-      start_.wait(lock, [&] { return stop_ || round_ != seen; });
-      if (stop_) return;
-      seen = round_;
-    }
-    take(thread);
-    const std::lock_guard lock(mutex_);
-    if (--busy_ == 0) done_.notify_one();
-  }
-}
-
-void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
-  if (threads_.empty() || items <= 1) {
-    for (int i = 0; i < items; ++i) work(i, 0);
-    return;
-  }
-  {
-    const std::lock_guard lock(mutex_);
-    work_ = &work;
-    items_ = items;
-    next_ = 0;
-    busy_ = static_cast<int>(threads_.size());
-    ++round_;
-  }
-  start_.notify_all();
-  take(0);
-  std::unique_lock lock(mutex_);
-  done_.wait(lock, [&] { return busy_ == 0; });
-}
 
 template <class T>
 Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
@@ -159,8 +110,8 @@ template <class T>
 void Batch<T>::wrenches(T* out) {
   pool_.run(n, [&](int e, int thread) {
     kinematics(e, memory_[thread].work);
-    contact_wrenches<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored,
-                        memory_[thread].work, out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
+    contact_wrenches<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored, memory_[thread].work,
+                        out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
   });
 }
 
@@ -258,8 +209,9 @@ void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
       const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
       Signature hash;
       hash.add(branch_signature<T>(m, params_of(env), r.q + after * m.nq, r.v + after * m.nv,
-                                   reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na, r.anchored + before * m.na,
-                                   r.u + before * m.actuators.size(), read, memory_[thread].work));
+                                   reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na,
+                                   r.anchored + before * m.na, r.u + before * m.actuators.size(), read,
+                                   memory_[thread].work));
       hash.add(static_cast<std::uint64_t>(r.halvings[before]));
       out[before] = hash.value();
     }
@@ -335,8 +287,5 @@ void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>&
     if (r.status[e] == 0) transpose_one(e, r, g, memory_[thread]);  // a failed environment has gradient zero
   });
 }
-
-template class Batch<double>;
-template class Batch<float>;
 
 }  // namespace gelflow
