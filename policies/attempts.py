@@ -1,7 +1,8 @@
 """Insertion attempts on a vector environment, seen one way by training and by evaluation.
 
 An episode is one part. Its first observation is the flow map of a first attempt; each step corrects the pose and
-makes another. Finished environments start the next part within the same step.
+makes another. Finished environments start the next part within the same step. The environment's info tells the true
+pose (key "pose"), which training takes its reward from and the policy never sees.
 """
 
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ class Noise:
 
     marker: float = 0.05  # largest standard deviation of one marker's vector, drawn anew for every attempt
     offset: float = 0.03  # standard deviation of a whole pad's shift in an attempt (the reference drifted)
-    gain: float = 0.1  # standard deviation of a pad's gain (one gel softer than the other)
+    gain: float = 0.05  # standard deviation of a pad's gain (one gel softer than the other)
     turn: float = 0.03  # standard deviation of a camera's turn against its pad [rad]
 
     def part(self, count: int, sensors: int, rng: np.random.Generator) -> Array:
@@ -64,9 +65,15 @@ class Outcome:
     """What one step brought: arrays over the environments."""
 
     images: NDArray[np.float32]  # the newest flow maps, of the next part where `done`
-    reward: Array
+    reward: Array  # of the pose after the correction
+    better: Array  # reward gained over the pose before the correction
     done: NDArray[np.bool_]  # inserted, or all attempts used up
     success: NDArray[np.bool_]  # inserted
+
+
+def penalty(pose: Array) -> Array:
+    """The environment's reward of a pose (…, 3) [m, m, rad]: −1e4 ‖position‖² − 20 yaw²."""
+    return np.asarray(-1e4 * (pose[..., :2] ** 2).sum(-1) - 20 * pose[..., 2] ** 2)
 
 
 class Attempts:
@@ -85,22 +92,26 @@ class Attempts:
         self.count = env.num_envs
         self.noise = noise
         self._rng = np.random.default_rng(0)
+        self._before: Array = np.zeros(self.count)
         self._part: Array = np.zeros((self.count, 1 + 2 * task.sensors))
 
     def reset(self, seed: int) -> NDArray[np.float32]:
         """New parts everywhere; returns the flow maps of their first attempts."""
         self._rng = np.random.default_rng(seed)
-        images, _ = self.env.reset(seed=seed)
+        images, info = self.env.reset(seed=seed)
+        self._before = penalty(info["pose"])
         return self._noisy(images, np.ones(self.count, dtype=bool))
 
     def step(self, corrections: Array) -> Outcome:
         """Correct every pose by `corrections` (count, 3) [m, m, rad] and make the next attempt."""
         actions = corrections / np.asarray(self.task.action_scale)
-        images, reward, terminated, truncated, _ = self.env.step(np.clip(actions, -1, 1).astype(np.float32))
+        images, reward, terminated, truncated, info = self.env.step(np.clip(actions, -1, 1).astype(np.float32))
         done = np.asarray(terminated | truncated)
         if done.any() and not self._same_step:
-            images, _ = self.env.reset(options={"reset_mask": done})
-        return Outcome(self._noisy(images, done), np.asarray(reward, dtype=float), done, np.asarray(terminated))
+            images, info = self.env.reset(options={"reset_mask": done})
+        better = reward - self._before
+        self._before = penalty(info["pose"])
+        return Outcome(self._noisy(images, done), np.asarray(reward, dtype=float), better, done, np.asarray(terminated))
 
     def _noisy(self, images: NDArray[Any], fresh: NDArray[np.bool_]) -> NDArray[np.float32]:
         if self.noise is None:

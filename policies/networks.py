@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap, Grid
+from gelflow.policies.mirrors import Mirrors, exponents
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -75,8 +76,7 @@ def polynomial_basis(grid: Grid, degree: int) -> Array:
     positions = grid.positions()
     half = np.maximum(np.abs(positions - positions.mean(0)).max(0), grid.pitch / 2)
     x, y = ((positions - positions.mean(0)) / half).T
-    terms = [x**i * y ** (total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
-    q, r = np.linalg.qr(np.stack(terms, axis=1))
+    q, r = np.linalg.qr(np.stack([x**i * y**j for i, j in exponents(degree)], axis=1))
     return np.asarray(q * np.sign(np.diag(r)) / np.sqrt(len(positions)))
 
 
@@ -152,6 +152,7 @@ class Network:
                 raise UsageError(f"tensor {name} has shape {tensors[name].shape}; expected {shape}")
             if not np.isfinite(tensors[name]).all():
                 raise UsageError(f"tensor {name} has values that are not finite")
+        self._mirrors = Mirrors(architecture, task)
         self._basis: Array = tensors["basis"].astype(float)
         self._scale: Array = tensors["scale"].astype(float)
         depth = len(architecture.hidden) + 1
@@ -167,14 +168,18 @@ class Network:
         """Features of flow maps (n, channels, rows, cols), each divided by its root mean square in training."""
         return reduce_maps(images, self._basis) / self._scale
 
+    def canonical(self, inputs: Array) -> tuple[Array, Array]:
+        """What the perceptron sees of inputs that `History.observe` made, and its answer's signs: see `Mirrors`."""
+        return self._mirrors.canonical(inputs)
+
     def corrections(self, inputs: Array) -> Array:
         """Corrections (n, 3) [m, m, rad] for inputs that `History.observe` made."""
-        values = inputs
+        values, signs = self.canonical(inputs)
         for weight, bias in self._layers[:-1]:
             values = np.tanh(np.einsum("ni,oi->no", values, weight) + bias)
         weight, bias = self._layers[-1]
         out = np.clip(np.einsum("ni,oi->no", values, weight) + bias, -1, 1)
-        return np.asarray(out * np.asarray(self.architecture.reach))
+        return np.asarray(out * signs * np.asarray(self.architecture.reach))
 
 
 def tensor_shapes(architecture: Architecture, task: InsertionTask) -> dict[str, tuple[int, ...]]:

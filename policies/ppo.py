@@ -1,7 +1,8 @@
 """Training of the insertion policy: PPO (stable-baselines3) over the history's input, exported to our checkpoint.
 
 The flow maps are reduced to their features before PPO sees them, so its buffers and updates are small. The reward is
-immediate in every attempt (how far the pose is off after the correction), so the discount is small.
+what the correction gained: the environment's reward of the pose after it, less that of the pose before. It comes at
+once, so the discount is small; and a part that happens to start far off does not drown what the correction did.
 """
 
 import dataclasses
@@ -35,13 +36,13 @@ Array = NDArray[np.float64]
 class PPOSettings:
     """Everything that decides a training run beside the environment; stored in the checkpoint."""
 
-    attempts: int = 600_000  # attempts in all
+    attempts: int = 120_000  # attempts in all
     minutes: float = float("inf")  # stop after this time [min]; a run cut off by time can not be repeated exactly
     seed: int = 0
-    rollout: int = 32  # attempts of each environment between updates
-    batch: int = 512
-    epochs: int = 8
-    learning_rate: float = 1e-3  # falls to a tenth, linearly
+    rollout: int = 16  # attempts of each environment between updates
+    batch: int = 256
+    epochs: int = 10
+    learning_rate: float = 2e-3  # falls to a tenth, linearly
     discount: float = 0.5
     gae: float = 0.95
     clip: float = 0.2
@@ -50,7 +51,7 @@ class PPOSettings:
     gradient_norm: float = 0.5
     spread: float = 0.4  # first standard deviation of the actions, in units of the reach
     calibration: int = 2_000  # random attempts that give the features' root mean square
-    evaluate_every: int = 40_000  # attempts
+    evaluate_every: int = 20_000  # attempts
     evaluate_episodes: int = 256
 
 
@@ -88,6 +89,7 @@ class HistoryVecEnv(VecEnv):
         self._reach = np.asarray(architecture.reach)
         self._seed = seed
         self._actions: Array = np.zeros((attempts.count, 3))
+        self._signs: Array = np.ones((attempts.count, 3))
         self.rewards: list[float] = []
         self.successes: deque[bool] = deque(maxlen=512)
 
@@ -96,7 +98,7 @@ class HistoryVecEnv(VecEnv):
         return self._observe(self._attempts.reset(self._seed))
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        self._actions = np.asarray(actions, dtype=float) * self._reach
+        self._actions = np.asarray(actions, dtype=float) * self._signs * self._reach
 
     def step_wait(self) -> VecEnvStepReturn:
         self._history.record(self._actions)
@@ -106,10 +108,11 @@ class HistoryVecEnv(VecEnv):
         self._history.reset(outcome.done)
         # The attempts used up are part of the observation, so the last one is an end like any other.
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self._observe(outcome.images), outcome.reward.astype(np.float32), outcome.done, infos
+        return self._observe(outcome.images), outcome.better.astype(np.float32), outcome.done, infos
 
     def _observe(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        return self._history.observe(self._network.encode(images)).astype(np.float32)
+        inputs, self._signs = self._network.canonical(self._history.observe(self._network.encode(images)))
+        return inputs.astype(np.float32)
 
     def close(self) -> None:
         self._attempts.env.close()

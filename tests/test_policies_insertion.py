@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
-from gelflow.policies.attempts import Attempts, NetworkActor, Noise, RandomActor, evaluate
+from gelflow.policies.attempts import Attempts, NetworkActor, Noise, RandomActor, evaluate, penalty
 from gelflow.policies.checkpoint import load, load_policy, save
 from gelflow.policies.networks import (
     Architecture,
@@ -39,7 +39,7 @@ SMALL = Architecture(hidden=(16, 16))
 class Toy(VectorEnv[Any, Any, Any]):
     """Insertion as a formula: the part goes in when every error is below a third of the first misalignment.
 
-    Both pads feel the same upward force; its gradients over the pad tell x and y, the difference of the pads yaw.
+    Both pads feel an upward force; the pads' differences along x and y of the pad tell x and y, their sum along y yaw.
     """
 
     def __init__(self, count: int, *, same_step: bool = True) -> None:
@@ -56,28 +56,25 @@ class Toy(VectorEnv[Any, Any, Any]):
         super().reset(seed=seed)
         mask = np.ones(self.num_envs, dtype=bool) if options is None else options["reset_mask"]
         self._restart(mask)
-        return self._observe(), {}
+        return self._observe(), {"pose": self.error.copy()}
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.error += actions * np.array(INSERTION.action_scale)
         self.tries += 1
-        relative = self.error / np.array(INSERTION.misalignment)
-        inserted = (np.abs(relative) < 1 / 3).all(1)
+        reward = penalty(self.error)
+        inserted = (np.abs(self.error) < np.array(INSERTION.misalignment) / 3).all(1)
         ended = ~inserted & (self.tries >= INSERTION.attempts)
         if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
             self._restart(inserted | ended)
-        return self._observe(), -(relative**2).sum(1), inserted, ended, {}
+        return self._observe(), reward, inserted, ended, {"pose": self.error.copy()}
 
     def _restart(self, mask: NDArray[np.bool_]) -> None:
         self.error[mask] = self.np_random.uniform(-1, 1, (int(mask.sum()), 3)) * np.array(INSERTION.misalignment)
         self.tries[mask] = 0
 
     def _observe(self) -> NDArray[np.float32]:
-        rows, cols = np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 10), indexing="ij")
-        x, y, yaw = (self.error / np.array(INSERTION.misalignment)).T[:, :, None, None]
-        left = 1 + 0.5 * x * rows + 0.5 * y * cols + 0.5 * yaw
-        right = 1 + 0.5 * x * rows + 0.5 * y * cols - 0.5 * yaw
-        flow = np.stack([left, 0 * left, right, 0 * right], axis=1)
+        x, y, yaw = (self.error / np.array(INSERTION.misalignment)).T / 2
+        flow = np.stack([1 + x, yaw + y, 1 - x, yaw - y], axis=1)[:, :, None, None] * np.ones((1, 1, 13, 10))
         return np.asarray(flow / np.abs(flow).max(axis=(1, 2, 3), keepdims=True), dtype=np.float32)
 
 
@@ -250,6 +247,38 @@ def test_parts_in_one_history_do_not_mix() -> None:
         stack = images(3, seed=i)
         both = together.act(stack)
         assert np.allclose(both[1], alone.act(stack[1:2])[0], rtol=1e-12, atol=1e-15)
+
+
+def mirrored(image: NDArray[Any], in_x: bool, in_y: bool) -> NDArray[Any]:
+    """What the pads feel of a scene mirrored in the gripper's x, y or both, worked out pad by pad."""
+    pads = image.reshape(2, 2, 13, 10)
+    if in_x:
+        pads = pads[::-1]
+    if in_x != in_y:  # a reflection turns each pad's y axis over; mirroring both is a half turn and does not
+        pads = pads[:, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
+    return np.asarray(pads.reshape(image.shape))
+
+
+@pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
+def test_a_mirrored_part_gets_the_mirrored_corrections(in_x: bool, in_y: bool) -> None:
+    network = Network(SMALL, INSERTION, tensors())
+    one, other = NetworkActor(network, 8), NetworkActor(network, 8)
+    signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
+    for i in range(5):
+        stack = images(8, seed=i)
+        reflected = np.stack([mirrored(image, in_x, in_y) for image in stack])
+        assert np.allclose(other.act(reflected), one.act(stack) * signs, atol=1e-9)
+
+
+def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
+    env = Toy(4)
+    attempts = Attempts(env, INSERTION)
+    attempts.reset(0)
+    total = penalty(env.error)
+    for _ in range(3):
+        outcome = attempts.step(np.full((4, 3), 1e-3))
+        total = np.where(outcome.done, penalty(env.error), total + outcome.better)
+        assert np.allclose(total[~outcome.done], outcome.reward[~outcome.done])
 
 
 @pytest.mark.parametrize("same_step", [True, False])
