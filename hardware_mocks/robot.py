@@ -1,0 +1,169 @@
+"""The whole mock robot: gripper, arm and two tactile cameras on the wire, one simulated world behind them."""
+
+import contextlib
+import json
+import math
+import threading
+from dataclasses import dataclass, field, replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import Any, Literal, Self
+from urllib.parse import parse_qs, urlsplit
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
+from gelflow.hardware_mocks.egm import MockEgm, MockEgmConfig
+from gelflow.hardware_mocks.gel import GelLook, GelRenderer
+from gelflow.hardware_mocks.mjpeg import MjpegServer
+from gelflow.hardware_mocks.world import WorldConfig
+from gelflow.hardware_mocks.world_process import RemoteWorld
+from gelflow.hardware_mocks.wsg import MockWsg
+from gelflow.real.kinematics import Joints
+
+Rotation = Literal[0, 90, 180, 270]
+
+# Elbow up, flange down, wrist not stretched: where the arm stands above the hole.
+_NEAR: Joints = (0.0, 0.3, 0.1, 0.0, 1.2, 0.0)
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """Where the mock robot is served, and what it looks like. Times in robot time."""
+
+    world: WorldConfig = field(default_factory=WorldConfig)
+    host: str = "127.0.0.1"
+    egm_port: int = 6510  # where the arm sends its feedback
+    tcp_port: int = 0  # of the gripper, beside its pty; 0 takes a free one
+    truth_port: int = 0  # of the side channel that tells the truth; 0 takes a free one
+    camera_rate: float = 12.5  # frames a second: one every 80 ms, as the real set-up processes them
+    look: GelLook = field(default_factory=GelLook)
+    rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and the right camera's image [°]: 0, 90, 180 or 270
+
+
+class MockRobot:
+    """Starts all mocks; `with` or `start` and `stop`. Order faults from the parts: `gripper`, `arm`, `cameras`."""
+
+    def __init__(self, clock: ScaledClock, config: RobotConfig | None = None) -> None:
+        self.config = config = config or RobotConfig()
+        self.world = RemoteWorld(clock, config.world)
+        self.arm = MockEgm(
+            self.world, clock=clock, config=MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR)
+        )
+        self.gripper = MockWsg(self.world, clock=clock, tcp_port=config.tcp_port, host=config.host)
+        self.cameras = tuple(
+            MjpegServer(
+                _Gel(self.world, finger, _look(config, finger)), clock, rate=config.camera_rate, host=config.host
+            )
+            for finger in (0, 1)
+        )
+        self._truth = _TruthServer((config.host, config.truth_port), self.world)
+        self._stack = contextlib.ExitStack()
+
+    @property
+    def truth_url(self) -> str:
+        """Of the side channel: GET tells what is true now, POST ?seed=N chooses the next part."""
+        host, port = self._truth.server_address[:2]
+        return f"http://{host!s}:{port}/truth"
+
+    def start(self) -> Self:
+        """Start the world, then the devices. Raises UsageError when a port is taken."""
+        with contextlib.ExitStack() as stack:
+            self.world.start()
+            stack.callback(self.world.stop)
+            self.arm.start()
+            stack.callback(self.arm.stop)
+            stack.enter_context(self.gripper)
+            for camera in self.cameras:
+                stack.enter_context(camera)
+            threading.Thread(target=self._truth.serve_forever, args=(0.05,), name="truth", daemon=True).start()
+            stack.callback(self._truth.close)
+            self._stack = stack.pop_all()
+        return self
+
+    def stop(self) -> None:
+        """Stop all. Raises what went wrong inside a mock."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.stop()
+
+
+def _look(config: RobotConfig, finger: int) -> GelLook:
+    rotation = config.rotations[finger]
+    width, height = config.look.width, config.look.height
+    turned = (height, width) if rotation in (90, 270) else (width, height)
+    look = replace(config.look, grid=config.world.grid, seed=config.look.seed + finger)
+    return replace(look, rotation=rotation, width=turned[0], height=turned[1])
+
+
+class _Gel:
+    """The picture source of one camera."""
+
+    def __init__(self, world: RemoteWorld, finger: int, look: GelLook) -> None:
+        self._world, self._finger = world, finger
+        self._renderer = GelRenderer(look)
+        self._count = 0
+
+    def __call__(self) -> bytes:
+        self._count += 1
+        image = self._renderer.render(self._world.marker_displacement(self._finger), sequence=self._count)
+        return self._renderer.encode(image)
+
+
+class _TruthServer(ThreadingHTTPServer):
+    """What no device tells: for demonstrations and evaluations, which print it as another column."""
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, where: tuple[str, int], world: RemoteWorld) -> None:
+        self.world = world
+        try:
+            super().__init__(where, _TruthHandler)
+        except OSError as error:
+            raise UsageError(f"cannot serve the truth at {where[0]}:{where[1]}: {error.strerror}") from error
+
+    def close(self) -> None:
+        self.shutdown()
+        self.server_close()
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that left is no error, and a mock does not print."""
+
+
+class _TruthHandler(BaseHTTPRequestHandler):
+    server: _TruthServer
+
+    def do_GET(self) -> None:
+        self._answer(self.server.world.truth())
+
+    def do_POST(self) -> None:
+        text = parse_qs(urlsplit(self.path).query).get("seed", [""])[0]
+        if not text.isdecimal():
+            self.send_error(400, "expected ?seed=N with a whole number")
+            return
+        self.server.world.next_seed(int(text))
+        self._answer({"next_seed": int(text)})
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Mocks do not print."""
+
+    def _answer(self, values: dict[str, Any]) -> None:
+        data = json.dumps(_finite(values)).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no infinity: what was not measured yet becomes null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

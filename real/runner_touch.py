@@ -1,0 +1,131 @@
+"""What the runner feels: frames of both cameras, tracked from an attempt's reference on, each with its depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError, UsageError
+from gelflow.observation import FlowMap, TactileFrame, flow_map
+from gelflow.perception.frames import CameraMount, decode, tactile_frame
+from gelflow.perception.tracker import MarkerTracker, Tracked
+from gelflow.protocols import Camera, CameraImage
+from gelflow.task import InsertionTask
+
+_FEWEST = 0.6  # of a pad's markers must be seen: below this a frame says nothing
+
+
+class Unreadable(PeerError):
+    """Frames came, but no markers could be read from them: the attempt may be tried again."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One moment as both pads felt it."""
+
+    frame: TactileFrame
+    images: tuple[CameraImage, ...]  # one per sensor
+    depth: float  # below the attempt's start [m]
+    shear: float  # mean shear along the finger since the reference, of the pad that feels more [mm]
+
+    @property
+    def sequences(self) -> tuple[int, ...]:
+        return tuple(image.sequence for image in self.images)
+
+
+class Touch:
+    """Reads the pads during one attempt: fresh trackers, the first readable pair of images is the reference."""
+
+    def __init__(self, cameras: Sequence[Camera], mounts: Sequence[CameraMount], *, stale: float) -> None:
+        self._cameras, self._mounts, self._stale = cameras, mounts, stale
+        self._trackers = [MarkerTracker(mount.tracker_config()) for mount in mounts]
+        self._last = [-1] * len(cameras)
+        self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order
+        self.reference: Reading | None = None
+        self.readings: list[Reading] = []
+        self.unreadable = 0
+
+    def start(self, since: float) -> Reading:
+        """The reference, from the first frames that came after the robot time `since` [s].
+
+        Raises Unreadable when they show no markers, PeerTimeout when no frames come.
+        """
+        images = self._images(since)
+        self._last = [image.sequence for image in images]
+        try:
+            trackeds = self._track(images)
+        except (PeerError, UsageError) as error:  # UsageError: another grid than the lab file's
+            raise Unreadable(f"no reference frame: {error}") from None
+        frame = self._frame(trackeds, images)
+        if frame is None:
+            raise Unreadable(f"no reference frame: fewer than {_FEWEST:.0%} of the markers are seen; look at the gels")
+        self.reference = Reading(frame, images, 0.0, 0.0)
+        return self.reference
+
+    def next(self) -> Reading | None:
+        """The newest pair of frames that was not read yet, with depth 0; None where the pair was unreadable.
+
+        Raises PeerTimeout when no new frames come.
+        """
+        assert self.reference is not None, "start comes first"
+        images = tuple(camera.next(last, self._stale) for camera, last in zip(self._cameras, self._last, strict=True))
+        self._last = [image.sequence for image in images]
+        try:
+            frame = self._frame(self._track(images), images)
+        except PeerError:
+            frame = None
+        if frame is None:
+            self.unreadable += 1
+            return None
+        return Reading(frame, images, 0.0, mean_shear(frame, self.reference.frame))
+
+    def keep(self, reading: Reading) -> None:
+        """Add a reading, with its depth, to those that the observation is chosen from."""
+        self.readings.append(reading)
+
+    def chosen(self, depths: Sequence[float]) -> list[Reading]:
+        """For each depth [m] the reading nearest to it; where the descent was stopped before, the deepest one."""
+        if not self.readings:
+            raise Unreadable("no frame of the descent could be read; look at the gels")
+        found = np.array([reading.depth for reading in self.readings])
+        return [self.readings[int(np.abs(found - depth).argmin())] for depth in depths]
+
+    def observe(self, frames: Sequence[Reading], task: InsertionTask) -> FlowMap:
+        """The flow map of chosen readings against the reference."""
+        assert self.reference is not None
+        return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)
+
+    def _images(self, since: float) -> tuple[CameraImage, ...]:
+        images = []
+        for camera in self._cameras:
+            image = camera.latest()
+            while image.stamp < since:
+                image = camera.next(image.sequence, self._stale)
+            images.append(image)
+        return tuple(images)
+
+    def _track(self, images: Sequence[CameraImage]) -> list[Tracked]:
+        trackeds = []
+        for sensor, image in enumerate(images):
+            pixels = decode(image.data)
+            # Listed as soon as the tracker saw it, readable or not: a replay must show it the same images.
+            self.tracked[sensor].append(image.sequence)
+            trackeds.append(self._trackers[sensor].track(pixels))
+        return trackeds
+
+    def _frame(self, trackeds: Sequence[Tracked], images: Sequence[CameraImage]) -> TactileFrame | None:
+        frame = tactile_frame(trackeds, self._mounts, max(image.stamp for image in images))
+        return frame if (frame.valid.mean(axis=1) >= _FEWEST).all() else None
+
+
+def mean_shear(frame: TactileFrame, reference: TactileFrame) -> float:
+    """Mean change of shear along the finger [unit of the frames], of the pad where it is larger.
+
+    Over the markers that are valid in both frames.
+    """
+    change = frame.shear[..., 0].astype(float) - reference.shear[..., 0]
+    both = frame.valid & reference.valid
+    sums = np.where(both, change, 0.0).sum(axis=1)
+    means: NDArray[np.float64] = np.abs(sums) / np.maximum(both.sum(axis=1), 1)
+    return float(means.max())

@@ -1,0 +1,98 @@
+"""Pictures of an insertion that a person understands: the gels, what was felt, what the policy said. No command."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gelflow.errors import UsageError
+
+if TYPE_CHECKING:
+    from gelflow.perception.frames import CameraMount
+    from gelflow.real.runner import Attempt, Insertion
+    from gelflow.task import InsertionTask
+
+_MOST = 6  # attempts in one picture
+_SIDES = ("left", "right")
+
+
+def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task: "InsertionTask", path: Path) -> None:
+    """One line per attempt: both gels with the tracked markers' arrows, both flow maps, and the correction in words.
+
+    At most 6 attempts are drawn, the last ones. Raises UsageError when the picture can't be written.
+    """
+    from matplotlib.figure import Figure  # here: slow to import
+
+    attempts = [made for made in insertion.attempts if made.reference is not None][-_MOST:]
+    if not attempts:
+        return
+    figure = Figure(figsize=(11.5, 3.1 * len(attempts) + 0.7), layout="constrained")
+    figure.suptitle(f"Part {insertion.number + 1}: {insertion.outcome} after {len(insertion.attempts)} attempts")
+    axes = figure.subplots(len(attempts), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 1.1))
+    for line, made in zip(axes, attempts, strict=True):
+        for sensor in (0, 1):
+            _gel(line[sensor], made, sensor, mounts[sensor])
+            _flow(line[2 + sensor], made, sensor, task)
+        line[0].set_ylabel(f"attempt {made.number + 1}", fontsize=10)
+        line[4].axis("off")
+        line[4].text(0.0, 0.5, _words(made), transform=line[4].transAxes, fontsize=9, va="center")
+    try:
+        figure.savefig(path, dpi=90)
+    except OSError as error:
+        raise UsageError(f"cannot write the picture {path}: {error.strerror}") from error
+
+
+def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
+    """The deepest image, with where its markers went since the reference."""
+    from gelflow.perception.frames import decode
+    from gelflow.perception.overlay import draw_overlay
+    from gelflow.perception.tracker import MarkerTracker
+
+    assert made.reference is not None and made.deepest is not None
+    tracker = MarkerTracker(mount.tracker_config())
+    tracker.start(decode(made.reference.images[sensor].data))
+    image = decode(made.deepest.images[sensor].data)
+    picture = draw_overlay(image, tracker.track(image), magnify=8.0, smallest=800)
+    axis.imshow(np.rot90(picture[:, :, ::-1], k=mount.rotation // 90))
+    axis.set(xticks=[], yticks=[])
+    axis.set_title(f"{_SIDES[sensor]} camera, motion × 8", fontsize=8)
+
+
+def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> None:
+    """The flow map of one pad: seen from outside, the fingertip down."""
+    axis.set(aspect="equal", xticks=[], yticks=[])
+    axis.set_title(f"{_SIDES[sensor]} pad, flow map", fontsize=8)
+    if made.observation is None:
+        axis.text(0.5, 0.5, "not asked", transform=axis.transAxes, ha="center", va="center", fontsize=9, color="gray")
+        return
+    positions = task.grid.positions()
+    last = len(task.frame_depths) - 1
+    down, right = made.observation.image.reshape(-1, task.sensors, 2, task.grid.rows * task.grid.cols)[last, sensor]
+    axis.quiver(
+        positions[:, 1], positions[:, 0], right * task.grid.pitch * 1.5, down * task.grid.pitch * 1.5,
+        np.hypot(down, right), angles="xy", scale_units="xy", scale=1, cmap="viridis", clim=(0, 1), width=0.008,
+    )  # fmt: skip
+    axis.invert_yaxis()
+    axis.margins(0.15)
+
+
+def _words(made: "Attempt") -> str:
+    x, y, yaw = made.place
+    lines = [
+        f"at x {1e3 * x:+.1f} mm, y {1e3 * y:+.1f} mm, yaw {np.degrees(yaw):+.1f}°",
+        f"depth {1e3 * made.depth:.2f} mm, shear {made.shear:.3f} mm",
+    ]
+    if made.inserted:
+        lines += ["", "nothing met: in the hole"]
+    elif made.action is not None and made.observation is not None:
+        dx, dy, turn = made.action * (1e3, 1e3, 180 / np.pi)
+        lines += [
+            "stopped by touch" if made.stopped else "not in the hole",
+            f"longest arrow {made.observation.divisor:.3f} {made.observation.unit}",
+            "",
+            "the policy's correction:",
+            f"x {dx:+.2f} mm, y {dy:+.2f} mm",
+            f"yaw {turn:+.2f}°",
+        ]
+    return "\n".join(lines)
