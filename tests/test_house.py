@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import tomllib
 import zipfile
 from pathlib import Path
@@ -90,12 +91,13 @@ def lint_imports(skeleton: Path, edges: list[tuple[str, str]]) -> subprocess.Com
     for folder in {folder for folder, _ in edges}:
         lines = [f"import {target}\n" for source, target in edges if source == folder]
         (skeleton / folder / "edge.py").write_text("".join(lines))
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; sys.path.insert(0, 'src'); from importlinter.cli import lint_imports; "
-        "sys.exit(lint_imports(config_filename='pyproject.toml', no_cache=True))",
-    ]
+    # -S: without the editable install's own import hook, which would lead back to this tree.
+    code = (
+        f"import sys; sys.path[:0] = ['src', {sysconfig.get_path('purelib')!r}]; "
+        "from importlinter.cli import lint_imports; "
+        "sys.exit(lint_imports(config_filename='pyproject.toml', no_cache=True))"
+    )
+    command = [sys.executable, "-S", "-c", code]
     result = subprocess.run(command, cwd=skeleton, capture_output=True, text=True)
     for folder in {folder for folder, _ in edges}:
         (skeleton / folder / "edge.py").unlink()
