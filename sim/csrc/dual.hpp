@@ -1,6 +1,6 @@
 // Forward-mode dual numbers a + b ε, ε² = 0. The whole core is instantiated with them once, so that its analytic
-// derivatives can be compared with exact ones. Every branch is decided by the real part alone: a dual run takes the
-// same branches as the real run.
+// derivatives can be compared with exact ones. Every comparison but equality is decided by the real part alone: a dual run takes
+// the same branches as the real run.
 #pragma once
 
 #include <Eigen/Core>
@@ -32,8 +32,9 @@ struct Dual {
   friend bool operator>(const Dual& x, const Dual& y) { return x.a > y.a; }
   friend bool operator<=(const Dual& x, const Dual& y) { return x.a <= y.a; }
   friend bool operator>=(const Dual& x, const Dual& y) { return x.a >= y.a; }
-  friend bool operator==(const Dual& x, const Dual& y) { return x.a == y.a; }
-  friend bool operator!=(const Dual& x, const Dual& y) { return x.a != y.a; }
+  // Equality looks at both parts: a linear solver that skips zeros must not skip a zero with a derivative.
+  friend bool operator==(const Dual& x, const Dual& y) { return x.a == y.a && x.b == y.b; }
+  friend bool operator!=(const Dual& x, const Dual& y) { return !(x == y); }
 };
 
 inline Dual sqrt(const Dual& x) {
