@@ -46,9 +46,10 @@ class MockRobot:
     def __init__(self, clock: ScaledClock, config: RobotConfig | None = None) -> None:
         self.config = config = config or RobotConfig()
         self.world = RemoteWorld(clock, config.world)
-        self.arm = MockEgm(
-            self.world, clock=clock, config=MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR)
-        )
+        # CommTimeout is 0.4 s in wall time: this computer's jitter does not shrink when the clock is scaled.
+        timeout = 0.4 * max(1.0, clock.factor)
+        controller = MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR, comm_timeout=timeout)
+        self.arm = MockEgm(self.world, clock=clock, config=controller)
         self.gripper = MockWsg(self.world, clock=clock, tcp_port=config.tcp_port, host=config.host)
         self.cameras = tuple(
             MjpegServer(

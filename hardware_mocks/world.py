@@ -5,6 +5,7 @@ between the open fingers, holds it until it is gripped, and takes it away when i
 and what is true differ by a random misalignment for every part; `truth` tells it, the devices never do.
 """
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -41,7 +42,7 @@ class WorldConfig:
     grid: Grid = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # markers printed on the gels [mm]
     compliance: float = 10.0  # a marker's displacement by its shear force [mm/N]
     grasp_height: float = 0.030  # of the pads' centres above the part's lower face [m]
-    load_height: float = 0.032  # of the lower face above the hole's floor where the hand holds out a part [m]
+    load_height: float = 0.032  # of the lower face above the hole's floor where the hand holds out a part, over it [m]
     height_error: float = 0.2e-3  # the hand holds it this much too high or too low, at most [m]
     step: float = 4e-3  # of the simulation [s]; divides EGM's 4 ms
     arm_stiffness: float = 1e5  # [N/m]
@@ -107,7 +108,7 @@ class World:
         self._hand: Array | None = _PARKED
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
-        self._tool = Pose(*config.start_tool())
+        self._tool = self._start = Pose(*config.start_tool())
         self._place_arm()
         self._hold_part()
 
@@ -259,10 +260,10 @@ class World:
             self._hand, self._current = _PARKED, None
 
     def _ready_to_load(self) -> bool:
-        """The fingers are open, and the arm stands where parts are handed over."""
+        """The fingers are open, and the arm stands still where parts are handed over."""
         open_wide = self._grip.width() > _PART_WIDTH + 0.005
-        height = float(self._u[self._arm_u[2]]) - self.config.grasp_height
-        return open_wide and height > self.config.load_height - 1e-3 and self._time - self._still_since > 0.3
+        there = self._tool.near(self._start, 1e-3, math.radians(1.0))
+        return open_wide and there and self._time - self._still_since > 0.3
 
     def _hold_out(self) -> None:
         """Draw the next part's misalignment and hold the part between the fingers."""

@@ -184,7 +184,7 @@ class InsertionRunner:
         reference = touch.start(self._clock.now())
         stopped = self._descend(place, touch, begun)
         frames = touch.chosen(self._task.frame_depths)
-        deepest = max(touch.readings, key=lambda reading: reading.depth)
+        deepest = touch.readings[-1]
         contact = deepest.shear > self._lab.descent.contact_shear_mm
         reached = self._task.start_height - deepest.depth < self._task.success_height
         inserted = reached and not contact and not stopped and self._lower(place, touch)

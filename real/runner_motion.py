@@ -113,9 +113,7 @@ class Mover:
         goal = self._goal
         if goal is None:
             return False
-        now = self.pose()
-        near = float(np.linalg.norm(now.position - goal.position)) < within
-        return near and angle_between(now.quaternion, goal.quaternion) < _ARRIVED[1]
+        return self.pose().near(goal, within, _ARRIVED[1])
 
     def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
         """Go to `target` and wait until the arm is there. Raises PeerTimeout when it takes far too long."""

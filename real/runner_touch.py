@@ -85,11 +85,11 @@ class Touch:
         self.readings.append(reading)
 
     def chosen(self, depths: Sequence[float]) -> list[Reading]:
-        """For each depth [m] the reading nearest to it; where the descent was stopped before, the deepest one."""
+        """For each depth [m] the reading nearest to it; where the descent was stopped before, the last one."""
         if not self.readings:
             raise Unreadable("no frame of the descent could be read; look at the gels")
         found = np.array([reading.depth for reading in self.readings])
-        return [self.readings[int(np.abs(found - depth).argmin())] for depth in depths]
+        return [self.readings[int(np.abs(found - min(depth, found[-1])).argmin())] for depth in depths]
 
     def observe(self, frames: Sequence[Reading], task: InsertionTask) -> FlowMap:
         """The flow map of chosen readings against the reference."""

@@ -65,6 +65,11 @@ class Pose:
         back = conjugate(self.quaternion)
         return Pose(-rotate(back, self.position), back)
 
+    def near(self, other: "Pose", distance: float, angle: float) -> bool:
+        """Whether another pose is within a distance [m] and an angle [rad]."""
+        apart = math.dist(self.position.tolist(), other.position.tolist())
+        return apart < distance and angle_between(self.quaternion, other.quaternion) < angle
+
     @property
     def yaw(self) -> float:
         """The turn about z [rad], −π to π, of a frame whose z is near the parent's z."""

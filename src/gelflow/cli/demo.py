@@ -116,12 +116,16 @@ def demonstrate(
         lab = load_lab(lab_path)
         console.print(f"[bold]{title}[/]: {lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
 
+        seeds: dict[int, int] = {}
+
         def tell(number: int, attempt: "Attempt") -> None:
+            seeds[number] = ask(truth_url)["parts"][-1]["seed"]
             console.print(attempt_line(number, attempt), markup=False)
 
         def finish(result: "Insertion") -> None:
-            truth = ask(truth_url)
-            shown.append(Shown(result, truth["parts"][-1]))
+            # The hand may hold out the next part already.
+            parts = {part["seed"]: part for part in ask(truth_url)["parts"]}
+            shown.append(Shown(result, parts[seeds.get(result.number, max(parts))]))
             console.print(f"  part {result.number + 1}: {result.outcome}", markup=False)
 
         plan = RunPlan(

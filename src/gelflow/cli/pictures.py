@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gelflow.task import InsertionTask
 
 _MOST = 6  # attempts in one picture
+_MAGNIFY = 5  # arrows on the gel images
 _SIDES = ("left", "right")
 
 
@@ -46,17 +47,21 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
 def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
     """The deepest image, with where its markers went since the reference."""
     from gelflow.perception.frames import decode
-    from gelflow.perception.overlay import draw_overlay
     from gelflow.perception.tracker import MarkerTracker
 
     assert made.reference is not None and made.deepest is not None
     tracker = MarkerTracker(mount.tracker_config())
     tracker.start(decode(made.reference.images[sensor].data))
     image = decode(made.deepest.images[sensor].data)
-    picture = draw_overlay(image, tracker.track(image), magnify=8.0, smallest=800)
-    axis.imshow(np.rot90(picture[:, :, ::-1], k=mount.rotation // 90))
+    tracked = tracker.track(image)
+    axis.imshow(image[:, :, ::-1])
+    (x, y), (right, down) = tracked.positions[tracked.valid].T, tracked.displacement[tracked.valid].T
+    start = x - right, y - down
+    axis.quiver(
+        *start, _MAGNIFY * right, _MAGNIFY * down, color="w", angles="xy", scale_units="xy", scale=1, width=0.006
+    )
     axis.set(xticks=[], yticks=[])
-    axis.set_title(f"{_SIDES[sensor]} camera, motion × 8", fontsize=8)
+    axis.set_title(f"{_SIDES[sensor]} camera, motion × {_MAGNIFY}", fontsize=8)
 
 
 def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> None:
