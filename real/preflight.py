@@ -90,7 +90,9 @@ def _gripper(cell: Cell) -> str:
     state = cell.gripper.state()
     if state.fault:
         raise PeerError(f"it reports {state.fault}; look at it and acknowledge")
-    if not state.referenced and cell.lab.gripper.home_at_start and not cell.dry_run:
+    if not state.referenced and cell.lab.gripper.home_at_start:
+        if cell.dry_run:
+            return "not homed: a run would home it outwards first"
         cell.gripper.home()
         state = cell.gripper.state()
     if not state.referenced:
