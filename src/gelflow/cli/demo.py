@@ -12,14 +12,14 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from gelflow.errors import PeerError, UsageError
+from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
@@ -60,19 +60,27 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         title=title,
     )
-    if not args.no_real_time:
+    if not args.no_real_time and done.trouble is None:
         real = demonstrate(
             console, policy, checkpoint, out=args.out, count=1, factor=1.0, seed=args.seed + args.insertions,
             title="One more in real time (factor 1)", name="session-real-time",
         )  # fmt: skip
         console.print(table(real, "One more in real time (factor 1)"))
+        done = replace(done, trouble=real.trouble)
     console.print(table(done, title))
     session = args.out / "session.mcap"
-    console.print(f"{len(done.shown)} insertions took {done.wall:.0f} s, with the mock robot's start.")
+    said = sum(one.result.inserted for one in done.shown)
+    true = sum(one.truth["inserted"] for one in done.shown)
+    count = len(done.shown)
+    console.print(
+        f"inserted: {said} of {count} as the robot says, {true} of {count} in truth; {done.wall:.0f} s in all."
+    )
     console.print(f"pictures of what the policy saw: {args.out}/insertion-*.png", soft_wrap=True)
     console.print(f"the session is {session}; make its decisions again with:", soft_wrap=True)
     console.print(f"  gelflow replay {session}", soft_wrap=True)
-    return 0 if all(one.result.inserted for one in done.shown) else 1
+    if done.trouble is not None:
+        raise done.trouble
+    return 0
 
 
 @dataclass(frozen=True)
@@ -90,6 +98,7 @@ class Demonstration:
     shown: list[Shown]
     wall: float  # [s]
     slack: str  # empty, or how much the simulation lacked
+    trouble: GelflowError | None  # what ended it before all parts were tried
 
 
 def demonstrate(
@@ -138,7 +147,11 @@ def demonstrate(
             on_attempt=tell,
             on_insertion=finish,
         )
-        run_insertions(plan)
+        trouble = None
+        try:
+            run_insertions(plan)
+        except GelflowError as error:
+            trouble = error  # what was done until then is shown first
         truth = ask(truth_url)
     wall = time.monotonic() - begun
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
@@ -149,7 +162,7 @@ def demonstrate(
     slack = ""
     if coarse + skipped > 0.5:
         slack = f"this computer was busy: {coarse:.0f} s simulated in long steps, {skipped:.1f} s left out"
-    return Demonstration(shown, wall, slack)
+    return Demonstration(shown, wall, slack, trouble)
 
 
 def table(done: Demonstration, title: str) -> Table:
