@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         title=title,
     )
+    console.print(table(done, title))
     if not args.no_real_time and done.trouble is None:
         real = demonstrate(
             console, policy, checkpoint, out=args.out, count=1, factor=1.0, seed=args.seed + args.insertions,
@@ -67,7 +68,6 @@ def run(args: argparse.Namespace) -> int:
         )  # fmt: skip
         console.print(table(real, "One more in real time (factor 1)"))
         done = replace(done, trouble=real.trouble)
-    console.print(table(done, title))
     session = args.out / "session.mcap"
     said = sum(one.result.inserted for one in done.shown)
     true = sum(one.truth["inserted"] for one in done.shown)
@@ -115,7 +115,7 @@ def demonstrate(
 ) -> Demonstration:
     """Start a mock robot, insert `count` parts through its wires, record, draw; the truth is asked beside the wires."""
     from gelflow.cli.pictures import draw_insertion
-    from gelflow.cli.run import attempt_line
+    from gelflow.cli.run import ATTEMPT_HEADER, attempt_line
     from gelflow.real.lab_file import load_lab
     from gelflow.real.session_run import RunPlan, run_insertions
 
@@ -123,7 +123,8 @@ def demonstrate(
     shown: list[Shown] = []
     with mock_robot(factor=factor, seed=seed) as (lab_path, truth_url):
         lab = load_lab(lab_path)
-        console.print(f"[bold]{title}[/]: {lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
+        console.print(f"[bold]{title}[/]\n{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
+        console.print(ATTEMPT_HEADER, markup=False)
 
         seeds: dict[int, int] = {}
 
@@ -135,7 +136,7 @@ def demonstrate(
             # The hand may hold out the next part already.
             parts = {part["seed"]: part for part in ask(truth_url)["parts"]}
             shown.append(Shown(result, parts[seeds.get(result.number, max(parts))]))
-            console.print(f"  part {result.number + 1}: {result.outcome}", markup=False)
+            console.print(f"{result.number + 1:6d}  {result.outcome} after {result.duration:.0f} s of the robot's time")
 
         plan = RunPlan(
             lab=lab,

@@ -2,6 +2,7 @@
 
 import argparse
 import datetime
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         checkpoint=checkpoint,
         insertions=args.insertions,
         operator=(lambda mover: _Prompt(console, mover)) if lab.part.presentation == "prompt" else None,
-        on_preflight=lambda items: console.print(preflight_table(items)),
+        on_preflight=lambda items: console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n"),
         on_attempt=lambda number, attempt: console.print(attempt_line(number, attempt), markup=False),
     )
     if args.dry_run:
@@ -70,13 +71,16 @@ def preflight_table(items: "list[Item]") -> Table:
     return table
 
 
+ATTEMPT_HEADER = "  part  try   x [mm]   y [mm]  yaw [°]  depth [mm]  shear [mm]"
+
+
 def attempt_line(number: int, attempt: "Attempt") -> str:
-    """One attempt in one line."""
+    """One attempt in one line, under `ATTEMPT_HEADER`."""
     x, y, yaw = attempt.place
-    where = f"x {1e3 * x:+5.1f}  y {1e3 * y:+5.1f} mm  yaw {yaw * 57.29578:+5.1f}°"
-    felt = f"depth {1e3 * attempt.depth:.2f} mm  shear {attempt.shear:.3f} mm"
+    where = f"{1e3 * x:+9.1f}{1e3 * y:+9.1f}{math.degrees(yaw):+9.1f}"
+    felt = f"{1e3 * attempt.depth:12.2f}{attempt.shear:12.3f}"
     outcome = "in the hole" if attempt.inserted else "stopped by touch" if attempt.stopped else "not in the hole"
-    return f"  part {number + 1}, attempt {attempt.number + 1:2d}: {where}  {felt}  {outcome}"
+    return f"{number + 1:6d}{attempt.number + 1:5d}{where}{felt}  {outcome}"
 
 
 def _table(results: "list[Insertion]") -> Table:
