@@ -116,7 +116,7 @@ class InsertionRunner:
         except PartLost:
             outcome = "part lost"
             self._give_up(place)
-        except PeerRefused as error:
+        except NotGrasped as error:
             outcome = str(error)
             self._give_up(place)
         except Unreadable as error:
@@ -165,7 +165,10 @@ class InsertionRunner:
             self._cell.gripper.move(width=lab.open_width, speed=lab.speed)
         self._operator.present(number)
         self._mover.wait(0.0)
-        self._cell.gripper.grasp(width=lab.part_width, speed=lab.speed, force=lab.grasp_force)
+        try:
+            self._cell.gripper.grasp(width=lab.part_width, speed=lab.speed, force=lab.grasp_force)
+        except PeerRefused as error:
+            raise NotGrasped(str(error)) from error
         self._mover.expect_part(True)
 
     def _attempt_with_retries(self, number: int, attempt: int, place: Place) -> Attempt:
@@ -307,6 +310,10 @@ class InsertionRunner:
 
     def _height(self) -> float:
         return float(self._mover.pose().position[2])
+
+
+class NotGrasped(PeerRefused):
+    """The gripper closed and holds nothing: this insertion ends, the next one may be tried."""
 
 
 class _Met(Exception):

@@ -116,16 +116,15 @@ def runner_parts(cell: Cell) -> tuple[Supervisor, Mover]:
 
 def _recording(plan: RunPlan, *, dry_run: bool) -> SessionRecorder:
     mounts = [plan.lab.cameras.left.mount, plan.lab.cameras.right.mount]
-    recorder = SessionRecorder(plan.session, plan.lab.clock).open()
-    recorder.metadata(
-        describe_session(
-            task=plan.task,
-            trackers=[mount.tracker_config() for mount in mounts],
-            mounts=mounts,
-            checkpoint=plan.checkpoint,
-            lab=plan.lab,
-            clock_factor=plan.lab.clock_factor,
-            dry_run=dry_run,
-        )
+    description = describe_session(
+        task=plan.task,
+        trackers=[mount.tracker_config() for mount in mounts],
+        mounts=mounts,
+        checkpoint=plan.checkpoint,
+        lab=plan.lab,
+        clock_factor=plan.lab.clock_factor,
+        dry_run=dry_run,
     )
+    recorder = SessionRecorder(plan.session, plan.lab.clock).open()
+    recorder.metadata(description)
     return recorder

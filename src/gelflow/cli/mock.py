@@ -49,8 +49,6 @@ def run(args: argparse.Namespace) -> int:
     def end(number: int, frame: FrameType | None) -> None:
         ending.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
     # The default of 5 ms lets one busy thread keep the others' 4 ms cycles waiting.
     sys.setswitchinterval(5e-4)
     with MockRobot(ScaledClock(args.factor), config) as robot:
@@ -60,8 +58,13 @@ def run(args: argparse.Namespace) -> int:
         _tell(robot, args.lab_out)
         if args.attached:
             threading.Thread(target=_wait_for_end_of_input, args=(ending,), daemon=True).start()
-        while not ending.wait(0.5):
-            pass
+        before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while not ending.wait(0.5):
+                pass
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
     return 0
 
 
