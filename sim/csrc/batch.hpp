@@ -15,7 +15,7 @@
 namespace gelflow {
 
 class ThreadPool {
-public:
+ public:
   explicit ThreadPool(int threads);
   ~ThreadPool();
   ThreadPool(const ThreadPool&) = delete;
@@ -24,7 +24,7 @@ public:
   // work(item, thread) for every item below `items`; returns when all are done.
   void run(int items, const std::function<void(int, int)>& work);
 
-private:
+ private:
   void loop(int thread);
   void take(int thread);
   std::vector<std::thread> threads_;
@@ -59,7 +59,7 @@ struct RolloutGradient {
 
 template <class T>
 class Batch {
-public:
+ public:
   Batch(std::shared_ptr<const Model> model, int environments, int threads);
 
   const std::shared_ptr<const Model> model;
@@ -83,7 +83,7 @@ public:
   void branches(const Rollout<T>& r, std::uint64_t* out);
   void rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g);
 
-private:
+ private:
   StateView<T> state(int env);
   const T* params_of(int env) const {
     return params.data() + static_cast<std::size_t>(env) * model->param_names.size();

@@ -7,11 +7,11 @@
 namespace gelflow {
 
 class Signature {
-public:
+ public:
   void add(std::uint64_t value) { hash_ = (hash_ ^ (value + 0x9e3779b97f4a7c15ULL)) * 0x100000001b3ULL; }
   std::uint64_t value() const { return hash_; }
 
-private:
+ private:
   std::uint64_t hash_ = 0xcbf29ce484222325ULL;
 };
 
@@ -44,7 +44,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   };
   for (const Contact& contact : m.contacts) {
     ++pair;
-    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
         [&](int i, const V3<T>&, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,
@@ -55,7 +55,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
-      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       for_touched_markers<T>(
           pad, static_cast<int>(s), params, h, frame, anchors, anchored,
           [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,

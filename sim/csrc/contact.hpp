@@ -18,16 +18,16 @@ void for_touching_points(const Model& m, const Contact& contact, const T* params
   numbers.rolling = set.radius > 0;
   Distance<T> at;
   for_near_points<T>(
-      frame, set.cloud,
+      frame, set.cloud, set.radius,
       [&](int i) {
         const V3<T> c = frame.point(set.cloud.points[i]);
         V3<T> x = c;
         if (numbers.rolling) x[2] -= T(set.radius);  // planes only: n = z
-        if (!(distance_only<T>(frame.kind, frame.size, x) < T(0))) {
+        distance<T>(frame.kind, frame.size, x, at);
+        if (!(at.d < T(0))) {
           outside(i, i + 1);
           return;
         }
-        distance<T>(frame.kind, frame.size, x, at);
         const PointLaw<T> law = weighted<T>(numbers, set.cloud.weights[i]);
         const V3<T> v = frame.velocity(x);
         const bool remembers = numbers.elastic && anchored[contact.anchor + i];
@@ -49,7 +49,7 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
   for (const Contact& contact : m.contacts) {
     const Shape& shape = m.shapes[contact.shape];
     const int first = m.point_sets[contact.points].body;
-    const PairFrame<T> frame = pair_frame<T>(m, params, first, shape, w);
+    const PairFrame<T> frame = pair_frame<T>(params, first, shape, w);
     V6<T> wrench = V6<T>::Zero();
     // The blocks of K and D: rows moment, force; columns turn, shift.
     M3<T> k_mm = M3<T>::Zero(), k_mf = k_mm, k_fm = k_mm, k_ff = k_mm;
@@ -79,7 +79,7 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
         },
         ignore);
     if (!touching) continue;
-    pair_columns<T>(contact.pair, first, frame, w, c);
+    pair_columns<derivatives, T>(contact.pair, first, frame, w, c);
     for (int i = 0; i < c.n; ++i) {
       const T force_i = c.s[i].dot(wrench);
       w.residual[contact.pair.dof[i]] -= h * force_i;
@@ -87,23 +87,32 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     }
     if constexpr (derivatives) {
       M6<T> k, d;
-      k << k_mm, k_mf, k_fm, k_ff;
-      d << d_mm, d_mf, d_fm, d_ff;
+      k.template topLeftCorner<3, 3>() = k_mm;
+      k.template topRightCorner<3, 3>() = k_mf;
+      k.template bottomLeftCorner<3, 3>() = k_fm;
+      k.template bottomRightCorner<3, 3>() = k_ff;
+      d.template topLeftCorner<3, 3>() = d_mm;
+      d.template topRightCorner<3, 3>() = d_mf;
+      d.template bottomLeftCorner<3, 3>() = d_fm;
+      d.template bottomRightCorner<3, 3>() = d_ff;
+      k *= h;
+      d *= h;
+      wrench *= h;
+      V6<T> by_v, by_q, by_q_turned;
       for (int i = 0; i < c.n; ++i) {  // column: displacement of dof j
         const int j = contact.pair.dof[i];
         const bool j_first = contact.pair.first[i];
-        const V6<T> by_v = d * c.s[i];
-        const V6<T> by_q = k * c.s[i] + d * c.y[i];
-        const V6<T> turned = cross_force<T>(c.s[i], wrench) * (j_first ? T(1) : T(-1));
+        by_v.noalias() = d * c.s[i];
+        by_q.noalias() = k * c.s[i];
+        by_q.noalias() += d * c.y[i];
+        // −(S_j ×* W) where j moves the first body, +(S_j ×* W) where it moves the second: s_j S_j carries the sign.
+        by_q_turned = by_q - cross_force<T>(c.s[i], wrench);
         for (int r = 0; r < c.n; ++r) {
           const int row = contact.pair.dof[r];
           const bool row_first = contact.pair.first[r];
-          T factor = T(0);
-          if (j_first && row_first) factor = m.carries(j, row) ? T(-1) : T(0);
-          if (!j_first && row_first) factor = T(1);
-          if (!j_first && !row_first) factor = m.carries(j, row) ? T(0) : T(1);
-          w.by_q(row, j) -= h * (c.s[r].dot(by_q) + factor * c.s[r].dot(turned));
-          w.by_v(row, j) -= h * c.s[r].dot(by_v);
+          const bool turned = j_first ? row_first && m.carries(j, row) : row_first || !m.carries(j, row);
+          w.by_q(row, j) -= dot6<T>(c.s[r], turned ? by_q_turned : by_q);
+          w.by_v(row, j) -= dot6<T>(c.s[r], by_v);
         }
       }
     }
@@ -118,7 +127,7 @@ void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* 
   PointForce<T> force;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
-    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     V6<T> wrench = V6<T>::Zero();
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
@@ -141,7 +150,7 @@ void advance_contact_anchors(const Model& m, const T* params, const T& h, const 
   PointForce<T> force;
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
-    const PairFrame<T> frame = pair_frame<T>(m, params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
     for_touching_points<T>(
         m, contact, params, h, frame, anchors, anchored,
         [&](int i, const V3<T>& x, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
@@ -166,8 +175,8 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
     const int first = m.point_sets[contact.points].body;
-    const PairFrame<T> frame = pair_frame<T>(m, params, first, m.shapes[contact.shape], w);
-    pair_columns<T>(contact.pair, first, frame, w, c);
+    const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
+    pair_columns<true, T>(contact.pair, first, frame, w, c);
     V6<T> virtual_twist = V6<T>::Zero(), by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
     if constexpr (!from_next) {
       for (int i = 0; i < c.n; ++i) virtual_twist += c.s[i] * multipliers[contact.pair.dof[i]];

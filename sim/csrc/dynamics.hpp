@@ -26,7 +26,9 @@ M6<T> body_inertia(const Body& body, const T* params, const M3<T>& r, const V3<T
   local << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
   const M3<T> k = skew<T>(c);
   M6<T> inertia;
-  inertia.template topLeftCorner<3, 3>() = r * local * r.transpose() - mass * (k * k);
+  const M3<T> turned = r.lazyProduct(local);
+  inertia.template topLeftCorner<3, 3>() = turned.lazyProduct(r.transpose());
+  inertia.template topLeftCorner<3, 3>() -= mass * cross_columns<T>(c, k);
   inertia.template topRightCorner<3, 3>() = mass * k;
   inertia.template bottomLeftCorner<3, 3>() = -mass * k;
   inertia.template bottomRightCorner<3, 3>() = mass * M3<T>::Identity();
@@ -44,9 +46,9 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace
     if constexpr (derivatives) {
       const M6<T> x = cross_motion_matrix<T>(w.twist[i]);
       w.inertia[i] = inertia;
-      w.rate[i] = cross_with_force_matrix<T>(momentum);
-      w.rate[i].noalias() -= inertia * x;
-      w.rate[i].noalias() -= x.transpose() * inertia;
+      M6<T> product;
+      product.noalias() = inertia * x;
+      w.rate[i] = cross_with_force_matrix<T>(momentum) - product - product.transpose();  // I is symmetric
     }
   }
   for (int i = bodies - 1; i >= 0; --i) {
@@ -58,7 +60,7 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace
       w.rate[parent] += w.rate[i];
     }
   }
-  for (int k = 0; k < m.nv; ++k) w.residual[k] += h * w.axis[k].dot(w.force[m.dof_body[k]]);
+  for (int k = 0; k < m.nv; ++k) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
   if constexpr (derivatives) {
     for (int j = 0; j < m.nv; ++j) {
       const V6<T>& s = w.axis[j];
@@ -78,14 +80,14 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace
         if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
         const V6<T>& sk = w.axis[k];
         const bool same = m.group_begin[k] == m.group_begin[j];
-        w.by_q(k, j) += h * (sk.dot(force_q) + (same ? T(0) : sk.dot(carried)));
-        w.by_v(k, j) += h * sk.dot(force_v);
-        w.mass(k, j) = sk.dot(force_a);
+        w.by_q(k, j) += h * (dot6<T>(sk, force_q) + (same ? T(0) : dot6<T>(sk, carried)));
+        w.by_v(k, j) += h * dot6<T>(sk, force_v);
+        w.mass(k, j) = dot6<T>(sk, force_a);
         if (same) continue;
         // The transposed entry: dof j's force when the earlier dof k is displaced; the shared subtree is j's.
         // I is symmetric: Sⱼᵀ I = (I Sⱼ)ᵀ.
-        w.by_q(j, k) += h * (force_a.dot(w.q_missing[k]) + rate_s.dot(w.p[k]));
-        w.by_v(j, k) += h * (force_a.dot(w.v_missing[k]) + rate_s.dot(sk));
+        w.by_q(j, k) += h * (dot6<T>(force_a, w.q_missing[k]) + dot6<T>(rate_s, w.p[k]));
+        w.by_v(j, k) += h * (dot6<T>(force_a, w.v_missing[k]) + dot6<T>(rate_s, sk));
         w.mass(j, k) = w.mass(k, j);
       }
     }

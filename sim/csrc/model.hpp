@@ -134,7 +134,7 @@ struct Model {
   bool carries(int j, int k) const { return carries_[static_cast<std::size_t>(j) * nv + k] != 0; }
 
   double step = 5e-3;       // h [s]
-  double tolerance = 1e-9;  // Newton: residual relative to the forces at work
+  double tolerance = 1e-7;  // Newton: residual relative to the forces at work
   int max_iterations = 50;
   int max_halvings = 6;
 
@@ -143,10 +143,10 @@ struct Model {
 
 // Collects a scene piece by piece, checks each, and hands out the Model.
 class ModelSpec {
-public:
+ public:
   V3<double> gravity{0, 0, -9.8};
   double step = 5e-3;
-  double tolerance = 1e-9;
+  double tolerance = 1e-7;
   int max_iterations = 50;
   int max_halvings = 6;
 
@@ -170,7 +170,7 @@ public:
                    double force_lower, double force_upper);
   Model build() const;
 
-private:
+ private:
   Model model_;
   int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
   void check_body(const std::string& what, int body, bool world_allowed) const;

@@ -23,6 +23,22 @@ struct PairFrame {
   V3<T> angular, linear;  // V, at the shape's origin
   const T* size;
   ShapeKind kind;
+  V3<T> local;    // in the first body's frame: a sphere's centre, a plane's normal
+  T local_level;  // height of the first body's origin above a plane
+
+  // Whether a ball of this radius about a point of the first body may reach into the shape. May say yes to a ball that
+  // just does not; costs less than the point's place in the shape's frame.
+  GELFLOW_INLINE bool may_reach(const V3<double>& center, double radius) const {
+    constexpr double slack = 1e-6;  // [m], above the rounding of single precision
+    const T reach = T(radius + slack);
+    const V3<T> c = center.template cast<T>();
+    if (kind == ShapeKind::sphere) {
+      const T limit = size[0] + reach;
+      return (c - local).squaredNorm() < limit * limit;
+    }
+    if (kind == ShapeKind::plane) return local.dot(c) + local_level < reach;
+    return distance_only<T>(kind, size, point(center)) < reach;
+  }
 
   GELFLOW_INLINE V3<T> point(const V3<double>& local) const { return rotation * local.template cast<T>() + offset; }
   GELFLOW_INLINE V3<T> velocity(const V3<T>& x) const { return linear + cross<T>(angular, x); }
@@ -33,7 +49,7 @@ struct PairFrame {
 };
 
 template <class T>
-PairFrame<T> pair_frame(const Model& m, const T* params, int first, const Shape& shape, const Workspace<T>& w) {
+PairFrame<T> pair_frame(const T* params, int first, const Shape& shape, const Workspace<T>& w) {
   PairFrame<T> f;
   f.kind = shape.kind;
   f.size = params + shape.size;
@@ -49,29 +65,37 @@ PairFrame<T> pair_frame(const Model& m, const T* params, int first, const Shape&
   const V3<T> first_position = first == world ? V3<T>(V3<T>::Zero()) : w.position[first];
   f.rotation = f.to_world.transpose() * first_rotation;
   f.offset = f.to_world.transpose() * (first_position - f.origin);
+  f.local =
+      shape.kind == ShapeKind::plane ? V3<T>(f.rotation.transpose().col(2)) : V3<T>(f.rotation.transpose() * -f.offset);
+  f.local_level = f.offset[2];
   const V6<T> local = f.motion(twist);
   f.angular = top(local);
   f.linear = bottom(local);
-  (void)m;
   return f;
 }
 
-// Calls visit(i) for every point that may be inside the shape, skip(begin, end) for runs that can not be.
+// Calls visit(i) for every point that may be inside the shape grown by `margin`, skip(begin, end) for runs that can not.
 template <class T, class Visit, class Skip>
-GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, Visit&& visit, Skip&& skip) {
+GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, double margin, Visit&& visit,
+                                    Skip&& skip) {
   for (const auto& group : cloud.groups) {
-    const int first = cloud.leaves[group.begin].begin, last = cloud.leaves[group.end - 1].end;
-    if (cloud.groups.size() > 1 && distance_only<T>(f.kind, f.size, f.point(group.center)) >= T(group.radius)) {
-      skip(first, last);
+    if (!f.may_reach(group.center, group.radius + margin)) {
+      skip(cloud.leaves[group.begin].begin, cloud.leaves[group.end - 1].end);
       continue;
     }
     for (int l = group.begin; l < group.end; ++l) {
       const auto& leaf = cloud.leaves[l];
-      if (cloud.points.size() > 1 && distance_only<T>(f.kind, f.size, f.point(leaf.center)) >= T(leaf.radius)) {
+      if (!f.may_reach(leaf.center, leaf.radius + margin)) {
         skip(leaf.begin, leaf.end);
         continue;
       }
-      for (int i = leaf.begin; i < leaf.end; ++i) visit(i);
+      for (int i = leaf.begin; i < leaf.end; ++i) {
+        if (f.may_reach(cloud.points[i], margin)) {
+          visit(i);
+        } else {
+          skip(i, i + 1);
+        }
+      }
     }
   }
 }
@@ -98,15 +122,15 @@ struct PairColumns {
   V6<T> s[most], y[most];
 };
 
-template <class T>
+template <bool derivatives, class T>
 void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, const Workspace<T>& w, PairColumns<T>& c) {
   c.n = static_cast<int>(pair.dof.size());
-  const V6<T> twist = first == world ? V6<T>(V6<T>::Zero()) : w.twist[first];
-  for (int i = 0; i < c.n; ++i) {
-    const int j = pair.dof[i];
-    const T sign = pair.first[i] ? T(1) : T(-1);
-    c.s[i] = sign * f.motion(w.axis[j]);
-    c.y[i] = sign * f.motion(cross_motion<T>(w.axis[j], V6<T>(twist - w.twist_before[j])));
+  for (int i = 0; i < c.n; ++i) c.s[i] = (pair.first[i] ? T(1) : T(-1)) * f.motion(w.axis[pair.dof[i]]);
+  if constexpr (derivatives) {
+    const V6<T> twist = f.motion(first == world ? V6<T>(V6<T>::Zero()) : w.twist[first]);
+    for (int i = 0; i < c.n; ++i) {
+      c.y[i] = cross_motion<T>(c.s[i], V6<T>(twist - f.motion(w.twist_before[pair.dof[i]])));
+    }
   }
 }
 

@@ -76,8 +76,15 @@ GELFLOW_INLINE V3<T> bottom(const V6<T>& x) {
 template <class T>
 GELFLOW_INLINE V6<T> stack(const V3<T>& a, const V3<T>& b) {
   V6<T> x;
-  x << a, b;
+  for (int i = 0; i < 3; ++i) {
+    x[i] = a[i];
+    x[i + 3] = b[i];
+  }
   return x;
+}
+template <class T>
+GELFLOW_INLINE T dot6(const V6<T>& a, const V6<T>& b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5];
 }
 
 // Motion × motion: the rate of change of y when it is carried along by x.

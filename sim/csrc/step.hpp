@@ -147,7 +147,7 @@ bool at_rounding_floor(const Model& m, const Workspace<T>& w) {
   return true;
 }
 
-// Solves one substep; on success `v` is v_t, and w holds residual, derivatives and kinematics at (w.q, v).
+// Solves one substep; on success `v` is v_t, and w holds residual and kinematics at (w.q, v).
 // `polish` more Newton updates follow convergence (dual numbers need two for their derivative part).
 //
 // The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
@@ -158,18 +158,25 @@ template <class T>
 Status newton(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
               const std::uint8_t* anchored, const T* u, int polish, VX<T>& v, int& iterations, Workspace<T>& w) {
   constexpr int full_steps = 8;
-  const double tolerance = std::max(m.tolerance, 100 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
-  const auto at = [&](const VX<T>& velocity, bool scale) {
-    evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, velocity.data(), scale, w);
+  const double tolerance = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  bool fresh = false;  // w holds the derivatives at v
+  const auto measure = [&](bool derivatives, bool scale) {
+    if (derivatives) {
+      evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), scale, w);
+    } else {
+      evaluate<false, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), scale, w);
+    }
+    fresh = derivatives;
     return merit(w);
   };
-  double size = at(v, true), best = size;
+  double size = measure(true, true), best = size;
   if (!std::isfinite(size)) return Status::not_finite;
   w.best = v;
   bool settled = false;  // no better residual can be had
   for (int k = 0; k < m.max_iterations; ++k) {
     const bool converged = settled || size <= tolerance;
     if (converged && polish-- <= 0) return Status::ok;
+    if (!fresh) size = measure(true, false);
     w.lu.compute(w.tangent);
     w.direction = w.lu.solve(w.residual);
     w.start = v;
@@ -178,7 +185,7 @@ Status newton(const Model& m, const T* params, const T& h, const T* q0, const T*
     double fraction = 1;
     for (int tries = 0;; ++tries) {
       v = w.start - w.direction * T(fraction);
-      size = at(v, false);
+      size = measure(k == 0, false);  // the first update is seldom the last: its derivatives will be needed
       if (converged || size <= (1 - 1e-4 * fraction) * before) break;
       if (std::isfinite(size) && at_rounding_floor<T>(m, w)) {
         settled = true;
@@ -193,7 +200,7 @@ Status newton(const Model& m, const T* params, const T& h, const T* q0, const T*
       w.best = v;
     } else if (k + 1 == full_steps && !settled && size > tolerance) {
       v = w.best;
-      size = at(v, false);
+      size = measure(true, false);
     }
   }
   return settled || size <= tolerance ? Status::ok : Status::newton;
@@ -209,7 +216,7 @@ struct StepMemory {
   std::vector<std::uint8_t> anchored;
 };
 
-// Called after each accepted substep with (h, state before it, v_t); memory.work holds the accepted evaluation.
+// Called after each accepted substep with (h, state before it, v_t); memory.work holds the kinematics of its end.
 struct NoObserver {
   template <class... A>
   void operator()(const A&...) const {}

@@ -17,14 +17,14 @@ void for_touched_markers(const Pad& pad, int s, const T* params, const T& h, con
   const int slot = pad.anchor + s * pad.cloud.size();
   Distance<T> at;
   for_near_points<T>(
-      frame, pad.cloud,
+      frame, pad.cloud, 0.0,
       [&](int i) {
         const V3<T> x = frame.point(pad.cloud.points[i]);
-        if (!(distance_only<T>(frame.kind, frame.size, x) < T(0))) {
+        distance<T>(frame.kind, frame.size, x, at);
+        if (!(at.d < T(0))) {
           outside(i, i + 1);
           return;
         }
-        distance<T>(frame.kind, frame.size, x, at);
         const PointLaw<T> law = weighted<T>(numbers, pad.cloud.weights[i]);
         const V3<T> v = frame.velocity(x);
         const bool remembers = numbers.elastic && anchored[slot + i];
@@ -42,7 +42,7 @@ void read_markers(const Model& m, const T* params, const T& h, const V3<T>* anch
   PointForce<T> force;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       for_touched_markers<T>(
           pad, static_cast<int>(s), params, h, frame, anchors, anchored,
           [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e,
@@ -67,7 +67,7 @@ void advance_marker_anchors(const Model& m, const T* params, const T& h, const V
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       const int base = pad.anchor + static_cast<int>(s) * pad.cloud.size();
       for_touched_markers<T>(
           pad, static_cast<int>(s), params, h, frame, anchors, anchored,
@@ -92,7 +92,7 @@ void read_markers_transposed(const Model& m, const T* params, const T& h, const 
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
       for_touched_markers<T>(
           pad, static_cast<int>(s), params, h, frame, anchors, anchored,
@@ -110,7 +110,7 @@ void read_markers_transposed(const Model& m, const T* params, const T& h, const 
             if (remembers) by_anchor[slot] += force.by_anchor.transpose() * by_force;
           },
           [](int, int) {});
-      pair_columns<T>(pad.pairs[s], pad.body, frame, w, c);
+      pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
   }
@@ -126,7 +126,7 @@ void marker_anchors_transposed(const Model& m, const T* params, const T& h, cons
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(m, params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
       for_touched_markers<T>(
           pad, static_cast<int>(s), params, h, frame, anchors, anchored,
@@ -140,7 +140,7 @@ void marker_anchors_transposed(const Model& m, const T* params, const T& h, cons
             if (remembers) by_anchor[slot] += g.anchor;
           },
           [](int, int) {});
-      pair_columns<T>(pad.pairs[s], pad.body, frame, w, c);
+      pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
   }

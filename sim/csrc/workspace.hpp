@@ -52,12 +52,12 @@ struct Workspace {
 
   // The step's residual g and its derivatives.
   VX<T> residual, scale;
-  VX<T> update, trial;     // accelerations; v_t − v*
+  VX<T> update, trial;           // accelerations; v_t − v*
   VX<T> direction, start, best;  // Newton's
-  MX<T> mass, by_q, by_v;  // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
-  VX<T> by_u;              // ∂g_dof/∂u per actuator
-  MX<T> tangent;           // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t
-  VX<T> q;                 // q_t of the trial velocity
+  MX<T> mass, by_q, by_v;        // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  VX<T> by_u;                    // ∂g_dof/∂u per actuator
+  MX<T> tangent;                 // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t
+  VX<T> q;                       // q_t of the trial velocity
   Eigen::PartialPivLU<MX<T>> lu;
 };
 
