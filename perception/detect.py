@@ -64,7 +64,8 @@ def find_dots(response: Floats, *, radius: float, apart: float, least: float | N
     `least` is the smallest contrast that counts; None takes 0.4 of what the strongest thirty have.
     """
     sigma = max(0.6 * radius, 0.8)
-    smooth = cv2.GaussianBlur(response, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    side = 2 * int(np.ceil(1.8 * sigma)) + 1
+    smooth = cv2.GaussianBlur(response, (side, side), sigma, borderType=cv2.BORDER_REPLICATE)
     half = max(int(apart), 1)
     highest = cv2.dilate(smooth, np.ones((2 * half + 1, 2 * half + 1), np.uint8))
     floor = 0.02 if least is None else least
@@ -90,7 +91,7 @@ def _refine(
     A pixel weighs 0 below a quarter of the dot's contrast, 1 above three quarters and linearly between: the dot's
     inside may be scratched or shine without moving its centre, and the soft edge carries the sub-pixel part.
     """
-    reach = int(np.ceil(min(1.5 * radius + 1.5, max(apart, radius))))
+    reach = int(np.ceil(min(1.4 * radius + 1.5, max(apart, radius))))
     steps = np.arange(-reach, reach + 1)
     disc = np.hypot(steps[:, None], steps[None, :]) <= reach + 0.3
     step_down, step_right = (a[disc].astype(np.intp) for a in np.meshgrid(steps, steps, indexing="ij"))
@@ -98,10 +99,15 @@ def _refine(
     stride = padded.shape[1]
     places = ((down + reach) * stride + right + reach)[:, None] + (step_down * stride + step_right)
     height = peaks.astype(np.float32)[:, None]
-    weight = np.clip((padded.reshape(-1)[places] - 0.25 * height) / (0.5 * height), 0, 1)
-    area = weight.sum(axis=1, dtype=np.float64)
-    moments = weight.astype(np.float64) @ np.stack([step_right, step_down], axis=1).astype(np.float64)
-    centers = np.stack([right, down], axis=1) + moments / np.maximum(area, 1e-9)[:, None]
+    weight = padded.reshape(-1)[places]
+    weight -= 0.25 * height
+    weight /= 0.5 * height
+    np.clip(weight, 0, 1, out=weight)
+    moments = weight.astype(np.float64) @ np.stack([step_right, step_down, np.ones_like(step_down)], axis=1).astype(
+        float
+    )
+    area = moments[:, 2]
+    centers = np.stack([right, down], axis=1) + moments[:, :2] / np.maximum(area, 1e-9)[:, None]
     own = np.sqrt(area / np.pi)
     limit = np.array([response.shape[1] - 1, response.shape[0] - 1])
     border = np.minimum(centers, limit - centers).min(axis=1)

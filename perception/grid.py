@@ -118,7 +118,7 @@ def _search(image: NDArray[np.uint8], looks: tuple[Look, ...]) -> tuple[Look, fl
             response = contrast(image, look, round(5 * radius))
             dots = _likely(find_dots(response, radius=radius, apart=1.5 * radius))
             lattice = grow(dots.centers)
-            if lattice is None or lattice.unevenness > _UNEVEN:
+            if lattice is None or lattice.unevenness > _UNEVEN or _are_gaps(response, dots, lattice):
                 continue
             full = _full(lattice, dots)
             top, bottom, left, right = _trim(full)
@@ -129,10 +129,18 @@ def _search(image: NDArray[np.uint8], looks: tuple[Look, ...]) -> tuple[Look, fl
             score = float(inner.sum()) * share * (1 - lattice.unevenness / _UNEVEN) * clear / (clear + 4)
             if score > best_score:
                 best, best_score = (look, _radius(dots, lattice), lattice.spacing), score
-            # The gaps between dots form a grid as well, but never one that stands out like this.
             if clear > 4 and share > 0.85 and lattice.unevenness < 0.5 * _UNEVEN and inner.sum() > 0.8 * len(dots):
                 return best
     return best
+
+
+def _are_gaps(response: NDArray[np.float32], dots: Dots, lattice: Lattice) -> bool:
+    """Whether this is the grid of the gaps between dots, which are a little brighter than the mean of dots and gel.
+
+    Then the opposite contrast, that of the dots, is by far the larger one.
+    """
+    opposite = -float(np.quantile(response, 0.01))
+    return float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) < 0.5 * opposite
 
 
 def _trim(full: NDArray[np.float64]) -> tuple[int, int, int, int]:

@@ -38,7 +38,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class TrajectoryGradient:
-    """Gradient of a scalar with respect to what a rollout was given. A quaternion's gradient is its tangent gradient."""
+    """Gradient of a scalar with respect to what a rollout was given; a quaternion's is its tangent gradient."""
 
     u: NDArray[Any]  # (steps, N, nu)
     q: NDArray[Any]  # (N, nq)

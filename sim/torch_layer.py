@@ -52,7 +52,7 @@ def rollout(sim: Simulator, state: TorchState, u: torch.Tensor, *, read_after: S
     for name, tensor in (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors)):
         if tensor.dtype != expected or tensor.device.type != "cpu":
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
-    outputs = _Rollout.apply(u, state.q, state.v, state.anchors, state.anchored, sim, tuple(read_after))
+    outputs = _Rollout.apply(u, state.q, state.v, state.anchors, state.anchored, sim, tuple(read_after))  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, anchored, ok = outputs
     return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored), ok)
 
@@ -96,7 +96,7 @@ class _Rollout(torch.autograd.Function):
         return (*(torch.from_numpy(array.copy()) for array in arrays), end, set_at_end, ok)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(
         ctx: Any, by_q: torch.Tensor, by_v: torch.Tensor, by_tactile: torch.Tensor, by_end: torch.Tensor, *_: Any
     ) -> tuple[torch.Tensor | None, ...]:

@@ -15,10 +15,11 @@ SPACING = 1.4  # [mm]
 
 def press(rest: np.ndarray, rng: np.random.Generator, largest: float) -> np.ndarray:
     """A smooth patch of displacement [mm] at a random place, `largest` at its centre."""
-    centre = rng.uniform(-6, 6, 2) + (2, 0)
+    centre = rng.uniform((-4, -6), (8, 6))
     angle = rng.uniform(0, 2 * np.pi)
     bump = np.exp(-((rest - centre) ** 2).sum(1) / (2 * rng.uniform(3, 7) ** 2))
-    return bump[:, None] * largest * np.array([np.cos(angle), np.sin(angle)])
+    field: np.ndarray = bump[:, None] * largest * np.array([np.cos(angle), np.sin(angle)])
+    return field
 
 
 def follow(look: GelLook, fields: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -143,7 +144,7 @@ def test_it_recovers_after_blank_images() -> None:
     ids=["blank", "noise"],
 )
 def test_an_image_without_markers_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(PeerError, match="no .*grid of markers found"):
+    with pytest.raises(PeerError, match=r"no .*grid of markers found"):
         MarkerTracker().start(image.astype(np.uint8))
 
 

@@ -27,7 +27,8 @@ def multiply(a: Array, b: Array) -> Array:
 
 
 def conjugate(q: Array) -> Array:
-    return q * np.array([1.0, -1.0, -1.0, -1.0])
+    conjugated: Array = q * np.array([1.0, -1.0, -1.0, -1.0])
+    return conjugated
 
 
 def rotate(q: Array, v: Array) -> Array:

@@ -9,15 +9,12 @@ marker's displacement has its sign. Sensor 0 is the left finger, the one at the 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
-
-if TYPE_CHECKING:
-    import torch
 
 Unit = Literal["N", "mm", "px"]
 
@@ -147,7 +144,9 @@ def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
         if valid.all():
             continue
         if valid.sum() < 6:
-            raise UsageError(f"sensor {sensor} shows {valid.sum()} valid markers of {valid.size}; at least 6 are needed")
+            raise UsageError(
+                f"sensor {sensor} shows {valid.sum()} valid markers of {valid.size}; at least 6 are needed"
+            )
         lost = np.flatnonzero(~valid)
         distance = np.linalg.norm(frame.positions[lost, None] - frame.positions[None, valid], axis=-1)
         near = np.argsort(distance, axis=1)[:, :6]
@@ -181,7 +180,8 @@ def flow_map(
     sensors = reference.shear.shape[0]
 
     def on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.einsum("gm,smc->sgc", weights, values).reshape(sensors, grid.rows, grid.cols, 2)
+        resampled: NDArray[np.float64] = np.einsum("gm,smc->sgc", weights, values)
+        return resampled.reshape(sensors, grid.rows, grid.cols, 2)
 
     stack = np.stack([on_grid(fill_invalid(frame)) for frame in frames])
     image, divisor = normalize(stack, on_grid(fill_invalid(reference)), floor=floors[reference.unit])

@@ -1,0 +1,139 @@
+"""Where images come from: a folder, one image file, a video file, a stream's URL, a camera's number.
+
+A source has a name, a length where that is known, and is iterated once; it yields (name of the image, image). Nothing
+is opened before iteration starts. For the robot's cameras there are drivers that keep the received bytes; these
+sources are for looking at what one has.
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError, PeerTimeout, UsageError
+from gelflow.perception.frames import decode
+
+Image = NDArray[np.uint8]
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
+
+
+@dataclass(frozen=True)
+class Source:
+    """A finite or endless sequence of images."""
+
+    text: str  # as the user wrote it
+    kind: str  # "folder", "image", "video", "stream" or "camera"
+    files: tuple[Path, ...] = ()  # of a folder or an image
+    timeout: float = 5.0  # of a stream, for opening and for each image [s]
+
+    @property
+    def live(self) -> bool:
+        """Whether it goes on until it is told to stop."""
+        return self.kind in ("stream", "camera")
+
+    def __iter__(self) -> Iterator[tuple[str, Image]]:
+        """(name, image as B G R) one after the other. Raises PeerError when one can not be had."""
+        return self._from_files() if self.files else self._from_capture()
+
+    def count(self) -> int | None:
+        """How many images there will be, None when that is not known before."""
+        if self.files:
+            return len(self.files)
+        if self.live:
+            return None
+        capture = self._open()
+        number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        capture.release()
+        return number if number > 0 else None
+
+    def _from_files(self) -> Iterator[tuple[str, Image]]:
+        for file in self.files:
+            try:
+                yield file.name, decode(file.read_bytes())
+            except PeerError as error:
+                raise PeerError(f"{file}: {error}") from None
+            except OSError as error:
+                raise PeerError(f"{file} can not be read: {error.strerror}") from None
+
+    def _from_capture(self) -> Iterator[tuple[str, Image]]:
+        capture = self._open()
+        number = 0
+        try:
+            while True:
+                good, image = capture.read()
+                if not good:
+                    break
+                if image.ndim == 2:
+                    image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+                yield f"{number:06d}", np.asarray(image, dtype=np.uint8)
+                number += 1
+        finally:
+            capture.release()
+        if number == 0:
+            raise PeerError(f"{self.kind} {self.text} opened, but gave no image")
+        if self.live:
+            raise PeerTimeout(
+                f"{self.kind} {self.text} ended after {number} images: it was closed, or silent for {self.timeout:g} s"
+            )
+
+    def _open(self) -> cv2.VideoCapture:
+        # Both libraries write to the terminal by themselves; what they say is in the error below.
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        level = cv2.getLogLevel()  # type: ignore[attr-defined]
+        cv2.setLogLevel(0)  # type: ignore[attr-defined]
+        try:
+            if self.kind == "camera":
+                capture = cv2.VideoCapture(int(self.text))
+                advice = "is one connected, and does this user have the right to use it?"
+            elif self.kind == "stream":
+                limit = int(self.timeout * 1000)
+                options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
+                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG, options)
+                advice = f"no video stream within {self.timeout:g} s; check address and port"
+            else:
+                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
+                advice = "it is neither an image nor a video that OpenCV reads"
+        finally:
+            cv2.setLogLevel(level)  # type: ignore[attr-defined]
+        if not capture.isOpened():
+            capture.release()
+            raise PeerError(f"{self.kind} {self.text} can not be opened: {advice}")
+        return capture
+
+
+def find_source(text: str, *, timeout: float = 5.0) -> Source:
+    """What `text` means: a number is a camera, scheme://... a stream, otherwise a folder or a file.
+
+    Raises UsageError when there is no such file or folder, or a folder without images.
+    """
+    if not text:
+        raise UsageError("expected a folder, a file, a URL or a camera's number, got nothing")
+    if text.isascii() and text.isdigit():
+        return Source(text, "camera", timeout=timeout)
+    if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
+        return Source(text, "stream", timeout=timeout)
+    path = Path(text)
+    if path.is_dir():
+        files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural))
+        if not files:
+            raise UsageError(f"folder {text} has no images (known are {', '.join(sorted(IMAGE_SUFFIXES))})")
+        return Source(text, "folder", files)
+    if not path.exists():
+        raise UsageError(f"expected a folder, a file, a URL or a camera's number, got {text}, which does not exist")
+    return Source(text, "image", (path,)) if _is_image(path) else Source(text, "video")
+
+
+def natural(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """A key that sorts 9.jpg before 10.jpg."""
+    parts = re.split(r"([0-9]+)", path.name)
+    return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts)
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and not path.name.startswith(".")
