@@ -3,10 +3,10 @@
 The scalar is a random linear function of one part of the end of a rollout (positions, velocities or marker readings);
 its gradient with respect to controls, initial positions and initial velocities comes from the reverse pass.
 
-* Dual numbers run the same core with the same branches and give the exact derivative along one direction: agreement to
-  rounding shows that every analytic derivative and the reverse pass are right.
-* Central differences know nothing of the derivation. A stencil whose runs took other branches than the middle (touching,
-  sliding, clipped) measures a kink, not a derivative: it is left out and counted.
+* Dual numbers run the same core with the same branches and give the exact derivative along one direction: agreement
+  to rounding shows that every analytic derivative and the reverse pass are right.
+* Central differences know nothing of the derivation. A stencil whose runs took other branches than the middle
+  (touching, sliding, clipped) measures a kink, not a derivative: it is left out and counted.
 """
 
 from dataclasses import dataclass
