@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 class PPOSettings:
     """Everything that decides a training run beside the environment; stored in the checkpoint."""
 
-    attempts: int = 120_000  # attempts in all
+    attempts: int = 200_000  # attempts in all
     minutes: float = float("inf")  # stop after this time [min]; a run cut off by time can not be repeated exactly
     seed: int = 0
     rollout: int = 16  # attempts of each environment between updates
@@ -164,12 +164,17 @@ def train(
     command: the command line to store in the checkpoint
     report: called after every update and every evaluation
 
-    Raises UsageError when the settings do not fit each other.
+    Raises UsageError when the settings do not fit each other, or `out` holds a trained policy already.
     """
     architecture = architecture or Architecture()
     settings = settings or PPOSettings()
     _check(settings, attempts)
-    out.mkdir(parents=True, exist_ok=True)
+    if (out / CHECKPOINT).exists():  # hours of another run, perhaps one that is still going on
+        raise UsageError(f"{out} already holds a trained policy; give another folder, or delete that one")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot write into {out}: {error.strerror}") from error
     torch.set_num_threads(1)  # the products are tiny, and one thread makes a run repeatable
     basis = polynomial_basis(attempts.task.grid, architecture.degree)
     scale = calibrate(attempts, architecture, basis, settings)

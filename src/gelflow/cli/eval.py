@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     ways: list[tuple[str, NetworkActor | RandomActor, Attempts]] = [
         ("policy", NetworkActor(network, count), plain),
         ("policy, noisy flow maps", NetworkActor(network, count), noisy),
-        ("random, within the policy's reach", RandomActor(reach, count, args.seed), plain),
-        ("random, whole action range", RandomActor(INSERTION.action_scale, count, args.seed), plain),
+        ("random, policy's reach", RandomActor(reach, count, args.seed), plain),
+        ("random, full range", RandomActor(INSERTION.action_scale, count, args.seed), plain),
     ]
     results = []
     with console.status("evaluating") as status:

@@ -2,7 +2,6 @@
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -23,8 +22,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, with a progress bar; says where the checkpoint is."""
-    if args.envs < 1:
-        raise UsageError(f"--envs must be at least 1, got {args.envs}")
+    if args.envs < 1 or args.seed < 0:
+        raise UsageError(f"--envs must be at least 1 and --seed at least 0, got {args.envs} and {args.seed}")
     from gelflow.policies.attempts import Noise  # here: torch takes seconds to import
     from gelflow.policies.curve import Progress as Point
     from gelflow.policies.ppo import PPOSettings, train
@@ -53,10 +52,17 @@ def run(args: argparse.Namespace) -> int:
             simulated(args.envs, noise=Noise()),
             out=args.out,
             settings=settings,
-            command=["gelflow", *sys.argv[1:]],
+            command=_command(args, settings.attempts),
             report=report,
         )
     console.print(f"best on validation: {made.best.success:.1%} inserted in {made.best.attempts:.1f} attempts")
     console.print(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}", soft_wrap=True)
     console.print(f"judge it with: gelflow eval insertion --checkpoint {shlex.quote(str(made.checkpoint))}")
     return 0
+
+
+def _command(args: argparse.Namespace, attempts: int) -> list[str]:
+    """The command that makes the same again, whatever the defaults become."""
+    values = {"attempts": attempts, "minutes": args.minutes, "envs": args.envs, "seed": args.seed, "out": args.out}
+    given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
+    return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]
