@@ -85,8 +85,8 @@ class Source:
     def _open(self) -> cv2.VideoCapture:
         # Both libraries write to the terminal by themselves; what they say is in the error below.
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        level = cv2.getLogLevel()  # type: ignore[attr-defined]
-        cv2.setLogLevel(0)  # type: ignore[attr-defined]
+        level = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(0)
         try:
             if self.kind == "camera":
                 capture = cv2.VideoCapture(int(self.text))
@@ -100,7 +100,7 @@ class Source:
                 capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
                 advice = "it is neither an image nor a video that OpenCV reads"
         finally:
-            cv2.setLogLevel(level)  # type: ignore[attr-defined]
+            cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
             capture.release()
             raise PeerError(f"{self.kind} {self.text} can not be opened: {advice}")
