@@ -7,9 +7,11 @@ sources are for looking at what one has.
 
 import os
 import re
+import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -21,6 +23,9 @@ from gelflow.perception.frames import decode
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
+_PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # of the protocols that run over TCP
+# FFmpeg writes to the terminal by itself; OpenCV reads this when it uses FFmpeg for the first time.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True)
@@ -83,8 +88,7 @@ class Source:
             )
 
     def _open(self) -> cv2.VideoCapture:
-        # Both libraries write to the terminal by themselves; what they say is in the error below.
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+        # OpenCV writes to the terminal by itself; what it says is in the error below.
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(0)
         try:
@@ -92,11 +96,13 @@ class Source:
                 capture = cv2.VideoCapture(int(self.text))
                 advice = "is one connected, and does this user have the right to use it?"
             elif self.kind == "stream":
+                self._reach()
                 limit = int(self.timeout * 1000)
                 options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
                 capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG, options)
                 advice = f"no video stream within {self.timeout:g} s; check address and port"
             else:
+                self._refuse_text()
                 capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
                 advice = "it is neither an image nor a video that OpenCV reads"
         finally:
@@ -105,6 +111,26 @@ class Source:
             capture.release()
             raise PeerError(f"{self.kind} {self.text} can not be opened: {advice}")
         return capture
+
+    def _reach(self) -> None:
+        """Raises PeerError when nobody listens at the stream's address: sooner and clearer than the video library."""
+        try:
+            url = urlsplit(self.text)
+            if url.scheme in _PORTS:
+                address = url.hostname or "", url.port or _PORTS[url.scheme]
+                socket.create_connection(address, timeout=self.timeout).close()
+        except (OSError, ValueError) as error:
+            raise PeerError(f"stream {self.text} can not be opened: {error}; check address and port") from None
+
+    def _refuse_text(self) -> None:
+        """Raises PeerError for a text file, which FFmpeg would draw letter by letter and call a video."""
+        try:
+            with Path(self.text).open("rb") as file:
+                start = file.read(4096)
+        except OSError as error:
+            raise PeerError(f"{self.text} can not be read: {error.strerror}") from None
+        if start and b"\0" not in start and _is_text(start):
+            raise PeerError(f"{self.text} is a text file, not an image or a video")
 
 
 def find_source(text: str, *, timeout: float = 5.0) -> Source:
@@ -133,6 +159,15 @@ def natural(path: Path) -> tuple[tuple[int, int, str], ...]:
     """A key that sorts 9.jpg before 10.jpg."""
     parts = re.split(r"([0-9]+)", path.name)
     return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts)
+
+
+def _is_text(start: bytes) -> bool:
+    """Whether a file that begins so is text; its last character may be cut off."""
+    try:
+        start.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return error.start > len(start) - 4 and error.reason == "unexpected end of data"
+    return True
 
 
 def _is_image(path: Path) -> bool:

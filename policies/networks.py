@@ -1,8 +1,8 @@
 """The policy's network: a few numbers per flow map, the last attempts, a small perceptron. NumPy only.
 
 A flat face in a grasp makes smooth flow maps, so each channel is first reduced to its least-squares fit by low
-polynomials in row and column. That fixed linear layer averages the noise of the markers (130 values to 6 numbers) and
-keeps what tells a misalignment: the mean force, its gradients over the pad and its curvature.
+polynomials in row and column. That fixed linear layer averages the noise of the markers (130 values to 3 numbers) and
+keeps what tells a misalignment: the mean force and its gradients over the pad.
 
 One attempt cannot tell yaw from translation (either may load the same corner of the hole), so the network also sees
 the attempts before and the corrections made between them. `History` builds that input in training and in use alike.
@@ -31,8 +31,8 @@ class Architecture:
     """What the tensors of a checkpoint mean."""
 
     kind: str = KIND
-    degree: int = 2  # of the polynomials in row and column
-    history: int = 3  # attempts that the network sees, the newest included
+    degree: int = 1  # of the polynomials in row and column
+    history: int = 5  # attempts that the network sees, the newest included
     hidden: tuple[int, ...] = (64, 64)  # units of each hidden layer (tanh)
     reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)  # output ±1 means this correction [m, m, rad]
 

@@ -52,7 +52,7 @@ class PPOSettings:
     spread: float = 0.4  # first standard deviation of the actions, in units of the reach
     calibration: int = 2_000  # random attempts that give the features' root mean square
     evaluate_every: int = 20_000  # attempts
-    evaluate_episodes: int = 256
+    evaluate_episodes: int = 512
 
 
 CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
@@ -230,7 +230,7 @@ def calibrate(attempts: Attempts, architecture: Architecture, basis: Array, sett
     rng = np.random.default_rng([settings.seed, 1])
     images = attempts.reset(settings.seed)
     squares = []
-    for _ in range(max(1, settings.calibration // attempts.count)):
+    for _ in range(max(1, min(settings.calibration, settings.attempts) // attempts.count)):
         squares.append(reduce_maps(images, basis) ** 2)
         reach = np.asarray(architecture.reach)
         images = attempts.step(rng.uniform(-reach, reach, (attempts.count, 3)) / 2).images
@@ -286,7 +286,8 @@ class _Keeper(BaseCallback):
         task = run.validation.task
         actor = NetworkActor(Network(run.architecture, task, tensors), run.validation.count)
         seed = settings.seed + 1_000_003  # parts that training does not begin with
-        result = evaluate("validation", actor, run.validation, episodes=settings.evaluate_episodes, seed=seed)
+        episodes = min(settings.evaluate_episodes, settings.attempts)  # a trial run is not mostly evaluation
+        result = evaluate("validation", actor, run.validation, episodes=episodes, seed=seed)
         if self._best is None or (result.success, result.reward) > (self._best.success, self._best.reward):
             self._best = result
             training = {

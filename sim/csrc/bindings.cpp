@@ -226,7 +226,7 @@ std::vector<std::string> names(const std::vector<Item>& items) {
 
 }  // namespace
 
-PYBIND11_MODULE(_core, module) {
+PYBIND11_MODULE(GELFLOW_CORE, module) {
   module.doc() = "C++ core of the simulator; use gelflow.sim.Simulator.";
   constexpr double inf = ModelSpec::inf;
 

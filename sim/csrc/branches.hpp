@@ -15,12 +15,13 @@ class Signature {
   std::uint64_t hash_ = 0xcbf29ce484222325ULL;
 };
 
-// The face or edge of the shape that the point is nearest to, as told by the normal's zero pattern and signs.
+// The face of the shape that the point is nearest to, as told by the normal's zero pattern and signs.
 template <class T>
-std::uint64_t face(const Distance<T>& at) {
-  std::uint64_t code = at.curved ? 1 : 0;
-  for (int a = 0; a < 3; ++a) code = code * 3 + (at.n[a] > T(0) ? 1 : at.n[a] < T(0) ? 2 : 0);
-  return at.curved ? 1 : code;
+std::uint64_t face(const V3<T>& normal, bool curved) {
+  if (curved) return 1;
+  std::uint64_t code = 0;
+  for (int a = 0; a < 3; ++a) code = code * 3 + (normal[a] > T(0) ? 1 : normal[a] < T(0) ? 2 : 0);
+  return code;
 }
 
 // Signature of the step that ended in (q, v), with the anchors from before it. Markers count where `markers` is true
@@ -33,34 +34,29 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   w.update.setZero();
   forward_positions<T>(m, params, q, w);
   forward_velocities<T>(m, params, v, w.update.data(), w);
-  PointForce<T> force;
   int pair = 0;
-  const auto visit = [&](int i, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity, const V3<T>& e,
-                         bool remembers) {
-    point_force<0, T>(law, at, velocity, e, remembers, force);
-    const bool pulls = force.force.dot(at.n) <= T(0);
-    hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
-    hash.add(face(at) * 16 + (at.d < T(-1e-6) ? 8 : 0) + (force.slips ? 4 : 0) + (remembers ? 2 : 0) + (pulls ? 1 : 0));
+  const auto visit = [&](const Touching<T>& t) {
+    PointForce<Pack<T>> force;
+    point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    const auto pulls = dot(force.force, t.at.n);
+    t.for_each_inside([&](int k, int i) {
+      hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
+      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.curved) * 16 + (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) +
+               (is_set(force.slips, k) ? 4 : 0) + (is_set(t.remembers, k) ? 2 : 0) + (lane(pulls, k) > T(0) ? 0 : 1));
+    });
   };
   for (const Contact& contact : m.contacts) {
     ++pair;
-    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
-    for_touching_points<T>(
-        m, contact, params, h, frame, anchors, anchored,
-        [&](int i, const V3<T>&, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,
-            const V3<T>& e, const V3<T>&, bool remembers) { visit(i, law, at, velocity, e, remembers); },
-        ignore);
+    const PointSet& set = m.point_sets[contact.points];
+    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
+    for_touching_points<T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), visit);
   }
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
-      for_touched_markers<T>(
-          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
-          [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& velocity,
-              const V3<T>& e, const V3<T>&, bool remembers) { visit(i, law, at, velocity, e, remembers); },
-          ignore);
+      for_touching_points<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), visit);
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {

@@ -9,35 +9,54 @@
 
 namespace gelflow {
 
-// Calls f(i, x, c, law, distance, v, e, anchored) for every point of the contact that is inside the shape.
-template <class T, class F, class Skip>
-void for_touching_points(const Model& m, const Contact& contact, const T* params, const T& h, const PairFrame<T>& frame,
-                         const V3<T>* anchors, const std::uint8_t* anchored, F&& f, Skip&& outside) {
-  const PointSet& set = m.point_sets[contact.points];
-  PointLaw<T> numbers = law_numbers<T>(params + contact.param, contact.law, contact.damping, h);
-  numbers.rolling = set.radius > 0;
-  Distance<T> at;
-  for_near_points<T>(
-      frame, set.cloud, set.radius,
-      [&](int i) {
-        const V3<T> c = frame.point(set.cloud.points[i]);
-        V3<T> x = c;
-        if (numbers.rolling) x[2] -= T(set.radius);  // planes only: n = z
-        distance<T>(frame.kind, frame.size, x, at);
-        if (!(at.d < T(0))) {
-          outside(i, i + 1);
-          return;
-        }
-        const PointLaw<T> law = weighted<T>(numbers, set.cloud.weights[i]);
-        const V3<T> v = frame.velocity(x);
-        const bool remembers = numbers.elastic && anchored[contact.anchor + i];
-        const V3<T> anchor = remembers ? anchors[contact.anchor + i] : V3<T>(V3<T>::Zero());
-        f(i, x, c, law, at, v, anchor_offset<T>(law, x, v, anchor, remembers), anchor, remembers);
-      },
-      outside);
+template <class T>
+TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const T& h, const V3<T>* anchors,
+                        const std::uint8_t* anchored) {
+  const int slot = contact.anchor < 0 ? 0 : contact.anchor;
+  return {params + contact.param, contact.law,    contact.damping, h, m.point_sets[contact.points].radius,
+          anchors + slot,         anchored + slot};
 }
 
-inline void ignore(int, int) {}
+// The wrench of all touching points on the first body, about the shape's origin in its frame, and with derivatives the
+// blocks of K and D (mm, mf, fm, ff of each). Returns whether any point touches.
+template <bool derivatives, class T>
+bool sum_forces(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, V6<T>& wrench,
+                const std::array<M3<T>*, 8>& blocks) {
+  using L = Pack<T>;
+  Vec3<L> moment_sum = zero3<L>(), force_sum = zero3<L>();
+  Mat3<L> sums[8];
+  if constexpr (derivatives) std::fill(sums, sums + 8, zero33<L>());
+  bool touching = false;
+  for_touching_points<T>(frame, cloud, rule, [&](const Touching<T>& t) {
+    touching = true;
+    PointForce<L> force;
+    point_force<derivatives ? 1 : 0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    moment_sum += cross(t.x, force.force);
+    force_sum += force.force;
+    if constexpr (derivatives) {
+      const Mat3<L> a = force.by_x + cross_rows(force.by_v, spread<L>(frame.angular));
+      Mat3<L> moment = cross_columns(t.x, a);  // − [f]×
+      moment.row[0] += Vec3<L>{L(0.0), force.force.z, -force.force.y};
+      moment.row[1] += Vec3<L>{-force.force.z, L(0.0), force.force.x};
+      moment.row[2] += Vec3<L>{force.force.y, -force.force.x, L(0.0)};
+      const Mat3<L> moment_v = cross_columns(t.x, force.by_v);
+      sums[0] -= cross_rows(moment, t.center);
+      sums[1] += moment;
+      sums[2] -= cross_rows(a, t.center);
+      sums[3] += a;
+      sums[4] -= cross_rows(moment_v, t.x);
+      sums[5] += moment_v;
+      sums[6] -= cross_rows(force.by_v, t.x);
+      sums[7] += force.by_v;
+    }
+  });
+  if (!touching) return false;
+  wrench = stack<T>(sum3<T>(moment_sum), sum3<T>(force_sum));
+  if constexpr (derivatives) {
+    for (int i = 0; i < 8; ++i) *blocks[i] = sum33<T>(sums[i]);
+  }
+  return true;
+}
 
 // Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `scale`: adds the
 // forces' size to w.scale.
@@ -52,32 +71,10 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     const PairFrame<T> frame = pair_frame<T>(params, first, shape, w);
     V6<T> wrench = V6<T>::Zero();
     // The blocks of K and D: rows moment, force; columns turn, shift.
-    M3<T> k_mm = M3<T>::Zero(), k_mf = k_mm, k_fm = k_mm, k_ff = k_mm;
-    M3<T> d_mm = k_mm, d_mf = k_mm, d_fm = k_mm, d_ff = k_mm;
-    PointForce<T> force;
-    bool touching = false;
-    for_touching_points<T>(
-        m, contact, params, h, frame, anchors, anchored,
-        [&](int, const V3<T>& x, const V3<T>& center, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-            const V3<T>& e, const V3<T>&, bool remembers) {
-          touching = true;
-          point_force<derivatives ? 1 : 0, T>(law, at, v, e, remembers, force);
-          wrench += stack<T>(cross<T>(x, force.force), force.force);
-          if constexpr (derivatives) {
-            const M3<T> a = force.by_x + cross_rows<T>(force.by_v, frame.angular);
-            const M3<T> moment = cross_columns<T>(x, a) - skew<T>(force.force);
-            const M3<T> moment_v = cross_columns<T>(x, force.by_v);
-            k_mm -= cross_rows<T>(moment, center);
-            k_mf += moment;
-            k_fm -= cross_rows<T>(a, center);
-            k_ff += a;
-            d_mm -= cross_rows<T>(moment_v, x);
-            d_mf += moment_v;
-            d_fm -= cross_rows<T>(force.by_v, x);
-            d_ff += force.by_v;
-          }
-        },
-        ignore);
+    M3<T> k_mm, k_mf, k_fm, k_ff, d_mm, d_mf, d_fm, d_ff;
+    const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud,
+                                                     touch_rule<T>(m, contact, params, h, anchors, anchored), wrench,
+                                                     {&k_mm, &k_mf, &k_fm, &k_ff, &d_mm, &d_mf, &d_fm, &d_ff});
     if (!touching) continue;
     pair_columns<derivatives, T>(contact.pair, first, frame, w, c);
     for (int i = 0; i < c.n; ++i) {
@@ -124,19 +121,12 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
 template <class T>
 void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
                       const Workspace<T>& w, T* out) {
-  PointForce<T> force;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
-    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
+    const PointSet& set = m.point_sets[contact.points];
+    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
     V6<T> wrench = V6<T>::Zero();
-    for_touching_points<T>(
-        m, contact, params, h, frame, anchors, anchored,
-        [&](int, const V3<T>& x, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-            const V3<T>& e, const V3<T>&, bool remembers) {
-          point_force<0, T>(law, at, v, e, remembers, force);
-          wrench += stack<T>(cross<T>(x, force.force), force.force);
-        },
-        ignore);
+    sum_forces<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), wrench, {});
     const V3<T> moment = frame.to_world * top(wrench), push = frame.to_world * bottom(wrench);
     const V6<T> in_world = stack<T>(moment + cross<T>(frame.origin, push), push);
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
@@ -146,20 +136,13 @@ void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* 
 // Anchors after an accepted step (w holds its kinematics). `next` and `next_set` may be the arrays that are read.
 template <class T>
 void advance_contact_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                             const std::uint8_t* anchored, const Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
-  PointForce<T> force;
+                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
-    const PairFrame<T> frame = pair_frame<T>(params, m.point_sets[contact.points].body, m.shapes[contact.shape], w);
-    for_touching_points<T>(
-        m, contact, params, h, frame, anchors, anchored,
-        [&](int i, const V3<T>& x, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-            const V3<T>& e, const V3<T>& anchor, bool remembers) {
-          point_force<0, T>(law, at, v, e, remembers, force);
-          next[contact.anchor + i] = next_anchor<T>(law, force, at.n, x, e, anchor, remembers);
-          next_set[contact.anchor + i] = 1;
-        },
-        [&](int begin, int end) { std::fill(next_set + contact.anchor + begin, next_set + contact.anchor + end, 0); });
+    const PointSet& set = m.point_sets[contact.points];
+    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
+    advance_anchors<T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), w.kept,
+                       next + contact.anchor, next_set + contact.anchor);
   }
 }
 
@@ -170,35 +153,32 @@ template <bool from_next, class T>
 void contact_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
                                 const std::uint8_t* anchored, const Workspace<T>& w, const V3<T>* by_next,
                                 const VX<T>& multipliers, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
-  PointForce<T> force;
+  using L = Pack<T>;
   PairColumns<T> c;
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
     const int first = m.point_sets[contact.points].body;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     pair_columns<true, T>(contact.pair, first, frame, w, c);
-    V6<T> virtual_twist = V6<T>::Zero(), by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-    if constexpr (!from_next) {
+    V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
+    const TouchRule<T> rule = touch_rule<T>(m, contact, params, h, anchors, anchored);
+    V3<T>* const by_own = by_anchor + contact.anchor;
+    if constexpr (from_next) {
+      anchors_transposed<T>(frame, m.point_sets[contact.points].cloud, rule, by_next + contact.anchor, by_pose,
+                            by_twist, by_own);
+      pull_back<T>(contact.pair, c, by_pose, by_twist, by_q, by_v);
+    } else {
+      V6<T> virtual_twist = V6<T>::Zero();
       for (int i = 0; i < c.n; ++i) virtual_twist += c.s[i] * multipliers[contact.pair.dof[i]];
+      for_touching_points<T>(frame, m.point_sets[contact.points].cloud, rule, [&](const Touching<T>& t) {
+        PointForce<L> force;
+        point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+        const Vec3<L> weight =
+            L(h) * (spread<L>(V3<T>(bottom(virtual_twist))) + cross(spread<L>(V3<T>(top(virtual_twist))), t.x));
+        const Vec3<L> by = transposed_times(force.by_anchor, weight);
+        t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
+      });
     }
-    for_touching_points<T>(
-        m, contact, params, h, frame, anchors, anchored,
-        [&](int i, const V3<T>& x, const V3<T>& center, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-            const V3<T>& e, const V3<T>&, bool remembers) {
-          point_force<2, T>(law, at, v, e, remembers, force);
-          if constexpr (from_next) {
-            const AnchorGradient<T> g = next_anchor_transposed<T>(law, force, remembers, by_next[contact.anchor + i]);
-            const V3<T> by_point = g.x - cross<T>(frame.angular, g.v);
-            by_pose += stack<T>(cross<T>(center, by_point), by_point);
-            by_twist += stack<T>(cross<T>(x, g.v), g.v);
-            if (remembers) by_anchor[contact.anchor + i] += g.anchor;
-          } else if (remembers) {
-            const V3<T> weight = h * (bottom(virtual_twist) + cross<T>(top(virtual_twist), x));
-            by_anchor[contact.anchor + i] += force.by_anchor.transpose() * weight;
-          }
-        },
-        ignore);
-    if constexpr (from_next) pull_back<T>(contact.pair, c, by_pose, by_twist, by_q, by_v);
   }
 }
 

@@ -18,156 +18,139 @@
 
 namespace gelflow {
 
-template <class T>
+// Everything is written for a lane type L: some points at once (lanes.hpp). A point of weight 0 feels nothing.
+template <class L>
 struct PointLaw {
-  T kn, kt, mu, kd, ks;  // of this point: already times its weight
+  L kn, kt, mu, kd, ks;  // of these points: already times their weights
+  L h;
   DampingLaw damping;
   bool elastic;
   bool rolling;
-  T h;
 };
 
-template <class T>
+template <class L>
 struct PointForce {
-  V3<T> force;
-  M3<T> by_x, by_v, by_anchor;  // ∂force/∂(x, v, X); the anchor moves the friction alone
-  bool slips;
-  V3<T> friction, slip;  // f_t, v_t
-  M3<T> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
+  Vec3<L> force;
+  Mat3<L> by_x, by_v, by_anchor;  // ∂force/∂(x, v, X); the anchor moves the friction alone
+  Mask<L> slips;
+  Vec3<L> friction, slip;  // f_t, v_t
+  Mat3<L> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
 };
 
-template <class T>
-GELFLOW_INLINE V3<T> anchor_offset(const PointLaw<T>& law, const V3<T>& x, const V3<T>& v, const V3<T>& anchor,
-                                   bool anchored) {
-  if (!law.elastic || !anchored) return V3<T>::Zero();
-  return law.rolling ? V3<T>(anchor + law.h * v) : V3<T>(x - anchor);
+template <class L>
+GELFLOW_INLINE Vec3<L> anchor_offset(const PointLaw<L>& law, const Vec3<L>& x, const Vec3<L>& v, const Vec3<L>& anchor,
+                                     const Mask<L>& anchored) {
+  return select3<L>(anchored, law.rolling ? anchor + law.h * v : x - anchor, zero3<L>());
 }
 
 // `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
-template <int derivatives, class T>
-GELFLOW_INLINE void point_force(const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e,
-                                bool anchored, PointForce<T>& out) {
+template <int derivatives, class L>
+GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
+                                const Mask<L>& anchored, PointForce<L>& out) {
   using std::sqrt;
-  const V3<T>& n = at.n;
-  const T rate = n.dot(v);
-  T normal, by_d, by_rate;
+  const L zero(0.0), one(1.0);
+  const Vec3<L>& n = at.n;
+  const L rate = dot(n, v);
+  L normal, by_d, by_rate;
   if (law.damping == DampingLaw::depth) {
-    const T stiffness = law.kn - law.kd * rate;
-    const bool pushes = stiffness > T(0);
-    normal = pushes ? -stiffness * at.d : T(0);
-    by_d = pushes ? -stiffness : T(0);
-    by_rate = pushes ? law.kd * at.d : T(0);
+    const L wanted = law.kn - law.kd * rate;
+    const Mask<L> pushes = wanted > zero;
+    const L stiffness = select(pushes, wanted, zero);
+    normal = -stiffness * at.d;
+    by_d = -stiffness;
+    by_rate = select(pushes, law.kd * at.d, zero);
   } else {
-    constexpr double ramp = 1e-6;  // [m]
-    const bool full = at.d < T(-ramp);
-    const T r = full ? T(1) : T(-at.d / T(ramp));
-    const T push = -law.kn * at.d - r * law.kd * rate;
-    const bool pushes = push > T(0);
-    normal = pushes ? push : T(0);
-    by_d = pushes ? T((full ? T(0) : T(law.kd * rate / T(ramp))) - law.kn) : T(0);
-    by_rate = pushes ? T(-r * law.kd) : T(0);
+    const L ramp(1e-6);  // [m]
+    const Mask<L> full = at.d < -ramp;
+    const L r = select(full, one, -at.d / ramp);
+    const L push = -law.kn * at.d - r * law.kd * rate;
+    const Mask<L> pushes = push > zero;
+    normal = select(pushes, push, zero);
+    by_d = select(pushes, select(full, zero, law.kd * rate / ramp) - law.kn, zero);
+    by_rate = select(pushes, -r * law.kd, zero);
   }
-  const V3<T> slip = v - rate * n;
-  V3<T> wanted = -law.kt * slip;
-  T along = T(0);
-  const bool memory = law.elastic && anchored;
-  if (memory) {
-    along = n.dot(e);
-    wanted -= law.ks * (e - along * n);
+  const Vec3<L> slip = v - rate * n;
+  Vec3<L> wanted = -law.kt * slip;
+  L along = zero;
+  if (law.elastic) {
+    along = dot(n, e);
+    wanted -= law.ks * (e - along * n);  // e is zero where there is no anchor
   }
-  const T bound = law.mu * normal, squared = wanted.squaredNorm();
+  const L bound = law.mu * normal, squared = dot(wanted, wanted);
   out.slips = squared > bound * bound;
-  const T length = out.slips ? T(sqrt(squared)) : T(1);
-  const T ratio = out.slips ? T(bound / length) : T(1);
-  out.friction = wanted * ratio;
+  const L inverse = one / sqrt(select(out.slips, squared, one));
+  const L ratio = select(out.slips, bound * inverse, one);
+  out.friction = ratio * wanted;
   out.slip = slip;
   out.force = normal * n + out.friction;
   if constexpr (derivatives > 0) {
     // d f* = −(k_t + k_s ev) (1 − n nᵀ) dv − k_s ex (1 − n nᵀ) dx + curvature, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
-    const T ex = memory && !law.rolling ? T(1) : T(0);
-    const T ev = memory && law.rolling ? law.h : T(0);
-    const V3<T> direction = out.slips ? V3<T>(wanted / length) : V3<T>(V3<T>::Zero());
-    const T mu = out.slips ? law.mu : T(0);
-    V3<T> normal_by_x = by_d * n;
-    const V3<T> normal_by_v = by_rate * n;
+    const L memory = law.elastic ? select(anchored, law.ks, zero) : zero;
+    const Vec3<L> direction = select(out.slips, inverse, zero) * wanted;
+    Vec3<L> normal_by_x = by_d * n;
+    const Vec3<L> normal_by_v = by_rate * n;
     // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ), as t is tangential.
-    M3<T> project;
-    for (int j = 0; j < 3; ++j) {
-      for (int i = 0; i < 3; ++i) {
-        project(i, j) = ratio * ((i == j ? T(1) : T(0)) - n[i] * n[j] - direction[i] * direction[j]);
-      }
-    }
-    const V3<T> lever = mu * direction;
-    M3<T> friction_by_x = (-law.ks * ex) * project;
-    M3<T> friction_by_v = (-law.kt - law.ks * ev) * project;
+    const Mat3<L> project = ratio * (identity_minus_outer(n) - outer(direction, direction));
+    const Vec3<L> lever = law.mu * direction;
+    const L by_slip = law.rolling ? -law.kt - memory * law.h : -law.kt;
+    out.friction_by_v = by_slip * project + outer(lever, normal_by_v);
+    out.friction_by_x = law.elastic && !law.rolling ? -memory * project : zero33<L>();
     if (at.curved) {
-      const V3<T> hv = at.hessian * v;
+      const Vec3<L> hv = at.hessian * v;
       normal_by_x += by_rate * hv;
-      M3<T> wanted_by_x = law.kt * (n * hv.transpose() + rate * at.hessian);
-      if (memory) wanted_by_x += law.ks * (n * (at.hessian * e).transpose() + along * at.hessian);
-      friction_by_x += ratio * (wanted_by_x - direction * (direction.transpose() * wanted_by_x));
-      out.by_x = normal * at.hessian;
-    } else {
-      out.by_x.setZero();
+      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + rate * at.hessian);
+      if (law.elastic) wanted_by_x += memory * (outer(n, at.hessian * e) + along * at.hessian);
+      out.friction_by_x += ratio * (wanted_by_x - outer(direction, transposed_times(wanted_by_x, direction)));
     }
-    for (int j = 0; j < 3; ++j) {
-      for (int i = 0; i < 3; ++i) {
-        friction_by_x(i, j) += lever[i] * normal_by_x[j];
-        friction_by_v(i, j) += lever[i] * normal_by_v[j];
-        out.by_x(i, j) += friction_by_x(i, j) + n[i] * normal_by_x[j];
-        out.by_v(i, j) = friction_by_v(i, j) + n[i] * normal_by_v[j];
-      }
-    }
+    out.friction_by_x += outer(lever, normal_by_x);
+    out.by_x = out.friction_by_x + outer(n, normal_by_x);
+    if (at.curved) out.by_x += normal * at.hessian;
+    out.by_v = out.friction_by_v + outer(n, normal_by_v);
     if constexpr (derivatives > 1) {
-      const T sign = law.rolling ? T(-1) : T(1);  // ∂f*/∂X = sign k_s (1 − n nᵀ)
-      out.by_anchor = memory ? M3<T>((sign * law.ks) * project) : M3<T>(M3<T>::Zero());
-      out.friction_by_x = friction_by_x;
-      out.friction_by_v = friction_by_v;
-      out.slip_by_v = M3<T>::Identity() - n * n.transpose();
-      out.slip_by_x = M3<T>::Zero();
-      if (at.curved) out.slip_by_x = -(n * (at.hessian * v).transpose() + rate * at.hessian);
+      // ∂f*/∂X = ± k_s (1 − n nᵀ)
+      out.by_anchor = (law.rolling ? -memory : memory) * project;
+      out.slip_by_v = identity_minus_outer(n);
+      out.slip_by_x = zero33<L>();
+      if (at.curved) out.slip_by_x -= outer(n, at.hessian * v) + rate * at.hessian;
     }
   }
 }
 
 // The anchor after an accepted step, for a point that is inside (outside, the anchor is cleared).
-template <class T>
-V3<T> next_anchor(const PointLaw<T>& law, const PointForce<T>& f, const V3<T>& n, const V3<T>& x, const V3<T>& e,
-                  const V3<T>& anchor, bool anchored) {
-  if (f.slips) {
-    const V3<T> s = -(f.friction + law.kt * f.slip) / law.ks;
-    return law.rolling ? s : V3<T>(x - s);
-  }
-  if (law.rolling) return e - n.dot(e) * n;
-  return anchored ? anchor : x;
+template <class L>
+GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const PointForce<L>& f, const Vec3<L>& n, const Vec3<L>& x,
+                                   const Vec3<L>& e, const Vec3<L>& anchor, const Mask<L>& anchored) {
+  const L stiffness = select(law.ks > L(0.0), law.ks, L(1.0));  // of weight 0: what comes out is not used
+  const Vec3<L> s = -(L(1.0) / stiffness) * (f.friction + law.kt * f.slip);
+  if (law.rolling) return select3<L>(f.slips, s, e - dot(n, e) * n);
+  return select3<L>(f.slips, x - s, select3<L>(anchored, anchor, x));
 }
 
 // Gradient of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
-template <class T>
+template <class L>
 struct AnchorGradient {
-  V3<T> x = V3<T>::Zero(), v = V3<T>::Zero(), anchor = V3<T>::Zero();
+  Vec3<L> x, v, anchor;
 };
-template <class T>
-AnchorGradient<T> next_anchor_transposed(const PointLaw<T>& law, const PointForce<T>& f, bool anchored,
-                                         const V3<T>& lambda) {
-  AnchorGradient<T> g;
-  if (f.slips) {
-    const V3<T> scaled = (law.rolling ? T(-1) : T(1)) / law.ks * lambda;
-    g.x = f.friction_by_x.transpose() * scaled + law.kt * (f.slip_by_x.transpose() * scaled);
-    g.v = f.friction_by_v.transpose() * scaled + law.kt * (f.slip_by_v.transpose() * scaled);
-    g.anchor = f.by_anchor.transpose() * scaled;
-    if (!law.rolling) g.x += lambda;
-  } else if (law.rolling) {
-    const V3<T> projected = f.slip_by_v * lambda;  // 1 − n nᵀ, symmetric
-    if (anchored) {
-      g.v = law.h * projected;
-      g.anchor = projected;
-    }
-  } else if (anchored) {
-    g.anchor = lambda;
+template <class L>
+GELFLOW_INLINE AnchorGradient<L> next_anchor_transposed(const PointLaw<L>& law, const PointForce<L>& f,
+                                                        const Mask<L>& anchored, const Vec3<L>& lambda) {
+  const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one);
+  const Vec3<L> none = zero3<L>();
+  const Vec3<L> scaled = (law.rolling ? -one / stiffness : one / stiffness) * lambda;
+  AnchorGradient<L> g;
+  g.x = transposed_times(f.friction_by_x, scaled) + law.kt * transposed_times(f.slip_by_x, scaled);
+  g.v = transposed_times(f.friction_by_v, scaled) + law.kt * transposed_times(f.slip_by_v, scaled);
+  g.anchor = transposed_times(f.by_anchor, scaled);
+  if (law.rolling) {
+    const Vec3<L> kept = select3<L>(anchored, f.slip_by_v * lambda, none);  // 1 − n nᵀ, symmetric
+    g.x = select3<L>(f.slips, g.x, none);
+    g.v = select3<L>(f.slips, g.v, law.h * kept);
+    g.anchor = select3<L>(f.slips, g.anchor, kept);
   } else {
-    g.x = lambda;
+    g.x = select3<L>(f.slips, g.x + lambda, select3<L>(anchored, none, lambda));
+    g.v = select3<L>(f.slips, g.v, none);
+    g.anchor = select3<L>(f.slips, g.anchor, select3<L>(anchored, lambda, none));
   }
   return g;
 }

@@ -74,44 +74,120 @@ PairFrame<T> pair_frame(const T* params, int first, const Shape& shape, const Wo
   return f;
 }
 
-// Calls visit(i) for every point that may be inside the shape grown by `margin`, skip(begin, end) for runs that can not.
-template <class T, class Visit, class Skip>
-GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, double margin, Visit&& visit,
-                                    Skip&& skip) {
+// Calls visit(i) for every point that may be inside the shape grown by `margin`.
+template <class T, class Visit>
+GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, double margin, Visit&& visit) {
   for (const auto& group : cloud.groups) {
-    if (!f.may_reach(group.center, group.radius + margin)) {
-      skip(cloud.leaves[group.begin].begin, cloud.leaves[group.end - 1].end);
-      continue;
-    }
+    if (!f.may_reach(group.center, group.radius + margin)) continue;
     for (int l = group.begin; l < group.end; ++l) {
       const auto& leaf = cloud.leaves[l];
-      if (!f.may_reach(leaf.center, leaf.radius + margin)) {
-        skip(leaf.begin, leaf.end);
-        continue;
-      }
+      if (!f.may_reach(leaf.center, leaf.radius + margin)) continue;
       for (int i = leaf.begin; i < leaf.end; ++i) {
-        if (f.may_reach(cloud.points[i], margin)) {
-          visit(i);
-        } else {
-          skip(i, i + 1);
-        }
+        if (f.may_reach(cloud.points[i], margin)) visit(i);
       }
     }
   }
 }
 
+// Up to pack_width points that are looked at together; `inside` tells which of them touch.
 template <class T>
-PointLaw<T> law_numbers(const T* p, FrictionLaw law, DampingLaw damping, const T& h) {
-  return {p[0], p[1], p[2], p[3], p[4], damping, law == FrictionLaw::elastic, false, h};
+struct Touching {
+  using L = Pack<T>;
+  int count = 0;
+  int index[pack_width<T>];  // in the cloud's order
+  Mask<L> inside;
+  PointLaw<L> law;  // of weight 0 where a point does not touch
+  Distance<L> at;
+  Vec3<L> center, x;  // the point itself, or the centre of a rolling sphere; the point that touches
+  Vec3<L> v;          // relative to the shape
+  Vec3<L> anchor, e;
+  Mask<L> remembers;  // has an anchor
+
+  template <class F>
+  GELFLOW_INLINE void for_each_inside(F&& f) const {
+    for (int k = 0; k < count; ++k) {
+      if (is_set(inside, k)) f(k, index[k]);
+    }
+  }
+};
+
+// What the points of one cloud need besides their places.
+template <class T>
+struct TouchRule {
+  const T* params;  // kn, kt, mu, kd, ks
+  FrictionLaw law;
+  DampingLaw damping;
+  T h;
+  double rolling_radius;         // 0: the points themselves touch
+  const V3<T>* anchors;          // of this cloud against this shape
+  const std::uint8_t* anchored;  // both unused under the viscous law
+};
+
+template <class T>
+GELFLOW_INLINE PointLaw<Pack<T>> weighted(const TouchRule<T>& rule, const Pack<T>& weight) {
+  using L = Pack<T>;
+  const T* p = rule.params;
+  const bool elastic = rule.law == FrictionLaw::elastic;
+  return {weight * L(p[0]), weight * L(p[1]), L(p[2]), weight * L(p[3]),       weight * L(p[4]),
+          L(rule.h),        rule.damping,     elastic, rule.rolling_radius > 0};
 }
+
+// Calls f(touching) for all points that are inside the shape, a pack at a time.
+template <class T, class F>
+void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  Touching<T> t;
+  const bool elastic = rule.law == FrictionLaw::elastic;
+  const auto flush = [&]() __attribute__((noinline)) {
+    L weight(0.0), remembers(0.0);
+    Vec3<L> local = zero3<L>();
+    t.anchor = zero3<L>();
+    for (int k = 0; k < width; ++k) {
+      const int i = t.index[k < t.count ? k : 0];
+      set_lane3<T>(local, k, cloud.points[i].template cast<T>());
+      set_lane(weight, k, k < t.count ? T(cloud.weights[i]) : T(0));
+      if (elastic && rule.anchored[i]) {
+        set_lane3<T>(t.anchor, k, rule.anchors[i]);
+        set_lane(remembers, k, T(1));
+      }
+    }
+    t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
+    if (rule.rolling_radius > 0) t.x.z -= L(T(rule.rolling_radius));  // planes only: n = z
+    distance<L>(frame.kind, frame.size, t.x, t.at);
+    t.inside = t.at.d < L(0.0) && weight > L(0.0);
+    if (any(t.inside)) {
+      t.law = weighted<T>(rule, select(t.inside, weight, L(0.0)));
+      t.v = spread<L>(frame.linear) + cross(spread<L>(frame.angular), t.x);
+      t.remembers = remembers > L(0.0);
+      t.e = anchor_offset<L>(t.law, t.x, t.v, t.anchor, t.remembers);
+      f(static_cast<const Touching<T>&>(t));
+    }
+    t.count = 0;
+  };
+  for_near_points<T>(frame, cloud, rule.rolling_radius, [&](int i) {
+    t.index[t.count++] = i;
+    if (t.count == width) flush();
+  });
+  if (t.count > 0) flush();
+}
+
+// The anchors of one cloud after an accepted step; `next` and `next_set` may be the arrays that are read.
 template <class T>
-PointLaw<T> weighted(PointLaw<T> law, double weight) {
-  const T w = T(weight);
-  law.kn *= w;
-  law.kt *= w;
-  law.kd *= w;
-  law.ks *= w;
-  return law;
+void advance_anchors(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
+                     std::vector<std::pair<int, V3<T>>>& kept, V3<T>* next, std::uint8_t* next_set) {
+  kept.clear();
+  for_touching_points<T>(frame, cloud, rule, [&](const Touching<T>& t) {
+    PointForce<Pack<T>> force;
+    point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.at.n, t.x, t.e, t.anchor, t.remembers);
+    t.for_each_inside([&](int k, int i) { kept.emplace_back(i, lane3<T>(anchor, k)); });
+  });
+  std::fill(next_set, next_set + cloud.size(), 0);
+  for (const auto& [i, anchor] : kept) {
+    next[i] = anchor;
+    next_set[i] = 1;
+  }
 }
 
 // The dofs of a pair in the shape's frame, signs applied: δξ = Σ S_j δq_j, δV = Σ (Y_j δq_j + S_j δv_j).
@@ -142,6 +218,32 @@ void pull_back(const PairDofs& pair, const PairColumns<T>& c, const V6<T>& by_po
     by_q[pair.dof[i]] += c.s[i].dot(by_pose) + c.y[i].dot(by_twist);
     by_v[pair.dof[i]] += c.s[i].dot(by_twist);
   }
+}
+
+// The reverse of `advance_anchors`: gradients of the anchors after the step go to the relative pose and twist and to the
+// anchors before.
+template <class T>
+void anchors_transposed(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
+                        const V3<T>* by_next, V6<T>& by_pose, V6<T>& by_twist, V3<T>* by_anchor) {
+  using L = Pack<T>;
+  Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
+  for_touching_points<T>(frame, cloud, rule, [&](const Touching<T>& t) {
+    PointForce<L> force;
+    point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+    Vec3<L> lambda = zero3<L>();
+    t.for_each_inside([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
+    const AnchorGradient<L> g = next_anchor_transposed(t.law, force, t.remembers, lambda);
+    const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
+    turn += cross(t.center, by_point);
+    shift += by_point;
+    spin += cross(t.x, g.v);
+    slide += g.v;
+    t.for_each_inside([&](int k, int i) {
+      if (is_set(t.remembers, k)) by_anchor[i] += lane3<T>(g.anchor, k);
+    });
+  });
+  by_pose += stack<T>(sum3<T>(turn), sum3<T>(shift));
+  by_twist += stack<T>(sum3<T>(spin), sum3<T>(slide));
 }
 
 }  // namespace gelflow

@@ -1,87 +1,70 @@
-// Signed distance of a point to a shape, in the shape's frame: d < 0 inside, n = ∇d, H = ∇²d. Nothing else.
+// Signed distance of points to a shape, in the shape's frame: d < 0 inside, n = ∇d, H = ∇²d. Nothing else.
 //
-// Where a distance has no gradient (a sphere's centre, a box's medial surface) one branch is taken, always the same:
-// +x at a sphere's centre; inside a box the face with the largest (least negative) distance, x before y before z.
+// Only what is inside is touched, so the distance is exact inside; outside it has the right sign. Where a distance has
+// no gradient (a sphere's centre, a box's medial surface) one branch is taken, always the same: +x at a sphere's centre;
+// inside a box the face with the largest (least negative) distance, x before y before z.
 #pragma once
 
+#include "lanes.hpp"
 #include "model.hpp"
 
 namespace gelflow {
 
-template <class T>
+template <class L>
 struct Distance {
-  T d;
-  V3<T> n;
-  M3<T> hessian;  // only written where curved
-  bool curved;
+  L d;
+  Vec3<L> n;
+  Mat3<L> hessian;  // only written where curved
+  bool curved;      // of the shape's kind, the same for all its points
 };
 
-template <class T>
-GELFLOW_INLINE void plane_distance(const V3<T>& x, Distance<T>& out) {  // the half space z < 0
-  out.d = x[2];
-  out.n = V3<T>(T(0), T(0), T(1));
+template <class L>
+GELFLOW_INLINE void plane_distance(const Vec3<L>& x, Distance<L>& out) {  // the half space z < 0
+  out.d = x.z;
+  out.n = {L(0.0), L(0.0), L(1.0)};
   out.curved = false;
 }
 
-template <class T>
-GELFLOW_INLINE void sphere_distance(const V3<T>& x, const T& radius, Distance<T>& out) {
+template <class L>
+GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<L>& out) {
   using std::sqrt;
-  const T squared = x.squaredNorm();
-  if (real_part(squared) < 1e-30) {
-    out.d = -radius;
-    out.n = V3<T>(T(1), T(0), T(0));
-    out.curved = false;
-    return;
-  }
-  const T length = sqrt(squared);
-  out.d = length - radius;
-  out.n = x / length;
+  const L zero(0.0), one(1.0), squared = dot(x, x);
+  const Mask<L> center = squared < L(1e-30);
+  const L length = sqrt(select(center, one, squared)), inverse = one / length;
+  out.d = select(center, -radius, length - radius);
+  out.n = select3<L>(center, Vec3<L>{one, zero, zero}, inverse * x);
+  out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
   out.curved = true;
-  out.hessian = (M3<T>::Identity() - out.n * out.n.transpose()) / length;
 }
 
-template <class T>
-void box_distance(const V3<T>& x, const V3<T>& half, Distance<T>& out) {
-  using std::sqrt;
-  V3<T> sign, outside;
-  int beyond = 0, deepest = 0;
+template <class L>
+GELFLOW_INLINE void box_distance(const Vec3<L>& x, const Vec3<L>& half, Distance<L>& out) {
+  const L zero(0.0), one(1.0);
+  Vec3<L> sign, beyond;  // of the faces on the point's side
   for (int a = 0; a < 3; ++a) {
-    sign[a] = x[a] < T(0) ? T(-1) : T(1);
-    outside[a] = sign[a] * x[a] - half[a];
-    if (outside[a] > T(0)) ++beyond;
-    if (outside[a] > outside[deepest]) deepest = a;
+    sign[a] = select(x[a] < zero, -one, one);
+    beyond[a] = sign[a] * x[a] - half[a];
   }
-  if (beyond <= 1) {  // inside, or in front of one face
-    out.d = outside[deepest];
-    out.n = V3<T>::Zero();
-    out.n[deepest] = sign[deepest];
-    out.curved = false;
-    return;
-  }
-  V3<T> excess;
-  for (int a = 0; a < 3; ++a) excess[a] = outside[a] > T(0) ? outside[a] : T(0);
-  out.d = sqrt(excess.squaredNorm());
-  out.n = excess.cwiseProduct(sign) / out.d;
-  out.curved = true;
-  out.hessian = -out.n * out.n.transpose();
-  for (int a = 0; a < 3; ++a) {
-    if (outside[a] > T(0)) out.hessian(a, a) += T(1);
-  }
-  out.hessian /= out.d;
+  const Mask<L> y = beyond.y > beyond.x;
+  const L larger = select(y, beyond.y, beyond.x);
+  const Mask<L> z = beyond.z > larger;
+  out.d = select(z, beyond.z, larger);
+  out.n = {select(y || z, zero, sign.x), select(z, zero, select(y, sign.y, zero)), select(z, sign.z, zero)};
+  out.curved = false;
 }
 
-template <class T>
-GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const V3<T>& x, Distance<T>& out) {
+template <class L, class T>
+GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const Vec3<L>& x, Distance<L>& out) {
   if (kind == ShapeKind::box) {
-    box_distance<T>(x, V3<T>(size[0], size[1], size[2]), out);
+    box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
   } else if (kind == ShapeKind::sphere) {
-    sphere_distance<T>(x, size[0], out);
+    sphere_distance<L>(x, L(size[0]), out);
   } else {
-    plane_distance<T>(x, out);
+    plane_distance<L>(x, out);
   }
 }
 
-// The distance alone, for culling.
+// The distance alone, right on both sides, for culling.
 template <class T>
 GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const V3<T>& x) {
   using std::sqrt;

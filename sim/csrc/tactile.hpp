@@ -9,29 +9,12 @@
 
 namespace gelflow {
 
-// Calls f(slot, i, x, law, distance, v, e, anchor, remembers) for every marker of the pad inside shape number s.
-template <class T, class F, class Skip>
-void for_touched_markers(const Pad& pad, int s, const T* params, const T& h, const PairFrame<T>& frame,
-                         const V3<T>* anchors, const std::uint8_t* anchored, F&& f, Skip&& outside) {
-  const PointLaw<T> numbers = law_numbers<T>(params + pad.param, pad.law, DampingLaw::depth, h);
-  const int slot = pad.anchor + s * pad.cloud.size();
-  Distance<T> at;
-  for_near_points<T>(
-      frame, pad.cloud, 0.0,
-      [&](int i) {
-        const V3<T> x = frame.point(pad.cloud.points[i]);
-        distance<T>(frame.kind, frame.size, x, at);
-        if (!(at.d < T(0))) {
-          outside(i, i + 1);
-          return;
-        }
-        const PointLaw<T> law = weighted<T>(numbers, pad.cloud.weights[i]);
-        const V3<T> v = frame.velocity(x);
-        const bool remembers = numbers.elastic && anchored[slot + i];
-        const V3<T> anchor = remembers ? anchors[slot + i] : V3<T>(V3<T>::Zero());
-        f(slot + i, i, x, law, at, v, anchor_offset<T>(law, x, v, anchor, remembers), anchor, remembers);
-      },
-      outside);
+// The markers of a pad against the shape number s of those it feels.
+template <class T>
+TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const T& h, const V3<T>* anchors,
+                        const std::uint8_t* anchored) {
+  const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
+  return {params + pad.param, pad.law, DampingLaw::depth, h, 0.0, anchors + slot, anchored + slot};
 }
 
 // Readings of all markers, shape (markers, 3); needs the kinematics of (q, v) in w.
@@ -39,45 +22,38 @@ template <class T>
 void read_markers(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
                   const Workspace<T>& w, T* out) {
   std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
-  PointForce<T> force;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
-      for_touched_markers<T>(
-          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
-          [&](int, int i, const V3<T>&, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v, const V3<T>& e,
-              const V3<T>&, bool remembers) {
-            point_force<0, T>(law, at, v, e, remembers, force);
-            const V3<T> local =
-                pad.frames[i].template cast<T>().transpose() * (frame.rotation.transpose() * force.force);
-            T* reading = out + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
-            reading[0] += local[0];
-            reading[1] += local[1];
-            reading[2] -= local[2];
-          },
-          [](int, int) {});
+      for_touching_points<T>(
+          frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), [&](const Touching<T>& t) {
+            PointForce<Pack<T>> force;
+            point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+            const Vec3<Pack<T>> in_body = transposed_times(spread<Pack<T>>(frame.rotation), force.force);
+            t.for_each_inside([&](int k, int i) {
+              const V3<T> f = lane3<T>(in_body, k);
+              const M3<double>& axes = pad.frames[i];
+              T* reading = out + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
+              for (int a = 0; a < 3; ++a) {
+                const T component = T(axes(0, a)) * f[0] + T(axes(1, a)) * f[1] + T(axes(2, a)) * f[2];
+                reading[a] += a < 2 ? component : T(-component);
+              }
+            });
+          });
     }
   }
 }
 
 template <class T>
 void advance_marker_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                            const std::uint8_t* anchored, const Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
-  PointForce<T> force;
+                            const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
-      const int base = pad.anchor + static_cast<int>(s) * pad.cloud.size();
-      for_touched_markers<T>(
-          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
-          [&](int slot, int, const V3<T>& x, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-              const V3<T>& e, const V3<T>& anchor, bool remembers) {
-            point_force<0, T>(law, at, v, e, remembers, force);
-            next[slot] = next_anchor<T>(law, force, at.n, x, e, anchor, remembers);
-            next_set[slot] = 1;
-          },
-          [&](int begin, int end) { std::fill(next_set + base + begin, next_set + base + end, 0); });
+      const std::size_t slot = pad.anchor + s * pad.cloud.size();
+      advance_anchors<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), w.kept, next + slot,
+                         next_set + slot);
     }
   }
 }
@@ -88,28 +64,35 @@ template <class T>
 void read_markers_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
                              const std::uint8_t* anchored, const Workspace<T>& w, const T* by_reading, VX<T>& by_q,
                              VX<T>& by_v, V3<T>* by_anchor) {
-  PointForce<T> force;
+  using L = Pack<T>;
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
-      V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-      for_touched_markers<T>(
-          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
-          [&](int slot, int i, const V3<T>& x, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-              const V3<T>& e, const V3<T>&, bool remembers) {
-            const T* g = by_reading + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
-            if (g[0] == T(0) && g[1] == T(0) && g[2] == T(0)) return;
-            point_force<2, T>(law, at, v, e, remembers, force);
-            const V3<T> by_force = frame.rotation * (pad.frames[i].template cast<T>() * V3<T>(g[0], g[1], -g[2]));
-            const V3<T> by_velocity = force.by_v.transpose() * by_force;
-            const V3<T> by_point = force.by_x.transpose() * by_force - cross<T>(frame.angular, by_velocity);
-            by_pose +=
-                stack<T>(cross<T>(x, by_point) + cross<T>(by_force, force.force), by_point);  // the axes turn too
-            by_twist += stack<T>(cross<T>(x, by_velocity), by_velocity);
-            if (remembers) by_anchor[slot] += force.by_anchor.transpose() * by_force;
-          },
-          [](int, int) {});
+      Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
+      V3<T>* const by_own = pad.anchor < 0 ? nullptr : by_anchor + pad.anchor + s * pad.cloud.size();
+      for_touching_points<T>(
+          frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), [&](const Touching<T>& t) {
+            Vec3<L> by_force = zero3<L>();
+            t.for_each_inside([&](int k, int i) {
+              const T* g = by_reading + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
+              const V3<T> in_body = pad.frames[i].template cast<T>() * V3<T>(g[0], g[1], -g[2]);
+              set_lane3<T>(by_force, k, V3<T>(frame.rotation * in_body));
+            });
+            PointForce<L> force;
+            point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+            const Vec3<L> by_velocity = transposed_times(force.by_v, by_force);
+            const Vec3<L> by_point =
+                transposed_times(force.by_x, by_force) - cross(spread<L>(frame.angular), by_velocity);
+            turn += cross(t.x, by_point) + cross(by_force, force.force);  // the axes turn too
+            shift += by_point;
+            spin += cross(t.x, by_velocity);
+            slide += by_velocity;
+            if (by_own == nullptr) return;
+            const Vec3<L> by = transposed_times(force.by_anchor, by_force);
+            t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
+          });
+      const V6<T> by_pose = stack<T>(sum3<T>(turn), sum3<T>(shift)), by_twist = stack<T>(sum3<T>(spin), sum3<T>(slide));
       pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
@@ -121,25 +104,15 @@ template <class T>
 void marker_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
                                const std::uint8_t* anchored, const Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q,
                                VX<T>& by_v, V3<T>* by_anchor) {
-  PointForce<T> force;
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const std::size_t slot = pad.anchor + s * pad.cloud.size();
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-      for_touched_markers<T>(
-          pad, static_cast<int>(s), params, h, frame, anchors, anchored,
-          [&](int slot, int, const V3<T>& x, const PointLaw<T>& law, const Distance<T>& at, const V3<T>& v,
-              const V3<T>& e, const V3<T>&, bool remembers) {
-            point_force<2, T>(law, at, v, e, remembers, force);
-            const AnchorGradient<T> g = next_anchor_transposed<T>(law, force, remembers, by_next[slot]);
-            const V3<T> by_point = g.x - cross<T>(frame.angular, g.v);
-            by_pose += stack<T>(cross<T>(x, by_point), by_point);
-            by_twist += stack<T>(cross<T>(x, g.v), g.v);
-            if (remembers) by_anchor[slot] += g.anchor;
-          },
-          [](int, int) {});
+      anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), by_next + slot,
+                            by_pose, by_twist, by_anchor + slot);
       pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <Eigen/LU>
+#include <utility>
 #include <vector>
 
 #include "model.hpp"
@@ -59,6 +60,8 @@ struct Workspace {
   MX<T> tangent;                 // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t
   VX<T> q;                       // q_t of the trial velocity
   Eigen::PartialPivLU<MX<T>> lu;
+
+  std::vector<std::pair<int, V3<T>>> kept;  // anchors in the making (pair.hpp)
 };
 
 }  // namespace gelflow

@@ -105,6 +105,7 @@ class InsertionAttempts:
         self._outline = np.array([right.pose.pos[0] - right.size[0], back.pose.pos[1] - back.size[1]])
         self.pose: Array = np.zeros((num_envs, 3))
         self._noise: Array = np.zeros(num_envs)
+        self._stop_shear: Array = np.full(num_envs, np.inf)
         # The part at rest in the grasp: state, controls, and what the pads feel then.
         self._u: Array = np.zeros((num_envs, self.scene.nu))
         self._held: dict[str, NDArray[Any]] = {
@@ -125,7 +126,7 @@ class InsertionAttempts:
         drawn = self.randomization.draw(rng, self.num_envs, elastic=self.scene.friction == "elastic")
         for name, values in drawn.params.items():
             self.sim.param(name)[:] = values
-        self._noise = drawn.noise
+        self._noise, self._stop_shear = drawn.noise, drawn.stop_shear
         self.pose = self.task.draw_misalignment(rng, self.num_envs)
         if misalignment is not None:
             self.pose = np.array(np.broadcast_to(misalignment, self.pose.shape), dtype=float)
@@ -157,22 +158,34 @@ class InsertionAttempts:
         self._held["tactile"][:] = sim.tactile()[..., :2]
 
     def attempt(self, rng: np.random.Generator) -> AttemptResult:
-        """One attempt of every environment from its `pose`."""
+        """One attempt of every environment from its `pose`.
+
+        As on the robot, touch stops the descent: frames due later are what was felt then.
+        """
         sim, z = self.sim, self._arm_u[2]
         u = self._place(rng)
         start = u[:, z].copy()
-        readings = {0: self._held["tactile"]}
+        felt = self._held["tactile"]
+        readings = {0: felt}
+        stopped = np.zeros(self.num_envs, dtype=bool)
         for step in range(1, self._steps + 1):
             u[:, z] = start - self.task.descent * step / self._steps
             sim.step(u)
-            if step == self._reference_at or step in self._frames:
-                readings[step] = sim.tactile()[..., :2].copy()
-        noisy = {step: self._with_noise(reading, rng) for step, reading in readings.items()}
+            felt = readings[step] = np.where(stopped[:, None, None], felt, sim.tactile()[..., :2])
+            if step > self._reference_at:
+                stopped |= self._mean_shear(felt - readings[self._reference_at]) > self._stop_shear
+        noisy = {step: self._with_noise(readings[step], rng) for step in sorted({self._reference_at, *self._frames})}
         stack = np.stack([noisy[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, noisy[self._reference_at], floor=DEFAULT_FLOORS["N"])
         height, inserted = self._outcome()
         failed = sim.status != 0
-        return AttemptResult(image.astype(np.float32), divisor, height, inserted & ~failed, failed)
+        inserted &= ~failed & ~stopped
+        return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed)
+
+    def _mean_shear(self, change: NDArray[Any]) -> Array:
+        """Mean change of shear along the finger, of the pad where it is larger [N]; shape (N,)."""
+        along = change[..., 0].reshape(self.num_envs, len(PADS), -1)
+        return np.asarray(np.abs(along.mean(2)).max(1))
 
     def _place(self, rng: np.random.Generator) -> Array:
         """Put what each gripper holds at its pose, the lower face at its start height; returns the controls there."""
@@ -218,6 +231,7 @@ class InsertionAttempts:
         self.sim.params[rows] = other.sim.params[other_rows]
         self.pose[rows] = other.pose[other_rows]
         self._noise[rows] = other._noise[other_rows]
+        self._stop_shear[rows] = other._stop_shear[other_rows]
         self._u[rows] = other._u[other_rows]
         for name, values in self._held.items():
             values[rows] = other._held[name][other_rows]

@@ -27,6 +27,7 @@ class Drawn:
     params: dict[str, Array]  # simulator parameter → values, shape (N,)
     grasp_force: Array  # of each finger [N]
     grasp_height: Array  # of the pads' centres above the part's [m]
+    stop_shear: Array  # mean shear along the finger at which touch stops a descent [N per marker]
     noise: Array  # standard deviation of a marker's force [N]
 
 
@@ -49,7 +50,9 @@ class Randomization:
     hole_kn: Range = (2.5e3, 2e4)  # part against hole, log [N/m]: how hard both are
     hole_mu: Range = (0.3, 1.5)  # printed plastic is smoother than the 1.5 of the published scene
     # A servo of 200 N/m is the published arm; a robot yields hundreds of times less. Log [N/m].
-    arm_stiffness: Range = (200.0, 1e5)
+    arm_stiffness: Range = (200.0, 3e5)
+    # A robot stops at a displacement of the markers; how many newtons that is depends on the gel. Log [N].
+    stop_shear: Range = (5e-3, 0.1)
     noise: Range = (1e-5, 1e-3)  # of a marker's force, log [N]: from the published 1e-5 to a tracked image's
 
     def __post_init__(self) -> None:
@@ -83,7 +86,9 @@ class Randomization:
         for arm, scale in (("arm_x", 1.0), ("arm_y", 1.0), ("arm_z", 1.0), ("arm_yaw", 0.05)):
             params[f"{arm}.kp"] = stiffness * scale
             params[f"{arm}.kd"] = stiffness * scale / 200
-        return Drawn(params, uniform(self.grasp_force), uniform(self.grasp_height), log(self.noise))
+        return Drawn(
+            params, uniform(self.grasp_force), uniform(self.grasp_height), log(self.stop_shear), log(self.noise)
+        )
 
 
 TABLE_7 = Randomization()
@@ -105,5 +110,6 @@ NOMINAL = Randomization(
     hole_kn=(5e3, 5e3),
     hole_mu=(1.5, 1.5),
     arm_stiffness=(1e5, 1e5),
+    stop_shear=(0.1, 0.1),
     noise=(1e-5, 1e-5),
 )
