@@ -14,6 +14,7 @@ from pathlib import Path
 from gelflow import __version__
 from gelflow.cli.bench import EVERY, SIDES, plain
 from gelflow.errors import GelflowError
+from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark import processor, rolling_speed
 
 RESULTS = Path(__file__).parent / "results"
@@ -21,7 +22,7 @@ RESULTS = Path(__file__).parent / "results"
 
 def versions() -> dict[str, str]:
     """Of gelflow, Python, and what the run goes through."""
-    found = {"gelflow": __version__, "python": platform.python_version(), "system": platform.platform()}
+    found = {"gelflow": __version__, "core": LEVEL, "python": platform.python_version(), "system": platform.platform()}
     for package in ("numpy", "mujoco"):
         try:
             found[package] = version(package)

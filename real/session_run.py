@@ -1,6 +1,7 @@
 """A whole run, as the command line and the demo call it: open, preflight, insert, record, close; or a dry run."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,7 +115,8 @@ def runner_parts(cell: Cell) -> tuple[Supervisor, Mover]:
     return supervisor, mover
 
 
-def _recording(plan: RunPlan, *, dry_run: bool) -> SessionRecorder:
+@contextmanager
+def _recording(plan: RunPlan, *, dry_run: bool) -> Iterator[SessionRecorder]:
     mounts = [plan.lab.cameras.left.mount, plan.lab.cameras.right.mount]
     description = describe_session(
         task=plan.task,
@@ -125,6 +127,6 @@ def _recording(plan: RunPlan, *, dry_run: bool) -> SessionRecorder:
         clock_factor=plan.lab.clock_factor,
         dry_run=dry_run,
     )
-    recorder = SessionRecorder(plan.session, plan.lab.clock).open()
-    recorder.metadata(description)
-    return recorder
+    with SessionRecorder(plan.session, plan.lab.clock).open() as recorder:
+        recorder.metadata(description)
+        yield recorder

@@ -6,8 +6,9 @@ GELFLOW_CORE=base takes the build for any processor, for comparing; GELFLOW_CORE
 import importlib
 import os
 
-from gelflow.errors import UsageError
 from gelflow.sim._core_processor import runs_v3
+
+from gelflow.errors import UsageError
 
 _wanted = os.environ.get("GELFLOW_CORE") or ("v3" if runs_v3() else "base")
 if _wanted not in ("base", "v3"):

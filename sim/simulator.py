@@ -132,11 +132,12 @@ class Simulator:
 
     def _controls(self, u: ArrayLike) -> NDArray[Any]:
         array = np.asarray(u, dtype=self.dtype)
-        if array.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
-            raise UsageError(
-                f"u must have shape ({self.num_envs}, {self.model.nu}) or ({self.model.nu},), got {array.shape}"
-            )
-        return np.ascontiguousarray(np.broadcast_to(array, (self.num_envs, self.model.nu)))
+        full = (self.num_envs, self.model.nu)
+        if array.shape != full:
+            if array.shape != full[1:]:
+                raise UsageError(f"u must have shape {full} or ({full[1]},), got {array.shape}")
+            array = np.repeat(array[np.newaxis], self.num_envs, axis=0)
+        return np.ascontiguousarray(array)
 
     def check(self) -> None:
         """Raises SimulationError when an environment has failed, naming the first."""

@@ -1,6 +1,10 @@
 """Batches: the same bits whatever the company, clear errors for what is not finite, and failures that stay at home."""
 
+import os
 import re
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -227,3 +231,54 @@ def test_single_precision_follows_double(name: str, friction: str) -> None:
     reading = double.tactile()
     np.testing.assert_allclose(single.tactile(), reading, atol=1e-3 * np.abs(reading).max())
     assert reading.any()
+
+
+def test_single_precision_follows_double_in_a_grasp(insertion: Scene) -> None:
+    double, single = (started(insertion, list(range(ENVS)), precision=p) for p in ("double", "single"))
+    for u in controls(insertion):
+        for sim in (double, single):
+            sim.step(u)
+            sim.check()
+    np.testing.assert_allclose(single.q, double.q, atol=1e-5)
+    np.testing.assert_allclose(single.v, double.v, atol=2e-3)
+    reading = double.tactile()
+    np.testing.assert_allclose(single.tactile(), reading, atol=5e-3 * np.abs(reading).max())
+
+
+BUILDS = """
+import sys
+import numpy as np
+from gelflow.sim import _core
+from gelflow.sim.scene import load_scene
+from gelflow.sim.simulator import Simulator
+
+assert _core.LEVEL == "base"
+scene = load_scene("insertion", friction=sys.argv[1])
+sim = Simulator(scene)
+sim.q[0] = scene.q0
+for u in np.load(sys.argv[2]):
+    sim.step(u)
+np.savez(sys.argv[3], q=sim.q, tactile=sim.tactile())
+"""
+
+
+def test_the_build_for_any_processor_computes_the_same(insertion: Scene, tmp_path: Path) -> None:
+    u = controls(insertion)[:, 0]
+    np.save(tmp_path / "u.npy", u)
+    command = [sys.executable, "-c", BUILDS, insertion.friction, tmp_path / "u.npy", tmp_path / "end.npz"]
+    subprocess.run(command, env={**os.environ, "GELFLOW_CORE": "base"}, check=True)
+    sim = Simulator(insertion)
+    sim.q[0] = insertion.q0
+    for now in u:
+        sim.step(now)
+    other = np.load(tmp_path / "end.npz")
+    np.testing.assert_allclose(sim.q, other["q"], atol=1e-9)
+    np.testing.assert_allclose(sim.tactile(), other["tactile"], atol=1e-6)
+
+
+@pytest.mark.parametrize(("wanted", "says"), [("fast", "must be base or v3"), ("", "")])
+def test_a_build_that_is_not_there_is_told(wanted: str, says: str) -> None:
+    command = [sys.executable, "-c", "import gelflow.sim._core"]
+    run = subprocess.run(command, env={**os.environ, "GELFLOW_CORE": wanted}, capture_output=True, text=True)
+    assert (run.returncode == 0) == (not says)
+    assert says in run.stderr

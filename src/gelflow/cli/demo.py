@@ -23,10 +23,12 @@ from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
+    from gelflow.policies.networks import NetworkPolicy
     from gelflow.protocols import Policy
     from gelflow.real.runner import Attempt, Insertion
 
 _START_LIMIT = 60.0  # for the mock robot to be up [s, wall]
+_COMPARED = 100  # parts in simulation alone
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -75,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
     console.print(
         f"inserted: {said} of {count} as the robot says, {true} of {count} in truth; {done.wall:.0f} s in all."
     )
+    with console.status("the same policy in simulation alone"):
+        console.print(in_simulation(policy), soft_wrap=True)
     console.print(f"pictures of what the policy saw: {args.out}/insertion-*.png", soft_wrap=True)
     console.print(f"the session is {session}; make its decisions again with:", soft_wrap=True)
     console.print(f"  gelflow replay {session}", soft_wrap=True)
@@ -188,6 +192,21 @@ def table(done: Demonstration, title: str) -> Table:
             style=None if inside and one.result.inserted else "red",
         )
     return view
+
+
+def in_simulation(policy: "NetworkPolicy") -> str:
+    """How the policy does without wires and cameras, and what luck would do: the figures that the demo's compare to."""
+    from gelflow.policies.attempts import NetworkActor, RandomActor, evaluate
+    from gelflow.policies.simulation import simulated
+
+    attempts = simulated(_COMPARED)
+    reach = policy.network.architecture.reach
+    ways = (NetworkActor(policy.network, _COMPARED), RandomActor(reach, _COMPARED, 0))
+    own, random = (evaluate("", way, attempts, episodes=_COMPARED, seed=1) for way in ways)
+    return (
+        f"in simulation alone, {_COMPARED} parts: this policy {own.success:.0%} in {own.attempts:.1f} attempts,"
+        f" random corrections {random.success:.0%}."
+    )
 
 
 @contextlib.contextmanager
