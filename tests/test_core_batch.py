@@ -265,7 +265,7 @@ np.savez(sys.argv[3], q=sim.q, tactile=sim.tactile())
 def test_the_build_for_any_processor_computes_the_same(insertion: Scene, tmp_path: Path) -> None:
     u = controls(insertion)[:, 0]
     np.save(tmp_path / "u.npy", u)
-    command = [sys.executable, "-c", BUILDS, insertion.friction, tmp_path / "u.npy", tmp_path / "end.npz"]
+    command = [sys.executable, "-c", BUILDS, insertion.friction, str(tmp_path / "u.npy"), str(tmp_path / "end.npz")]
     subprocess.run(command, env={**os.environ, "GELFLOW_CORE": "base"}, check=True)
     sim = Simulator(insertion)
     sim.q[0] = insertion.q0
