@@ -88,8 +88,8 @@ class Touch:
         """For each depth [m] the reading nearest to it; where the descent was stopped before, the last one."""
         if not self.readings:
             raise Unreadable("no frame of the descent could be read; look at the gels")
-        found = np.array([reading.depth for reading in self.readings])
-        return [self.readings[int(np.abs(found - min(depth, found[-1])).argmin())] for depth in depths]
+        found = np.array([reading.depth for reading in reversed(self.readings)])  # of equal depths the newest counts
+        return [self.readings[-1 - int(np.abs(found - min(depth, found[0])).argmin())] for depth in depths]
 
     def observe(self, frames: Sequence[Reading], task: InsertionTask) -> FlowMap:
         """The flow map of chosen readings against the reference."""
