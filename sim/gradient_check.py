@@ -30,18 +30,23 @@ class Agreement:
     left_out: float  # share of stencils left out for crossing a branch (0 for dual numbers)
 
 
-def free_joints(model: Any) -> list[tuple[int, int]]:
-    """(first position, first velocity) of each free joint."""
+def turning_joints(model: Any) -> list[tuple[int, int]]:
+    """(first number of the quaternion, first angular velocity) of each ball and free joint."""
     ends = [*list(model.joint_q)[1:], model.nq]
-    return [(q, v) for q, v, end in zip(model.joint_q, model.joint_v, ends, strict=True) if end - q == 7]
+    widths = [end - q for q, end in zip(model.joint_q, ends, strict=True)]
+    return [
+        (q + width - 4, v + width - 4)  # a free joint has three plain positions before
+        for q, v, width in zip(model.joint_q, model.joint_v, widths, strict=True)
+        if width >= 4
+    ]
 
 
 def _straight(model: Any) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which positions and which velocities are plain numbers: all but the quaternions and their angular velocities."""
     straight_q, straight_v = np.ones(model.nq, bool), np.ones(model.nv, bool)
-    for at_q, at_v in free_joints(model):
-        straight_q[at_q + 3 : at_q + 7] = False
-        straight_v[at_v + 3 : at_v + 6] = False
+    for at_q, at_v in turning_joints(model):
+        straight_q[at_q : at_q + 4] = False
+        straight_v[at_v : at_v + 3] = False
     return straight_q, straight_v
 
 
@@ -65,8 +70,8 @@ def retract(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float64]) ->
     """Positions q (…, nq) displaced by tangent vectors (…, nv)."""
     q, tangent = np.broadcast_to(q, (*tangent.shape[:-1], model.nq)).copy(), np.asarray(tangent)
     straight_q, straight_v = _straight(model)
-    for at_q, at_v in free_joints(model):
-        q[..., at_q + 3 : at_q + 7] = _turn(q[..., at_q + 3 : at_q + 7], tangent[..., at_v + 3 : at_v + 6])
+    for at_q, at_v in turning_joints(model):
+        q[..., at_q : at_q + 4] = _turn(q[..., at_q : at_q + 4], tangent[..., at_v : at_v + 3])
     q[..., straight_q] += tangent[..., straight_v]
     return q
 
@@ -75,8 +80,8 @@ def to_tangent(model: Any, q: NDArray[np.float64], gradient: NDArray[np.float64]
     """Gradient with respect to q (nq,) as a gradient with respect to its tangent (nv,)."""
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nv)
-    for at_q, at_v in free_joints(model):
-        result[at_v + 3 : at_v + 6] = 0.5 * _columns(q[at_q + 3 : at_q + 7]).T @ gradient[at_q + 3 : at_q + 7]
+    for at_q, at_v in turning_joints(model):
+        result[at_v : at_v + 3] = 0.5 * _columns(q[at_q : at_q + 4]).T @ gradient[at_q : at_q + 4]
     result[straight_v] = gradient[straight_q]
     return result
 
@@ -100,9 +105,9 @@ class Case:
         return (len(self.u),) if self.output == "tactile" else ()
 
 
-def analytic(case: Case) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
+def analytic(case: Case, *, params: bool = False) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
     """The rollout, and the gradient by the reverse pass: "u" (steps, nu), "q" (nv,) as a tangent, "v" (nv,),
-    "anchors" (na, 3)."""
+    "anchors" (na, 3), and with `params` "params" (parameters,)."""
     sim, model = case.sim, case.sim.model
     trajectory = sim.rollout(case.u[:, None], read_after=case.reads)
     if trajectory.status[0]:
@@ -116,29 +121,31 @@ def analytic(case: Case) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
         by["v"][-1, 0] = case.weights
     else:
         by["tactile"] = case.weights[None, None]
-    g = sim.rollout_gradient(trajectory, **by)
+    g = sim.rollout_gradient(trajectory, params=params, **by)
     start = to_tangent(model, trajectory.q[0, 0], g.q[0])
-    return trajectory, {"u": g.u[:, 0], "q": start, "v": g.v[0], "anchors": g.anchors[0]}
+    gradient = {"u": g.u[:, 0], "q": start, "v": g.v[0], "anchors": g.anchors[0]}
+    return trajectory, {**gradient, "params": g.params[0]} if params else gradient
 
 
 def _from_tangent(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float64]) -> NDArray[np.float64]:
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nq)
-    for at_q, at_v in free_joints(model):
-        result[at_q + 3 : at_q + 7] = 2 * _columns(q[at_q + 3 : at_q + 7]) @ tangent[at_v + 3 : at_v + 6]
+    for at_q, at_v in turning_joints(model):
+        result[at_q : at_q + 4] = 2 * _columns(q[at_q : at_q + 4]) @ tangent[at_v : at_v + 3]
     result[straight_q] = tangent[straight_v]
     return result
 
 
 def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -> Agreement:
-    """Worst relative difference along random directions in (u, q, v, anchors), each taken alone as well.
+    """Worst relative difference along random directions in (u, q, v, anchors, params), each taken alone as well.
 
     The adjoint identity ⟨w, J d⟩ = ⟨Jᵀ w, d⟩ is what is compared: J d by dual numbers, Jᵀ w by the reverse pass.
     """
     sim, model = case.sim, case.sim.model
-    trajectory, gradient = analytic(case)
+    trajectory, gradient = analytic(case, params=True)
     set_now = sim.anchored[0].astype(bool)
-    parts = ["u", "q", "v"] + (["anchors"] if set_now.any() else [])
+    parts = ["u", "q", "v", "params"] + (["anchors"] if set_now.any() else [])
+    scale = _param_scale(sim.params[0])
     worst = 0.0
     for _ in range(directions):
         for only in [*parts, "all"]:
@@ -146,9 +153,10 @@ def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -
             for name in parts if only == "all" else [only]:
                 d[name] = rng.normal(size=d[name].shape)
             d["anchors"][~set_now] = 0
+            d["params"] *= scale
             exact = _core.directional_rollout(
                 model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], case.u,
-                np.zeros(len(model.param_names)), d["q"], d["v"], d["anchors"], d["u"],
+                d["params"], d["q"], d["v"], d["anchors"], d["u"],
             )  # fmt: skip
             along = case.weights.ravel() @ exact["d" + case.output]
             size = np.linalg.norm(case.weights) * np.linalg.norm(exact["d" + case.output])
@@ -157,6 +165,11 @@ def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -
             if np.abs(exact["q"] - trajectory.q[-1, 0]).max() > 1e-9:
                 raise SimulationError("the dual-number run left the run that it should repeat")
     return Agreement(worst, 0.0)
+
+
+def _param_scale(params: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much each parameter is displaced: by its own size; infinite limits and zeros hardly."""
+    return np.where(np.isfinite(params), np.maximum(np.abs(params), 1e-6), 0.0)
 
 
 FACTORS = (4.0, 2.0, 1.0, 0.5, 0.25)  # stencil sizes that are tried, times `STENCIL`
@@ -231,9 +244,9 @@ def _difference(model: Any, q: NDArray[np.float64], base: NDArray[np.float64]) -
     """Tangent from `base` to a nearby q."""
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nv)
-    for at_q, at_v in free_joints(model):
-        vector = _columns(base[at_q + 3 : at_q + 7]).T @ q[at_q + 3 : at_q + 7]  # sin(angle/2) axis
+    for at_q, at_v in turning_joints(model):
+        vector = _columns(base[at_q : at_q + 4]).T @ q[at_q : at_q + 4]  # sin(angle/2) axis
         length = float(np.linalg.norm(vector))
-        result[at_v + 3 : at_v + 6] = 2 * vector * (np.arcsin(min(length, 1.0)) / length if length > 1e-12 else 1.0)
+        result[at_v : at_v + 3] = 2 * vector * (np.arcsin(min(length, 1.0)) / length if length > 1e-12 else 1.0)
     result[straight_v] = (q - base)[straight_q]
     return result

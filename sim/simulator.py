@@ -44,6 +44,7 @@ class TrajectoryGradient:
     q: NDArray[Any]  # (N, nq)
     v: NDArray[Any]  # (N, nv)
     anchors: NDArray[Any]  # (N, na, 3)
+    params: NDArray[np.float64]  # (N, parameters), in the order of `Model.param_names`; (N, 0) where not asked for
 
 
 class Simulator:
@@ -266,9 +267,11 @@ class Simulator:
         v: ArrayLike | None = None,
         tactile: ArrayLike | None = None,
         anchors_end: ArrayLike | None = None,
+        params: bool = False,
     ) -> TrajectoryGradient:
         """The reverse pass: gradients with respect to the trajectory's q, v, tactile (shaped as there) in, gradients
-        with respect to controls and initial state out. Environments that failed have gradient zero."""
+        with respect to controls and initial state out, and with `params` by every physical parameter, which costs
+        many times the rest. Environments that failed have gradient zero."""
 
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:
@@ -281,5 +284,6 @@ class Simulator:
             shaped(v, trajectory.v),
             shaped(anchors_end, trajectory.anchors[0]),
             shaped(tactile, trajectory.tactile),
+            params,
         )
         return TrajectoryGradient(*gradients)

@@ -27,10 +27,11 @@ struct Record {
   std::vector<std::uint8_t> anchored;
 };
 
-// `g` enters as the gradient at the substep's end and leaves as the gradient at its start; by_u is added to.
-template <class T>
+// `g` enters as the gradient at the substep's end and leaves as the gradient at its start; by_u is added to. Before the
+// anchors' gradient changes, multipliers(c) is called.
+template <class T, class Multipliers>
 void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
-                        StepMemory<T>& memory) {
+                        StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
   evaluate<true, T>(m, params, r.h, r.q0.data(), r.v0.data(), r.anchors.data(), r.anchored.data(), u, r.v1.data(),
                     false, w);
@@ -44,6 +45,7 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   const VX<T> b = g.v + position_by_velocity_transposed<T>(m, r.v1.data(), r.h, g.q);
   w.lu.compute(w.tangent.transpose());
   const VX<T> c = w.lu.solve(b);
+  multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
   g.q = position_by_position_transposed<T>(m, r.v1.data(), r.h, VX<T>(g.q - w.by_q.transpose() * c));
   g.v = w.mass.transpose() * c;

@@ -11,6 +11,7 @@
 #include <thread>
 
 #include "adjoint.hpp"
+#include "param_gradient.hpp"
 
 namespace gelflow {
 
@@ -55,6 +56,7 @@ struct RolloutGradient {
   const T* anchors_end;       // in: (N, na, 3), of the anchors at the end
   const T* tactile;           // in: (reads, N, markers, 3)
   T *u, *q0, *v0, *anchors0;  // out
+  double* params;             // out, (N, params); null: not asked for
 };
 
 template <class T>

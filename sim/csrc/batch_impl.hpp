@@ -218,6 +218,54 @@ void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
   });
 }
 
+// What the gradients by parameters are asked with: everything in double precision.
+template <class From>
+std::vector<double> in_double(const From* values, std::size_t count) {
+  return {values, values + count};
+}
+template <class T>
+std::vector<V3<double>> in_double(const V3<T>* values, std::size_t count) {
+  std::vector<V3<double>> result;
+  for (std::size_t i = 0; i < count; ++i) result.push_back(values[i].template cast<double>());
+  return result;
+}
+template <class T>
+struct StepInDouble {
+  StepInDouble(const Model& m, const T* numbers, const T* control, const Record<T>& r, const VX<T>& multipliers,
+               const StateGradient<T>& g)
+      : params(in_double(numbers, m.param_names.size())),
+        u(in_double(control, m.actuators.size())),
+        q0(in_double(r.q0.data(), m.nq)),
+        v0(in_double(r.v0.data(), m.nv)),
+        v1(in_double(r.v1.data(), m.nv)),
+        c(in_double(multipliers.data(), m.nv)),
+        anchors(in_double(r.anchors.data(), m.na)),
+        by_next(in_double(g.anchors.data(), m.na)),
+        h(real_part(r.h)),
+        anchored(r.anchored.data()) {}
+  ParamState state() const { return {h, q0.data(), v0.data(), v1.data(), u.data(), anchors.data(), anchored}; }
+  std::vector<double> params, u, q0, v0, v1, c;
+  std::vector<V3<double>> anchors, by_next;
+  double h;
+  const std::uint8_t* anchored;
+};
+template <class T>
+struct ReadingInDouble {
+  ReadingInDouble(const Model& m, const T* numbers, const StateView<T>& s, const T* by_reading)
+      : params(in_double(numbers, m.param_names.size())),
+        q(in_double(s.q, m.nq)),
+        v(in_double(s.v, m.nv)),
+        by(in_double(by_reading, static_cast<std::size_t>(m.markers) * 3)),
+        anchors(in_double(s.anchors, m.na)),
+        anchored(s.anchored) {}
+  ParamState state(const Model& m) const {
+    return {m.step, q.data(), v.data(), nullptr, nullptr, anchors.data(), anchored};
+  }
+  std::vector<double> params, q, v, by;
+  std::vector<V3<double>> anchors;
+  const std::uint8_t* anchored;
+};
+
 template <class T>
 void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient<T>& g, StepMemory<T>& memory) {
   const Model& m = *model;
@@ -234,7 +282,13 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
     gradient.q += to_tangent<T>(m, now.q, g.q + row * m.nq);
     gradient.v += Eigen::Map<const VX<T>>(g.v + row * m.nv, m.nv);
     for (; read >= 0 && r.read_after[read] == t; --read) {
-      tactile_transposed<T>(m, params, now, g.tactile + (read * N + e) * m.markers * 3, gradient, memory.work);
+      const T* by_reading = g.tactile + (read * N + e) * m.markers * 3;
+      tactile_transposed<T>(m, params, now, by_reading, gradient, memory.work);
+      if (g.params) {
+        const ReadingInDouble<T> exact(m, params, now, by_reading);
+        add_reading_param_gradient(m, exact.params.data(), exact.state(m), exact.by.data(),
+                                   g.params + e * m.param_names.size());
+      }
     }
     if (t == 0) break;
     // The step is taken again from where it started, so that each substep's start and anchors are at hand.
@@ -268,7 +322,12 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
                   });
     }
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
-      substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory);
+      substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {
+        if (!g.params) return;
+        const StepInDouble<T> exact(m, params, u, *it, c, gradient);
+        add_step_param_gradient(m, exact.params.data(), exact.state(), exact.c.data(), exact.by_next.data(),
+                                g.params + e * m.param_names.size());
+      });
     }
   }
   add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, g.q0 + e * m.nq);
@@ -283,6 +342,7 @@ void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>&
   std::fill_n(g.q0, N * model->nq, T(0));
   std::fill_n(g.v0, N * model->nv, T(0));
   std::fill_n(g.anchors0, N * model->na * 3, T(0));
+  if (g.params) std::fill_n(g.params, N * model->param_names.size(), 0.0);
   pool_.run(n, [&](int e, int thread) {
     if (r.status[e] == 0) transpose_one(e, r, g, memory_[thread]);  // a failed environment has gradient zero
   });

@@ -168,7 +168,8 @@ void bind_batch(py::module_& module, const char* name) {
       .def("rollout_transposed",
            [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
               py::array halvings, py::array status, const Array<int>& read_after, py::array tactile,
-              const Array<T>& by_q, const Array<T>& by_v, const Array<T>& by_anchors_end, const Array<T>& by_tactile) {
+              const Array<T>& by_q, const Array<T>& by_v, const Array<T>& by_anchors_end, const Array<T>& by_tactile,
+              bool params) {
              const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, halvings, status, read_after, tactile);
              const Model& m = *b.model;
              const py::ssize_t n = b.n, nu = m.actuators.size();
@@ -179,14 +180,22 @@ void bind_batch(py::module_& module, const char* name) {
              py::array_t<T> by_u({static_cast<py::ssize_t>(r.steps), n, nu}),
                  by_q0({n, static_cast<py::ssize_t>(m.nq)}), by_v0({n, static_cast<py::ssize_t>(m.nv)}),
                  by_anchors0({n, static_cast<py::ssize_t>(m.na), py::ssize_t{3}});
-             const RolloutGradient<T> g{
-                 by_q.data(),         by_v.data(),          by_anchors_end.data(), by_tactile.data(),
-                 by_u.mutable_data(), by_q0.mutable_data(), by_v0.mutable_data(),  by_anchors0.mutable_data()};
+             const py::ssize_t asked = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
+             py::array_t<double> by_params({n, asked});
+             const RolloutGradient<T> g{by_q.data(),
+                                        by_v.data(),
+                                        by_anchors_end.data(),
+                                        by_tactile.data(),
+                                        by_u.mutable_data(),
+                                        by_q0.mutable_data(),
+                                        by_v0.mutable_data(),
+                                        by_anchors0.mutable_data(),
+                                        params ? by_params.mutable_data() : nullptr};
              {
                const py::gil_scoped_release release;
                b.rollout_transposed(r, g);
              }
-             return py::make_tuple(by_u, by_q0, by_v0, by_anchors0);
+             return py::make_tuple(by_u, by_q0, by_v0, by_anchors0, by_params);
            });
 }
 
@@ -242,7 +251,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def("add_joint", &ModelSpec::add_joint, py::arg("name"), py::arg("body"), py::arg("type"), py::arg("pos"),
            py::arg("axis"), py::arg("damping") = 0., py::arg("armature") = 0., py::arg("stiffness") = 0.,
            py::arg("springref") = 0., py::arg("lower") = -inf, py::arg("upper") = inf, py::arg("limit_stiffness") = 0.,
-           py::arg("limit_damping") = 0.)
+           py::arg("limit_damping") = 0., py::arg("ref") = 0., py::arg("frictionloss") = 0.)
       .def("add_shape", &ModelSpec::add_shape, py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"),
            py::arg("quat"), py::arg("size"))
       .def(
@@ -280,7 +289,8 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
           py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none())
       .def("add_actuator", &ModelSpec::add_actuator, py::arg("name"), py::arg("joint"), py::arg("kind"),
            py::arg("gear") = 1., py::arg("kp") = 0., py::arg("kd") = 0., py::arg("force_lower") = -inf,
-           py::arg("force_upper") = inf);
+           py::arg("force_upper") = inf, py::arg("ctrl_lower") = -inf, py::arg("ctrl_upper") = inf,
+           py::arg("gain") = 1., py::arg("bias") = 0.);
 
   py::class_<Model, std::shared_ptr<Model>>(module, "Model")
       .def(py::init([](const ModelSpec& spec) { return std::make_shared<Model>(spec.build()); }), py::arg("spec"))

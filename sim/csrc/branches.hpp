@@ -60,15 +60,15 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
-    const T* p = params + m.actuators[a].param;
-    const T force_a = m.actuators[a].kind == ActuatorKind::position
-                          ? T(p[1] * (u[a] - p[0] * q[m.actuators[a].q]) - p[2] * p[0] * v[m.actuators[a].dof])
-                          : u[a];
-    hash.add(force_a < p[3] ? 1 : force_a > p[4] ? 2 : 0);
+    const Actuator& actuator = m.actuators[a];
+    hash.add(static_cast<std::uint64_t>(actuator_pull<T>(actuator, params + actuator.param, u[a], q, v).clipped));
   }
   for (const Joint& joint : m.joints) {
-    if (joint.type == JointType::free) continue;
     const T* p = params + joint.param;
+    for (int k = joint.v; p[8] != T(0) && k < joint.v + joint.dofs; ++k) {
+      hash.add(v[k] > T(1e-3) ? 1 : v[k] < T(-1e-3) ? 2 : 0);
+    }
+    if (joint.turns()) continue;
     hash.add(q[joint.q] < p[4] ? 1 : q[joint.q] > p[5] ? 2 : 0);
   }
   return hash.value();

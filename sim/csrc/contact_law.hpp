@@ -23,6 +23,7 @@ template <class L>
 struct PointLaw {
   L kn, kt, mu, kd, ks;  // of these points: already times their weights
   L h;
+  L rounding;  // of places [m]
   DampingLaw damping;
   bool elastic;
   bool rolling;
@@ -77,7 +78,10 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     wanted -= law.ks * (e - along * n);  // e is zero where there is no anchor
   }
   const L bound = law.mu * normal, squared = dot(wanted, wanted);
-  out.slips = squared > bound * bound;
+  // After a slip the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
+  // reverse and the readings must not take different sides.
+  const L limit = law.elastic ? bound * (one + L(1e-14)) + law.ks * law.rounding : bound;
+  out.slips = squared > limit * limit;
   const L inverse = one / sqrt(select(out.slips, squared, one));
   const L ratio = select(out.slips, bound * inverse, one);
   out.friction = ratio * wanted;

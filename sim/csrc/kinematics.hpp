@@ -1,7 +1,8 @@
 // Where every body is and how it moves; and the group operations q ⊕ h v of the configuration space.
 //
 // Joints act in order on the body's frame, as in MuJoCo. A free joint is three slides along the world's axes followed
-// by a ball: velocities are (linear in the world frame, angular in the body frame). With S_k the motion that dof k
+// by a ball: velocities are (linear in the world frame, angular in the body frame). A ball's velocity is angular, in the
+// frame that it turns. With S_k the motion that dof k
 // makes possible (world frame, at the world's origin), a displacement of dof j carries everything behind it along:
 //     ∂S_k/∂q_j = S_j × S_k   for every k behind j or in j's group (`Model::carries`),
 // which is the only derivative of kinematics that the rest of the core needs.
@@ -14,6 +15,11 @@ namespace gelflow {
 template <class T>
 V3<T> vec3(const T* p) {
   return {p[0], p[1], p[2]};
+}
+
+template <class T>
+V4<T> vec4(const T* p) {
+  return {p[0], p[1], p[2], p[3]};
 }
 
 template <class T>
@@ -40,16 +46,27 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
         }
         continue;
       }
+      if (joint.type == JointType::ball) {
+        const V3<T> offset = joint.pos.template cast<T>();
+        const V3<T> anchor = p + r * offset;
+        r = (r * rotation_of<T>(V4<T>(value[0], value[1], value[2], value[3]))).eval();
+        p = anchor - r * offset;
+        for (int a = 0; a < 3; ++a) {
+          const V3<T> turn = r.col(a);
+          w.axis[joint.v + a] = stack<T>(turn, cross<T>(anchor, turn));
+        }
+        continue;
+      }
       const V3<T> local = joint.axis.template cast<T>();
       const V3<T> direction = r * local;
       if (joint.type == JointType::slide) {
         w.axis[joint.v] = stack<T>(V3<T>::Zero(), direction);
-        p += direction * value[0];
+        p += direction * (value[0] - T(joint.ref));
       } else {
         const V3<T> offset = joint.pos.template cast<T>();
         const V3<T> anchor = p + r * offset;
         w.axis[joint.v] = stack<T>(direction, cross<T>(anchor, direction));
-        r = (r * axis_rotation<T>(local, value[0])).eval();
+        r = (r * axis_rotation<T>(local, value[0] - T(joint.ref))).eval();
         p = anchor - r * offset;
       }
     }
@@ -92,16 +109,12 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
 template <class T>
 void integrate(const Model& m, const T* q0, const T* v, const T& h, T* q1) {
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) {
-      q1[joint.q] = q0[joint.q] + h * v[joint.v];
-      continue;
-    }
-    for (int a = 0; a < 3; ++a) q1[joint.q + a] = q0[joint.q + a] + h * v[joint.v + a];
-    const V4<T> turn(q0[joint.q + 3], q0[joint.q + 4], q0[joint.q + 5], q0[joint.q + 6]);
-    V4<T> turned = quaternion_product<T>(turn, quaternion_exp<T>(vec3(v + joint.v + 3) * h));
+    for (int a = 0; a < joint.plain(); ++a) q1[joint.q + a] = q0[joint.q + a] + h * v[joint.v + a];
+    if (!joint.turns()) continue;
+    V4<T> turned = quaternion_product<T>(vec4(q0 + joint.turn_q()), quaternion_exp<T>(vec3(v + joint.turn_v()) * h));
     using std::sqrt;
     turned /= sqrt(turned.squaredNorm());
-    for (int a = 0; a < 4; ++a) q1[joint.q + 3 + a] = turned[a];
+    for (int a = 0; a < 4; ++a) q1[joint.turn_q() + a] = turned[a];
   }
 }
 
@@ -110,9 +123,9 @@ template <class T>
 void times_position_by_velocity(const Model& m, const T* v, const T& h, MX<T>& columns) {
   columns *= h;
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) continue;
-    const auto turning = columns.middleCols(joint.v + 3, 3);
-    columns.middleCols(joint.v + 3, 3) = (turning * right_jacobian<T>(vec3(v + joint.v + 3) * h)).eval();
+    if (!joint.turns()) continue;
+    const int k = joint.turn_v();
+    columns.middleCols(k, 3) = (columns.middleCols(k, 3) * right_jacobian<T>(vec3(v + k) * h)).eval();
   }
 }
 
@@ -121,9 +134,9 @@ template <class T>
 VX<T> position_by_velocity_transposed(const Model& m, const T* v, const T& h, const VX<T>& lambda) {
   VX<T> result = lambda * h;
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) continue;
-    const V3<T> phi = vec3(v + joint.v + 3) * h;
-    result.segment(joint.v + 3, 3) = right_jacobian<T>(phi).transpose() * lambda.segment(joint.v + 3, 3) * h;
+    if (!joint.turns()) continue;
+    const int k = joint.turn_v();
+    result.segment(k, 3) = right_jacobian<T>(vec3(v + k) * h).transpose() * lambda.segment(k, 3) * h;
   }
   return result;
 }
@@ -131,9 +144,9 @@ template <class T>
 VX<T> position_by_position_transposed(const Model& m, const T* v, const T& h, const VX<T>& lambda) {
   VX<T> result = lambda;
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) continue;
-    const V4<T> turn = quaternion_exp<T>(vec3(v + joint.v + 3) * h);
-    result.segment(joint.v + 3, 3) = rotation_of<T>(turn) * lambda.segment(joint.v + 3, 3);
+    if (!joint.turns()) continue;
+    const int k = joint.turn_v();
+    result.segment(k, 3) = rotation_of<T>(quaternion_exp<T>(vec3(v + k) * h)) * lambda.segment(k, 3);
   }
   return result;
 }
@@ -143,19 +156,16 @@ template <class T>
 VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
   VX<T> result(m.nv);
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) {
-      result[joint.v] = gradient[joint.q];
-      continue;
-    }
-    for (int a = 0; a < 3; ++a) result[joint.v + a] = gradient[joint.q + a];
-    const V4<T> turn(q[joint.q + 3], q[joint.q + 4], q[joint.q + 5], q[joint.q + 6]);
+    for (int a = 0; a < joint.plain(); ++a) result[joint.v + a] = gradient[joint.q + a];
+    if (!joint.turns()) continue;
+    const V4<T> turn = vec4(q + joint.turn_q());
     for (int a = 0; a < 3; ++a) {
       V4<T> unit = V4<T>::Zero();
       unit[1 + a] = T(0.5);
       const V4<T> column = quaternion_product<T>(turn, unit);
       T sum = T(0);
-      for (int i = 0; i < 4; ++i) sum += column[i] * gradient[joint.q + 3 + i];
-      result[joint.v + 3 + a] = sum;
+      for (int i = 0; i < 4; ++i) sum += column[i] * gradient[joint.turn_q() + i];
+      result[joint.turn_v() + a] = sum;
     }
   }
   return result;
@@ -163,15 +173,12 @@ VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
 template <class T>
 void add_from_tangent(const Model& m, const T* q, const VX<T>& tangent, T* gradient) {
   for (const Joint& joint : m.joints) {
-    if (joint.type != JointType::free) {
-      gradient[joint.q] += tangent[joint.v];
-      continue;
-    }
-    for (int a = 0; a < 3; ++a) gradient[joint.q + a] += tangent[joint.v + a];
-    const V4<T> turn(q[joint.q + 3], q[joint.q + 4], q[joint.q + 5], q[joint.q + 6]);
-    const V4<T> turning(T(0), tangent[joint.v + 3], tangent[joint.v + 4], tangent[joint.v + 5]);
-    const V4<T> mapped = quaternion_product<T>(turn, turning) * T(2);
-    for (int i = 0; i < 4; ++i) gradient[joint.q + 3 + i] += mapped[i];
+    for (int a = 0; a < joint.plain(); ++a) gradient[joint.q + a] += tangent[joint.v + a];
+    if (!joint.turns()) continue;
+    const int k = joint.turn_v();
+    const V4<T> turning(T(0), tangent[k], tangent[k + 1], tangent[k + 2]);
+    const V4<T> mapped = quaternion_product<T>(vec4(q + joint.turn_q()), turning) * T(2);
+    for (int i = 0; i < 4; ++i) gradient[joint.turn_q() + i] += mapped[i];
   }
 }
 

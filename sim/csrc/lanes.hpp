@@ -128,6 +128,11 @@ GELFLOW_INLINE Lanes<T, W> sqrt(const Lanes<T, W>& x) {
   return root;
 }
 
+template <class T, int W>
+GELFLOW_INLINE Lanes<T, W> abs(const Lanes<T, W>& x) {
+  return select<T, W>(x < Lanes<T, W>(T(0)), -x, x);
+}
+
 template <class L>
 struct Vec3 {
   L x, y, z;

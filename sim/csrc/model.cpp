@@ -163,7 +163,8 @@ int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& p
 
 int ModelSpec::add_joint(const std::string& name, int body, const std::string& type, const V3<double>& pos,
                          const V3<double>& axis, double damping, double armature, double stiffness, double springref,
-                         double lower, double upper, double limit_stiffness, double limit_damping) {
+                         double lower, double upper, double limit_stiffness, double limit_damping, double ref,
+                         double frictionloss) {
   check_body("joint '" + name + "'", body, false);
   if (!model_.joints.empty() && body < model_.joints.back().body) {
     refuse("joint '" + name + "': joints must be added in the order of their bodies");
@@ -179,10 +180,12 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
     joint.type = JointType::slide;
   } else if (type == "hinge") {
     joint.type = JointType::hinge;
+  } else if (type == "ball") {
+    joint.type = JointType::ball;
   } else if (type == "free") {
     joint.type = JointType::free;
   } else {
-    refuse("joint '" + name + "': type '" + type + "' is not one of slide, hinge, free");
+    refuse("joint '" + name + "': type '" + type + "' is not one of slide, hinge, ball, free");
   }
   const bool free = joint.type == JointType::free;
   Body& owner = model_.bodies[body];
@@ -190,31 +193,36 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
   if (free && (owner.parent != world || owner.joint_begin != next_index(model_.joints))) {
     refuse("joint '" + name + "': a free joint must be the only joint of a body whose parent is the world");
   }
-  if (!free) {
+  if (!joint.turns()) {
     if (!(axis.norm() > 1e-9)) refuse("joint '" + name + "': axis must not be zero");
     joint.axis = axis.normalized();
     if (!(lower < upper)) refuse("joint '" + name + "': lower limit must be below upper");
   }
-  joint.dofs = free ? 6 : 1;
-  joint.param = add_params(
-      name, {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping"},
-      {damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping});
+  joint.dofs = joint.plain() + (joint.turns() ? 3 : 0);
+  joint.ref = joint.turns() ? 0 : ref;
+  joint.param =
+      add_params(name,
+                 {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping",
+                  "frictionloss"},
+                 {damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping, frictionloss});
   for (int i = 0; i < joint.dofs; ++i) {
     const int k = model_.nv + i;
-    const bool turning = free && i >= 3;
+    const bool turning = joint.turns() && i >= joint.plain();
     model_.dof_body.push_back(body);
     model_.dof_joint.push_back(next_index(model_.joints));
-    model_.group_begin.push_back(turning ? model_.nv + 3 : k);
-    model_.group_end.push_back(turning ? model_.nv + 6 : k + 1);
+    model_.group_begin.push_back(turning ? joint.turn_v() : k);
+    model_.group_end.push_back(turning ? joint.turn_v() + 3 : k + 1);
     model_.angular.push_back(turning || joint.type == JointType::hinge ? 1 : 0);
   }
   if (free) {
     const double* p = &model_.param_defaults[owner.pos];
     model_.q0.insert(model_.q0.end(), {p[0], p[1], p[2], owner.quat[0], owner.quat[1], owner.quat[2], owner.quat[3]});
+  } else if (joint.type == JointType::ball) {
+    model_.q0.insert(model_.q0.end(), {1, 0, 0, 0});
   } else {
-    model_.q0.push_back(0);
+    model_.q0.push_back(ref);
   }
-  model_.nq += free ? 7 : 1;
+  model_.nq += joint.plain() + (joint.turns() ? 4 : 0);
   model_.nv += joint.dofs;
   model_.joints.push_back(joint);
   owner.joint_end = next_index(model_.joints);
@@ -230,18 +238,20 @@ int ModelSpec::add_shape(const std::string& name, int body, const std::string& k
   shape.body = body;
   shape.pos = pos;
   shape.rotation = rotation_of<double>(quat.normalized());
-  int sizes = 0;
-  if (kind == "plane") {
-    shape.kind = ShapeKind::plane;
-  } else if (kind == "sphere") {
-    shape.kind = ShapeKind::sphere;
-    sizes = 1;
-  } else if (kind == "box") {
-    shape.kind = ShapeKind::box;
-    sizes = 3;
-  } else {
-    refuse("shape '" + name + "': kind '" + kind + "' is not one of plane, sphere, box");
+  struct Kind {
+    const char* name;
+    ShapeKind kind;
+    int sizes;
+  };
+  constexpr Kind kinds[] = {{"plane", ShapeKind::plane, 0},     {"sphere", ShapeKind::sphere, 1},
+                            {"box", ShapeKind::box, 3},         {"cylinder", ShapeKind::cylinder, 2},
+                            {"capsule", ShapeKind::capsule, 2}, {"ellipsoid", ShapeKind::ellipsoid, 3}};
+  const auto* found = std::find_if(std::begin(kinds), std::end(kinds), [&](const Kind& k) { return kind == k.name; });
+  if (found == std::end(kinds)) {
+    refuse("shape '" + name + "': kind '" + kind + "' is not one of plane, sphere, box, cylinder, capsule, ellipsoid");
   }
+  shape.kind = found->kind;
+  const int sizes = found->sizes;
   for (int i = 0; i < sizes; ++i) {
     if (!(size[i] > 0)) refuse("shape '" + name + "': size must be positive");
   }
@@ -325,24 +335,31 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
 }
 
 int ModelSpec::add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp,
-                            double kd, double force_lower, double force_upper) {
+                            double kd, double force_lower, double force_upper, double ctrl_lower, double ctrl_upper,
+                            double gain, double bias) {
   const std::string owner = "actuator '" + name + "'";
   if (joint < 0 || joint >= next_index(model_.joints)) refuse(owner + ": no such joint");
-  if (model_.joints[joint].type == JointType::free) refuse(owner + ": a free joint can not be actuated");
+  if (model_.joints[joint].turns()) refuse(owner + ": only slide and hinge joints can be actuated");
   if (!(force_lower < force_upper)) refuse(owner + ": force_lower must be below force_upper");
+  if (!(ctrl_lower < ctrl_upper)) refuse(owner + ": ctrl_lower must be below ctrl_upper");
   Actuator actuator;
   actuator.name = name;
   if (kind == "motor") {
     actuator.kind = ActuatorKind::motor;
   } else if (kind == "position") {
     actuator.kind = ActuatorKind::position;
+  } else if (kind == "velocity") {
+    actuator.kind = ActuatorKind::velocity;
+  } else if (kind == "general") {
+    actuator.kind = ActuatorKind::general;
   } else {
-    refuse(owner + ": kind '" + kind + "' is not motor or position");
+    refuse(owner + ": kind '" + kind + "' is not motor, position, velocity or general");
   }
   actuator.dof = model_.joints[joint].v;
   actuator.q = model_.joints[joint].q;
   actuator.param =
-      add_params(name, {"gear", "kp", "kd", "force_lower", "force_upper"}, {gear, kp, kd, force_lower, force_upper});
+      add_params(name, {"gear", "kp", "kd", "force_lower", "force_upper", "ctrl_lower", "ctrl_upper", "gain", "bias"},
+                 {gear, kp, kd, force_lower, force_upper, ctrl_lower, ctrl_upper, gain, bias});
   model_.actuators.push_back(actuator);
   return next_index(model_.actuators) - 1;
 }

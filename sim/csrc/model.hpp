@@ -12,11 +12,11 @@
 
 namespace gelflow {
 
-enum class JointType : std::uint8_t { slide, hinge, free };
-enum class ShapeKind : std::uint8_t { plane, sphere, box };
+enum class JointType : std::uint8_t { slide, hinge, ball, free };
+enum class ShapeKind : std::uint8_t { plane, sphere, box, cylinder, capsule, ellipsoid };
 enum class FrictionLaw : std::uint8_t { viscous, elastic };
 enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not (ground)
-enum class ActuatorKind : std::uint8_t { motor, position };
+enum class ActuatorKind : std::uint8_t { motor, position, velocity, general };
 
 constexpr int world = -1;
 
@@ -35,8 +35,16 @@ struct Joint {
   int body;
   V3<double> pos, axis;  // in the body's frame
   int q, v;              // first position and first velocity
-  int dofs;              // 1 or 6
-  int param;             // damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping
+  int dofs;              // 1, 3 (ball) or 6 (free)
+  double ref;            // position at which the joint does not move its body
+  int param;             // damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping,
+                         // frictionloss
+
+  // A ball or free joint turns by a unit quaternion; before it come `plain` positions that are just numbers.
+  bool turns() const { return type == JointType::ball || type == JointType::free; }
+  int plain() const { return type == JointType::free ? 3 : type == JointType::ball ? 0 : 1; }
+  int turn_q() const { return q + plain(); }
+  int turn_v() const { return v + plain(); }
 };
 
 struct Shape {
@@ -45,7 +53,7 @@ struct Shape {
   int body;
   V3<double> pos;
   M3<double> rotation;
-  int size;  // offset in Params (3): half sizes of a box, radius of a sphere
+  int size;  // offset in Params (3): half sizes or half axes; radius, then half length along z
 };
 
 // Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
@@ -106,7 +114,7 @@ struct Actuator {
   std::string name;
   ActuatorKind kind;
   int dof, q;
-  int param;  // gear, kp, kd, force_lower, force_upper
+  int param;  // gear, kp, kd, force_lower, force_upper, ctrl_lower, ctrl_upper, gain, bias
 };
 
 struct Model {
@@ -156,7 +164,8 @@ class ModelSpec {
                const V3<double>& com, const V6<double>& inertia);
   int add_joint(const std::string& name, int body, const std::string& type, const V3<double>& pos,
                 const V3<double>& axis, double damping, double armature, double stiffness, double springref,
-                double lower, double upper, double limit_stiffness, double limit_damping);
+                double lower, double upper, double limit_stiffness, double limit_damping, double ref,
+                double frictionloss);
   int add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
                 const V4<double>& quat, const V3<double>& size);
   int add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
@@ -167,7 +176,8 @@ class ModelSpec {
               const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
               const std::array<double, 5>& law_numbers, const std::vector<double>& weights);
   int add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
-                   double force_lower, double force_upper);
+                   double force_lower, double force_upper, double ctrl_lower, double ctrl_upper, double gain,
+                   double bias);
   Model build() const;
 
  private:

@@ -128,14 +128,15 @@ GELFLOW_INLINE PointLaw<Pack<T>> weighted(const TouchRule<T>& rule, const Pack<T
   using L = Pack<T>;
   const T* p = rule.params;
   const bool elastic = rule.law == FrictionLaw::elastic;
-  return {weight * L(p[0]), weight * L(p[1]), L(p[2]), weight * L(p[3]),       weight * L(p[4]),
-          L(rule.h),        rule.damping,     elastic, rule.rolling_radius > 0};
+  return {weight * L(p[0]), weight * L(p[1]), L(p[2]),      weight * L(p[3]), weight * L(p[4]),
+          L(rule.h),        L(0.0),           rule.damping, elastic,          rule.rolling_radius > 0};
 }
 
 // Calls f(touching) for all points that are inside the shape, a pack at a time.
 template <class T, class F>
 void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
   using L = Pack<T>;
+  using std::abs;
   constexpr int width = pack_width<T>;
   Touching<T> t;
   const bool elastic = rule.law == FrictionLaw::elastic;
@@ -160,6 +161,10 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
       t.law = weighted<T>(rule, select(t.inside, weight, L(0.0)));
       t.v = spread<L>(frame.linear) + cross(spread<L>(frame.angular), t.x);
       t.remembers = remembers > L(0.0);
+      if (elastic) {
+        const L size = abs(t.x.x) + abs(t.x.y) + abs(t.x.z);
+        t.law.rounding = L(T(4 * real_part(Eigen::NumTraits<T>::epsilon()))) * size;
+      }
       t.e = anchor_offset<L>(t.law, t.x, t.v, t.anchor, t.remembers);
       f(static_cast<const Touching<T>&>(t));
     }

@@ -1,9 +1,13 @@
 // Signed distance of points to a shape, in the shape's frame: d < 0 inside, n = ∇d, H = ∇²d. Nothing else.
 //
 // Only what is inside is touched, so the distance is exact inside; outside it has the right sign. Where a distance has
-// no gradient (a sphere's centre, a box's medial surface) one branch is taken, always the same: +x at a sphere's centre;
-// inside a box the face with the largest (least negative) distance, x before y before z.
+// no gradient one branch is taken, always the same: +x at the centre of a sphere and on the axis of a cylinder or capsule;
+// inside a box the face with the largest (least negative) distance, x before y before z; in a cylinder the wall before
+// the ends. Cylinders, capsules and ellipsoids have their sizes in MuJoCo's order: radius and half length along z; half
+// axes.
 #pragma once
+
+#include <algorithm>
 
 #include "lanes.hpp"
 #include "model.hpp"
@@ -53,23 +57,151 @@ GELFLOW_INLINE void box_distance(const Vec3<L>& x, const Vec3<L>& half, Distance
   out.curved = false;
 }
 
+// Length of (x, y) and its direction, +x on the axis; `inverse` is 1/length, 0 on the axis.
+template <class L>
+GELFLOW_INLINE Vec3<L> radial(const Vec3<L>& x, L& length, L& inverse) {
+  using std::sqrt;
+  const L zero(0.0), one(1.0), squared = x.x * x.x + x.y * x.y;
+  const Mask<L> axis = squared < L(1e-30);
+  const L root = sqrt(select(axis, one, squared));
+  length = select(axis, zero, root);
+  inverse = select(axis, zero, one / root);
+  return select3<L>(axis, {one, zero, zero}, {inverse * x.x, inverse * x.y, zero});
+}
+
+template <class L>
+GELFLOW_INLINE void cylinder_distance(const Vec3<L>& x, const L& radius, const L& half, Distance<L>& out) {
+  const L zero(0.0), one(1.0);
+  L length, inverse;
+  const Vec3<L> outwards = radial(x, length, inverse);
+  const L sign = select(x.z < zero, -one, one), wall = length - radius, end = sign * x.z - half;
+  const Mask<L> flat = end > wall;
+  out.d = select(flat, end, wall);
+  out.n = select3<L>(flat, {zero, zero, sign}, outwards);
+  const Vec3<L> around{-outwards.y, outwards.x, zero};
+  out.hessian = select(flat, zero, inverse) * outer(around, around);
+  out.curved = true;
+}
+
+template <class L>
+GELFLOW_INLINE void capsule_distance(const Vec3<L>& x, const L& radius, const L& half, Distance<L>& out) {
+  const L zero(0.0);
+  const L nearest = select(x.z > half, half, select(x.z < -half, -half, x.z));
+  const Mask<L> along = !(x.z > half) && !(x.z < -half);
+  sphere_distance<L>({x.x, x.y, x.z - nearest}, radius, out);
+  // Beside the segment nothing changes along it: (1 − n nᵀ − z zᵀ)/length.
+  out.hessian.row[2] = select3<L>(along, zero3<L>(), out.hessian.row[2]);
+}
+
+// One Newton step for t in Σ (a x/(a² + t))² = 1, on whose left end it starts: it then never steps over the root.
+template <class L>
+GELFLOW_INLINE L ellipsoid_step(const Vec3<L>& scaled, const Vec3<L>& square, const L& t) {
+  const L zero(0.0), one(1.0);
+  L value = -one, slope = zero;
+  for (int a = 0; a < 3; ++a) {
+    const L divisor = square[a] + t;
+    const Mask<L> regular = divisor > L(1e-12) * square[a];
+    const L ratio = select(regular, scaled[a] / select(regular, divisor, one), zero);
+    value += ratio * ratio;
+    slope -= L(2.0) * ratio * ratio / select(regular, divisor, one);
+  }
+  const Mask<L> goes = slope < L(-1e-30) && value > zero;
+  return select(goes, -value / select(goes, slope, one), zero);
+}
+
+// The nearest point y of the ellipsoid has x − y = t g with g = y/a²: y = a² x/(a² + t), d = t ‖g‖, n = g/‖g‖. In the
+// middle, where all is equally far along the shortest axis, its positive end is taken.
+template <class L>
+__attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L>& axes, Distance<L>& out) {
+  using std::sqrt;
+  const L zero(0.0), one(1.0);
+  const Vec3<L> square{axes.x * axes.x, axes.y * axes.y, axes.z * axes.z};
+  Vec3<L> scaled;
+  L t(-1e30);
+  for (int a = 0; a < 3; ++a) {
+    scaled[a] = axes[a] * x[a];
+    const L lowest = select(x[a] < zero, -scaled[a], scaled[a]) - square[a];
+    t = select(lowest > t, lowest, t);
+  }
+  const L size = square.x + square.y + square.z;
+  for (int more = 3, k = 0; more > 0 && k < 80; ++k) {  // past convergence a dual number's derivative follows
+    const L change = ellipsoid_step(scaled, square, t);
+    t += change;
+    if (!any(change > L(1e-12) * size)) --more;
+  }
+  Vec3<L> gradient;
+  L rest = one;
+  for (int a = 0; a < 3; ++a) {
+    const L divisor = square[a] + t;
+    const Mask<L> regular = divisor > L(1e-12) * square[a];
+    gradient[a] = select(regular, x[a] / select(regular, divisor, one), zero);
+    rest -= square[a] * gradient[a] * gradient[a];
+  }
+  // What is missing on the surface belongs to the axis without a regular divisor, where there is one.
+  for (int a = 0; a < 3; ++a) {
+    const Mask<L> open = !(square[a] + t > L(1e-12) * square[a]) && rest > zero;
+    const L length = sqrt(select(open, rest, one)) / axes[a];
+    gradient[a] = select(open, length, gradient[a]);
+    rest = select(open, zero, rest);
+  }
+  const L steepness = sqrt(dot(gradient, gradient)), inverse = one / steepness;
+  out.d = t * steepness;
+  out.n = inverse * gradient;
+  // Curvature of the surface S = P diag(1/a²) P/‖g‖ with P = 1 − n nᵀ, and of the parallel surface (1 + d S)⁻¹ S.
+  const Mat3<L> project = identity_minus_outer(out.n);
+  Mat3<L> surface = zero33<L>();
+  for (int a = 0; a < 3; ++a) surface += inverse / square[a] * outer(project.row[a], project.row[a]);
+  Mat3<L> moved = out.d * surface;
+  for (int a = 0; a < 3; ++a) moved.row[a][a] += one;
+  const Mat3<L> cofactors{
+      {cross(moved.row[1], moved.row[2]), cross(moved.row[2], moved.row[0]), cross(moved.row[0], moved.row[1])}};
+  const L determinant = dot(moved.row[0], cofactors.row[0]);
+  const Mask<L> regular = determinant > L(1e-6);  // not where the curvature's centre is
+  const L scale = select(regular, one / select(regular, determinant, one), one);
+  for (int a = 0; a < 3; ++a) {  // cofactors are symmetric here: they are the adjugate
+    const Vec3<L> row = transposed_times(surface, cofactors.row[a]);
+    out.hessian.row[a] = select3<L>(regular, scale * row, surface.row[a]);
+  }
+  out.curved = true;
+}
+
 template <class L, class T>
 GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const Vec3<L>& x, Distance<L>& out) {
-  if (kind == ShapeKind::box) {
-    box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
-  } else if (kind == ShapeKind::sphere) {
-    sphere_distance<L>(x, L(size[0]), out);
-  } else {
-    plane_distance<L>(x, out);
+  switch (kind) {
+    case ShapeKind::plane:
+      return plane_distance<L>(x, out);
+    case ShapeKind::sphere:
+      return sphere_distance<L>(x, L(size[0]), out);
+    case ShapeKind::box:
+      return box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
+    case ShapeKind::cylinder:
+      return cylinder_distance<L>(x, L(size[0]), L(size[1]), out);
+    case ShapeKind::capsule:
+      return capsule_distance<L>(x, L(size[0]), L(size[1]), out);
+    case ShapeKind::ellipsoid:
+      return ellipsoid_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
   }
 }
 
-// The distance alone, right on both sides, for culling.
+// A distance that nothing is nearer than, for culling: exact outside but for the ellipsoid, negative inside.
 template <class T>
 GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const V3<T>& x) {
   using std::sqrt;
   if (kind == ShapeKind::plane) return x[2];
   if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];
+  if (kind == ShapeKind::ellipsoid) {
+    const V3<T> scaled(x[0] / size[0], x[1] / size[1], x[2] / size[2]);
+    const T least = std::min({size[0], size[1], size[2]});
+    return (sqrt(scaled.squaredNorm()) - T(1)) * least;
+  }
+  if (kind == ShapeKind::cylinder || kind == ShapeKind::capsule) {
+    const T across = sqrt(x[0] * x[0] + x[1] * x[1]), along = (x[2] < T(0) ? -x[2] : x[2]) - size[1];
+    if (kind == ShapeKind::capsule) {
+      return (along > T(0) ? T(sqrt(across * across + along * along)) : across) - size[0];
+    }
+    const T wall = across - size[0];
+    return wall > T(0) && along > T(0) ? T(sqrt(wall * wall + along * along)) : (wall > along ? wall : along);
+  }
   T inside = T(-1e30), squared = T(0);
   for (int a = 0; a < 3; ++a) {
     const T o = (x[a] < T(0) ? -x[a] : x[a]) - size[a];

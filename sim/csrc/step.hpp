@@ -31,7 +31,48 @@ struct StepReport {
   int halvings = 0;    // the step was taken as 2^halvings substeps
 };
 
-// Joint-space forces: damping, springs, limits, actuators. Adds −h f and its derivatives to the residual.
+// What an actuator pulls with, and its derivatives by the control, its length and its speed (gear × those of the joint).
+template <class T>
+struct ActuatorPull {
+  T force, by_u, by_length, by_speed;
+  int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
+};
+template <class T>
+ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const T* q, const T* v) {
+  const T gear = p[0], kp = p[1], kd = p[2];
+  ActuatorPull<T> pull{T(0), T(1), T(0), T(0), 0};
+  T bias = T(0);
+  switch (actuator.kind) {
+    case ActuatorKind::motor:
+      break;
+    case ActuatorKind::position:
+      pull = {T(0), kp, -kp, -kd, 0};
+      break;
+    case ActuatorKind::velocity:
+      pull = {T(0), kd, T(0), -kd, 0};
+      break;
+    case ActuatorKind::general:
+      pull = {T(0), p[7], -kp, -kd, 0};
+      bias = p[8];
+      break;
+  }
+  const T gain = pull.by_u;
+  T control = u;
+  if (u < p[5] || u > p[6]) {
+    pull.clipped = u < p[5] ? 1 : 2;
+    control = u < p[5] ? p[5] : p[6];
+    pull.by_u = T(0);
+  }
+  pull.force =
+      gain * control + bias + pull.by_length * (gear * q[actuator.q]) + pull.by_speed * (gear * v[actuator.dof]);
+  if (pull.force < p[3] || pull.force > p[4]) {
+    const bool below = pull.force < p[3];
+    return {below ? p[3] : p[4], T(0), T(0), T(0), pull.clipped | (below ? 4 : 8)};
+  }
+  return pull;
+}
+
+// Joint-space forces: damping, friction, springs, limits, actuators. Adds −h f and its derivatives to the residual.
 template <bool derivatives, class T>
 void subtract_joint_forces(const Model& m, const T* params, const T& h, const T* q, const T* v, const T* u, bool scale,
                            Workspace<T>& w) {
@@ -42,6 +83,14 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
     for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
       w.residual[k] += h * damping * v[k];
       if constexpr (derivatives) w.by_v(k, k) += h * damping;
+      if (p[8] != T(0)) {               // dry friction: viscous below `creep`, constant above
+        constexpr double creep = 1e-3;  // [m/s] or [rad/s]
+        const bool slides = abs(v[k]) > T(creep);
+        const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / T(creep) * v[k]);
+        w.residual[k] += h * force;
+        if (scale) w.scale[k] += h * p[8];
+        if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / T(creep));
+      }
       if (armature != T(0)) {
         w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
         if constexpr (derivatives) {
@@ -50,7 +99,7 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
         }
       }
     }
-    if (joint.type == JointType::free) continue;
+    if (joint.turns()) continue;
     const int k = joint.v;
     const T value = q[joint.q];
     w.residual[k] += h * stiffness * (value - rest);
@@ -71,21 +120,15 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
     const T* p = params + actuator.param;
-    const T gear = p[0], kp = p[1], kd = p[2];
-    const bool servo = actuator.kind == ActuatorKind::position;
+    const T gear = p[0];
     const int k = actuator.dof;
-    // The gear carries forces to the joint and lengths to the actuator.
-    T force = servo ? T(kp * (u[a] - gear * q[actuator.q]) - kd * gear * v[k]) : T(u[a]);
-    const bool clipped = force < p[3] || force > p[4];
-    if (clipped) force = force < p[3] ? p[3] : p[4];
-    w.residual[k] -= h * gear * force;
-    if (scale) w.scale[k] += h * abs(gear * force);
+    const ActuatorPull<T> pull = actuator_pull<T>(actuator, p, u[a], q, v);
+    w.residual[k] -= h * gear * pull.force;
+    if (scale) w.scale[k] += h * abs(gear * pull.force);
     if constexpr (derivatives) {
-      w.by_u[a] = clipped ? T(0) : T(-h * gear * (servo ? kp : T(1)));
-      if (servo && !clipped) {
-        w.by_q(k, k) += h * gear * gear * kp;
-        w.by_v(k, k) += h * gear * gear * kd;
-      }
+      w.by_u[a] = -h * gear * pull.by_u;
+      w.by_q(k, k) -= h * gear * gear * pull.by_length;
+      w.by_v(k, k) -= h * gear * gear * pull.by_speed;
     }
   }
 }
