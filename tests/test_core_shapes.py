@@ -1,0 +1,162 @@
+"""Shapes: distance and normal against independent formulas, and exact gradients in contact with each."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from gelflow.errors import UsageError
+from gelflow.sim import _core, gradient_check
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
+SIZES = {
+    "sphere": (0.02, 0, 0),
+    "box": (0.03, 0.02, 0.01),
+    "cylinder": (0.02, 0.03, 0),
+    "capsule": (0.015, 0.03, 0),
+    "ellipsoid": (0.03, 0.02, 0.012),
+}
+
+
+def felt(kind: str, points: Array) -> tuple[Array, Array]:
+    """Depth (n,) and outward normal (n, 3) at points of a fixed shape, as markers of 1 N/m there show them."""
+    spec = _core.ModelSpec()
+    spec.gravity = (0, 0, 0)
+    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
+    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), SIZES[kind])
+    axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+    spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.0, mu=0.0, kd=0.0)
+    force = Simulator(_core.Model(spec)).tactile()[0] * [1, 1, -1]
+    depth = np.linalg.norm(force, axis=1)
+    return depth, force / np.maximum(depth, 1e-300)[:, None]
+
+
+def outside_of_box(x: Array, half: Array) -> float:
+    q = np.abs(x) - half
+    return float(np.linalg.norm(np.maximum(q, 0)) + min(q.max(), 0.0))
+
+
+def distance(kind: str, x: Array) -> float:
+    """Signed distance by another way than the core's."""
+    a, b, c = SIZES[kind]
+    if kind == "sphere":
+        return float(np.linalg.norm(x) - a)
+    if kind == "box":
+        return outside_of_box(x, np.array([a, b, c]))
+    if kind == "cylinder":
+        return outside_of_box(np.array([np.hypot(*x[:2]), x[2]]), np.array([a, b]))
+    if kind == "capsule":
+        return float(np.linalg.norm([x[0], x[1], max(abs(x[2]) - b, 0)]) - a)
+    radii = np.array([a, b, c])
+
+    def surface(angles: Array) -> Array:
+        (ct, cp), (st, sp) = np.cos(angles), np.sin(angles)
+        return np.array([radii[0] * ct * cp, radii[1] * st * cp, radii[2] * sp])
+
+    starts = itertools.product(np.linspace(-np.pi, np.pi, 7), np.linspace(-1.2, 1.2, 5))
+    near = min(np.linalg.norm(surface(minimize(lambda s: ((surface(s) - x) ** 2).sum() * 1e4, s0, tol=1e-14).x) - x)
+               for s0 in starts)  # fmt: skip
+    return float(near if (x**2 / radii**2).sum() > 1 else -near)
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_depth_and_normal(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    reach = {"cylinder": (0.02, 0.02, 0.03), "capsule": (0.015, 0.015, 0.045)}.get(kind, SIZES[kind])
+    points = rng.uniform(-1.1, 1.1, (40 if kind == "ellipsoid" else 400, 3)) * np.where(
+        np.array(reach) > 0, reach, reach[0]
+    )
+    depth, normal = felt(kind, points)
+    expected = np.array([max(-distance(kind, x), 0.0) for x in points])
+    assert 0.2 < (expected > 0).mean() < 1
+    np.testing.assert_allclose(depth, expected, atol=2e-9 if kind == "ellipsoid" else 1e-15)
+    # Going along the normal by the depth leads onto the surface.
+    inside = expected > 1e-6
+    ends = points[inside] + normal[inside] * depth[inside, None] * (1 - 1e-9)
+    assert felt(kind, ends)[0].max() < 1e-10
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_where_there_is_no_gradient_something_finite_is_felt(kind: str) -> None:
+    points = np.array([[0, 0, 0], [0, 0, 1e-3], [1e-3, 0, 0], [0, 1e-20, 0], [1e-3, 1e-3, 0]], dtype=float)
+    depth, normal = felt(kind, points)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
+    np.testing.assert_array_equal(normal, felt(kind, points)[1])
+
+
+def pressed(kind: str, law: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+    """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge."""
+    spec = _core.ModelSpec()
+    spec.tolerance = 1e-13
+    turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
+    hinge = spec.add_joint("turn", turret, "hinge", (0, 0, 0), (0.3, 0.2, 1), damping=1e-3, frictionloss=1e-4)
+    carriage = spec.add_body("carriage", -1, (0, 0, 0), (1, 0, 0, 0), 0.05, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    slides = [
+        spec.add_joint(name, carriage, "slide", (0, 0, 0), axis, damping=0.5)
+        for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
+    ]
+    hand = spec.add_body("hand", carriage, (0, 0, 0.005), (1, 0, 0, 0), 0.02, (0, 0, 1e-3), (1e-5, 2e-5, 1e-5, 0, 0, 0))
+    spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
+    shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), SIZES[kind])
+    cloud = rng.normal(size=(60, 3))
+    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
+    points = spec.add_points("cloud", hand, cloud, np.ones(60))
+    numbers: dict[str, Any] = {
+        "law": law,
+        "kn": 200.0,
+        "kt": 2.0,
+        "mu": 0.4,
+        "kd": 20.0,
+        "ks": 100.0 if law == "elastic" else 0.0,
+    }
+    spec.add_contact("press", points, shape, **numbers)
+    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
+    spec.add_pad("skin", hand, cloud * 1.01, *axes, shapes=[shape], **{**numbers, "kn": 50.0})
+    spec.add_actuator("turn", hinge, "velocity", kd=2e-3)
+    spec.add_actuator("x", slides[0], "general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1)
+    spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0, ctrl_lower=-1.0, ctrl_upper=1.0)
+    sim = Simulator(_core.Model(spec))
+    top = {"sphere": 0.02, "box": 0.01, "cylinder": 0.03, "capsule": 0.045, "ellipsoid": 0.012}[kind]
+    height = top + 0.012 - 0.005
+    sim.q[0, sim.joint_q("z")] = height
+    hold = np.array([0.5, 0.0, height - 2e-3])
+    sim.step(hold + rng.normal(size=3) * [0.3, 2e-3, 2e-4], 12)
+    sim.check()
+    return sim, hold + rng.normal(size=(3, 3)) * [0.3, 2e-3, 2e-4]
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("kind", SIZES)
+def test_gradients_in_contact(kind: str, law: str) -> None:
+    left_out = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        sim, u = pressed(kind, law, rng)
+        assert (sim.tactile() != 0).any()
+        case = gradient_check.Case.random(sim, u, OUTPUTS[seed % 3], rng)
+        assert gradient_check.against_dual(case, rng, directions=1).error < 1e-10
+        agreement = gradient_check.against_differences(case)
+        left_out.append(agreement.left_out)
+        assert agreement.error < 1e-6
+    assert np.mean(left_out) <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "says"),
+    [
+        ("cone", (1, 1, 1), "kind 'cone' is not one of plane, sphere, box, cylinder, capsule, ellipsoid"),
+        ("ellipsoid", (0.1, 0.1, 0), "size must be positive"),
+        ("capsule", (0.1, -0.1, 0), "size must be positive"),
+    ],
+)
+def test_a_wrong_shape_is_refused(kind: str, size: tuple[float, float, float], says: str) -> None:
+    with pytest.raises((UsageError, ValueError), match=says):
+        _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), size)
