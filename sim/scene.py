@@ -56,16 +56,16 @@ class Scene:
     points: tuple[PointsDef, ...]
     contacts: tuple[ContactDef, ...]
     pads: tuple[PadDef, ...]
-    q0: Array  # where the scene starts: the keyframe "start", or the pose in the model file
+    q0: Array  # where the scene starts: the keyframe "start" or "home", or the pose in the model file
     left_out: tuple[str, ...]  # what the files have and the simulation doesn't, and why
 
     @property
     def nq(self) -> int:
-        return sum(7 if joint.type == "free" else 1 for joint in self.joints)
+        return sum(joint.nq for joint in self.joints)
 
     @property
     def nv(self) -> int:
-        return sum(6 if joint.type == "free" else 1 for joint in self.joints)
+        return sum(joint.nv for joint in self.joints)
 
     @property
     def nu(self) -> int:
@@ -84,12 +84,12 @@ class Scene:
     def q(self, joint: str) -> slice:
         """Where a joint's positions stand in q. Raises UsageError on an unknown name."""
         found = self._joint(joint)
-        return slice(found.q, found.q + (7 if found.type == "free" else 1))
+        return slice(found.q, found.q + found.nq)
 
     def v(self, joint: str) -> slice:
         """Where a joint's velocities stand in v. Raises UsageError on an unknown name."""
         found = self._joint(joint)
-        return slice(found.v, found.v + (6 if found.type == "free" else 1))
+        return slice(found.v, found.v + found.nv)
 
     def u(self, actuator: str) -> int:
         """Where an actuator stands in u. Raises UsageError on an unknown name."""
@@ -161,6 +161,10 @@ class Scene:
                 kd=a.kd,
                 force_lower=a.force[0],
                 force_upper=a.force[1],
+                ctrl_lower=a.control[0],
+                ctrl_upper=a.control[1],
+                gain=a.gain,
+                bias=a.bias,
             )
         return spec
 
@@ -184,6 +188,8 @@ def _tell_joint(spec: Any, joint: JointDef, limit: Limit) -> None:
         upper=high,
         limit_stiffness=limit.stiffness,
         limit_damping=limit.damping,
+        ref=joint.ref,
+        frictionloss=joint.frictionloss,
     )
 
 

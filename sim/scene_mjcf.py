@@ -12,7 +12,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import UsageError
+from gelflow.sim.mjcf_actuators import ActuatorDef as ActuatorDef
+from gelflow.sim.mjcf_actuators import default_limit, joint_extra, read_actuators
+from gelflow.sim.mjcf_file import compile_model, names
+from gelflow.sim.mjcf_refusals import left_out, refuse, switch_off
 
 Array = NDArray[np.float64]
 
@@ -57,7 +60,7 @@ class BodyDef:
 class JointDef:
     name: str
     body: int
-    type: str  # "slide", "hinge" or "free"
+    type: str  # "slide", "hinge", "ball" or "free"
     pos: Array  # in the body's frame [m]
     axis: Array
     q: int  # first position
@@ -67,6 +70,19 @@ class JointDef:
     stiffness: float
     springref: float
     range: tuple[float, float] | None
+    limit: tuple[float, float] | None  # stiffness and damping beyond the range, where the scene gives none
+    ref: float  # position at the pose of the file
+    frictionloss: float  # [N] or [N m]
+
+    @property
+    def nq(self) -> int:
+        """How many positions."""
+        return {"free": 7, "ball": 4}.get(self.type, 1)
+
+    @property
+    def nv(self) -> int:
+        """How many velocities."""
+        return {"free": 6, "ball": 3}.get(self.type, 1)
 
 
 @dataclass(frozen=True)
@@ -76,17 +92,6 @@ class GeomDef:
     kind: str  # MuJoCo's name of the type: "box", "cylinder", …
     pose: Pose  # in the moving body's frame
     size: Array  # MuJoCo's three sizes [m]
-
-
-@dataclass(frozen=True)
-class ActuatorDef:
-    name: str
-    joint: int
-    kind: str  # "motor" or "position"
-    gear: float
-    kp: float
-    kd: float
-    force: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,7 @@ class Mechanics:
 
 _JOINTS = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
+    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
     int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
 }
@@ -115,61 +121,35 @@ def read_mechanics(path: Path) -> Mechanics:
 
     Raises UsageError, in one line, when a file is missing or unreadable, or holds what the simulator does not model.
     """
-    if not path.is_file():
-        raise UsageError(f"no such model file: {path}")
-    try:
-        model = mujoco.MjSpec.from_file(str(path)).compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise UsageError(f"{path}: {' '.join(str(error).split())}") from None
-    where = path.name
-    _refuse(model, where)
+    model, urdf = compile_model(path)
+    switch_off(model)
+    refuse(model, path.name)
     carrier, poses = _merge(model)
-    joints = _joints(model, carrier, where)
-    start = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "start")
+    actuators = read_actuators(model, path.name)
+    sites = {
+        name: (int(carrier[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
+        for i, (name, b) in enumerate(zip(names(model, "site", model.nsite), model.site_bodyid, strict=True))
+    }
+    if urdf:  # it has no sites: the frames of its links serve as such
+        sites = {name: (int(carrier[b]), poses[b]) for b, name in enumerate(names(model, "body", model.nbody))}
     return Mechanics(
         bodies=_bodies(model, carrier, poses),
-        joints=joints,
+        joints=_joints(model, carrier, actuators),
         geoms=_geoms(model, carrier, poses),
-        sites={
-            model.site(i).name: (int(carrier[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
-            for i, b in enumerate(model.site_bodyid)
-        },
-        actuators=_actuators(model, where),
+        sites=sites,
+        actuators=actuators,
         gravity=model.opt.gravity.copy(),
-        q0=(model.qpos0 if start < 0 else model.key_qpos[start]).copy(),
-        left_out=_left_out(model),
+        q0=_start(model),
+        left_out=left_out(model),
     )
 
 
-def _refuse(model: Any, where: str) -> None:
-    """Raise UsageError on a feature whose absence would silently change the motion."""
-    counts = {
-        "equality constraints": model.neq,
-        "tendons": model.ntendon,
-        "flexible bodies": model.nflex,
-        "plugins": model.nplugin,
-        "mocap bodies": model.nmocap,
-        "joint friction loss": np.count_nonzero(model.dof_frictionloss),
-        "gravity compensation": np.count_nonzero(model.body_gravcomp),
-        "joint force ranges (actuatorfrcrange)": np.count_nonzero(model.jnt_actfrclimited),
-        "a surrounding medium (density, viscosity, wind)": np.count_nonzero(
-            [model.opt.density, model.opt.viscosity, *model.opt.wind]
-        ),
-    }
-    if found := [name for name, count in counts.items() if count]:
-        raise UsageError(f"{where}: {found[0]} are not modelled; take them out of the model")
-
-
-def _left_out(model: Any) -> tuple[str, ...]:
-    """What the file has besides, that changes no motion here."""
-    parts = []
-    if model.npair or model.nexclude:
-        parts.append(
-            f"{model.npair + model.nexclude} contact pairs and excludes: the scene file says what touches what"
-        )
-    if model.nsensor:
-        parts.append(f"{model.nsensor} MuJoCo sensors: the scene file has pads")
-    return tuple(parts)
+def _start(model: Any) -> Array:
+    """Where the scene starts: the keyframe "start", else "home", else the pose in the file."""
+    for name in ("start", "home"):
+        if (key := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)) >= 0:
+            return np.array(model.key_qpos[key])
+    return np.array(model.qpos0)
 
 
 def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
@@ -189,6 +169,7 @@ def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
 
 def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[BodyDef, ...]:
     bodies = []
+    body_names = names(model, "body", model.nbody)
     for root in np.flatnonzero(model.body_jntnum > 0):
         members = np.flatnonzero(carrier == carrier[root])
         masses = model.body_mass[members]
@@ -203,23 +184,18 @@ def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[
         parent = model.body_parentid[root]
         pose = poses[parent] @ Pose(model.body_pos[root].copy(), model.body_quat[root].copy())
         packed = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        bodies.append(BodyDef(model.body(root).name or f"body{root}", int(carrier[parent]), pose, mass, com, packed))
+        bodies.append(BodyDef(body_names[root], int(carrier[parent]), pose, mass, com, packed))
     return tuple(bodies)
 
 
-def _joints(model: Any, carrier: NDArray[np.int64], where: str) -> tuple[JointDef, ...]:
+def _joints(model: Any, carrier: NDArray[np.int64], actuators: tuple[ActuatorDef, ...]) -> tuple[JointDef, ...]:
     joints = []
-    for j in range(model.njnt):
-        name = model.joint(j).name or f"joint{j}"
-        kind = _JOINTS.get(int(model.jnt_type[j]))
-        if kind is None:
-            raise UsageError(f"{where}: joint {name!r} is a ball joint; slide, hinge and free joints are modelled")
+    for j, name in enumerate(names(model, "joint", model.njnt)):
+        kind = _JOINTS[int(model.jnt_type[j])]
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-        if kind != "free" and model.qpos0[q] != 0:
-            raise UsageError(f"{where}: joint {name!r} has ref = {model.qpos0[q]:g}; positions must count from 0")
-        if kind == "free" and model.jnt_stiffness[j] != 0:
-            raise UsageError(f"{where}: joint {name!r} is free and has a stiffness; a free body has no spring")
-        limits = tuple(float(x) for x in model.jnt_range[j])
+        turns = kind in ("ball", "free")
+        limited = bool(model.jnt_limited[j]) and not turns
+        own = [a for a in actuators if a.joint == j]
         joints.append(
             JointDef(
                 name=name,
@@ -229,11 +205,14 @@ def _joints(model: Any, carrier: NDArray[np.int64], where: str) -> tuple[JointDe
                 axis=model.jnt_axis[j].copy(),
                 q=q,
                 v=v,
-                damping=float(model.dof_damping[v]),
-                armature=float(model.dof_armature[v]),
+                damping=float(model.dof_damping[v]) + joint_extra(model, j, "damping"),
+                armature=float(model.dof_armature[v]) + joint_extra(model, j, "armature"),
                 stiffness=float(model.jnt_stiffness[j]),
-                springref=0.0 if kind == "free" else float(model.qpos_spring[q]),
-                range=(limits[0], limits[1]) if model.jnt_limited[j] else None,
+                springref=0.0 if turns else float(model.qpos_spring[q]),
+                range=(float(model.jnt_range[j, 0]), float(model.jnt_range[j, 1])) if limited else None,
+                limit=default_limit(kind, float(model.dof_M0[v]), own) if limited else None,
+                ref=0.0 if turns else float(model.qpos0[q]),
+                frictionloss=float(model.dof_frictionloss[v]),
             )
         )
     return tuple(joints)
@@ -241,52 +220,9 @@ def _joints(model: Any, carrier: NDArray[np.int64], where: str) -> tuple[JointDe
 
 def _geoms(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[GeomDef, ...]:
     geoms = []
-    for g in range(model.ngeom):
+    for g, name in enumerate(names(model, "geom", model.ngeom)):
         b = model.geom_bodyid[g]
         pose = poses[b] @ Pose(model.geom_pos[g].copy(), model.geom_quat[g].copy())
         kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
-        geoms.append(GeomDef(model.geom(g).name or f"geom{g}", int(carrier[b]), kind, pose, model.geom_size[g].copy()))
+        geoms.append(GeomDef(name, int(carrier[b]), kind, pose, model.geom_size[g].copy()))
     return tuple(geoms)
-
-
-def _actuators(model: Any, where: str) -> tuple[ActuatorDef, ...]:
-    actuators = []
-    for a in range(model.nu):
-        name = model.actuator(a).name or f"actuator{a}"
-        gain, bias = model.actuator_gainprm[a], model.actuator_biasprm[a]
-        joint = int(model.actuator_trnid[a, 0])
-        plain = (
-            model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
-            and model.actuator_dyntype[a] == mujoco.mjtDyn.mjDYN_NONE
-            and model.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_FIXED
-            and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE
-        )
-        motor = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_NONE
-        servo = (
-            model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
-            and bias[0] == 0
-            and bias[1] == -gain[0]
-            and bias[2] <= 0
-            and model.actuator_gear[a, 0] == 1
-        )
-        if not plain or not (motor or servo):
-            raise UsageError(
-                f"{where}: actuator {name!r} is of a kind that is not modelled; there are motors and position servos "
-                "(gear 1) on slide and hinge joints"
-            )
-        if model.actuator_ctrllimited[a]:
-            raise UsageError(f"{where}: actuator {name!r} has a ctrlrange; controls are not clipped, give forcerange")
-        limited = model.actuator_forcelimited[a]
-        low, high = model.actuator_forcerange[a] if limited else (-np.inf, np.inf)
-        actuators.append(
-            ActuatorDef(
-                name=name,
-                joint=joint,
-                kind="motor" if motor else "position",
-                gear=float(model.actuator_gear[a, 0] * (gain[0] if motor else 1)),
-                kp=0.0 if motor else float(gain[0]),
-                kd=0.0 if motor else float(-bias[2]),
-                force=(float(low), float(high)),
-            )
-        )
-    return tuple(actuators)

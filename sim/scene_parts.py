@@ -190,7 +190,7 @@ def _grid(table: Table) -> Grid:
 
 
 def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -> tuple[Limit, ...]:
-    """How each joint resists beyond its range; a joint with a range must say."""
+    """How each joint resists beyond its range: as its table says, or as the model file's reader chose."""
     names = [joint.name for joint in mechanics.joints]
     for name, table in tables.items():
         if name not in names:
@@ -199,11 +199,12 @@ def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -
     limits = []
     for joint in mechanics.joints:
         table = tables.get(joint.name, Table({}, where))
-        limit = Limit(table.number("limit_stiffness", 0.0, least=0), table.number("limit_damping", 0.0, least=0))
-        if (joint.range is not None) != (limit.stiffness > 0):
-            missing = "limit_stiffness in the scene" if joint.range is not None else "range in the model"
-            raise UsageError(f"{where}: joint {joint.name!r} has no {missing}; a limit needs range and stiffness")
-        limits.append(limit)
+        if table.data and joint.range is None:
+            raise UsageError(f"{where}: joint {joint.name!r} has no range in the model; a limit needs one")
+        stiffness, damping = joint.limit or (0.0, 0.0)
+        if "limit_stiffness" in table.data:
+            stiffness, damping = table.number("limit_stiffness", least=0), 0.0
+        limits.append(Limit(stiffness, table.number("limit_damping", damping, least=0)))
     return tuple(limits)
 
 
