@@ -22,6 +22,7 @@ COMMANDS = {
     "recover": "salvage what a killed recorder left behind",
     "mock": "start the mock robot: gripper, arm and two cameras on the wire",
     "bench": "measure speed",
+    "describe": "what a scene models, what it leaves out and why, its size, and where a step's time goes",
     "demo": "the main job on the mock robot: five insertions, pictures, a session",
 }
 
