@@ -107,7 +107,7 @@ class Case:
 
 def analytic(case: Case, *, params: bool = False) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
     """The rollout, and the gradient by the reverse pass: "u" (steps, nu), "q" (nv,) as a tangent, "v" (nv,),
-    "anchors" (na, 3), and with `params` "params" (parameters,)."""
+    "anchors" (na, 3), "history" (nh,), and with `params` "params" (parameters,)."""
     sim, model = case.sim, case.sim.model
     trajectory = sim.rollout(case.u[:, None], read_after=case.reads)
     if trajectory.status[0]:
@@ -123,7 +123,7 @@ def analytic(case: Case, *, params: bool = False) -> tuple[Trajectory, dict[str,
         by["tactile"] = case.weights[None, None]
     g = sim.rollout_gradient(trajectory, params=params, **by)
     start = to_tangent(model, trajectory.q[0, 0], g.q[0])
-    gradient = {"u": g.u[:, 0], "q": start, "v": g.v[0], "anchors": g.anchors[0]}
+    gradient = {"u": g.u[:, 0], "q": start, "v": g.v[0], "anchors": g.anchors[0], "history": g.history[0]}
     return trajectory, {**gradient, "params": g.params[0]} if params else gradient
 
 
@@ -137,14 +137,15 @@ def _from_tangent(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float6
 
 
 def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -> Agreement:
-    """Worst relative difference along random directions in (u, q, v, anchors, params), each taken alone as well.
+    """Worst relative difference along random directions in (u, q, v, anchors, history, params), each taken alone as well.
 
     The adjoint identity ⟨w, J d⟩ = ⟨Jᵀ w, d⟩ is what is compared: J d by dual numbers, Jᵀ w by the reverse pass.
     """
     sim, model = case.sim, case.sim.model
     trajectory, gradient = analytic(case, params=True)
     set_now = sim.anchored[0].astype(bool)
-    parts = ["u", "q", "v", "params"] + (["anchors"] if set_now.any() else [])
+    parts = ["u", "q", "v", "params"]
+    parts += ["anchors"] * bool(set_now.any()) + ["history"] * bool(sim.history[0].any())
     scale = _param_scale(sim.params[0])
     worst = 0.0
     for _ in range(directions):
@@ -154,9 +155,10 @@ def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -
                 d[name] = rng.normal(size=d[name].shape)
             d["anchors"][~set_now] = 0
             d["params"] *= scale
+            d["history"][-1:] = 0  # whether there is one
             exact = _core.directional_rollout(
-                model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], case.u,
-                d["params"], d["q"], d["v"], d["anchors"], d["u"],
+                model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], sim.history[0], case.u,
+                d["params"], d["q"], d["v"], d["anchors"], d["history"], d["u"],
             )  # fmt: skip
             along = case.weights.ravel() @ exact["d" + case.output]
             size = np.linalg.norm(case.weights) * np.linalg.norm(exact["d" + case.output])
@@ -228,6 +230,7 @@ def _displaced(
         v=sim.v + moves["v"],
         anchors=np.repeat(sim.anchors, n, axis=0),
         anchored=np.repeat(sim.anchored, n, axis=0),
+        history=np.repeat(sim.history, n, axis=0),
         read_after=case.reads,
     )
     if case.output == "q":

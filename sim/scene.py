@@ -36,7 +36,8 @@ from gelflow.sim.scene_toml import Table, nearest, read_toml, set_path
 
 Array = NDArray[np.float64]
 
-SECTIONS = ("format", "model", "step", "friction", "joints", "points", "contacts", "pads")
+INTEGRATORS = ("bdf1", "bdf2")
+SECTIONS = ("format", "model", "step", "integrator", "friction", "joints", "points", "contacts", "pads")
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Scene:
     name: str
     path: Path
     step: float  # [s]
+    integrator: str  # "bdf1" or "bdf2"
     friction: str  # the law that contacts and pads follow unless they fix their own
     gravity: Array  # [m/s²]
     bodies: tuple[BodyDef, ...]
@@ -120,6 +122,7 @@ class Scene:
         """Tell a model builder (gelflow.sim._core.ModelSpec) every part of this scene; returns it."""
         spec.gravity = tuple(self.gravity)
         spec.step = self.step
+        spec.integrator = self.integrator
         for index, body in enumerate(self.bodies):
             spec.add_body(body.name, body.parent, body.pose.pos, body.pose.quat, body.mass, body.com, body.inertia)
             for joint, limit in zip(self.joints, self.limits, strict=True):
@@ -231,6 +234,7 @@ def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Map
         name=path.stem,
         path=path,
         step=top.number("step", least=1e-6),
+        integrator=top.word("integrator", "bdf1", among=INTEGRATORS),
         friction=law,
         gravity=mechanics.gravity,
         bodies=mechanics.bodies,

@@ -29,6 +29,7 @@ class Trajectory:
     v: NDArray[Any]  # (steps + 1, N, nv)
     anchors: NDArray[Any]  # (steps + 1, N, na, 3), in the frames of the shapes that are touched [m]
     anchored: NDArray[np.uint8]  # (steps + 1, N, na)
+    history: NDArray[Any]  # (steps + 1, N, nh): what BDF2 remembers of the step before, see `Simulator`
     u: NDArray[Any]  # (steps, N, nu)
     tactile: NDArray[Any]  # (reads, N, markers, 3): shear x, shear y, normal [N]
     read_after: NDArray[np.int32]  # markers were read after that many steps
@@ -44,6 +45,7 @@ class TrajectoryGradient:
     q: NDArray[Any]  # (N, nq)
     v: NDArray[Any]  # (N, nv)
     anchors: NDArray[Any]  # (N, na, 3)
+    history: NDArray[Any]  # (N, nh)
     params: NDArray[np.float64]  # (N, parameters), in the order of `Model.param_names`; (N, 0) where not asked for
 
 
@@ -57,7 +59,9 @@ class Simulator:
     threads: at most this many threads; all cores when None. Results do not depend on it.
     precision: "double" or "single"
 
-    `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them.
+    `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them. So are
+    `anchors` (N, na, 3) and `anchored` (N, na), the memory of the elastic friction law, and `history` (N, nh), that of
+    BDF2: last step's displacement (nv), the velocity before it (nv), and 1 where there was one; BDF1 has none, nh = 0.
     """
 
     def __init__(
@@ -85,6 +89,7 @@ class Simulator:
         self.params: NDArray[Any] = self._batch.params
         self.anchors: NDArray[Any] = self._batch.anchors
         self.anchored: NDArray[np.uint8] = self._batch.anchored
+        self.history: NDArray[Any] = self._batch.history
         self.status: NDArray[np.int32] = self._batch.status
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
@@ -115,10 +120,11 @@ class Simulator:
         """
         self._batch.reset(None if which is None else np.ascontiguousarray(which, dtype=np.uint8))
 
-    def forget_contact(self, which: ArrayLike | None = None) -> None:
-        """Clear the anchors of the elastic law, after a state was written by hand."""
+    def forget(self, which: ArrayLike | None = None) -> None:
+        """Clear what the state remembers of its past, after it was written by hand: anchors, and BDF2's history."""
         chosen = slice(None) if which is None else np.asarray(which, dtype=bool)
         self.anchored[chosen] = 0
+        self.history[chosen] = 0
 
     def step(self, u: ArrayLike, steps: int = 1) -> None:
         """Take `steps` steps under controls u (N, nu), or (nu,) for all environments alike.
@@ -209,6 +215,7 @@ class Simulator:
         v: ArrayLike | None = None,
         anchors: ArrayLike | None = None,
         anchored: ArrayLike | None = None,
+        history: ArrayLike | None = None,
         read_after: Sequence[int] = (),
     ) -> Trajectory:
         """Steps under controls u (steps, N, nu), from the given state or the present one, which is not changed.
@@ -232,6 +239,7 @@ class Simulator:
             v=along_time(v, self.v),
             anchors=along_time(anchors, self.anchors),
             anchored=along_time(anchored, self.anchored),
+            history=along_time(history, self.history),
             u=controls,
             tactile=np.empty((len(reads), n, self.model.markers, 3), self.dtype),
             read_after=reads,
@@ -257,7 +265,7 @@ class Simulator:
 
     @staticmethod
     def _arguments(t: Trajectory) -> tuple[NDArray[Any], ...]:
-        return (t.u, t.q, t.v, t.anchors, t.anchored, t.halvings, t.status, t.read_after, t.tactile)
+        return (t.u, t.q, t.v, t.anchors, t.anchored, t.history, t.halvings, t.status, t.read_after, t.tactile)
 
     def rollout_gradient(
         self,
@@ -267,6 +275,7 @@ class Simulator:
         v: ArrayLike | None = None,
         tactile: ArrayLike | None = None,
         anchors_end: ArrayLike | None = None,
+        history_end: ArrayLike | None = None,
         params: bool = False,
     ) -> TrajectoryGradient:
         """The reverse pass: gradients with respect to the trajectory's q, v, tactile (shaped as there) in, gradients
@@ -283,6 +292,7 @@ class Simulator:
             shaped(q, trajectory.q),
             shaped(v, trajectory.v),
             shaped(anchors_end, trajectory.anchors[0]),
+            shaped(history_end, trajectory.history[0]),
             shaped(tactile, trajectory.tactile),
             params,
         )

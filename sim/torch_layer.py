@@ -24,6 +24,7 @@ class TorchState:
     v: torch.Tensor  # (N, nv)
     anchors: torch.Tensor  # (N, na, 3)
     anchored: torch.Tensor  # (N, na) uint8: no gradient
+    history: torch.Tensor  # (N, nh): BDF2's, see `Simulator`; empty under BDF1
 
 
 @dataclass(frozen=True)
@@ -39,22 +40,25 @@ class TorchRollout:
 
 def state_of(sim: Simulator) -> TorchState:
     """The simulator's present state as tensors (copies)."""
-    return TorchState(*(torch.from_numpy(np.array(array)) for array in (sim.q, sim.v, sim.anchors, sim.anchored)))
+    arrays = (sim.q, sim.v, sim.anchors, sim.anchored, sim.history)
+    return TorchState(*(torch.from_numpy(np.array(array)) for array in arrays))
 
 
 def rollout(sim: Simulator, state: TorchState, u: torch.Tensor, *, read_after: Sequence[int] = ()) -> TorchRollout:
     """Steps under controls u (steps, N, nu) from `state`; markers are read after the steps in `read_after`.
 
-    Differentiable in u, state.q, state.v and state.anchors. Raises UsageError on wrong shapes, another precision than
+    Differentiable in u, state.q, state.v, state.anchors and state.history. Raises UsageError on wrong shapes, another precision than
     the simulator's, and numbers that are not finite.
     """
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
-    for name, tensor in (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors)):
+    named = (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors), ("history", state.history))
+    for name, tensor in named:
         if tensor.dtype != expected or tensor.device.type != "cpu":
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
-    outputs = _Rollout.apply(u, state.q, state.v, state.anchors, state.anchored, sim, tuple(read_after))  # type: ignore[no-untyped-call]
-    q, v, tactile, anchors, anchored, ok = outputs
-    return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored), ok)
+    inputs = (u, state.q, state.v, state.anchors, state.history, state.anchored)
+    outputs = _Rollout.apply(*inputs, sim, tuple(read_after))  # type: ignore[no-untyped-call]
+    q, v, tactile, anchors, history, anchored, ok = outputs
+    return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok)
 
 
 def step(sim: Simulator, state: TorchState, u: torch.Tensor) -> tuple[TorchState, torch.Tensor]:
@@ -72,6 +76,7 @@ class _Rollout(torch.autograd.Function):
         q: torch.Tensor,
         v: torch.Tensor,
         anchors: torch.Tensor,
+        history: torch.Tensor,
         anchored: torch.Tensor,
         sim: Simulator,
         read_after: tuple[int, ...],
@@ -82,23 +87,30 @@ class _Rollout(torch.autograd.Function):
             v=v.detach().numpy(),
             anchors=anchors.detach().numpy(),
             anchored=anchored.numpy(),
+            history=history.detach().numpy(),
             read_after=read_after,
         )
         ctx.sim = sim
         ctx.trajectory = trajectory
         # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
         ctx.params = sim.params.copy()
-        end = torch.from_numpy(trajectory.anchors[-1].copy())
+        ends = (torch.from_numpy(array[-1].copy()) for array in (trajectory.anchors, trajectory.history))
         set_at_end = torch.from_numpy(trajectory.anchored[-1].copy())
         ok = torch.from_numpy(trajectory.status == 0)
         ctx.mark_non_differentiable(set_at_end, ok)
         arrays = (trajectory.q, trajectory.v, trajectory.tactile)
-        return (*(torch.from_numpy(array.copy()) for array in arrays), end, set_at_end, ok)
+        return (*(torch.from_numpy(array.copy()) for array in arrays), *ends, set_at_end, ok)
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, by_q: torch.Tensor, by_v: torch.Tensor, by_tactile: torch.Tensor, by_end: torch.Tensor, *_: Any
+        ctx: Any,
+        by_q: torch.Tensor,
+        by_v: torch.Tensor,
+        by_tactile: torch.Tensor,
+        by_anchors: torch.Tensor,
+        by_history: torch.Tensor,
+        *_: Any,
     ) -> tuple[torch.Tensor | None, ...]:
         sim: Simulator = ctx.sim
         trajectory: Trajectory = ctx.trajectory
@@ -106,9 +118,14 @@ class _Rollout(torch.autograd.Function):
         sim.params[:] = ctx.params
         try:
             gradient = sim.rollout_gradient(
-                trajectory, q=by_q.numpy(), v=by_v.numpy(), tactile=by_tactile.numpy(), anchors_end=by_end.numpy()
+                trajectory,
+                q=by_q.numpy(),
+                v=by_v.numpy(),
+                tactile=by_tactile.numpy(),
+                anchors_end=by_anchors.numpy(),
+                history_end=by_history.numpy(),
             )
         finally:
             sim.params[:] = kept
-        arrays = (gradient.u, gradient.q, gradient.v, gradient.anchors)
+        arrays = (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history)
         return (*(torch.from_numpy(array) for array in arrays), None, None, None)

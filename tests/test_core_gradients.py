@@ -12,21 +12,23 @@ from gelflow.sim.simulator import Simulator
 
 SCENES = ("rolling", "insertion")
 LAWS = ("viscous", "elastic")
+INTEGRATORS = ("bdf1", "bdf2")
 OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 
 
-def exact_simulator(name: str, law: str) -> Simulator:
+def exact_simulator(name: str, law: str, integrator: str) -> Simulator:
     """The scene with Newton's tolerance at the rounding floor: a difference must see the step, not the solver."""
     overrides = {"pads.pad.rows": 24, "pads.pad.cols": 24} if name == "rolling" else {}
     spec = _core.ModelSpec()
     load_scene(name, friction=law, overrides=overrides).describe_to(spec)
     spec.tolerance = 1e-13
+    spec.integrator = integrator
     return Simulator(_core.Model(spec))
 
 
-def in_contact(name: str, law: str, rng: np.random.Generator) -> tuple[Simulator, np.ndarray]:
+def in_contact(name: str, law: str, rng: np.random.Generator, integrator: str = "bdf1") -> tuple[Simulator, np.ndarray]:
     """A simulator in the middle of contact, and the controls that hold it there, disturbed at random."""
-    sim = exact_simulator(name, law)
+    sim = exact_simulator(name, law, integrator)
     if name == "rolling":
         hold, spread = np.array([0.1, 0.03, 0.2]), np.array([0.05, 0.05, 0.01])
         sim.step([0, 0, 0.2], 120)  # down onto the ball
@@ -56,30 +58,32 @@ def in_contact(name: str, law: str, rng: np.random.Generator) -> tuple[Simulator
     return sim, hold + rng.normal(size=(3, sim.model.nu)) * spread
 
 
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", SCENES)
-def test_exact_against_dual_numbers(name: str, law: str) -> None:
+def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> None:
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        sim, u = in_contact(name, law, rng)
+        sim, u = in_contact(name, law, rng, integrator)
         assert sim.tactile().any(), "the markers must feel something for the check to mean anything"
         for output in OUTPUTS:
             case = gradient_check.Case.random(sim, u, output, rng)
             assert gradient_check.against_dual(case, rng).error < 1e-10
 
 
+@pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("name", SCENES)
-def test_right_against_central_differences(name: str, law: str) -> None:
+def test_right_against_central_differences(name: str, law: str, integrator: str) -> None:
     left_out, worst = [], 0.0
     for seed in range(20):
         rng = np.random.default_rng(100 + seed)
-        sim, u = in_contact(name, law, rng)
+        sim, u = in_contact(name, law, rng, integrator)
         output = OUTPUTS[seed % 3]
         agreement = gradient_check.against_differences(gradient_check.Case.random(sim, u, output, rng))
         left_out.append(agreement.left_out)
         worst = max(worst, agreement.error)
-    print(f"{name} {law}: error {worst:.1e}, left out {np.mean(left_out):.1%}")
+    print(f"{name} {law} {integrator}: error {worst:.1e}, left out {np.mean(left_out):.1%}")
     assert worst < 1e-6
     assert np.mean(left_out) <= 0.1
 
@@ -94,7 +98,7 @@ def test_the_checker_notices_a_wrong_gradient() -> None:
 
 def rollout_loss(sim: Simulator, u: torch.Tensor, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     state = torch_layer.state_of(sim)
-    state = torch_layer.TorchState(q, v, state.anchors, state.anchored)
+    state = torch_layer.TorchState(q, v, state.anchors, state.anchored, state.history)
     run = torch_layer.rollout(sim, state, u, read_after=(len(u) // 2, len(u)))
     return (run.q[-1] ** 2).sum() + (run.v**2).mean() + 10 * (run.tactile**2).sum()
 
@@ -158,7 +162,7 @@ def test_steps_one_by_one_are_the_rollout() -> None:
 
 
 def test_wrong_tensors_are_refused() -> None:
-    sim = exact_simulator("rolling", "viscous")
+    sim = exact_simulator("rolling", "viscous", "bdf1")
     state = torch_layer.state_of(sim)
     with pytest.raises(UsageError, match=r"u must be a CPU tensor of torch\.float64"):
         torch_layer.rollout(sim, state, torch.zeros((1, 1, 3), dtype=torch.float32))

@@ -1,9 +1,11 @@
 // The reverse pass of one step (eqs. 19-23).
 //
-// With b the gradient arriving at v_t, directly and through q_t = q_{t-1} ⊕ h v_t, and A = ∂g/∂v_t at the accepted state:
-//     Aᵀ c = b,   ∂L/∂u −= cᵀ ∂g/∂u,   ∂L/∂v_{t-1} = Mᵀ c,
+// With b the gradient arriving at v_t, directly and through the increment β h v_t + γ δ, and A = ∂g/∂v_t at the accepted
+// state:
+//     Aᵀ c = b,   ∂L/∂u −= cᵀ ∂g/∂u,   ∂L/∂v* = Mᵀ c,
 //     ∂L/∂q_{t-1} = (∂q_t/∂q_{t-1})ᵀ (∂L/∂q_t − (∂g/∂q_t)ᵀ c),   ∂L/∂X_{t-1} −= cᵀ ∂g/∂X_{t-1}.
-// The anchors after the step hang on the state at its end: their gradient joins ∂L/∂q_t and ∂L/∂v_t first.
+// The anchors after the step hang on the state at its end: their gradient joins ∂L/∂q_t and ∂L/∂v_t first. Under BDF2
+// the increment is the next step's δ, and v_{t-1} its v_{t-2}.
 #pragma once
 
 #include "step.hpp"
@@ -13,16 +15,48 @@ namespace gelflow {
 // Gradients with respect to a state; q as a tangent vector.
 template <class T>
 struct StateGradient {
-  explicit StateGradient(const Model& m) : q(VX<T>::Zero(m.nv)), v(VX<T>::Zero(m.nv)), anchors(m.na, V3<T>::Zero()) {}
-  VX<T> q, v;
+  explicit StateGradient(const Model& m)
+      : q(VX<T>::Zero(m.nv)), v(VX<T>::Zero(m.nv)), history(VX<T>::Zero(m.nh)), anchors(m.na, V3<T>::Zero()) {}
+  VX<T> q, v, history;
   std::vector<V3<T>> anchors;
 };
 
 // What the reverse pass needs of one accepted substep.
 template <class T>
 struct Record {
+  Record(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool whole)
+      : h(from.h),
+        second(from.shift != nullptr),
+        whole(whole),
+        q0(Eigen::Map<const VX<T>>(from.q0, m.nq)),
+        v_star(Eigen::Map<const VX<T>>(from.v_star, m.nv)),
+        v1(v_new),
+        anchors(from.anchors, from.anchors + m.na),
+        anchored(from.anchored, from.anchored + m.na) {
+    if (second) shift = Eigen::Map<const VX<T>>(from.shift, m.nv);
+  }
+  StepStart<T> start(const T* u) const {
+    return {h, q0.data(), v_star.data(), second ? shift.data() : nullptr, anchors.data(), anchored.data(), u};
+  }
   T h;
-  VX<T> q0, v0, v1;
+  bool second;  // a step of BDF2
+  bool whole;   // not one of several substeps: BDF2 goes on from it
+  VX<T> q0, v_star, shift, v1;
+  std::vector<V3<T>> anchors;
+  std::vector<std::uint8_t> anchored;
+};
+
+// A state of one's own.
+template <class T>
+struct StateCopy {
+  StateCopy(const Model& m, const StateView<T>& s)
+      : q(s.q, s.q + m.nq),
+        v(s.v, s.v + m.nv),
+        history(s.history, s.history + m.nh),
+        anchors(s.anchors, s.anchors + m.na),
+        anchored(s.anchored, s.anchored + m.na) {}
+  StateView<T> view() { return {q.data(), v.data(), anchors.data(), anchored.data(), history.data()}; }
+  std::vector<T> q, v, history;
   std::vector<V3<T>> anchors;
   std::vector<std::uint8_t> anchored;
 };
@@ -33,8 +67,7 @@ template <class T, class Multipliers>
 void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
                         StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.h, r.q0.data(), r.v0.data(), r.anchors.data(), r.anchored.data(), u, r.v1.data(),
-                    false, w);
+  evaluate<true, T>(m, params, r.start(u), r.v1.data(), false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,
@@ -42,13 +75,25 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
     marker_anchors_transposed<T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                                  by_anchor.data());
   }
-  const VX<T> b = g.v + position_by_velocity_transposed<T>(m, r.v1.data(), r.h, g.q);
+  VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
+  if (m.nh > 0 && r.whole) {
+    by_increment = g.history.head(m.nv);
+    by_v0 = g.history.segment(m.nv, m.nv);
+  }
+  const VX<T> b = g.v + r.h * (position_by_increment_transposed<T>(m, w.increment, g.q) + by_increment);
   w.lu.compute(w.tangent.transpose());
   const VX<T> c = w.lu.solve(b);
   multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
-  g.q = position_by_position_transposed<T>(m, r.v1.data(), r.h, VX<T>(g.q - w.by_q.transpose() * c));
-  g.v = w.mass.transpose() * c;
+  const VX<T> by_q1 = g.q - w.by_q.transpose() * c, by_v_star = w.mass.transpose() * c;
+  by_increment += position_by_increment_transposed<T>(m, w.increment, by_q1);
+  g.q = position_by_position_transposed<T>(m, w.increment, by_q1);
+  g.v = by_v0 + (r.second ? T(4) / T(3) : T(1)) * by_v_star;
+  g.history.setZero();
+  if (r.second) {
+    g.history.head(m.nv) = by_increment / T(3);
+    g.history.segment(m.nv, m.nv) = -by_v_star / T(3);
+  }
   if (m.na > 0) {
     contact_anchors_transposed<false, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, nullptr, c, g.q, g.v,
                                          by_anchor.data());

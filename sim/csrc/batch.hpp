@@ -44,6 +44,7 @@ struct Rollout {
   int steps, reads;
   const T* u;              // (steps, N, nu)
   T *q, *v, *anchors;      // (steps + 1, N, ·); the first entry is the start
+  T* history;              // (steps + 1, N, nh)
   std::uint8_t* anchored;  // (steps + 1, N, na)
   std::int8_t* halvings;   // (steps, N)
   std::int32_t* status;    // (N): 0, or why the environment stopped
@@ -54,8 +55,10 @@ template <class T>
 struct RolloutGradient {
   const T *q, *v;             // in: of the trajectory, shaped as there
   const T* anchors_end;       // in: (N, na, 3), of the anchors at the end
+  const T* history_end;       // in: (N, nh)
   const T* tactile;           // in: (reads, N, markers, 3)
   T *u, *q0, *v0, *anchors0;  // out
+  T* history0;                // out, (N, nh)
   double* params;             // out, (N, params); null: not asked for
 };
 
@@ -69,6 +72,7 @@ class Batch {
   std::vector<T> q, v, params;  // (N, nq), (N, nv), (N, params)
   std::vector<V3<T>> anchors;   // (N, na)
   std::vector<std::uint8_t> anchored;
+  std::vector<T> history;                        // (N, nh)
   std::vector<std::int32_t> status;              // (N)
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
@@ -110,9 +114,9 @@ struct DirectionalRollout {
   std::int32_t status = 0;
 };
 struct RolloutStart {
-  const double *params, *q, *v, *anchors, *u;  // u (steps, nu)
+  const double *params, *q, *v, *anchors, *history, *u;  // u (steps, nu)
   const std::uint8_t* anchored;
-  const double *dparams, *dq, *dv, *danchors, *du;  // the direction; dq as a tangent
+  const double *dparams, *dq, *dv, *danchors, *dhistory, *du;  // the direction; dq as a tangent
   int steps;
 };
 DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start);

@@ -17,6 +17,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
       params(static_cast<std::size_t>(n) * model->param_names.size()),
       anchors(static_cast<std::size_t>(n) * model->na, V3<T>::Zero()),
       anchored(static_cast<std::size_t>(n) * model->na),
+      history(static_cast<std::size_t>(n) * model->nh),
       status(n),
       iterations(n),
       halved(n),
@@ -33,7 +34,7 @@ template <class T>
 StateView<T> Batch<T>::state(int env) {
   const auto e = static_cast<std::size_t>(env);
   return {q.data() + e * model->nq, v.data() + e * model->nv, anchors.data() + e * model->na,
-          anchored.data() + e * model->na};
+          anchored.data() + e * model->na, history.data() + e * model->nh};
 }
 
 template <class T>
@@ -45,6 +46,7 @@ void Batch<T>::reset(const std::uint8_t* which) {
     std::fill(s.v, s.v + model->nv, T(0));
     std::fill(s.anchored, s.anchored + model->na, 0);
     std::fill(s.anchors, s.anchors + model->na, V3<T>::Zero());
+    std::fill(s.history, s.history + model->nh, T(0));
     status[e] = 0;
     iterations[e] = halved[e] = 0;
   }
@@ -173,7 +175,7 @@ void Batch<T>::rollout(const Rollout<T>& r) {
     const auto at = [&](int t) {
       const std::size_t row = t * N + e;
       return StateView<T>{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-                          r.anchored + row * na};
+                          r.anchored + row * na, r.history + row * m.nh};
     };
     for (int t = 0;; ++t) {
       const StateView<T> now = at(t);
@@ -190,6 +192,7 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       std::copy(now.v, now.v + m.nv, next.v);
       std::copy(now.anchors, now.anchors + na, next.anchors);
       std::copy(now.anchored, now.anchored + na, next.anchored);
+      std::copy(now.history, now.history + m.nh, next.history);
       if (r.status[e] != 0) continue;
       const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, 0, next, memory);
       r.status[e] = static_cast<std::int32_t>(report.status);
@@ -236,15 +239,19 @@ struct StepInDouble {
       : params(in_double(numbers, m.param_names.size())),
         u(in_double(control, m.actuators.size())),
         q0(in_double(r.q0.data(), m.nq)),
-        v0(in_double(r.v0.data(), m.nv)),
+        v0(in_double(r.v_star.data(), m.nv)),
+        shift(in_double(r.shift.data(), r.shift.size())),
         v1(in_double(r.v1.data(), m.nv)),
         c(in_double(multipliers.data(), m.nv)),
         anchors(in_double(r.anchors.data(), m.na)),
         by_next(in_double(g.anchors.data(), m.na)),
         h(real_part(r.h)),
         anchored(r.anchored.data()) {}
-  ParamState state() const { return {h, q0.data(), v0.data(), v1.data(), u.data(), anchors.data(), anchored}; }
-  std::vector<double> params, u, q0, v0, v1, c;
+  ParamState state() const {
+    return {h,         q0.data(), v0.data(),      shift.empty() ? nullptr : shift.data(),
+            v1.data(), u.data(),  anchors.data(), anchored};
+  }
+  std::vector<double> params, u, q0, v0, shift, v1, c;
   std::vector<V3<double>> anchors, by_next;
   double h;
   const std::uint8_t* anchored;
@@ -259,7 +266,7 @@ struct ReadingInDouble {
         anchors(in_double(s.anchors, m.na)),
         anchored(s.anchored) {}
   ParamState state(const Model& m) const {
-    return {m.step, q.data(), v.data(), nullptr, nullptr, anchors.data(), anchored};
+    return {m.step, q.data(), v.data(), nullptr, nullptr, nullptr, anchors.data(), anchored};
   }
   std::vector<double> params, q, v, by;
   std::vector<V3<double>> anchors;
@@ -273,12 +280,13 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
   const T* params = params_of(env);
   StateGradient<T> gradient(m);
   std::copy_n(reinterpret_cast<const V3<T>*>(g.anchors_end) + e * na, na, gradient.anchors.begin());
+  std::copy_n(g.history_end + e * m.nh, m.nh, gradient.history.data());
   std::vector<Record<T>> records;
   int read = r.reads - 1;
   for (int t = r.steps; t >= 0; --t) {
     const std::size_t row = t * N + e;
     const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-                           r.anchored + row * na};
+                           r.anchored + row * na, r.history + row * m.nh};
     gradient.q += to_tangent<T>(m, now.q, g.q + row * m.nq);
     gradient.v += Eigen::Map<const VX<T>>(g.v + row * m.nv, m.nv);
     for (; read >= 0 && r.read_after[read] == t; --read) {
@@ -293,32 +301,20 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
     if (t == 0) break;
     // The step is taken again from where it started, so that each substep's start and anchors are at hand.
     const std::size_t before = (t - 1) * N + e;
-    Record<T> record;
-    record.q0 = Eigen::Map<const VX<T>>(r.q + before * m.nq, m.nq);
-    record.v0 = Eigen::Map<const VX<T>>(r.v + before * m.nv, m.nv);
-    const V3<T>* anchors = reinterpret_cast<const V3<T>*>(r.anchors) + before * na;
-    record.anchors.assign(anchors, anchors + na);
-    record.anchored.assign(r.anchored + before * na, r.anchored + before * na + na);
+    const StateView<T> old{r.q + before * m.nq, r.v + before * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + before * na,
+                           r.anchored + before * na, r.history + before * m.nh};
     const T* u = r.u + before * nu;
-    const int halvings = r.halvings[before];
+    const int count = 1 << r.halvings[before];
     records.clear();
-    if (halvings == 0) {
-      record.h = T(m.step);
-      record.v1 = Eigen::Map<const VX<T>>(now.v, m.nv);
-      records.push_back(std::move(record));
+    if (count == 1) {
+      const StepStart<T> from = start_of<T>(m, T(m.step), 1, old, u, memory);
+      records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
     } else {
-      const StateView<T> scratch{record.q0.data(), record.v0.data(), record.anchors.data(), record.anchored.data()};
+      StateCopy<T> scratch(m, old);
       int iterations = 0;
-      substeps<T>(m, params, T(m.step / (1 << halvings)), 1 << halvings, u, 0, scratch, memory, iterations,
-                  [&](const T& h, const StateView<T>& s, const StepMemory<T>& taken) {
-                    Record<T> part;
-                    part.h = h;
-                    part.q0 = Eigen::Map<const VX<T>>(s.q, m.nq);
-                    part.v0 = Eigen::Map<const VX<T>>(s.v, m.nv);
-                    part.anchors.assign(s.anchors, s.anchors + na);
-                    part.anchored.assign(s.anchored, s.anchored + na);
-                    part.v1 = taken.v_new;
-                    records.push_back(std::move(part));
+      substeps<T>(m, params, T(m.step / count), count, u, 0, scratch.view(), memory, iterations,
+                  [&](const StepStart<T>& from, const StepMemory<T>& taken) {
+                    records.emplace_back(m, from, taken.v_new, false);
                   });
     }
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
@@ -333,6 +329,7 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
   add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, g.q0 + e * m.nq);
   std::copy_n(gradient.v.data(), m.nv, g.v0 + e * m.nv);
   std::copy_n(gradient.anchors.data(), na, reinterpret_cast<V3<T>*>(g.anchors0) + e * na);
+  std::copy_n(gradient.history.data(), m.nh, g.history0 + e * m.nh);
 }
 
 template <class T>
@@ -342,6 +339,7 @@ void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>&
   std::fill_n(g.q0, N * model->nq, T(0));
   std::fill_n(g.v0, N * model->nv, T(0));
   std::fill_n(g.anchors0, N * model->na * 3, T(0));
+  std::fill_n(g.history0, N * model->nh, T(0));
   if (g.params) std::fill_n(g.params, N * model->param_names.size(), 0.0);
   pool_.run(n, [&](int e, int thread) {
     if (r.status[e] == 0) transpose_one(e, r, g, memory_[thread]);  // a failed environment has gradient zero

@@ -57,8 +57,8 @@ std::vector<V3<double>> points_of(const Array<double>& array, const char* name) 
 
 template <class T>
 Rollout<T> rollout_of(const Batch<T>& b, const Array<T>& u, py::array& q, py::array& v, py::array& anchors,
-                      py::array& anchored, py::array& halvings, py::array& status, const Array<int>& read_after,
-                      py::array& tactile) {
+                      py::array& anchored, py::array& history, py::array& halvings, py::array& status,
+                      const Array<int>& read_after, py::array& tactile) {
   if (u.ndim() != 3) throw std::invalid_argument("u must have shape (steps, environments, actuators)");
   const Model& m = *b.model;
   const py::ssize_t steps = u.shape(0), n = b.n, reads = read_after.size(), nu = m.actuators.size();
@@ -75,6 +75,7 @@ Rollout<T> rollout_of(const Batch<T>& b, const Array<T>& u, py::array& q, py::ar
           writable<T>(q, {steps + 1, n, m.nq}, "q"),
           writable<T>(v, {steps + 1, n, m.nv}, "v"),
           writable<T>(anchors, {steps + 1, n, m.na, 3}, "anchors"),
+          writable<T>(history, {steps + 1, n, m.nh}, "history"),
           writable<std::uint8_t>(anchored, {steps + 1, n, m.na}, "anchored"),
           writable<std::int8_t>(halvings, {steps, n}, "halvings"),
           writable<std::int32_t>(status, {n}, "status"),
@@ -114,6 +115,8 @@ void bind_batch(py::module_& module, const char* name) {
                              })
       .def_property_readonly(
           "anchored", self_view(&B::anchored, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->na}; }))
+      .def_property_readonly(
+          "history", self_view(&B::history, [](const B& b) { return std::vector<py::ssize_t>{b.n, b.model->nh}; }))
       .def_property_readonly("status", self_view(&B::status, per_env))
       .def_property_readonly("iterations", self_view(&B::iterations, per_env))
       .def_property_readonly("halved", self_view(&B::halved, per_env))
@@ -150,59 +153,66 @@ void bind_batch(py::module_& module, const char* name) {
       .def("mass_matrix",
            [](B& b, py::array out) { b.mass_matrix(writable<T>(out, {b.n, b.model->nv, b.model->nv}, "out")); })
       .def("bias", [](B& b, py::array out) { b.bias(writable<T>(out, {b.n, b.model->nv}, "out")); })
-      .def("rollout",
-           [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
-              py::array halvings, py::array status, const Array<int>& read_after, py::array tactile) {
-             const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, halvings, status, read_after, tactile);
-             const py::gil_scoped_release release;
-             b.rollout(r);
-           })
-      .def("branches",
-           [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
-              py::array halvings, py::array status, const Array<int>& read_after, py::array tactile) {
-             const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, halvings, status, read_after, tactile);
-             py::array_t<std::uint64_t> out({static_cast<py::ssize_t>(r.steps), static_cast<py::ssize_t>(b.n)});
-             b.branches(r, out.mutable_data());
-             return out;
-           })
-      .def("rollout_transposed",
-           [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
-              py::array halvings, py::array status, const Array<int>& read_after, py::array tactile,
-              const Array<T>& by_q, const Array<T>& by_v, const Array<T>& by_anchors_end, const Array<T>& by_tactile,
-              bool params) {
-             const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, halvings, status, read_after, tactile);
-             const Model& m = *b.model;
-             const py::ssize_t n = b.n, nu = m.actuators.size();
-             check_shape<T>(by_q, {r.steps + 1, n, m.nq}, "by_q");
-             check_shape<T>(by_v, {r.steps + 1, n, m.nv}, "by_v");
-             check_shape<T>(by_anchors_end, {n, m.na, 3}, "by_anchors_end");
-             check_shape<T>(by_tactile, {r.reads, n, m.markers, 3}, "by_tactile");
-             py::array_t<T> by_u({static_cast<py::ssize_t>(r.steps), n, nu}),
-                 by_q0({n, static_cast<py::ssize_t>(m.nq)}), by_v0({n, static_cast<py::ssize_t>(m.nv)}),
-                 by_anchors0({n, static_cast<py::ssize_t>(m.na), py::ssize_t{3}});
-             const py::ssize_t asked = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
-             py::array_t<double> by_params({n, asked});
-             const RolloutGradient<T> g{by_q.data(),
-                                        by_v.data(),
-                                        by_anchors_end.data(),
-                                        by_tactile.data(),
-                                        by_u.mutable_data(),
-                                        by_q0.mutable_data(),
-                                        by_v0.mutable_data(),
-                                        by_anchors0.mutable_data(),
-                                        params ? by_params.mutable_data() : nullptr};
-             {
-               const py::gil_scoped_release release;
-               b.rollout_transposed(r, g);
-             }
-             return py::make_tuple(by_u, by_q0, by_v0, by_anchors0, by_params);
-           });
+      .def(
+          "rollout",
+          [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
+             py::array history, py::array halvings, py::array status, const Array<int>& read_after, py::array tactile) {
+            const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, history, halvings, status, read_after, tactile);
+            const py::gil_scoped_release release;
+            b.rollout(r);
+          })
+      .def(
+          "branches",
+          [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors, py::array anchored,
+             py::array history, py::array halvings, py::array status, const Array<int>& read_after, py::array tactile) {
+            const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, history, halvings, status, read_after, tactile);
+            py::array_t<std::uint64_t> out({static_cast<py::ssize_t>(r.steps), static_cast<py::ssize_t>(b.n)});
+            b.branches(r, out.mutable_data());
+            return out;
+          })
+      .def("rollout_transposed", [](B& b, const Array<T>& u, py::array q, py::array v, py::array anchors,
+                                    py::array anchored, py::array history, py::array halvings, py::array status,
+                                    const Array<int>& read_after, py::array tactile, const Array<T>& by_q,
+                                    const Array<T>& by_v, const Array<T>& by_anchors_end,
+                                    const Array<T>& by_history_end, const Array<T>& by_tactile, bool params) {
+        const auto r = rollout_of<T>(b, u, q, v, anchors, anchored, history, halvings, status, read_after, tactile);
+        const Model& m = *b.model;
+        const py::ssize_t n = b.n, nu = m.actuators.size();
+        check_shape<T>(by_q, {r.steps + 1, n, m.nq}, "by_q");
+        check_shape<T>(by_v, {r.steps + 1, n, m.nv}, "by_v");
+        check_shape<T>(by_anchors_end, {n, m.na, 3}, "by_anchors_end");
+        check_shape<T>(by_history_end, {n, m.nh}, "by_history_end");
+        check_shape<T>(by_tactile, {r.reads, n, m.markers, 3}, "by_tactile");
+        py::array_t<T> by_u({static_cast<py::ssize_t>(r.steps), n, nu}), by_q0({n, static_cast<py::ssize_t>(m.nq)}),
+            by_v0({n, static_cast<py::ssize_t>(m.nv)}),
+            by_anchors0({n, static_cast<py::ssize_t>(m.na), py::ssize_t{3}});
+        const py::ssize_t asked = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
+        py::array_t<T> by_history0({n, static_cast<py::ssize_t>(m.nh)});
+        py::array_t<double> by_params({n, asked});
+        const RolloutGradient<T> g{by_q.data(),
+                                   by_v.data(),
+                                   by_anchors_end.data(),
+                                   by_history_end.data(),
+                                   by_tactile.data(),
+                                   by_u.mutable_data(),
+                                   by_q0.mutable_data(),
+                                   by_v0.mutable_data(),
+                                   by_anchors0.mutable_data(),
+                                   by_history0.mutable_data(),
+                                   params ? by_params.mutable_data() : nullptr};
+        {
+          const py::gil_scoped_release release;
+          b.rollout_transposed(r, g);
+        }
+        return py::make_tuple(by_u, by_q0, by_v0, by_anchors0, by_history0, by_params);
+      });
 }
 
 py::dict directional(const Model& m, const Array<double>& params, const Array<double>& q, const Array<double>& v,
-                     const Array<double>& anchors, const Array<std::uint8_t>& anchored, const Array<double>& u,
-                     const Array<double>& dparams, const Array<double>& dq, const Array<double>& dv,
-                     const Array<double>& danchors, const Array<double>& du) {
+                     const Array<double>& anchors, const Array<std::uint8_t>& anchored, const Array<double>& history,
+                     const Array<double>& u, const Array<double>& dparams, const Array<double>& dq,
+                     const Array<double>& dv, const Array<double>& danchors, const Array<double>& dhistory,
+                     const Array<double>& du) {
   const py::ssize_t np = m.param_names.size(), nu = m.actuators.size(), steps = u.shape(0);
   check_shape<double>(params, {np}, "params");
   check_shape<double>(dparams, {np}, "dparams");
@@ -213,11 +223,13 @@ py::dict directional(const Model& m, const Array<double>& params, const Array<do
   check_shape<double>(anchors, {m.na, 3}, "anchors");
   check_shape<double>(danchors, {m.na, 3}, "danchors");
   check_shape<std::uint8_t>(anchored, {m.na}, "anchored");
+  check_shape<double>(history, {m.nh}, "history");
+  check_shape<double>(dhistory, {m.nh}, "dhistory");
   check_shape<double>(u, {steps, nu}, "u");
   check_shape<double>(du, {steps, nu}, "du");
   const DirectionalRollout out = directional_rollout(
-      m, {params.data(), q.data(), v.data(), anchors.data(), u.data(), anchored.data(), dparams.data(), dq.data(),
-          dv.data(), danchors.data(), du.data(), static_cast<int>(steps)});
+      m, {params.data(), q.data(), v.data(), anchors.data(), history.data(), u.data(), anchored.data(), dparams.data(),
+          dq.data(), dv.data(), danchors.data(), dhistory.data(), du.data(), static_cast<int>(steps)});
   const auto array = [](const std::vector<double>& x) { return py::array_t<double>(x.size(), x.data()); };
   return py::dict(py::arg("q") = array(out.q), py::arg("v") = array(out.v), py::arg("tactile") = array(out.tactile),
                   py::arg("anchors") = array(out.anchors), py::arg("dq") = array(out.dq), py::arg("dv") = array(out.dv),
@@ -246,6 +258,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def_readwrite("tolerance", &ModelSpec::tolerance)
       .def_readwrite("max_iterations", &ModelSpec::max_iterations)
       .def_readwrite("max_halvings", &ModelSpec::max_halvings)
+      .def_readwrite("integrator", &ModelSpec::integrator)
       .def("add_body", &ModelSpec::add_body, py::arg("name"), py::arg("parent"), py::arg("pos"), py::arg("quat"),
            py::arg("mass"), py::arg("com"), py::arg("inertia"))
       .def("add_joint", &ModelSpec::add_joint, py::arg("name"), py::arg("body"), py::arg("type"), py::arg("pos"),
@@ -329,7 +342,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
   bind_batch<double>(module, "Batch");
   bind_batch<float>(module, "BatchFloat");
   module.def("directional_rollout", &directional, py::arg("model"), py::arg("params"), py::arg("q"), py::arg("v"),
-             py::arg("anchors"), py::arg("anchored"), py::arg("u"), py::arg("dparams"), py::arg("dq"), py::arg("dv"),
-             py::arg("danchors"), py::arg("du"),
+             py::arg("anchors"), py::arg("anchored"), py::arg("history"), py::arg("u"), py::arg("dparams"),
+             py::arg("dq"), py::arg("dv"), py::arg("danchors"), py::arg("dhistory"), py::arg("du"),
              "Derivative of a rollout of one environment along one direction, by dual numbers (for checking).");
 }

@@ -23,7 +23,9 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
     const V4<double> rate = quaternion_product<double>(turn, {0, d[plain] / 2, d[plain + 1] / 2, d[plain + 2] / 2});
     for (int a = 0; a < 4; ++a) q[joint.turn_q() + a] = {turn[a], rate[a]};
   }
-  const StateView<Dual> state{q.data(), v.data(), anchors.data(), anchored.data()};
+  std::vector<Dual> history(m.nh);
+  for (int i = 0; i < m.nh; ++i) history[i] = {start.history[i], start.dhistory[i]};
+  const StateView<Dual> state{q.data(), v.data(), anchors.data(), anchored.data(), history.data()};
   StepMemory<Dual> memory(m);
   DirectionalRollout out;
   for (int t = 0; t < start.steps; ++t) {

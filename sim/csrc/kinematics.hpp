@@ -105,50 +105,50 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
   }
 }
 
-// q_t = q_{t-1} ⊕ h v.
+// q_t = q_{t-1} ⊕ increment.
 template <class T>
-void integrate(const Model& m, const T* q0, const T* v, const T& h, T* q1) {
+void integrate(const Model& m, const T* q0, const VX<T>& increment, T* q1) {
   for (const Joint& joint : m.joints) {
-    for (int a = 0; a < joint.plain(); ++a) q1[joint.q + a] = q0[joint.q + a] + h * v[joint.v + a];
+    for (int a = 0; a < joint.plain(); ++a) q1[joint.q + a] = q0[joint.q + a] + increment[joint.v + a];
     if (!joint.turns()) continue;
-    V4<T> turned = quaternion_product<T>(vec4(q0 + joint.turn_q()), quaternion_exp<T>(vec3(v + joint.turn_v()) * h));
+    V4<T> turned =
+        quaternion_product<T>(vec4(q0 + joint.turn_q()), quaternion_exp<T>(vec3(increment.data() + joint.turn_v())));
     using std::sqrt;
     turned /= sqrt(turned.squaredNorm());
     for (int a = 0; a < 4; ++a) q1[joint.turn_q() + a] = turned[a];
   }
 }
 
-// columns ← columns · ∂q_t/∂v_t, where the columns belong to the tangent of q_t: h, and h Jr(h ω) on turning dofs.
+// columns ← columns · ∂q_t/∂increment, where the columns belong to the tangent of q_t: Jr(φ) on turning dofs.
 template <class T>
-void times_position_by_velocity(const Model& m, const T* v, const T& h, MX<T>& columns) {
-  columns *= h;
+void times_position_by_increment(const Model& m, const VX<T>& increment, MX<T>& columns) {
   for (const Joint& joint : m.joints) {
     if (!joint.turns()) continue;
     const int k = joint.turn_v();
-    columns.middleCols(k, 3) = (columns.middleCols(k, 3) * right_jacobian<T>(vec3(v + k) * h)).eval();
+    columns.middleCols(k, 3) = (columns.middleCols(k, 3) * right_jacobian<T>(vec3(increment.data() + k))).eval();
   }
 }
 
-// (∂q_t/∂v_t)ᵀ λ and (∂q_t/∂q_{t-1})ᵀ λ on tangent vectors.
+// (∂q_t/∂increment)ᵀ λ and (∂q_t/∂q_{t-1})ᵀ λ on tangent vectors.
 template <class T>
-VX<T> position_by_velocity_transposed(const Model& m, const T* v, const T& h, const VX<T>& lambda) {
-  VX<T> result = lambda * h;
+VX<T> position_by_increment_transposed(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
     if (!joint.turns()) continue;
     const int k = joint.turn_v();
-    result.segment(k, 3) = right_jacobian<T>(vec3(v + k) * h).transpose() * lambda.segment(k, 3) * h;
+    const V3<T> part = lambda.template segment<3>(k);
+    lambda.template segment<3>(k) = right_jacobian<T>(vec3(increment.data() + k)).transpose() * part;
   }
-  return result;
+  return lambda;
 }
 template <class T>
-VX<T> position_by_position_transposed(const Model& m, const T* v, const T& h, const VX<T>& lambda) {
-  VX<T> result = lambda;
+VX<T> position_by_position_transposed(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
     if (!joint.turns()) continue;
     const int k = joint.turn_v();
-    result.segment(k, 3) = rotation_of<T>(quaternion_exp<T>(vec3(v + k) * h)) * lambda.segment(k, 3);
+    const V3<T> part = lambda.template segment<3>(k);
+    lambda.template segment<3>(k) = rotation_of<T>(quaternion_exp<T>(vec3(increment.data() + k))) * part;
   }
-  return result;
+  return lambda;
 }
 
 // Gradients of a unit quaternion: from the four numbers to the tangent (right perturbation) and back.

@@ -378,6 +378,8 @@ Model ModelSpec::build() const {
   model.tolerance = tolerance;
   model.max_iterations = max_iterations;
   model.max_halvings = max_halvings;
+  if (integrator != "bdf1" && integrator != "bdf2") refuse("integrator '" + integrator + "' is not bdf1 or bdf2");
+  model.nh = integrator == "bdf2" ? 2 * model.nv + 1 : 0;
   const int nv = model.nv;
   for (Body& body : model.bodies) {  // parents come first, so their dofs are complete
     if (body.joint_begin == body.joint_end) refuse("body '" + body.name + "' has no joint: merge it into its parent");

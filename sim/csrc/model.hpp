@@ -131,6 +131,7 @@ struct Model {
   int gravity = 0;  // offset in Params (3)
 
   int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
+  int nh = 0;                               // BDF2's history: 2 nv + 1 numbers, see step.hpp; BDF1 has none
   std::vector<double> q0;                   // reference positions
 
   // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, its joint.
@@ -157,6 +158,7 @@ class ModelSpec {
   double tolerance = 1e-7;
   int max_iterations = 50;
   int max_halvings = 6;
+  std::string integrator = "bdf1";
 
   static constexpr double inf = std::numeric_limits<double>::infinity();
 

@@ -12,7 +12,7 @@ namespace {
 
 // The core's view of one state, in taped numbers, with the parameters watched.
 struct TapedState {
-  std::vector<Taped> params, q0, v0, v1, u;
+  std::vector<Taped> params, q0, v0, shift, v1, u;
   std::vector<V3<Taped>> anchors;
 
   TapedState(const Model& m, const double* numbers, const ParamState& s) {
@@ -20,6 +20,7 @@ struct TapedState {
     for (std::size_t i = 0; i < m.param_names.size(); ++i) params.push_back(Taped::watched(numbers[i]));
     q0.assign(s.q0, s.q0 + m.nq);
     v0.assign(s.v0, s.v0 + m.nv);
+    if (s.shift != nullptr) shift.assign(s.shift, s.shift + m.nv);
     if (s.v1 != nullptr) v1.assign(s.v1, s.v1 + m.nv);
     if (s.u != nullptr) u.assign(s.u, s.u + m.actuators.size());
     for (int i = 0; i < m.na; ++i) anchors.push_back(s.anchors[i].cast<Taped>());
@@ -43,8 +44,10 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
   const Taped h(s.h);
-  evaluate<false, Taped>(m, t.params.data(), h, t.q0.data(), t.v0.data(), t.anchors.data(), s.anchored, t.u.data(),
-                         t.v1.data(), false, w);
+  const StepStart<Taped> from{
+      h,          t.q0.data(), t.v0.data(), t.shift.empty() ? nullptr : t.shift.data(), t.anchors.data(),
+      s.anchored, t.u.data()};
+  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), false, w);
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {

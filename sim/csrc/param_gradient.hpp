@@ -5,10 +5,10 @@
 
 namespace gelflow {
 
-// A step from (q0, v0) to v1 under u with the anchors from before it; or, for a reading, the state (q0, v0) alone.
+// A step (StepStart of step.hpp) to v1; or, for a reading, the state (q0, v0) alone.
 struct ParamState {
   double h;
-  const double *q0, *v0, *v1, *u;
+  const double *q0, *v0, *shift, *v1, *u;  // v0 is the step's v*
   const V3<double>* anchors;
   const std::uint8_t* anchored;
 };

@@ -1,9 +1,11 @@
 // One implicit step (eqs. 6-7): the residual with its derivatives, Newton's method with line search, and halving.
 //
-//     q_t = q_{t-1} ⊕ h v_t
-//     g(v_t) = M(q_t) (v_t − v*) + h (C(q_t, v_t) − f(q_t, v_t, u)) = 0,   BDF1: v* = v_{t-1}
+//     q_t = q_{t-1} ⊕ (β h v_t + γ δ),   δ = q_{t-1} ⊖ q_{t-2}
+//     g(v_t) = M(q_t) (v_t − v*) + β h (C(q_t, v_t) − f(q_t, v_t, u)) = 0
+//     BDF1: β = 1, γ = 0, v* = v_{t-1}         BDF2: β = 2/3, γ = 1/3, v* = 4/3 v_{t-1} − 1/3 v_{t-2}
 //
-// written as g = h · (inverse dynamics of (q_t, v_t, (v_t − v*)/h) − f), and solved for v_t.
+// written as g = β h · (inverse dynamics of (q_t, v_t, (v_t − v*)/(β h)) − f), and solved for v_t. In the code h is β h.
+// BDF2 starts with one step of BDF1, whose local error is of BDF2's order, and does so again after a halved step.
 #pragma once
 
 #include <algorithm>
@@ -16,13 +18,26 @@ namespace gelflow {
 
 enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
 
-// The state of one environment. Anchors live in the frame of the shape that they touch.
+// The state of one environment. Anchors live in the frame of the shape that they touch. History is BDF2's: δ (nv),
+// v_{t-2} (nv), and 1 where there is one, else 0.
 template <class T>
 struct StateView {
   T* q;
   T* v;
   V3<T>* anchors;
   std::uint8_t* anchored;
+  T* history;
+};
+
+// What a step's residual needs beside v_t.
+template <class T>
+struct StepStart {
+  T h;  // β h
+  const T *q0, *v_star;
+  const T* shift;  // γ δ, null under BDF1
+  const V3<T>* anchors;
+  const std::uint8_t* anchored;
+  const T* u;
 };
 
 struct StepReport {
@@ -136,10 +151,14 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
 // Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.scale, the size of
 // the forces at work, which Newton's tolerance refers to.
 template <bool derivatives, class T>
-void evaluate(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
-              const std::uint8_t* anchored, const T* u, const T* v, bool scale, Workspace<T>& w) {
-  integrate<T>(m, q0, v, h, w.q.data());
-  for (int k = 0; k < m.nv; ++k) w.trial[k] = v[k] - v_star[k];
+void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, bool scale, Workspace<T>& w) {
+  const T& h = from.h;
+  for (int k = 0; k < m.nv; ++k) {
+    w.trial[k] = v[k] - from.v_star[k];
+    w.increment[k] = h * v[k];
+    if (from.shift) w.increment[k] += from.shift[k];
+  }
+  integrate<T>(m, from.q0, w.increment, w.q.data());
   w.update = w.trial / h;  // accelerations
   forward_positions<T>(m, params, w.q.data(), w);
   forward_velocities<T>(m, params, v, w.update.data(), w);
@@ -154,11 +173,11 @@ void evaluate(const Model& m, const T* params, const T& h, const T* q0, const T*
   if (scale) {
     for (int k = 0; k < m.nv; ++k) w.scale[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
-  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, u, scale, w);
-  subtract_contact_forces<derivatives, T>(m, params, h, anchors, anchored, scale, w);
+  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, scale, w);
+  subtract_contact_forces<derivatives, T>(m, params, h, from.anchors, from.anchored, scale, w);
   if constexpr (derivatives) {
-    w.tangent = w.by_q;
-    times_position_by_velocity<T>(m, v, h, w.tangent);
+    w.tangent = h * w.by_q;
+    times_position_by_increment<T>(m, w.increment, w.tangent);
     w.tangent += w.by_v;
   }
 }
@@ -198,16 +217,16 @@ bool at_rounding_floor(const Model& m, const Workspace<T>& w) {
 // solves it, while a search along the line would stop at the first edge. Where that does not lead home, the search
 // starts from the best point seen.
 template <class T>
-Status newton(const Model& m, const T* params, const T& h, const T* q0, const T* v_star, const V3<T>* anchors,
-              const std::uint8_t* anchored, const T* u, int polish, VX<T>& v, int& iterations, Workspace<T>& w) {
+Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
+              Workspace<T>& w) {
   constexpr int full_steps = 8;
   const double tolerance = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   bool fresh = false;  // w holds the derivatives at v
   const auto measure = [&](bool derivatives, bool scale) {
     if (derivatives) {
-      evaluate<true, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), scale, w);
+      evaluate<true, T>(m, params, from, v.data(), scale, w);
     } else {
-      evaluate<false, T>(m, params, h, q0, v_star, anchors, anchored, u, v.data(), scale, w);
+      evaluate<false, T>(m, params, from, v.data(), scale, w);
     }
     fresh = derivatives;
     return merit(w);
@@ -252,14 +271,38 @@ Status newton(const Model& m, const T* params, const T& h, const T* q0, const T*
 // One environment's memory for steps: the state to fall back on, and the state in the making.
 template <class T>
 struct StepMemory {
-  explicit StepMemory(const Model& m) : work(m), q(m.nq), v(m.nv), v_new(m.nv), anchors(m.na), anchored(m.na) {}
+  explicit StepMemory(const Model& m)
+      : work(m),
+        q(m.nq),
+        v(m.nv),
+        v_new(m.nv),
+        v_star(m.nv),
+        shift(m.nv),
+        history(m.nh),
+        anchors(m.na),
+        anchored(m.na) {}
   Workspace<T> work;
-  VX<T> q, v, v_new;
+  VX<T> q, v, v_new, v_star, shift, history;
   std::vector<V3<T>> anchors;
   std::vector<std::uint8_t> anchored;
 };
 
-// Called after each accepted substep with (h, state before it, v_t); memory.work holds the kinematics of its end.
+// How a substep of length h, one of `count`, starts from state s: β, v* and γ δ, which are kept in `memory`.
+template <class T>
+StepStart<T> start_of(const Model& m, const T& h, int count, const StateView<T>& s, const T* u, StepMemory<T>& memory) {
+  memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
+  StepStart<T> from{h, s.q, memory.v_star.data(), nullptr, s.anchors, s.anchored, u};
+  if (m.nh == 0 || count > 1 || !(s.history[2 * m.nv] > T(0))) return from;
+  for (int k = 0; k < m.nv; ++k) {
+    memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
+    memory.shift[k] = s.history[k] / T(3);
+  }
+  from.h = h * T(2) / T(3);
+  from.shift = memory.shift.data();
+  return from;
+}
+
+// Called after each accepted substep with (its start, memory); memory.work holds the kinematics of its end.
 struct NoObserver {
   template <class... A>
   void operator()(const A&...) const {}
@@ -270,13 +313,21 @@ template <class T, class Observer>
 Status substeps(const Model& m, const T* params, const T& h, int count, const T* u, int polish, const StateView<T>& s,
                 StepMemory<T>& memory, int& iterations, Observer&& accepted) {
   for (int i = 0; i < count; ++i) {
+    const StepStart<T> from = start_of<T>(m, h, count, s, u, memory);
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-    const Status status =
-        newton<T>(m, params, h, s.q, s.v, s.anchors, s.anchored, u, polish, memory.v_new, iterations, memory.work);
+    const Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
     if (status != Status::ok) return status;
-    accepted(h, s, memory);
-    advance_contact_anchors<T>(m, params, h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-    advance_marker_anchors<T>(m, params, h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    accepted(from, memory);
+    advance_contact_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    advance_marker_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    if (m.nh > 0) {
+      std::fill(s.history, s.history + m.nh, T(0));
+      if (count == 1) {
+        std::copy(memory.work.increment.data(), memory.work.increment.data() + m.nv, s.history);
+        std::copy(s.v, s.v + m.nv, s.history + m.nv);
+        s.history[2 * m.nv] = T(1);
+      }
+    }
     std::copy(memory.work.q.data(), memory.work.q.data() + m.nq, s.q);
     std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
   }
@@ -291,6 +342,7 @@ StepReport step(const Model& m, const T* params, const T* u, int polish, const S
   StepReport report;
   memory.q = Eigen::Map<const VX<T>>(s.q, m.nq);
   memory.v = Eigen::Map<const VX<T>>(s.v, m.nv);
+  memory.history = Eigen::Map<const VX<T>>(s.history, m.nh);
   std::copy(s.anchors, s.anchors + m.na, memory.anchors.begin());
   std::copy(s.anchored, s.anchored + m.na, memory.anchored.begin());
   for (; report.halvings <= m.max_halvings; ++report.halvings) {
@@ -299,6 +351,7 @@ StepReport step(const Model& m, const T* params, const T* u, int polish, const S
     if (report.status == Status::ok) return report;
     std::copy(memory.q.data(), memory.q.data() + m.nq, s.q);
     std::copy(memory.v.data(), memory.v.data() + m.nv, s.v);
+    std::copy(memory.history.data(), memory.history.data() + m.nh, s.history);
     std::copy(memory.anchors.begin(), memory.anchors.end(), s.anchors);
     std::copy(memory.anchored.begin(), memory.anchored.end(), s.anchored);
   }

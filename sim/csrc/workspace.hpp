@@ -28,6 +28,7 @@ struct Workspace {
         v_missing(m.nv),
         residual(m.nv),
         scale(m.nv),
+        increment(m.nv),
         update(m.nv),
         trial(m.nv),
         direction(m.nv),
@@ -53,6 +54,7 @@ struct Workspace {
 
   // The step's residual g and its derivatives.
   VX<T> residual, scale;
+  VX<T> increment;               // q_t = q_{t-1} ⊕ increment
   VX<T> update, trial;           // accelerations; v_t − v*
   VX<T> direction, start, best;  // Newton's
   MX<T> mass, by_q, by_v;        // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
