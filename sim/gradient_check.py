@@ -137,7 +137,7 @@ def _from_tangent(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float6
 
 
 def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -> Agreement:
-    """Worst relative difference along random directions in (u, q, v, anchors, history, params), each taken alone as well.
+    """Worst relative difference along random directions in u, q, v, anchors, history, params: each alone, and all.
 
     The adjoint identity ⟨w, J d⟩ = ⟨Jᵀ w, d⟩ is what is compared: J d by dual numbers, Jᵀ w by the reverse pass.
     """

@@ -47,8 +47,8 @@ def state_of(sim: Simulator) -> TorchState:
 def rollout(sim: Simulator, state: TorchState, u: torch.Tensor, *, read_after: Sequence[int] = ()) -> TorchRollout:
     """Steps under controls u (steps, N, nu) from `state`; markers are read after the steps in `read_after`.
 
-    Differentiable in u, state.q, state.v, state.anchors and state.history. Raises UsageError on wrong shapes, another precision than
-    the simulator's, and numbers that are not finite.
+    Differentiable in u, state.q, state.v, state.anchors and state.history. Raises UsageError on wrong shapes, another
+    precision than the simulator's, and numbers that are not finite.
     """
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors), ("history", state.history))
