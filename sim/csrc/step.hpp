@@ -9,6 +9,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cstring>
 
 #include "contact.hpp"
 #include "dynamics.hpp"
@@ -272,19 +273,36 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
 template <class T>
 struct StepMemory {
   explicit StepMemory(const Model& m)
-      : work(m),
-        q(m.nq),
-        v(m.nv),
-        v_new(m.nv),
-        v_star(m.nv),
-        shift(m.nv),
-        history(m.nh),
-        anchors(m.na),
-        anchored(m.na) {}
+      : work(m), q(m.nq), v(m.nv), v_new(m.nv), v_star(m.nv), shift(m.nv), history(m.nh) {}
   Workspace<T> work;
   VX<T> q, v, v_new, v_star, shift, history;
-  std::vector<V3<T>> anchors;
-  std::vector<std::uint8_t> anchored;
+  std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
+
+  void keep(const Model& m, const StateView<T>& s) {
+    q = Eigen::Map<const VX<T>>(s.q, m.nq);
+    v = Eigen::Map<const VX<T>>(s.v, m.nv);
+    history = Eigen::Map<const VX<T>>(s.history, m.nh);
+    anchors.clear();
+    constexpr int word = sizeof(std::uint64_t);  // most are not set: look at eight at a time
+    for (int i = 0; i < m.na; i += word) {
+      const int end = std::min(i + word, m.na);
+      std::uint64_t any = 1;
+      if (end - i == word) std::memcpy(&any, s.anchored + i, word);
+      for (int k = i; any != 0 && k < end; ++k) {
+        if (s.anchored[k]) anchors.emplace_back(k, s.anchors[k]);
+      }
+    }
+  }
+  void give_back(const Model& m, const StateView<T>& s) const {
+    std::copy(q.data(), q.data() + m.nq, s.q);
+    std::copy(v.data(), v.data() + m.nv, s.v);
+    std::copy(history.data(), history.data() + m.nh, s.history);
+    std::fill(s.anchored, s.anchored + m.na, 0);
+    for (const auto& [i, anchor] : anchors) {
+      s.anchors[i] = anchor;
+      s.anchored[i] = 1;
+    }
+  }
 };
 
 // How a substep of length h, one of `count`, starts from state s: β, v* and γ δ, which are kept in `memory`.
@@ -340,20 +358,12 @@ template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 Observer&& accepted = {}) {
   StepReport report;
-  memory.q = Eigen::Map<const VX<T>>(s.q, m.nq);
-  memory.v = Eigen::Map<const VX<T>>(s.v, m.nv);
-  memory.history = Eigen::Map<const VX<T>>(s.history, m.nh);
-  std::copy(s.anchors, s.anchors + m.na, memory.anchors.begin());
-  std::copy(s.anchored, s.anchored + m.na, memory.anchored.begin());
+  memory.keep(m, s);
   for (; report.halvings <= m.max_halvings; ++report.halvings) {
     const int count = 1 << report.halvings;
     report.status = substeps<T>(m, params, T(m.step / count), count, u, polish, s, memory, report.iterations, accepted);
     if (report.status == Status::ok) return report;
-    std::copy(memory.q.data(), memory.q.data() + m.nq, s.q);
-    std::copy(memory.v.data(), memory.v.data() + m.nv, s.v);
-    std::copy(memory.history.data(), memory.history.data() + m.nh, s.history);
-    std::copy(memory.anchors.begin(), memory.anchors.end(), s.anchors);
-    std::copy(memory.anchored.begin(), memory.anchored.end(), s.anchored);
+    memory.give_back(m, s);
   }
   --report.halvings;
   return report;
