@@ -1,0 +1,59 @@
+"""Closed forms of touch: a sphere in a flat pad of stiffness per area, and a part held in a grasp for ten seconds."""
+
+import numpy as np
+import pytest
+
+from gelflow.sim import _core
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.randomization import NOMINAL
+
+RADIUS, DEPTH, STIFFNESS = 0.020, 1e-3, 1e8  # [m], [m], [N/m³]
+
+
+def pressed(side: int) -> float:
+    """Sum of the normal readings of side × side markers on 16 × 16 mm, pressed by DEPTH onto a fixed sphere [N]."""
+    spec = _core.ModelSpec()
+    body = spec.add_body("pad", -1, (0, 0, RADIUS - DEPTH), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    spec.add_joint("height", body, "slide", (0, 0, 0), (0, 0, 1))
+    sphere = spec.add_shape("sphere", -1, "sphere", (0, 0, 0), (1, 0, 0, 0), (RADIUS, 0, 0))
+    pitch = 0.016 / side
+    line = (np.arange(side) - (side - 1) / 2) * pitch
+    x, y = np.meshgrid(line, line)
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(side * side)])
+    axes = [np.tile(axis, (len(points), 1)) for axis in ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0))]
+    areas = np.full(len(points), pitch**2)
+    spec.add_pad("pad", body, points, *axes, shapes=[sphere], weights=areas, kn=STIFFNESS, kt=0.0, mu=0.0, kd=0.0)
+    return float(Simulator(_core.Model(spec)).tactile()[0, :, 2].sum())
+
+
+def test_a_sphere_pressed_into_a_pad_of_stiffness_per_area() -> None:
+    """F = π K (R − δ) δ²; the sum over cells converges to it."""
+    exact = np.pi * STIFFNESS * (RADIUS - DEPTH) * DEPTH**2
+    errors = [abs(pressed(side) / exact - 1) for side in (25, 50, 100, 200, 400)]
+    print([f"{error:.1e}" for error in errors])
+    assert errors[3] < 1e-3
+    assert errors[4] < errors[1] < errors[0]
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+def test_a_held_part_does_not_creep_under_the_elastic_law_and_shows_its_load(integrator: str) -> None:
+    attempts = InsertionAttempts(1, scene=insertion_scene(friction="elastic"), randomization=NOMINAL)
+    attempts.draw(np.random.default_rng(0))
+    spec = attempts.scene.describe_to(_core.ModelSpec())
+    spec.integrator = integrator
+    sim, u = Simulator(_core.Model(spec)), attempts._u
+    for name in ("q", "params", "anchors", "anchored"):
+        getattr(sim, name)[:] = getattr(attempts.sim, name)
+    sim.step(u, 200)  # 1 s
+    height = attempts.scene.q("part").start + 2
+    before = sim.q[0, height]
+    sim.step(u, 2000)  # 10 s
+    sim.check()
+    assert abs(sim.q[0, height] - before) < 1e-6
+    weight = float(sim.param("part.mass")[0]) * 9.8
+    contacts = list(sim.model.contact_names)
+    carried = sum(-sim.wrenches()[0, contacts.index(f"pad_{side}"), 5] for side in ("left", "right"))
+    assert carried == pytest.approx(weight, rel=1e-6)
+    shear = sim.tactile()[0, :, 0]  # towards the tip, which is down
+    assert (shear > 0).all() and shear.std() < 1e-3 * shear.mean()
