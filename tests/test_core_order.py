@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -82,3 +83,21 @@ def test_what_bdf2_remembers_belongs_to_the_state(at_rest: Array) -> None:
     sim.forget()
     assert not sim.history.any()
     assert rolling(5e-3, "bdf1").history.shape == (1, 0)
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+def test_a_step_tells_its_error(at_rest: Array, integrator: str) -> None:
+    """The estimate of BDF1 falls with the square of the step, as its local error does; BDF2's is no smaller than that."""
+    estimates = []
+    for step in (4e-3, 2e-3, 1e-3):
+        sim = rolling(step, integrator)
+        sim.q[:] = at_rest
+        sim.step([0, 0, 0.2], 2)
+        before = sim.q.copy()
+        estimate = sim.error_estimate([2e-3, 1e-3, 0.202])
+        np.testing.assert_array_equal(sim.q, before)
+        assert estimate.shape == (1, sim.model.nv)
+        estimates.append(np.abs(estimate).max())
+    assert all(1.5 < np.log2(big / small) < 3 for big, small in zip(estimates, estimates[1:], strict=False))
+    with pytest.raises(UsageError, match="not finite"):
+        sim.error_estimate([np.nan, 0, 0])

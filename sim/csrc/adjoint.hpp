@@ -72,7 +72,7 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   if (m.na > 0) {
     contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,
                                         g.q, g.v, by_anchor.data());
-    marker_anchors_transposed<T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+    marker_anchors_transposed<T>(m, params, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                                  by_anchor.data());
   }
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
@@ -108,7 +108,7 @@ void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, 
   w.update.setZero();
   forward_positions<T>(m, params, s.q, w);
   forward_velocities<T>(m, params, s.v, w.update.data(), w);
-  read_markers_transposed<T>(m, params, T(m.step), s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
+  read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
 }
 
 }  // namespace gelflow

@@ -92,6 +92,41 @@ void Batch<T>::step(const T* u, int steps) {
 }
 
 template <class T>
+void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
+  check_controls(u, n);
+  check_state();
+  const Model& m = *model;
+  const std::size_t nu = m.actuators.size();
+  pool_.run(n, [&](int e, int thread) {
+    StepMemory<T>& memory = memory_[thread];
+    const T* const control = u + static_cast<std::size_t>(e) * nu;
+    StateCopy<T> whole(m, state(e)), halves(m, state(e));
+    int iterations = 0;
+    Status status = gelflow::step<T>(m, params_of(e), control, 0, whole.view(), memory).status;
+    if (status == Status::ok) {
+      status =
+          substeps<T>(m, params_of(e), T(m.step / 2), 2, control, 0, halves.view(), memory, iterations, NoObserver{});
+    }
+    failures[e] = static_cast<std::int32_t>(status);
+    T* const difference = out + static_cast<std::size_t>(e) * m.nv;
+    std::fill_n(difference, m.nv, T(0));
+    if (status != Status::ok) return;
+    for (const Joint& joint : m.joints) {
+      for (int a = 0; a < joint.plain(); ++a) {
+        difference[joint.v + a] = whole.q[joint.q + a] - halves.q[joint.q + a];
+      }
+      if (!joint.turns()) continue;
+      V4<T> back = vec4(halves.q.data() + joint.turn_q());
+      back.template tail<3>() *= T(-1);
+      const V4<T> turn = quaternion_product<T>(back, vec4(whole.q.data() + joint.turn_q()));
+      const T sine = turn.template tail<3>().norm();  // a step turns by far less than half a turn
+      const T scale = sine > T(1e-12) ? T(2) * std::atan2(sine, turn[0]) / sine : T(2);
+      for (int a = 0; a < 3; ++a) difference[joint.turn_v() + a] = scale * turn[1 + a];
+    }
+  });
+}
+
+template <class T>
 void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
   w.update.setZero();
@@ -103,7 +138,7 @@ template <class T>
 void Batch<T>::tactile(T* out) {
   pool_.run(n, [&](int e, int thread) {
     kinematics(e, memory_[thread].work);
-    read_markers<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored, memory_[thread].work,
+    read_markers<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
                     out + static_cast<std::size_t>(e) * model->markers * 3);
   });
 }
@@ -112,7 +147,7 @@ template <class T>
 void Batch<T>::wrenches(T* out) {
   pool_.run(n, [&](int e, int thread) {
     kinematics(e, memory_[thread].work);
-    contact_wrenches<T>(*model, params_of(e), T(model->step), state(e).anchors, state(e).anchored, memory_[thread].work,
+    contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
                         out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
   });
 }
@@ -183,7 +218,7 @@ void Batch<T>::rollout(const Rollout<T>& r) {
         memory.work.update.setZero();
         forward_positions<T>(m, params_of(env), now.q, memory.work);
         forward_velocities<T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
-        read_markers<T>(m, params_of(env), T(m.step), now.anchors, now.anchored, memory.work,
+        read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
                         r.tactile + (read * N + e) * m.markers * 3);
       }
       if (t == r.steps) break;

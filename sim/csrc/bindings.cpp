@@ -136,6 +136,14 @@ void bind_batch(py::module_& module, const char* name) {
             b.step(data, steps);
           },
           py::arg("u"), py::arg("steps") = 1)
+      .def("error_estimate",
+           [](B& b, const Array<T>& u) {
+             check_shape<T>(u, {b.n, static_cast<py::ssize_t>(b.model->actuators.size())}, "u");
+             py::array_t<T> out({static_cast<py::ssize_t>(b.n), static_cast<py::ssize_t>(b.model->nv)});
+             py::array_t<std::int32_t> status(static_cast<py::ssize_t>(b.n));
+             b.error_estimate(u.data(), out.mutable_data(), status.mutable_data());
+             return py::make_tuple(out, status);
+           })
       .def("tactile",
            [](B& b, py::array out) {
              T* data = writable<T>(out, {b.n, b.model->markers, 3}, "out");

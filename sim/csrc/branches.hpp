@@ -15,12 +15,15 @@ class Signature {
   std::uint64_t hash_ = 0xcbf29ce484222325ULL;
 };
 
-// The face of the shape that the point is nearest to, as told by the normal's zero pattern and signs.
+// The face of the shape that the point is nearest to, as told by the normal: by its signs where faces are flat, by its
+// zeros where they are curved (the ends and the side of a cylinder or capsule).
 template <class T>
 std::uint64_t face(const V3<T>& normal, bool curved) {
-  if (curved) return 1;
-  std::uint64_t code = 0;
-  for (int a = 0; a < 3; ++a) code = code * 3 + (normal[a] > T(0) ? 1 : normal[a] < T(0) ? 2 : 0);
+  std::uint64_t code = curved ? 1 : 0;
+  for (int a = 0; a < 3; ++a) {
+    const int sign = normal[a] > T(0) ? 1 : normal[a] < T(0) ? 2 : 0;
+    code = code * 3 + (curved ? (sign == 0 ? 0 : 1) : sign);
+  }
   return code;
 }
 
@@ -30,7 +33,6 @@ template <class T>
 std::uint64_t branch_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
                                const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
   Signature hash;
-  const T h = T(m.step);
   w.update.setZero();
   forward_positions<T>(m, params, q, w);
   forward_velocities<T>(m, params, v, w.update.data(), w);
@@ -49,14 +51,14 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     ++pair;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
-    for_touching_points<T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), visit);
+    for_touching_points<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), visit);
   }
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
-      for_touching_points<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), visit);
+      for_touching_points<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), visit);
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
@@ -66,10 +68,11 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   for (const Joint& joint : m.joints) {
     const T* p = params + joint.param;
     for (int k = joint.v; p[8] != T(0) && k < joint.v + joint.dofs; ++k) {
-      hash.add(v[k] > T(1e-3) ? 1 : v[k] < T(-1e-3) ? 2 : 0);
+      hash.add(v[k] > T(friction_creep) ? 1 : v[k] < T(-friction_creep) ? 2 : 0);
     }
     if (joint.turns()) continue;
-    hash.add(q[joint.q] < p[4] ? 1 : q[joint.q] > p[5] ? 2 : 0);
+    const LimitPush<T> push = limit_push<T>(p, q[joint.q], v[joint.v]);
+    hash.add(push.force > T(0) ? 1 : push.force < T(0) ? 2 : 0);
   }
   return hash.value();
 }

@@ -10,10 +10,10 @@
 namespace gelflow {
 
 template <class T>
-TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const T& h, const V3<T>* anchors,
+TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const V3<T>* anchors,
                         const std::uint8_t* anchored) {
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
-  return {params + contact.param, contact.law,    contact.damping, h, m.point_sets[contact.points].radius,
+  return {params + contact.param, contact.law,    contact.damping, m.point_sets[contact.points].radius,
           anchors + slot,         anchored + slot};
 }
 
@@ -73,7 +73,7 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     // The blocks of K and D: rows moment, force; columns turn, shift.
     M3<T> k_mm, k_mf, k_fm, k_ff, d_mm, d_mf, d_fm, d_ff;
     const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud,
-                                                     touch_rule<T>(m, contact, params, h, anchors, anchored), wrench,
+                                                     touch_rule<T>(m, contact, params, anchors, anchored), wrench,
                                                      {&k_mm, &k_mf, &k_fm, &k_ff, &d_mm, &d_mf, &d_fm, &d_ff});
     if (!touching) continue;
     pair_columns<derivatives, T>(contact.pair, first, frame, w, c);
@@ -119,14 +119,14 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
 // Wrench of every contact on its first body, about the world's origin: (moment, force), shape (contacts, 6). Needs the
 // kinematics of (q, v) in w.
 template <class T>
-void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
+void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                       const Workspace<T>& w, T* out) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
     V6<T> wrench = V6<T>::Zero();
-    sum_forces<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), wrench, {});
+    sum_forces<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), wrench, {});
     const V3<T> moment = frame.to_world * top(wrench), push = frame.to_world * bottom(wrench);
     const V6<T> in_world = stack<T>(moment + cross<T>(frame.origin, push), push);
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
@@ -135,13 +135,13 @@ void contact_wrenches(const Model& m, const T* params, const T& h, const V3<T>* 
 
 // Anchors after an accepted step (w holds its kinematics). `next` and `next_set` may be the arrays that are read.
 template <class T>
-void advance_contact_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
+void advance_contact_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
+                             Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, set.cloud, touch_rule<T>(m, contact, params, h, anchors, anchored), w.kept,
+    advance_anchors<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), w.kept,
                        next + contact.anchor, next_set + contact.anchor);
   }
 }
@@ -161,7 +161,7 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     pair_columns<true, T>(contact.pair, first, frame, w, c);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-    const TouchRule<T> rule = touch_rule<T>(m, contact, params, h, anchors, anchored);
+    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     V3<T>* const by_own = by_anchor + contact.anchor;
     if constexpr (from_next) {
       anchors_transposed<T>(frame, m.point_sets[contact.points].cloud, rule, by_next + contact.anchor, by_pose,

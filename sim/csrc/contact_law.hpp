@@ -7,10 +7,11 @@
 //                                                       at once, a light body that arrives fast would find no solution
 //     wanted      f* = −k_t v_t                         viscous friction
 //                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
-//     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch: no division there
+//     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch: no division there; under the
+//                                                       elastic law with a slack of rounding size, see below
 //     force       f = N n + f_t
-// e is x − X with the anchor X in the shape's frame; for a rolling point (the lowest point of a sphere, which is not a
-// material point) e = X + h v: the anchor then stores the slip itself. A point that just touched has e = 0.
+// Under the elastic law e = x − X with the anchor X in the shape's frame; a point that just touched has e = 0. The one
+// moving point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
 // On slip the anchor moves so that −k_s s = f_t + k_t v_t.
 #pragma once
 
@@ -22,11 +23,9 @@ namespace gelflow {
 template <class L>
 struct PointLaw {
   L kn, kt, mu, kd, ks;  // of these points: already times their weights
-  L h;
-  L rounding;  // of places [m]
+  L rounding;            // of places [m]
   DampingLaw damping;
   bool elastic;
-  bool rolling;
 };
 
 template <class L>
@@ -37,12 +36,6 @@ struct PointForce {
   Vec3<L> friction, slip;  // f_t, v_t
   Mat3<L> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
 };
-
-template <class L>
-GELFLOW_INLINE Vec3<L> anchor_offset(const PointLaw<L>& law, const Vec3<L>& x, const Vec3<L>& v, const Vec3<L>& anchor,
-                                     const Mask<L>& anchored) {
-  return select3<L>(anchored, law.rolling ? anchor + law.h * v : x - anchor, zero3<L>());
-}
 
 // `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
 template <int derivatives, class L>
@@ -88,7 +81,7 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
   out.slip = slip;
   out.force = normal * n + out.friction;
   if constexpr (derivatives > 0) {
-    // d f* = −(k_t + k_s ev) (1 − n nᵀ) dv − k_s ex (1 − n nᵀ) dx + curvature, and
+    // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature, the second only where there is an anchor, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
     const L memory = law.elastic ? select(anchored, law.ks, zero) : zero;
     const Vec3<L> direction = select(out.slips, inverse, zero) * wanted;
@@ -97,9 +90,8 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ), as t is tangential.
     const Mat3<L> project = ratio * (identity_minus_outer(n) - outer(direction, direction));
     const Vec3<L> lever = law.mu * direction;
-    const L by_slip = law.rolling ? -law.kt - memory * law.h : -law.kt;
-    out.friction_by_v = by_slip * project + outer(lever, normal_by_v);
-    out.friction_by_x = law.elastic && !law.rolling ? -memory * project : zero33<L>();
+    out.friction_by_v = -law.kt * project + outer(lever, normal_by_v);
+    out.friction_by_x = law.elastic ? -memory * project : zero33<L>();
     if (at.curved) {
       const Vec3<L> hv = at.hessian * v;
       normal_by_x += by_rate * hv;
@@ -112,8 +104,7 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     if (at.curved) out.by_x += normal * at.hessian;
     out.by_v = out.friction_by_v + outer(n, normal_by_v);
     if constexpr (derivatives > 1) {
-      // ∂f*/∂X = ± k_s (1 − n nᵀ)
-      out.by_anchor = (law.rolling ? -memory : memory) * project;
+      out.by_anchor = memory * project;  // ∂f*/∂X = k_s (1 − n nᵀ)
       out.slip_by_v = identity_minus_outer(n);
       out.slip_by_x = zero33<L>();
       if (at.curved) out.slip_by_x -= outer(n, at.hessian * v) + rate * at.hessian;
@@ -123,11 +114,10 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
 
 // The anchor after an accepted step, for a point that is inside (outside, the anchor is cleared).
 template <class L>
-GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const PointForce<L>& f, const Vec3<L>& n, const Vec3<L>& x,
-                                   const Vec3<L>& e, const Vec3<L>& anchor, const Mask<L>& anchored) {
+GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const PointForce<L>& f, const Vec3<L>& x,
+                                   const Vec3<L>& anchor, const Mask<L>& anchored) {
   const L stiffness = select(law.ks > L(0.0), law.ks, L(1.0));  // of weight 0: what comes out is not used
   const Vec3<L> s = -(L(1.0) / stiffness) * (f.friction + law.kt * f.slip);
-  if (law.rolling) return select3<L>(f.slips, s, e - dot(n, e) * n);
   return select3<L>(f.slips, x - s, select3<L>(anchored, anchor, x));
 }
 
@@ -141,21 +131,14 @@ GELFLOW_INLINE AnchorGradient<L> next_anchor_transposed(const PointLaw<L>& law, 
                                                         const Mask<L>& anchored, const Vec3<L>& lambda) {
   const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one);
   const Vec3<L> none = zero3<L>();
-  const Vec3<L> scaled = (law.rolling ? -one / stiffness : one / stiffness) * lambda;
+  const Vec3<L> scaled = one / stiffness * lambda;
   AnchorGradient<L> g;
   g.x = transposed_times(f.friction_by_x, scaled) + law.kt * transposed_times(f.slip_by_x, scaled);
   g.v = transposed_times(f.friction_by_v, scaled) + law.kt * transposed_times(f.slip_by_v, scaled);
   g.anchor = transposed_times(f.by_anchor, scaled);
-  if (law.rolling) {
-    const Vec3<L> kept = select3<L>(anchored, f.slip_by_v * lambda, none);  // 1 − n nᵀ, symmetric
-    g.x = select3<L>(f.slips, g.x, none);
-    g.v = select3<L>(f.slips, g.v, law.h * kept);
-    g.anchor = select3<L>(f.slips, g.anchor, kept);
-  } else {
-    g.x = select3<L>(f.slips, g.x + lambda, select3<L>(anchored, none, lambda));
-    g.v = select3<L>(f.slips, g.v, none);
-    g.anchor = select3<L>(f.slips, g.anchor, select3<L>(anchored, lambda, none));
-  }
+  g.x = select3<L>(f.slips, g.x + lambda, select3<L>(anchored, none, lambda));
+  g.v = select3<L>(f.slips, g.v, none);
+  g.anchor = select3<L>(f.slips, g.anchor, select3<L>(anchored, lambda, none));
   return g;
 }
 

@@ -39,7 +39,7 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   memory.work.update.setZero();
   forward_positions<Dual>(m, params.data(), q.data(), memory.work);
   forward_velocities<Dual>(m, params.data(), v.data(), memory.work.update.data(), memory.work);
-  read_markers<Dual>(m, params.data(), Dual(m.step), anchors.data(), anchored.data(), memory.work, tactile.data());
+  read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data());
 
   for (const Dual& x : q) out.q.push_back(x.a);
   out.dq.resize(m.nv);

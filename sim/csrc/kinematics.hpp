@@ -2,8 +2,8 @@
 //
 // Joints act in order on the body's frame, as in MuJoCo. A free joint is three slides along the world's axes followed
 // by a ball: velocities are (linear in the world frame, angular in the body frame). A ball's velocity is angular, in the
-// frame that it turns. With S_k the motion that dof k
-// makes possible (world frame, at the world's origin), a displacement of dof j carries everything behind it along:
+// frame that it turns. With S_k the motion that dof k makes possible (world frame, at the world's origin), a displacement
+// of dof j carries everything behind it along:
 //     ∂S_k/∂q_j = S_j × S_k   for every k behind j or in j's group (`Model::carries`),
 // which is the only derivative of kinematics that the rest of the core needs.
 #pragma once

@@ -291,6 +291,9 @@ int ModelSpec::add_contact(const std::string& name, int points, int shape, const
   contact.law = friction_law(owner, law);
   check_law(owner, law_numbers, contact.law);
   if (damping != "depth" && damping != "plain") refuse(owner + ": damping '" + damping + "' is not depth or plain");
+  if (model_.point_sets[points].radius > 0 && contact.law == FrictionLaw::elastic) {
+    refuse(owner + ": a sphere's moving point can not keep an anchor; let its friction be viscous");
+  }
   contact.damping = damping == "depth" ? DampingLaw::depth : DampingLaw::plain;
   contact.param = add_params(name, {"kn", "kt", "mu", "kd", "ks"}, {law_numbers.begin(), law_numbers.end()});
   contact.anchor = -1;

@@ -117,7 +117,6 @@ struct TouchRule {
   const T* params;  // kn, kt, mu, kd, ks
   FrictionLaw law;
   DampingLaw damping;
-  T h;
   double rolling_radius;         // 0: the points themselves touch
   const V3<T>* anchors;          // of this cloud against this shape
   const std::uint8_t* anchored;  // both unused under the viscous law
@@ -128,8 +127,8 @@ GELFLOW_INLINE PointLaw<Pack<T>> weighted(const TouchRule<T>& rule, const Pack<T
   using L = Pack<T>;
   const T* p = rule.params;
   const bool elastic = rule.law == FrictionLaw::elastic;
-  return {weight * L(p[0]), weight * L(p[1]), L(p[2]),      weight * L(p[3]), weight * L(p[4]),
-          L(rule.h),        L(0.0),           rule.damping, elastic,          rule.rolling_radius > 0};
+  const L none(0.0);  // rounding: set where it is needed
+  return {weight * L(p[0]), weight * L(p[1]), L(p[2]), weight * L(p[3]), weight * L(p[4]), none, rule.damping, elastic};
 }
 
 // Calls f(touching) for all points that are inside the shape, a pack at a time.
@@ -165,7 +164,7 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
         const L size = abs(t.x.x) + abs(t.x.y) + abs(t.x.z);
         t.law.rounding = L(T(4 * real_part(Eigen::NumTraits<T>::epsilon()))) * size;
       }
-      t.e = anchor_offset<L>(t.law, t.x, t.v, t.anchor, t.remembers);
+      t.e = select3<L>(t.remembers, t.x - t.anchor, zero3<L>());
       f(static_cast<const Touching<T>&>(t));
     }
     t.count = 0;
@@ -185,7 +184,7 @@ void advance_anchors(const PairFrame<T>& frame, const PointCloud& cloud, const T
   for_touching_points<T>(frame, cloud, rule, [&](const Touching<T>& t) {
     PointForce<Pack<T>> force;
     point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
-    const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.at.n, t.x, t.e, t.anchor, t.remembers);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.x, t.anchor, t.remembers);
     t.for_each_inside([&](int k, int i) { kept.emplace_back(i, lane3<T>(anchor, k)); });
   });
   std::fill(next_set, next_set + cloud.size(), 0);

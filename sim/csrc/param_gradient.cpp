@@ -51,9 +51,8 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {
-    advance_contact_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(),
-                                   next_set.data());
-    advance_marker_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(), next_set.data());
+    advance_contact_anchors<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, next.data(), next_set.data());
+    advance_marker_anchors<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, next.data(), next_set.data());
   }
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (int k = 0; k < m.nv; ++k) weigh(weights, w.residual[k], -multipliers[k]);
@@ -71,7 +70,7 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
   forward_positions<Taped>(m, t.params.data(), t.q0.data(), w);
   forward_velocities<Taped>(m, t.params.data(), t.v0.data(), w.update.data(), w);
   std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
-  read_markers<Taped>(m, t.params.data(), Taped(s.h), t.anchors.data(), s.anchored, w, readings.data());
+  read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data());
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (std::size_t i = 0; i < readings.size(); ++i) weigh(weights, readings[i], by_reading[i]);
   t.add_to(by_params, weights);

@@ -47,6 +47,23 @@ struct StepReport {
   int halvings = 0;    // the step was taken as 2^halvings substeps
 };
 
+// Below this speed dry friction in a joint is viscous [m/s or rad/s].
+constexpr double friction_creep = 1e-3;
+
+// A limit pushes back like a damped spring and never pulls; p: the joint's parameters.
+template <class T>
+struct LimitPush {
+  T force, by_q, by_v;
+};
+template <class T>
+LimitPush<T> limit_push(const T* p, const T& value, const T& v) {
+  const bool above = value > p[5], below = value < p[4];
+  if (!above && !below) return {T(0), T(0), T(0)};
+  const T force = p[6] * (value - (above ? p[5] : p[4])) + p[7] * v;
+  if (above ? force > T(0) : force < T(0)) return {force, p[6], p[7]};
+  return {T(0), T(0), T(0)};
+}
+
 // What an actuator pulls with, and its derivatives by the control, its length and its speed (gear × those of the joint).
 template <class T>
 struct ActuatorPull {
@@ -95,17 +112,16 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
   using std::abs;
   for (const Joint& joint : m.joints) {
     const T* p = params + joint.param;
-    const T damping = p[0], armature = p[1], stiffness = p[2], rest = p[3], lower = p[4], upper = p[5];
+    const T damping = p[0], armature = p[1], stiffness = p[2], rest = p[3];
     for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
       w.residual[k] += h * damping * v[k];
       if constexpr (derivatives) w.by_v(k, k) += h * damping;
-      if (p[8] != T(0)) {               // dry friction: viscous below `creep`, constant above
-        constexpr double creep = 1e-3;  // [m/s] or [rad/s]
-        const bool slides = abs(v[k]) > T(creep);
-        const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / T(creep) * v[k]);
+      if (p[8] != T(0)) {  // dry friction: viscous below this speed, constant above
+        const bool slides = abs(v[k]) > T(friction_creep);
+        const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / T(friction_creep) * v[k]);
         w.residual[k] += h * force;
         if (scale) w.scale[k] += h * p[8];
-        if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / T(creep));
+        if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / T(friction_creep));
       }
       if (armature != T(0)) {
         w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
@@ -120,17 +136,11 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
     const T value = q[joint.q];
     w.residual[k] += h * stiffness * (value - rest);
     if constexpr (derivatives) w.by_q(k, k) += h * stiffness;
-    // A limit pushes back like a damped spring and never pulls.
-    const bool above = value > upper, below = value < lower;
-    if (above || below) {
-      const T force = p[6] * (value - (above ? upper : lower)) + p[7] * v[k];
-      if (above ? force > T(0) : force < T(0)) {
-        w.residual[k] += h * force;
-        if constexpr (derivatives) {
-          w.by_q(k, k) += h * p[6];
-          w.by_v(k, k) += h * p[7];
-        }
-      }
+    const LimitPush<T> push = limit_push<T>(p, value, v[k]);
+    w.residual[k] += h * push.force;
+    if constexpr (derivatives) {
+      w.by_q(k, k) += h * push.by_q;
+      w.by_v(k, k) += h * push.by_v;
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
@@ -336,8 +346,8 @@ Status substeps(const Model& m, const T* params, const T& h, int count, const T*
     const Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
     if (status != Status::ok) return status;
     accepted(from, memory);
-    advance_contact_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-    advance_marker_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    advance_contact_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+    advance_marker_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
     if (m.nh > 0) {
       std::fill(s.history, s.history + m.nh, T(0));
       if (count == 1) {

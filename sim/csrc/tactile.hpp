@@ -11,22 +11,22 @@ namespace gelflow {
 
 // The markers of a pad against the shape number s of those it feels.
 template <class T>
-TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const T& h, const V3<T>* anchors,
+TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3<T>* anchors,
                         const std::uint8_t* anchored) {
   const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
-  return {params + pad.param, pad.law, DampingLaw::depth, h, 0.0, anchors + slot, anchored + slot};
+  return {params + pad.param, pad.law, DampingLaw::depth, 0.0, anchors + slot, anchored + slot};
 }
 
 // Readings of all markers, shape (markers, 3); needs the kinematics of (q, v) in w.
 template <class T>
-void read_markers(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
+void read_markers(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                   const Workspace<T>& w, T* out) {
   std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       for_touching_points<T>(
-          frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), [&](const Touching<T>& t) {
+          frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), [&](const Touching<T>& t) {
             PointForce<Pack<T>> force;
             point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
             const Vec3<Pack<T>> in_body = transposed_times(spread<Pack<T>>(frame.rotation), force.force);
@@ -45,14 +45,14 @@ void read_markers(const Model& m, const T* params, const T& h, const V3<T>* anch
 }
 
 template <class T>
-void advance_marker_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                            const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
+void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
+                            Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
-      advance_anchors<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), w.kept, next + slot,
+      advance_anchors<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), w.kept, next + slot,
                          next_set + slot);
     }
   }
@@ -61,9 +61,8 @@ void advance_marker_anchors(const Model& m, const T* params, const T& h, const V
 // Adds, to by_q, by_v and by_anchor, the gradient of readings with gradient `by_reading`, shape (markers, 3), at the
 // state whose kinematics are in w. by_anchor may be null where there are no anchors.
 template <class T>
-void read_markers_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                             const std::uint8_t* anchored, const Workspace<T>& w, const T* by_reading, VX<T>& by_q,
-                             VX<T>& by_v, V3<T>* by_anchor) {
+void read_markers_transposed(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
+                             const Workspace<T>& w, const T* by_reading, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   using L = Pack<T>;
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
@@ -72,7 +71,7 @@ void read_markers_transposed(const Model& m, const T* params, const T& h, const 
       Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
       V3<T>* const by_own = pad.anchor < 0 ? nullptr : by_anchor + pad.anchor + s * pad.cloud.size();
       for_touching_points<T>(
-          frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), [&](const Touching<T>& t) {
+          frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), [&](const Touching<T>& t) {
             Vec3<L> by_force = zero3<L>();
             t.for_each_inside([&](int k, int i) {
               const T* g = by_reading + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
@@ -101,9 +100,9 @@ void read_markers_transposed(const Model& m, const T* params, const T& h, const 
 
 // The same for the anchors' turn: gradients of the anchors after the step to the step's end and the anchors before.
 template <class T>
-void marker_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                               const std::uint8_t* anchored, const Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q,
-                               VX<T>& by_v, V3<T>* by_anchor) {
+void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
+                               const Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
+                               V3<T>* by_anchor) {
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
@@ -111,8 +110,8 @@ void marker_anchors_transposed(const Model& m, const T* params, const T& h, cons
       const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-      anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, h, anchors, anchored), by_next + slot,
-                            by_pose, by_twist, by_anchor + slot);
+      anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), by_next + slot, by_pose,
+                            by_twist, by_anchor + slot);
       pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
