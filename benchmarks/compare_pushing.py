@@ -109,7 +109,7 @@ def one_term(scene: Scene, sim: Simulator) -> tuple[Array, Array, Array]:
     turning[:, 0, 2] = sim.v[:, scene.v("box_yaw")][:, 0]
     term = np.cross(turning, distance[..., None] * normal)
     term -= (term * normal).sum(-1, keepdims=True) * normal
-    axes = to_finger @ pad.axes
+    axes = to_finger @ pad.axes[0]  # flat: the same for all markers
     return term @ axes, normal @ axes, distance
 
 

@@ -73,9 +73,11 @@ class ContactPart:
 class PadPart:
     name: str
     body: str
-    rows: int
-    cols: int
-    pitch: float  # [mm]
+    shape: str  # "rectangle", "disc", "hemisphere" or "points"
+    markers: int
+    rows: int | None  # None where the markers have no rows and columns
+    cols: int | None
+    pitch: float | None  # [mm]
     against: tuple[str, ...]
     law: str
     unit: str
@@ -139,9 +141,11 @@ def describe(scene: Scene) -> Description:
             PadPart(
                 name=pad.name,
                 body=_body_name(scene, pad.body),
-                rows=pad.grid.rows,
-                cols=pad.grid.cols,
-                pitch=pad.grid.pitch,
+                shape=pad.shape,
+                markers=len(pad.positions),
+                rows=pad.grid.rows if pad.grid else None,
+                cols=pad.grid.cols if pad.grid else None,
+                pitch=pad.grid.pitch if pad.grid else None,
                 against=pad.against,
                 law=pad.law,
                 unit="per point" if (pad.weights == 1).all() else "per area",

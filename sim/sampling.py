@@ -2,16 +2,22 @@
 
 A contact is felt at points. Where stiffness is given per area, a point's weight is the part of the surface nearest to
 it, clipped to the face, so that the weights add up to the area exactly and results converge as points get denser.
+
+Round surfaces carry a Fibonacci lattice: points at equal steps of height, each turned by the golden angle from the one
+below. On spheres and cylinders alike equal steps of height are equal areas (Archimedes).
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import elliprg
 
 from gelflow.errors import UsageError
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
+ENDS = ("-z", "+z")
+_GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 Array = NDArray[np.float64]
 
@@ -56,7 +62,7 @@ def box_surface(
 
 
 def disc(
-    radius: float, half_thickness: float, *, angles: int = 8, radii: int = 4, faces: Sequence[str] = ("-z", "+z")
+    radius: float, half_thickness: float, *, angles: int = 8, radii: int = 4, faces: Sequence[str] = ENDS
 ) -> tuple[Array, Array]:
     """Points on the flat faces of a disc about z: the centre, and `radii` rings of `angles` points on each face.
 
@@ -69,8 +75,7 @@ def disc(
     """
     if angles < 3 or radii < 1:
         raise UsageError(f"a disc needs at least 3 angles and 1 ring, got angles {angles}, radii {radii}")
-    if not faces or any(face not in ("-z", "+z") for face in faces) or len(set(faces)) != len(faces):
-        raise UsageError(f"faces of a disc are -z and +z, once each, got {list(faces)}")
+    _check_faces("a disc", faces, ENDS)
     ring = radius * np.arange(1, radii + 1) / radii
     # Cells end half way between rings; the outermost ends at the rim.
     borders = np.append((ring - radius / radii / 2), radius)
@@ -82,6 +87,124 @@ def disc(
     heights = [-half_thickness if face == "-z" else half_thickness for face in faces]
     points = np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in heights])
     return points, np.tile(areas, len(heights))
+
+
+def cylinder(
+    radius: float,
+    half_length: float,
+    *,
+    angles: int = 16,
+    radii: int = 2,
+    heights: int = 5,
+    faces: Sequence[str] = (*ENDS, "wall"),
+) -> tuple[Array, Array]:
+    """Points on a cylinder about z: its ends as in `disc`, and `heights` rows of `angles` points on its wall.
+
+    The wall's rows reach from end to end; where an end is sampled too, its rim is among the points once.
+
+    Returns
+    -------
+    points [m], shape (n, 3); weights [m²], shape (n,), whose sum is the area of the faces.
+    Raises UsageError when there are fewer than 3 angles, 1 ring or 2 heights, or on an unknown face.
+    """
+    _check_faces("a cylinder", faces, (*ENDS, "wall"))
+    ends = [face for face in faces if face != "wall"]
+    points, weights = np.zeros((0, 3)), np.zeros(0)
+    if ends:
+        points, weights = disc(radius, half_length, angles=angles, radii=radii, faces=ends)
+    if "wall" not in faces:
+        return points, weights
+    if angles < 3 or heights < 2:
+        raise UsageError(f"a cylinder's wall needs at least 3 angles and 2 heights, got {angles} and {heights}")
+    strip = _trapezoid(2 * half_length, heights) * (2 * np.pi * radius / angles)
+    rows = np.linspace(-half_length, half_length, heights)
+    per_end = len(points) // max(len(ends), 1)
+    for row, end in ((0, "-z"), (-1, "+z")):
+        if end in ends:  # the outermost ring is the last of an end's points
+            last = (ends.index(end) + 1) * per_end
+            weights[last - angles : last] += strip[row]
+    kept = slice(1 if "-z" in ends else 0, heights - 1 if "+z" in ends else heights)
+    phi = 2 * np.pi * np.arange(angles) / angles
+    ring = radius * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+    wall = [np.column_stack([ring, np.full(angles, z)]) for z in rows[kept]]
+    return np.concatenate([points, *wall]), np.concatenate([weights, np.repeat(strip[kept], angles)])
+
+
+def capsule(radius: float, half_length: float, *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
+    """`count` points on a capsule about z, near-uniform and of equal area; of a sphere where `half_length` is 0.
+
+    `faces` chooses the halves below and above the middle, "-z" and "+z".
+
+    Returns
+    -------
+    points [m], shape (count, 3); weights [m²], shape (count,), whose sum is the area of the chosen halves.
+    Raises UsageError on a count below 1 or an unknown face.
+    """
+    height = _heights("a capsule", count, faces) * (radius + half_length)
+    along = np.clip(height, -half_length, half_length)
+    around = np.sqrt(np.maximum(radius**2 - (height - along) ** 2, 0))
+    area = 2 * np.pi * radius * (radius + half_length) * len(faces)
+    return np.column_stack([around[:, None] * _spiral(count), height]), np.full(count, area / count)
+
+
+def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
+    """`count` points on an ellipsoid with these half axes [m]: those of a sphere, stretched.
+
+    Each weight is proportional to how much the stretch enlarges the surface there; `faces` as in `capsule`.
+
+    Returns
+    -------
+    points [m], shape (count, 3); weights [m²], shape (count,), whose sum is the area of the chosen halves.
+    Raises UsageError on a count below 1 or an unknown face.
+    """
+    height = _heights("an ellipsoid", count, faces)
+    sphere = np.column_stack([np.sqrt(1 - height**2)[:, None] * _spiral(count), height])
+    a, b, c = axes
+    enlarged = np.linalg.norm(sphere / axes, axis=1)
+    whole = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)  # Carlson's symmetric integral
+    return sphere * axes, enlarged * (whole * len(faces) / 2 / enlarged.sum())
+
+
+def disc_lattice(radius: float, count: int) -> Array:
+    """`count` points spread near-uniformly over a disc, as a sunflower's seeds [m], shape (count, 2)."""
+    return radius * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * _spiral(count)
+
+
+def turned_frames(normals: Array) -> Array:
+    """Axes x y z turned the shortest way until z is each of these unit normals: columns, shape (n, 3, 3).
+
+    Where a normal is −z, they are turned about y.
+    """
+    x, y, z = normals.T
+    # 1 + z, without cancellation near z = −1.
+    above = np.where(z < 0, (x * x + y * y) / (1 - np.minimum(z, 0)), 1 + z)
+    opposite = above < 1e-24
+    share = 1 / np.where(opposite, 1, above)
+    first = np.stack([1 - x * x * share, -x * y * share, -x], axis=-1)
+    second = np.stack([-x * y * share, 1 - y * y * share, -y], axis=-1)
+    first[opposite], second[opposite] = (-1, 0, 0), (0, 1, 0)
+    return np.stack([first, second, normals], axis=-1)
+
+
+def _spiral(count: int) -> Array:
+    """Directions in the plane, each turned by the golden angle from the one before, shape (count, 2)."""
+    angle = _GOLDEN_ANGLE * np.arange(count)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _heights(what: str, count: int, faces: Sequence[str]) -> Array:
+    """Equal steps of height between −1 and 1, or over the chosen half, each point in the middle of its step."""
+    _check_faces(what, faces, ENDS)
+    if count < 1:
+        raise UsageError(f"{what} needs a count of at least 1, got {count}")
+    low, high = -1.0 if "-z" in faces else 0.0, 1.0 if "+z" in faces else 0.0
+    return low + (high - low) * (np.arange(count) + 0.5) / count
+
+
+def _check_faces(what: str, faces: Sequence[str], known: Sequence[str]) -> None:
+    if not faces or any(face not in known for face in faces) or len(set(faces)) != len(faces):
+        *most, last = known
+        raise UsageError(f"faces of {what} are {', '.join(most)} and {last}, once each, got {list(faces)}")
 
 
 def _trapezoid(length: float, count: int) -> Array:

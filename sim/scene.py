@@ -80,8 +80,12 @@ class Scene:
 
     @property
     def grids(self) -> tuple[Grid, ...]:
-        """The marker grid of each pad [mm]."""
-        return tuple(pad.grid for pad in self.pads)
+        """The marker grid of each pad [mm]. Raises UsageError where a pad has none."""
+        if round_pads := [pad.name for pad in self.pads if pad.grid is None]:
+            raise UsageError(
+                f"{self.path}: pad {round_pads[0]!r} is no rectangle; its markers have no rows and columns"
+            )
+        return tuple(pad.grid for pad in self.pads if pad.grid is not None)
 
     def q(self, joint: str) -> slice:
         """Where a joint's positions stand in q. Raises UsageError on an unknown name."""
@@ -143,7 +147,7 @@ class Scene:
                 **contact.numbers,
             )
         for pad in self.pads:
-            frames = [np.tile(axis, (len(pad.positions), 1)) for axis in pad.axes.T]
+            frames = [np.ascontiguousarray(pad.axes[..., axis]) for axis in range(3)]
             spec.add_pad(
                 pad.name,
                 pad.body,
@@ -227,7 +231,7 @@ def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Map
     mechanics = read_mechanics(path.parent / top.word("model"))
     points = read_points(top.tables("points"), mechanics)
     contacts = read_contacts(top.tables("contacts"), points, mechanics, law)
-    pads = read_pads(top.tables("pads"), mechanics, law)
+    pads = read_pads(top.tables("pads"), mechanics, law, path.parent)
     shapes, unused = used_shapes(mechanics, points, contacts, pads)
     idle = tuple(f"points {name}: in no contact" for name in points if all(c.points != name for c in contacts))
     return Scene(

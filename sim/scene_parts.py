@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.sampling import FACES, box_surface, disc
+from gelflow.sim.sampling import ENDS, FACES, box_surface, capsule, cylinder, disc_lattice, ellipsoid, turned_frames
 from gelflow.sim.scene_mjcf import GeomDef, Mechanics, Pose
 from gelflow.sim.scene_toml import Table, nearest
 
@@ -19,7 +20,15 @@ T = TypeVar("T")
 LAWS = ("viscous", "elastic")
 _NUMBERS = ("kn", "kt", "mu", "kd", "ks")
 _PER_UNIT = ("per point", "per area")
-_SHAPES = ("plane", "sphere", "box")
+_SHAPES = ("plane", "sphere", "box", "cylinder", "capsule", "ellipsoid")
+_GIVEN = ("positions", "normals", "x_axes")
+# Keys of a pad's table that only its shape has.
+_PAD_KEYS: Mapping[str, tuple[str, ...]] = {
+    "rectangle": ("rows", "cols", "pitch", "size", "center"),
+    "disc": ("radius", "count", "center"),
+    "hemisphere": ("radius", "count"),
+    "points": (*_GIVEN, "file"),
+}
 
 
 @dataclass(frozen=True)
@@ -28,9 +37,9 @@ class ShapeDef:
 
     name: str
     body: int
-    kind: str  # "plane", "sphere" or "box"
+    kind: str  # "plane", "sphere", "box", "cylinder", "capsule" or "ellipsoid"
     pose: Pose  # in the body's frame; a plane's normal is its z
-    size: Array  # box: half sizes; sphere: radius first [m]
+    size: Array  # MuJoCo's three: half sizes or half axes; radius; radius and half length [m]
 
 
 @dataclass(frozen=True)
@@ -61,17 +70,28 @@ class ContactDef:
 
 @dataclass(frozen=True)
 class PadDef:
-    """A tactile pad: a grid of markers on a body."""
+    """A tactile pad: markers on a body."""
 
     name: str
     body: int
+    shape: str  # "rectangle", "disc", "hemisphere" or "points"
     positions: Array  # of the markers, in the body's frame [m], shape (n, 3)
-    axes: Array  # columns x, y, z of the pad in the body's frame
+    axes: Array  # columns x, y, z of each marker in the body's frame, shape (n, 3, 3)
     weights: Array  # shape (n,)
-    grid: Grid  # on the pad [mm]
+    grid: Grid | None  # on the pad [mm]; only a rectangle has one
     against: tuple[str, ...]
     law: str
     numbers: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class _Markers:
+    """The markers of a pad, in its site's frame."""
+
+    positions: Array  # [m], shape (n, 3)
+    axes: Array  # columns x, y, z of each marker, shape (n, 3, 3)
+    area: float | None  # that one marker stands for [m²]; None where it is not known
+    grid: Grid | None  # a rectangle's [mm]
 
 
 @dataclass(frozen=True)
@@ -90,25 +110,41 @@ def read_points(tables: Mapping[str, Table], mechanics: Mechanics) -> dict[str, 
 
 def _sample(name: str, table: Table, geoms: Mapping[str, GeomDef]) -> PointsDef:
     geom = _named(geoms, table.word("geom"), table, "geometry")
-    radius, unit = 0.0, "per point"
+    if geom.kind == "sphere" and "count" not in table.data:
+        if len(table.data) > 1:
+            raise UsageError(f"{table.where}: without a count {geom.name!r} is one exact point, which takes geom alone")
+        return PointsDef(name, geom.name, geom.body, geom.pose.pos[None], np.ones(1), np.ones(1), float(geom.size[0]))
+    try:
+        local, areas = _surface(table, geom)
+    except UsageError as error:
+        raise UsageError(str(error) if str(error).startswith(table.where) else f"{table.where}: {error}") from None
+    per_area = table.word("stiffness", "per point", among=_PER_UNIT) == "per area"
+    weights = areas if per_area else np.ones(len(areas))
+    return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, 0.0)
+
+
+def _surface(table: Table, geom: GeomDef) -> tuple[Array, Array]:
+    """Points on a geometry's surface, in its frame [m], and the area of each [m²]."""
+    size = geom.size.tolist()
     if geom.kind == "box":
         table.only(("geom", "resolution", "faces", "stiffness"))
         resolution = [int(n) for n in table.numbers("resolution", 3)]
-        local, areas = box_surface(geom.size.tolist(), resolution, faces=table.words("faces", FACES))
-    elif geom.kind == "cylinder":
-        table.only(("geom", "angles", "radii", "faces", "stiffness"))
+        return box_surface(size, resolution, faces=table.words("faces", FACES))
+    if geom.kind == "cylinder":
+        table.only(("geom", "angles", "radii", "heights", "faces", "stiffness"))
         angles, radii = table.integer("angles", 8), table.integer("radii", 4)
-        local, areas = disc(*geom.size[:2], angles=angles, radii=radii, faces=table.words("faces", ("-z", "+z")))
-    elif geom.kind == "sphere":
-        table.only(("geom",))
-        radius = float(geom.size[0])
-        local, areas = np.zeros((1, 3)), np.ones(1)
-    else:
-        raise UsageError(f"{table.where}: {geom.kind} {geom.name!r} can't be sampled; box, cylinder (disc), sphere can")
-    if geom.kind != "sphere":
-        unit = table.word("stiffness", "per point", among=_PER_UNIT)
-    weights = areas if unit == "per area" else np.ones(len(areas))
-    return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, radius)
+        faces, heights = table.words("faces", ENDS), table.integer("heights", 5)
+        if "heights" in table.data and "wall" not in faces:
+            raise UsageError('heights are those of the wall; add faces = ["-z", "+z", "wall"]')
+        return cylinder(*size[:2], angles=angles, radii=radii, heights=heights, faces=faces)
+    if geom.kind not in ("sphere", "capsule", "ellipsoid"):
+        known = "box, cylinder, sphere, capsule, ellipsoid"
+        raise UsageError(f"{geom.kind} {geom.name!r} can't be sampled; {known} can")
+    table.only(("geom", "count", "faces", "stiffness"))
+    count, faces = table.integer("count"), table.words("faces", ENDS)
+    if geom.kind == "ellipsoid":
+        return ellipsoid(size, count=count, faces=faces)
+    return capsule(size[0], size[1] if geom.kind == "capsule" else 0.0, count=count, faces=faces)
 
 
 def read_contacts(
@@ -130,7 +166,8 @@ def read_contacts(
                 raise UsageError(f"{table.where}: {sampled.geom!r} and {shape!r} are on one body and can't touch")
             if sampled.radius > 0 and geom.kind != "plane":
                 raise UsageError(
-                    f"{table.where}: the one exact point of a sphere touches planes; let {shape!r} be the sampled side"
+                    f"{table.where}: the one exact point of a sphere touches planes; let {shape!r} be the sampled side "
+                    f"or give points {sampled.name!r} a count"
                 )
             if sampled.radius > 0 and law == "elastic":
                 raise UsageError(
@@ -142,33 +179,63 @@ def read_contacts(
     return tuple(contacts)
 
 
-def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str) -> tuple[PadDef, ...]:
-    """The pads: a grid of markers at a site of the model; z is its outward normal, x points to the tip."""
+def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, folder: Path) -> tuple[PadDef, ...]:
+    """The pads: markers about a site of the model, whose z is the outward normal and x points to the tip.
+
+    `folder` is where the files of markers are looked for.
+    """
     geoms = {geom.name: geom for geom in mechanics.geoms}
-    keys = ("site", "rows", "cols", "pitch", "size", "center", "against", "stiffness", "law", *LAWS, *_NUMBERS)
+    common = ("site", "shape", "against", "stiffness", "law", *LAWS, *_NUMBERS)
     pads = []
     for name, table in tables.items():
-        table.only(keys)
+        shape = table.word("shape", "rectangle", among=tuple(_PAD_KEYS))
+        table.only((*common, *_PAD_KEYS[shape]))
         body, frame = _named(mechanics.sites, table.word("site"), table, "site")
-        grid = _grid(table)
+        markers = _markers(table, shape, folder)
         law = table.word("law", friction, among=LAWS)
-        local = np.column_stack([grid.positions() * 1e-3, np.zeros(grid.rows * grid.cols)])
         per_area = table.word("stiffness", "per point", among=_PER_UNIT) == "per area"
-        against = tuple(_shape(geoms, shape, table).name for shape in table.words("against"))
+        if per_area and markers.area is None:
+            raise UsageError(f"{table.where}: the area of given markers is not known; set stiffness per point")
+        against = tuple(_shape(geoms, other, table).name for other in table.words("against"))
         pads.append(
             PadDef(
                 name=name,
                 body=body,
-                positions=frame.points(local),
-                axes=frame.matrix(),
-                weights=np.full(len(local), (grid.pitch * 1e-3) ** 2 if per_area else 1.0),
-                grid=grid,
+                shape=shape,
+                positions=frame.points(markers.positions),
+                axes=frame.matrix() @ markers.axes,
+                weights=np.full(len(markers.positions), markers.area if per_area and markers.area else 1.0),
+                grid=markers.grid,
                 against=against,
                 law=law,
                 numbers=_law_numbers(table, law),
             )
         )
     return tuple(pads)
+
+
+def _markers(table: Table, shape: str, folder: Path) -> _Markers:
+    """The markers of a pad of this shape; files are looked for in `folder`.
+
+    Raises UsageError, in one line, on missing or wrong values.
+    """
+    if shape == "rectangle":
+        grid = _grid(table)
+        return _flat(grid.positions() * 1e-3, (grid.pitch * 1e-3) ** 2, grid)
+    if shape == "points":
+        return _given(table, folder)
+    radius, count = table.number("radius", least=1e-9), table.integer("count")
+    if shape == "disc":
+        flat = disc_lattice(radius, count) + table.numbers("center", 2, (0.0, 0.0))
+        return _flat(flat, np.pi * radius**2 / count, None)
+    # From the top down, about the middle of the sphere.
+    positions = capsule(radius, 0.0, count=count, faces=("+z",))[0][::-1]
+    return _Markers(positions, turned_frames(positions / radius), 2 * np.pi * radius**2 / count, None)
+
+
+def _flat(points: Array, area: float, grid: Grid | None) -> _Markers:
+    positions = np.column_stack([points, np.zeros(len(points))])
+    return _Markers(positions, np.tile(np.eye(3), (len(points), 1, 1)), area, grid)
 
 
 def _grid(table: Table) -> Grid:
@@ -187,6 +254,78 @@ def _grid(table: Table) -> Grid:
             )
     center = table.numbers("center", 2, (0.0, 0.0))
     return Grid(rows, cols, pitch * 1e3, (center[0] * 1e3, center[1] * 1e3))
+
+
+def _given(table: Table, folder: Path) -> _Markers:
+    """Markers at points of the table or of a file: positions, and optionally normals and x axes."""
+    if ("positions" in table.data) == ("file" in table.data):
+        raise UsageError(f"{table.where}: a pad of points needs either positions or a file")
+    if "file" in table.data:
+        if extra := [key for key in _GIVEN if key in table.data]:
+            raise UsageError(f"{table.where}: {extra[0]} must stand in the file, beside its positions")
+        found, where = _from_file(folder / table.word("file"), table.where)
+    else:
+        found, where = {key: table.data[key] for key in _GIVEN if key in table.data}, table.where
+    positions = _vectors(found, "positions", where)
+    count = len(positions)
+    normals = _units(found, "normals", where, count)
+    axes = np.tile(np.eye(3), (count, 1, 1)) if normals is None else turned_frames(normals)
+    tips = _units(found, "x_axes", where, count)
+    if tips is not None:
+        x = tips - (tips * axes[..., 2]).sum(1, keepdims=True) * axes[..., 2]
+        length = np.linalg.norm(x, axis=1, keepdims=True)
+        if (length < 1e-6).any():
+            raise UsageError(f"{where}: x_axes[{int(length.argmin())}] is along the normal; it must lie across")
+        x /= length
+        axes = np.stack([x, np.cross(axes[..., 2], x), axes[..., 2]], axis=-1)
+    return _Markers(positions, axes, None, None)
+
+
+def _from_file(path: Path, where: str) -> tuple[dict[str, Any], str]:
+    """The arrays of an NPZ file, or the columns of a CSV file: position, then normal, then x axis."""
+    place = f"{where}: {path.name}"
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as arrays:
+                found = {name: arrays[name] for name in arrays.files}
+            if unknown := [name for name in found if name not in _GIVEN]:
+                raise UsageError(f"{place}: unknown array {unknown[0]!r}; known are {', '.join(_GIVEN)}")
+            return found, place
+        if path.suffix != ".csv":
+            raise UsageError(f"{place}: a file of markers must be .csv or .npz")
+        columns = np.loadtxt(path, delimiter=",", ndmin=2)
+    except FileNotFoundError:
+        raise UsageError(f"{place}: no such file beside the scene") from None
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{place} can't be read: {str(error).splitlines()[0]}") from None
+    if columns.shape[1] not in (3, 6, 9):
+        raise UsageError(f"{place}: expected 3, 6 or 9 columns (position, normal, x axis), got {columns.shape[1]}")
+    parts = np.split(columns, columns.shape[1] // 3, axis=1)
+    return dict(zip(_GIVEN, parts, strict=False)), place
+
+
+def _vectors(found: Mapping[str, Any], key: str, where: str) -> Array:
+    try:
+        vectors = np.array(found.get(key, ()), dtype=float)
+    except (TypeError, ValueError):
+        vectors = np.zeros(0)
+    if vectors.ndim != 2 or vectors.shape[1] != 3 or not len(vectors) or not np.isfinite(vectors).all():
+        raise UsageError(f"{where}: {key} must be a list of [x, y, z], all finite")
+    return vectors
+
+
+def _units(found: Mapping[str, Any], key: str, where: str, count: int) -> Array | None:
+    """Directions, one for each marker, as unit vectors; None where there are none."""
+    if key not in found:
+        return None
+    vectors = _vectors(found, key, where)
+    if len(vectors) != count:
+        raise UsageError(f"{where}: {key} must be as many as positions, {count}, got {len(vectors)}")
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if (length < 1e-9).any():
+        raise UsageError(f"{where}: {key}[{int(length.argmin())}] has no direction")
+    units: Array = vectors / length
+    return units
 
 
 def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -> tuple[Limit, ...]:

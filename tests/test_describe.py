@@ -94,7 +94,10 @@ def test_the_tree_holds_every_part(name: str, law: str, capsys: pytest.CaptureFi
         kind = next(g for g in ("box", "cylinder", "sphere") if f"{count} on {g} {sampled.geom}" in text)
         assert f"{contact.group}: {count} on {kind} {sampled.geom} against {against}" in text
     for pad in scene.pads:
-        assert f"{pad.name}: {pad.grid.rows} × {pad.grid.cols} markers" in text
+        count = (
+            f"{pad.grid.rows} × {pad.grid.cols} markers" if pad.grid else f"{len(pad.positions)} markers, a {pad.shape}"
+        )
+        assert f"{pad.name}: {count}" in text
 
 
 def test_numbers_of_a_contact_and_a_joint(capsys: pytest.CaptureFixture[str]) -> None:

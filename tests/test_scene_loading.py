@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim.scene import Scene, load_scene, scene_names
 
-SHIPPED = ("insertion", "pushing", "rolling")
+SHIPPED = ("dclaw", "grasp", "insertion", "pushing", "rolling")
 
 
 class RecordingSpec:
@@ -103,14 +103,20 @@ def test_frames_agree_with_mujoco(name: str, friction: str) -> None:
         for pad in scene.pads:
             x, r = body_frames(spec, q)[pad.body]
             site = model.site(_site_of(scene, pad.name)).id
+            axes = data.site_xmat[site].reshape(3, 3)
+            if pad.grid is None:
+                middle = x + pad.positions @ r.T - 0.01 * (r @ pad.axes)[..., 2]  # of the sphere, from every marker
+                np.testing.assert_allclose(middle, np.tile(data.site_xpos[site], (302, 1)), atol=1e-12)
+                assert ((r @ pad.axes)[..., 2] @ axes[:, 2] > 0).all()
+                continue
             corner = np.array([*(pad.grid.positions()[0] * 1e-3), 0])
-            expected = data.site_xpos[site] + data.site_xmat[site].reshape(3, 3) @ corner
-            np.testing.assert_allclose(x + r @ pad.positions[0], expected, atol=1e-12)
-            np.testing.assert_allclose(r @ pad.axes, data.site_xmat[site].reshape(3, 3), atol=1e-12)
+            np.testing.assert_allclose(x + r @ pad.positions[0], data.site_xpos[site] + axes @ corner, atol=1e-12)
+            np.testing.assert_allclose(r @ pad.axes, np.tile(axes, (len(pad.axes), 1, 1)), atol=1e-12)
 
 
 def _site_of(scene: Scene, pad: str) -> str:
-    return {"insertion": f"pad_{pad}", "pushing": "pad_face", "rolling": "pad_face"}[scene.name]
+    gripper = f"pad_{pad}"
+    return {"dclaw": pad, "grasp": gripper, "insertion": gripper}.get(scene.name, "pad_face")
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -150,7 +156,7 @@ def test_the_pads_follow_the_observation_format() -> None:
     data.qpos[:] = scene.q0
     mujoco.mj_kinematics(model, data)
     for pad, outward in zip(scene.pads, (1.0, -1.0), strict=True):
-        axes = data.xmat[model.body(scene.bodies[pad.body].name).id].reshape(3, 3) @ pad.axes
+        axes = data.xmat[model.body(scene.bodies[pad.body].name).id].reshape(3, 3) @ pad.axes[0]
         np.testing.assert_allclose(axes[:, 0], [0, 0, -1], atol=1e-12)
         np.testing.assert_allclose(axes[:, 2], [outward, 0, 0], atol=1e-12)
         np.testing.assert_allclose(axes[:, 1], np.cross(axes[:, 2], axes[:, 0]), atol=1e-12)
@@ -306,8 +312,12 @@ TOML_FAULTS = [
     ("step = 0.005", 'step = 0.005\nfriction = "elastik"', "friction is 'elastik'; did you mean 'elastic'"),
     ("step = 0.005", 'step = 0.005\nfriction = "elastic"', "ks is missing"),
     ('geom = "block"', 'geom = "blok"', "no geometry 'blok'; did you mean 'block'"),
-    ('geom = "block"', 'geom = "ornament"', "capsule 'ornament' can't be sampled"),
-    ('against = "ground"', 'against = "ornament"', "'ornament' is a capsule"),
+    (
+        'geom = "block"',
+        'geom = "ground"',
+        "plane 'ground' can't be sampled; box, cylinder, sphere, capsule, ellipsoid can",
+    ),
+    ('geom = "block"', 'geom = "ornament"', "unknown key 'resolution'; known are count, faces, geom, stiffness"),
     ('against = "ground"', 'against = "top"', "on one body"),
     ('site = "face"', 'site = "fase"', "no site 'fase'; did you mean 'face'"),
     ("rows = 2", "rows = 0", "rows must be a whole number"),

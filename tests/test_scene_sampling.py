@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gelflow.errors import UsageError
-from gelflow.sim.sampling import FACES, box_surface, disc
+from gelflow.sim.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
 
 
 def test_the_rolling_pad_has_as_many_points_as_published() -> None:
@@ -62,6 +62,61 @@ def test_integrals_over_a_disc_converge() -> None:
     assert errors[0] > 1.7 * errors[1] > 1.7**2 * errors[2]
 
 
+@settings(deadline=None, max_examples=40)
+@given(
+    angles=st.integers(3, 12),
+    radii=st.integers(1, 4),
+    heights=st.integers(2, 6),
+    faces=st.lists(st.sampled_from(("-z", "+z", "wall")), min_size=1, max_size=3, unique=True),
+)
+def test_cylinder_weights_add_up_to_the_area_of_the_faces(
+    angles: int, radii: int, heights: int, faces: list[str]
+) -> None:
+    radius, half = 0.3, 0.5
+    points, weights = cylinder(radius, half, angles=angles, radii=radii, heights=heights, faces=faces)
+    area = {"-z": np.pi * radius**2, "+z": np.pi * radius**2, "wall": 4 * np.pi * radius * half}
+    assert weights.sum() == pytest.approx(sum(area[face] for face in faces))
+    assert (weights > 0).all()
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # the rims once
+    around = np.linalg.norm(points[:, :2], axis=1)
+    assert np.maximum(around / radius, np.abs(points[:, 2]) / half) == pytest.approx(1)  # on the surface
+    # What each face integrates to on its own: moments of the height.
+    expected = sum(area[face] * {"-z": -half, "+z": half, "wall": 0}[face] for face in faces)
+    assert (weights * points[:, 2]).sum() == pytest.approx(expected, abs=1e-12)
+
+
+HALVES = [("-z", "+z"), ("-z",), ("+z",)]
+
+
+@pytest.mark.parametrize("faces", HALVES)
+@pytest.mark.parametrize("half", [0.0, 0.4])
+def test_spheres_and_capsules(half: float, faces: tuple[str, ...]) -> None:
+    points, weights = capsule(0.2, half, count=200, faces=faces)
+    assert len(points) == 200
+    axis = np.clip(points[:, 2], -half, half)
+    assert np.linalg.norm(points - np.stack([0 * axis, 0 * axis, axis], -1), axis=1) == pytest.approx(0.2)
+    assert weights.sum() == pytest.approx(len(faces) / 2 * (4 * np.pi * 0.2**2 + 4 * np.pi * 0.2 * half))
+    assert ((points[:, 2] < 0) == (len(faces) == 2) | (faces == ("-z",)))[points[:, 2] < 0].all()
+    # Equal areas, near-uniform: nobody's neighbour is much nearer than the area says.
+    gaps = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(200)
+    assert gaps.min() > 0.6 * np.sqrt(weights[0])
+
+
+@pytest.mark.parametrize("faces", HALVES)
+@pytest.mark.parametrize("axes", [(0.1, 0.1, 0.1), (0.1, 0.2, 0.3), (0.3, 0.1, 0.1)])
+def test_ellipsoids(axes: tuple[float, float, float], faces: tuple[str, ...]) -> None:
+    """Area by the mean of a dense grid over both angles; ∫ z² over the whole surface converges."""
+    u, v = np.meshgrid((np.arange(400) + 0.5) / 400 * np.pi, np.arange(400) / 400 * 2 * np.pi)
+    direction = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
+    cell = np.prod(axes) * np.linalg.norm(direction / axes, axis=-1) * np.sin(u) * np.pi / 400 * 2 * np.pi / 400
+    points, weights = ellipsoid(axes, count=500, faces=faces)
+    assert np.linalg.norm(points / axes, axis=1) == pytest.approx(1)
+    assert weights.sum() == pytest.approx(cell.sum() * len(faces) / 2, rel=1e-4)
+    z = (cell * (axes[2] * direction[..., 2]) ** 2).sum() * len(faces) / 2
+    assert (weights * points[:, 2] ** 2).sum() == pytest.approx(z, rel=2e-3)
+    assert (points[:, 2] < 0).any() == ("-z" in faces) and (points[:, 2] > 0).any() == ("+z" in faces)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -70,6 +125,10 @@ def test_integrals_over_a_disc_converge() -> None:
         (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["-z", "-z"]), "once each"),
         (lambda: disc(1, 1, angles=2), "at least 3 angles"),
         (lambda: disc(1, 1, faces=["-x"]), "faces of a disc"),
+        (lambda: cylinder(1, 1, faces=["-x"]), "faces of a cylinder are -z, .z and wall, once each"),
+        (lambda: cylinder(1, 1, heights=1), "at least 3 angles and 2 heights, got 16 and 1"),
+        (lambda: capsule(1, 1, count=0), "a capsule needs a count of at least 1, got 0"),
+        (lambda: ellipsoid((1, 1, 1), count=9, faces=["wall"]), "faces of an ellipsoid are -z and .z"),
     ],
 )
 def test_wrong_sampling_is_refused(call: object, message: str) -> None:

@@ -134,7 +134,15 @@ def _add_contact(at: Tree, contact: "ContactPart") -> None:
 
 
 def _add_pad(at: Tree, pad: "PadPart") -> None:
-    text = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart, on {pad.body} against {', '.join(pad.against)}"
+    if pad.pitch is None:
+        markers = (
+            f"{pad.markers} markers at given points"
+            if pad.shape == "points"
+            else f"{pad.markers} markers, a {pad.shape}"
+        )
+    else:
+        markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart"
+    text = f"{markers}, on {pad.body} against {', '.join(pad.against)}"
     branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")
     branch.add(_law(pad.law, pad.unit, pad.numbers, "", damped_by_depth=True))
 
