@@ -21,11 +21,11 @@ def test_every_command_explains_itself_in_80_columns(
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
 
 
-def test_a_reader_that_stops_is_no_error() -> None:
-    command = subprocess.Popen(
-        [*MAIN, "describe", "insertion", "--no-timing"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_a_reader_that_stops_ends_the_command_without_a_word(form: list[str]) -> None:
+    arguments = ["describe", "insertion", "--no-timing", *form]
+    command = subprocess.Popen([*MAIN, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert command.stdout is not None and command.stderr is not None
     command.stdout.close()
     assert command.stderr.read() == b""
-    assert command.wait() == 0
+    assert command.wait() == 1

@@ -134,7 +134,7 @@ def test_json_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureF
 
 
 def test_memory_grows_with_what_is_kept() -> None:
-    """Workspace, where it is known, keeps a second copy of the anchors, and the model every marker."""
+    """The state keeps every anchor, the model, where its size is known, every marker; the workspace neither."""
     small, large = (
         describe(load_scene("pushing", friction="elastic", overrides={"pads.pad.rows": rows})).size
         for rows in (10, 1000)
@@ -142,9 +142,7 @@ def test_memory_grows_with_what_is_kept() -> None:
     more = 990 * 10
     assert large.anchors - small.anchors == large.markers - small.markers == more
     assert large.state_bytes - small.state_bytes == more * 25
-    if large.workspace_bytes is not None and small.workspace_bytes is not None:
-        assert large.workspace_bytes - small.workspace_bytes >= more * 25
-        assert large.model_bytes is not None and small.model_bytes is not None
+    if large.model_bytes is not None and small.model_bytes is not None:
         assert large.model_bytes - small.model_bytes >= more * 24
 
 

@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except BrokenPipeError:  # the reader has seen enough, as in `gelflow … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python still wants to flush
-        return 0
+        return 1  # as rich's console has it
     except GelflowError as error:
         print(f"gelflow {args.command}: {error}", file=sys.stderr)
         return 2
