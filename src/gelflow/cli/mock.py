@@ -74,8 +74,8 @@ def lab_for(robot: "MockRobot", factor: float) -> "Lab":
 
     world, look = robot.config.world, robot.config.look
     # One computer plays robot and runner at once, and its jitter does not shrink when the clock is scaled: in wall time
-    # the limits are four times those for a robot.
-    scale = 4 * max(1.0, factor)
+    # the limits are twelve times those for a robot.
+    scale = 12 * max(1.0, factor)
 
     def camera(finger: int) -> lab.CameraLab:
         return lab.CameraLab(
