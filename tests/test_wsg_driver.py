@@ -139,6 +139,15 @@ def eventually(reached: Callable[[], bool], what: str) -> None:
         time.sleep(0.005)
 
 
+def await_trouble(gripper: WsgGripper) -> None:
+    """Ask for the state until that raises: the reading thread notices a lost link a little later than it happens."""
+    end = time.monotonic() + PATIENT
+    while time.monotonic() < end:
+        gripper.state()
+        time.sleep(0.005)
+    pytest.fail("the driver did not notice")
+
+
 # ------------------------------------------------------------------ the life of a grip
 
 
@@ -413,6 +422,8 @@ def test_after_an_unannounced_end_the_next_session_finds_fast_stop_and_the_part(
         plant.set_part(0.040)
         first.grasp(width=0.040, speed=0.4, force=20)
         relay.close()  # the cable is pulled
+        with pytest.raises(PeerError, match=r"closed|broke"):
+            await_trouble(first)
         with pytest.raises(PeerError, match=r"closed|broke"):
             first.move(width=0.05, speed=0.1)
         first.close()
