@@ -3,6 +3,7 @@
 #   make test    all tests
 #   make check   lint, format, types, import rules
 #   make core    rebuild the C++ core after a change
+#   make sanitize   the core's tests on a core that AddressSanitizer and UBSan watch (GCC, Linux)
 #   make clean   remove what was built (the environment .venv stays; delete it by hand to start afresh)
 # Variables: PYTHON=python3.12 names another Python for the environment; TORCH_INDEX=URL adds an index for torch
 # alone (see the README: CPU builds).
@@ -17,7 +18,16 @@ BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
 CXX_FILES = $(wildcard sim/csrc/*.cpp sim/csrc/*.hpp)
 
-.PHONY: demo test check core setup clean
+# The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
+SANITIZE_BUILD := build/sanitize
+# Every test of the core runs but those that repeat what others run, many times over: it is fifty times slower here.
+# test_core_order needs rest to the last bit, which not every build comes to.
+SANITIZE_TESTS = $(filter-out tests/test_core_order.py,$(wildcard tests/test_core_*.py)) tests/test_scene_simulated.py
+SANITIZE_CHOICE = not central_differences and not hundred_steps and not (exact and insertion and (viscous or bdf1)) \
+  and not (gradients_in_contact and viscous) and not (depth_and_normal and ellipsoid)
+SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
+
+.PHONY: demo test check core sanitize setup clean
 
 demo: core
 	@.venv/bin/gelflow demo
@@ -35,6 +45,14 @@ check: core
 # The editable install leaves a configured build behind: from then on only what changed is compiled.
 core: setup
 	@.venv/bin/cmake --build $(BUILD) > $(BUILD)/build.log 2>&1 || { cat $(BUILD)/build.log; exit 1; }
+
+# The report of an error goes past pytest, which captures what Python prints and no more: the process ends there.
+sanitize: core
+	@.venv/bin/cmake -S sim/csrc -B $(SANITIZE_BUILD) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/.venv/bin/ninja \
+	  -DCMAKE_CXX_COMPILER=$(CXX) -DGELFLOW_SANITIZE=ON -DGELFLOW_INPLACE=ON > $(SANITIZE_BUILD).log 2>&1 && \
+	  .venv/bin/cmake --build $(SANITIZE_BUILD) >> $(SANITIZE_BUILD).log 2>&1 || { cat $(SANITIZE_BUILD).log; exit 1; }
+	@LD_PRELOAD="$(SANITIZE_PRELOAD)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
+	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest --capture=sys -k "$(SANITIZE_CHOICE)" $(SANITIZE_TESTS)
 
 setup: $(SETUP)
 
