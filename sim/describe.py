@@ -219,7 +219,7 @@ def _contacts(scene: Scene, kinds: dict[str, str]) -> tuple[ContactPart, ...]:
         contacts = list(members)
         first = contacts[0]
         sampled = points[first.points]
-        unit = "per point" if (sampled.weights == 1).all() else "per area"
+        unit = "per area" if sampled.per_area else "per point"
         parts.append(
             ContactPart(
                 name=group,

@@ -27,7 +27,8 @@ class Agreement:
     """How well two ways to a gradient agree."""
 
     error: float  # norm of the difference over norm of the gradient
-    left_out: float  # share of stencils left out for crossing a branch (0 for dual numbers)
+    left_out: float  # share of entries left out, as every stencil crossed a branch (0 for dual numbers)
+    worst: str = ""  # where the error is: "u", "q", "v", or a group of parameters
 
 
 def turning_joints(model: Any) -> list[tuple[int, int]]:
@@ -136,8 +137,9 @@ def _from_tangent(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float6
     return result
 
 
-def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -> Agreement:
-    """Worst relative difference along random directions in u, q, v, anchors, history, params: each alone, and all.
+def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3, groups: bool = True) -> Agreement:
+    """Worst relative difference along random directions in u, q, v, anchors, history, params: each alone, and all;
+    with `groups` also in each group of parameters (`groups_of`) alone, once.
 
     The adjoint identity ⟨w, J d⟩ = ⟨Jᵀ w, d⟩ is what is compared: J d by dual numbers, Jᵀ w by the reverse pass.
     """
@@ -146,101 +148,168 @@ def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3) -
     set_now = sim.anchored[0].astype(bool)
     parts = ["u", "q", "v", "params"]
     parts += ["anchors"] * bool(set_now.any()) + ["history"] * bool(sim.history[0].any())
-    scale = _param_scale(sim.params[0])
-    worst = 0.0
-    for _ in range(directions):
-        for only in [*parts, "all"]:
-            d = {name: np.zeros_like(value) for name, value in gradient.items()}
-            for name in parts if only == "all" else [only]:
-                d[name] = rng.normal(size=d[name].shape)
-            d["anchors"][~set_now] = 0
-            d["params"] *= scale
-            d["history"][-1:] = 0  # whether there is one
-            exact = _core.directional_rollout(
-                model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], sim.history[0], case.u,
-                d["params"], d["q"], d["v"], d["anchors"], d["history"], d["u"],
-            )  # fmt: skip
-            along = case.weights.ravel() @ exact["d" + case.output]
-            size = np.linalg.norm(case.weights) * np.linalg.norm(exact["d" + case.output])
-            ours = sum(float((gradient[name] * d[name]).sum()) for name in gradient)
-            worst = max(worst, abs(along - ours) / max(size, 1e-300))
-            if np.abs(exact["q"] - trajectory.q[-1, 0]).max() > 1e-9:
-                raise SimulationError("the dual-number run left the run that it should repeat")
-    return Agreement(worst, 0.0)
+    scale, group = param_scale(model, sim.params[0]), groups_of(model)
+    found: list[tuple[str, float, float]] = []  # of what, difference, size
+    tries = [(only, group == only) for only in np.unique(group)] if groups else []
+    tries += [(only, np.ones(len(scale), bool)) for only in [*parts, "all"]] * directions
+    for only, chosen in tries:
+        d = {name: np.zeros_like(value) for name, value in gradient.items()}
+        for name in parts if only == "all" else [only if only in parts else "params"]:
+            d[name] = rng.normal(size=d[name].shape)
+        d["anchors"][~set_now] = 0
+        d["params"] *= scale * chosen
+        d["history"][-1:] = 0  # whether there is one
+        exact = _core.directional_rollout(
+            model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], sim.history[0], case.u,
+            d["params"], d["q"], d["v"], d["anchors"], d["history"], d["u"],
+        )  # fmt: skip
+        along = case.weights.ravel() @ exact["d" + case.output]
+        size = np.linalg.norm(case.weights) * np.linalg.norm(exact["d" + case.output])
+        ours = sum(float((gradient[name] * d[name]).sum()) for name in gradient)
+        found.append((str(only), abs(along - ours), size))
+        if np.abs(exact["q"] - trajectory.q[-1, 0]).max() > 1e-9:
+            raise SimulationError("the dual-number run left the run that it should repeat")
+    floor = 1e-6 * max(size for *_, size in found) + 1e-300  # below it rounding errors show
+    error, most = max((difference / max(size, floor), only) for only, difference, size in found)
+    return Agreement(error, 0.0, most)
 
 
-def _param_scale(params: NDArray[np.float64]) -> NDArray[np.float64]:
-    """By how much each parameter is displaced: by its own size; infinite limits and zeros hardly."""
-    return np.where(np.isfinite(params), np.maximum(np.abs(params), 1e-6), 0.0)
+def groups_of(model: Any) -> NDArray[np.str_]:
+    """What each parameter is, whatever its owner: "kn", "pos", "inertia", "gravity", …; (parameters,)."""
+    return np.array(
+        [next(part for part in reversed(name.split(".")) if part not in _COMPONENTS) for name in model.param_names]
+    )
 
 
-FACTORS = (4.0, 2.0, 1.0, 0.5, 0.25)  # stencil sizes that are tried, times `STENCIL`
-STENCIL = {"u": 1e-5, "q": 1e-7, "v": 1e-5}
-OFFSETS = np.array([-2.0, -1.0, 1.0, 2.0])
-COEFFICIENTS = np.array([1.0, -8.0, 8.0, -1.0]) / 12
+_COMPONENTS = ("x", "y", "z", "xx", "yy", "zz", "xy", "xz", "yz")
 
 
-def against_differences(case: Case) -> Agreement:
-    """Gradient with respect to (u, q, v) by five-point central differences, entry by entry.
+def param_scale(model: Any, params: NDArray[np.float64]) -> NDArray[np.float64]:
+    """By how much each parameter is displaced: by its own size, or one that fits what it is. 0 where it may not be:
+    an infinite bound, a size that a shape does not have."""
+    groups = groups_of(model)
+    scale = np.where(np.isfinite(params), np.abs(params), 0.0)
+    zero = params == 0
+    inertia = np.flatnonzero(groups == "inertia").reshape(-1, 6)
+    scale[inertia] = scale[inertia[:, :3]].mean(1, keepdims=True)
+    light = scale[np.isin(groups, ("mass", "inertia"))]
+    typical = {"pos": 0.01, "com": 0.01, "size": 0.0, "armature": float(np.median(light[light > 0]))}
+    for group in set(groups[zero]) - {"inertia"}:
+        scale[zero & (groups == group)] = typical.get(group, 1.0)
+    return scale
 
-    Each entry is differenced with several stencil sizes; of those that stayed on the middle's branch the one counts
-    that differs least from its smaller neighbour, which is where rounding and truncation balance. The analytic
-    gradient has no say in that choice. An entry with fewer than two such stencils is left out. The error is the largest
-    over u, q and v of norm of the difference over norm, as their units differ.
+
+# The sizes of stencils, largest first: a quarter of it is the next smaller. An entry starts with the first three; where
+# they cross a branch, or do not agree, three smaller ones follow, and so on.
+STENCIL = {"u": 1e-3, "q": 5e-6, "v": 1e-3, "params": 1e-3}  # the first: [as u], [m or rad], [m/s or rad/s], relative
+RATIO, ROUNDS, PER_ROUND = 4, 5, 3
+AGREE = 1e-8  # of two estimates, relative to the gradient: good enough
+CHUNK = 128  # environments at a time
+
+
+def against_differences(case: Case, *, params: bool = True) -> Agreement:
+    """Gradient with respect to (u, q, v, params) by five-point central differences, entry by entry.
+
+    A five-point difference is made of two of three points, of sizes s and s/4. Each entry is differenced with several
+    sizes; of those that stayed on the middle's branch the one counts that differs least from its smaller neighbour,
+    which is where rounding and truncation balance. Smaller sizes are tried only where the larger ones crossed a branch
+    or did not agree. The analytic gradient has no say in any of that. An entry without two such stencils is left out.
+
+    The error is the largest over u, q, v and the groups of parameters, as their units differ, of norm of the difference
+    over norm. Parameters count in multiples of `param_scale`; a group whose gradient is below a thousandth of that by
+    all parameters counts as if it were one.
     """
     model = case.sim.model
-    middle, gradient = analytic(case)
-    ours = np.concatenate([gradient["u"].ravel(), gradient["q"], gradient["v"]])
-    kind = np.repeat(["u", "q", "v"], [case.u.size, model.nv, model.nv])
-    sizes = np.array([STENCIL[k] for k in kind])[:, None] * np.array(FACTORS)  # (entries, factors)
-    ends, same = _displaced(case, middle, kind, sizes)
-    estimates = (ends @ COEFFICIENTS) / sizes
-    differences = np.abs(np.diff(estimates, axis=1))
-    differences[~(same[:, :-1] & same[:, 1:])] = np.inf
-    keep = np.isfinite(differences).any(1)
-    numeric = np.take_along_axis(estimates[:, :-1], differences.argmin(1)[:, None], 1)[:, 0]
-    errors = [
-        np.linalg.norm((numeric - ours)[keep & (kind == k)]) / (float(np.linalg.norm(ours[kind == k])) + 1e-300)
-        for k in ("u", "q", "v")
-    ]
-    return Agreement(float(max(errors)), float(1 - keep.mean()))
+    middle, gradient = analytic(case, params=params)
+    kinds = ["u", "q", "v"] + ["params"] * params
+    scale = {k: np.ones(gradient[k].size) for k in kinds}
+    if params:
+        scale["params"] = param_scale(model, case.sim.params[0])
+        scale["params"][(groups_of(model) == "frictionloss") & (case.sim.params[0] == 0)] = 0  # never negative
+    which = np.concatenate([np.flatnonzero(scale[k]) for k in kinds])
+    kind = np.concatenate([np.full(int((scale[k] != 0).sum()), k) for k in kinds])
+    unit = np.concatenate([scale[k][scale[k] != 0] for k in kinds])
+    ours = np.concatenate([gradient[k].ravel()[scale[k] != 0] for k in kinds]) * unit
+    label = kind.copy() if not params else np.where(kind == "params", groups_of(model)[which * (kind == "params")], kind)
+    first = np.array([STENCIL[k] for k in kind])
+
+    def norms(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Per entry: of the part or group that it belongs to, those of small groups raised."""
+        floor = 1e-3 * np.linalg.norm(values[kind == "params"])
+        sums = {group: np.linalg.norm(values[label == group]) for group in np.unique(label)}
+        return np.array([max(float(sums[g]), floor if k == "params" else 0.0) for g, k in zip(label, kind, strict=True)])
+
+    slopes = np.full((len(kind), 1 + ROUNDS * PER_ROUND), np.nan)  # three-point; nan: crossed a branch, or not tried
+    best, spread = np.full(len(kind), np.nan), np.full(len(kind), np.inf)
+    for done in range(ROUNDS):
+        todo = np.flatnonzero(~(spread <= AGREE * norms(np.nan_to_num(best))))
+        columns = slice(done * PER_ROUND, (done + 1) * PER_ROUND)
+        sizes = first[todo, None] / float(RATIO) ** np.arange(columns.start, columns.stop)
+        slopes[todo, columns] = _slopes(case, middle, kind[todo], which[todo], unit[todo], sizes)
+        estimates = (RATIO**2 * slopes[todo, 1:] - slopes[todo, :-1]) / (RATIO**2 - 1)
+        differences = np.abs(np.diff(estimates, axis=1))
+        differences[np.isnan(differences)] = np.inf
+        column = differences.argmin(1)
+        row = np.arange(len(todo))
+        spread[todo], best[todo] = differences[row, column], estimates[row, column]
+    keep = np.isfinite(spread)
+    allowed = norms(ours)
+    errors = {
+        str(group): np.linalg.norm((best - ours)[keep & (label == group)]) / max(allowed[label == group][0], 1e-300)
+        for group in np.unique(label)
+    }
+    most = max(errors, key=lambda group: errors[group])
+    return Agreement(float(errors[most]), float(1 - keep.mean()), most)
 
 
-def _displaced(
-    case: Case, middle: Trajectory, kind: NDArray[np.str_], sizes: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The scalar less its middle value (entries, factors, 4); whether a stencil kept its branch (entries, factors).
+def _slopes(
+    case: Case,
+    middle: Trajectory,
+    kind: NDArray[np.str_],
+    which: NDArray[np.intp],
+    unit: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Three-point differences (entries, sizes); nan where one of the two runs left the middle's branch.
 
-    Every point of every stencil is an environment of one batch.
+    Every displaced run is an environment of a batch.
     """
     sim, model = case.sim, case.sim.model
-    shape = (*sizes.shape, len(OFFSETS))
-    amounts = (sizes[..., None] * OFFSETS).ravel()
-    entry = np.broadcast_to(np.arange(len(sizes))[:, None, None], shape).ravel()
-    n = len(amounts)
-    moves = {k: np.zeros((n, int((kind == k).sum()))) for k in ("u", "q", "v")}
-    for k, move in moves.items():
-        chosen = kind[entry] == k
-        move[chosen, entry[chosen] - np.flatnonzero(kind == k)[0]] = amounts[chosen]
-    many = Simulator(model, num_envs=n)
-    many.params[:] = sim.params[0]
-    run = many.rollout(
-        case.u[:, None] + moves["u"].reshape(n, *case.u.shape).transpose(1, 0, 2),
-        q=retract(model, sim.q[0], moves["q"]),
-        v=sim.v + moves["v"],
-        anchors=np.repeat(sim.anchors, n, axis=0),
-        anchored=np.repeat(sim.anchored, n, axis=0),
-        history=np.repeat(sim.history, n, axis=0),
-        read_after=case.reads,
-    )
-    if case.output == "q":
-        ends = np.array([_difference(model, q, middle.q[-1, 0]) for q in run.q[-1]]) @ case.weights
-    elif case.output == "v":
-        ends = (run.v[-1] - middle.v[-1]) @ case.weights
-    else:
-        ends = ((run.tactile[0] - middle.tactile[0]) * case.weights).sum((1, 2))
-    same = (many.branches(run) == sim.branches(middle)).all(0) & (run.status == 0)
-    return ends.reshape(shape), same.reshape(shape).all(-1)
+    amounts = np.stack([-sizes, sizes], axis=-1).ravel()
+    entry = np.repeat(np.arange(len(kind)), 2 * sizes.shape[1])
+    ends, same = np.zeros(len(amounts)), np.zeros(len(amounts), bool)
+    many = Simulator(model, num_envs=CHUNK)
+    reference = sim.branches(middle)
+    for start in range(0, len(amounts), CHUNK):
+        chunk = np.arange(start, min(start + CHUNK, len(amounts)))
+        moves = {
+            k: np.zeros((CHUNK, n))
+            for k, n in (("u", case.u.size), ("q", model.nv), ("v", model.nv), ("params", len(model.param_names)))
+        }
+        for k, move in moves.items():
+            rows = np.flatnonzero(kind[entry[chunk]] == k)
+            at = entry[chunk[rows]]
+            move[rows, which[at]] = amounts[chunk[rows]] * unit[at]
+        many.params[:] = sim.params[0] + moves["params"]
+        run = many.rollout(
+            case.u[:, None] + moves["u"].reshape(CHUNK, *case.u.shape).transpose(1, 0, 2),
+            q=retract(model, sim.q[0], moves["q"]),
+            v=sim.v + moves["v"],
+            anchors=np.repeat(sim.anchors, CHUNK, axis=0),
+            anchored=np.repeat(sim.anchored, CHUNK, axis=0),
+            history=np.repeat(sim.history, CHUNK, axis=0),
+            read_after=case.reads,
+        )
+        if case.output == "q":
+            value = np.array([_difference(model, q, middle.q[-1, 0]) for q in run.q[-1]]) @ case.weights
+        elif case.output == "v":
+            value = (run.v[-1] - middle.v[-1]) @ case.weights
+        else:
+            value = ((run.tactile[0] - middle.tactile[0]) * case.weights).sum((1, 2))
+        unmoved = (many.branches(run) == reference).all(0) & (run.status == 0)
+        ends[chunk], same[chunk] = value[: len(chunk)], unmoved[: len(chunk)]
+    pairs = np.where(same, ends, np.nan).reshape(*sizes.shape, 2)
+    return np.asarray((pairs[..., 1] - pairs[..., 0]) / (2 * sizes))
 
 
 def _difference(model: Any, q: NDArray[np.float64], base: NDArray[np.float64]) -> NDArray[np.float64]:

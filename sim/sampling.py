@@ -2,6 +2,8 @@
 
 A contact is felt at points. Where stiffness is given per area, a point's weight is the part of the surface nearest to
 it, clipped to the face, so that the weights add up to the area exactly and results converge as points get denser.
+A point's area comes in three parts, whose sum it is: those across x, y and z. An area with normal n has the shares n²;
+where faces meet, each gives its own. When points are scaled the parts grow with it (docs/physics.md).
 
 Round surfaces carry a Fibonacci lattice: points at equal steps of height, each turned by the golden angle from the one
 below. On spheres and cylinders alike equal steps of height are equal areas (Archimedes).
@@ -35,7 +37,7 @@ def box_surface(
 
     Returns
     -------
-    points [m], shape (n, 3), in the box's frame; weights [m²], shape (n,), whose sum is the area of the faces.
+    points [m], shape (n, 3), in the box's frame; areas across x, y, z [m²], shape (n, 3), in all those of the faces.
     Raises UsageError on a resolution below 2 or an unknown face.
     """
     counts = [int(n) for n in resolution]
@@ -48,17 +50,17 @@ def box_surface(
     axes = [np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)]
     # The length nearest to each point: half a spacing at the two ends.
     lengths = [_trapezoid(2 * h, n) for h, n in zip(half, counts, strict=True)]
-    weights = np.zeros(counts)
+    areas = np.zeros((*counts, 3))
     chosen = np.zeros(counts, dtype=bool)
     for face in faces:
         axis = "xyz".index(face[1])
         where: list[slice | int] = [slice(None)] * 3
         where[axis] = 0 if face[0] == "-" else -1
         first, second = (lengths[i] for i in range(3) if i != axis)
-        weights[tuple(where)] += first[:, None] * second
+        areas[(*where, axis)] += first[:, None] * second
         chosen[tuple(where)] = True
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    return grid[chosen], weights[chosen]
+    return grid[chosen], areas[chosen]
 
 
 def disc(
@@ -70,7 +72,7 @@ def disc(
 
     Returns
     -------
-    points [m], shape (n, 3); weights [m²], shape (n,), whose sum is the area of the faces.
+    points [m], shape (n, 3); areas across x, y, z [m²], shape (n, 3), in all those of the faces.
     Raises UsageError when there are fewer than 3 angles or 1 ring, or on an unknown face.
     """
     if angles < 3 or radii < 1:
@@ -86,7 +88,7 @@ def disc(
     areas = np.concatenate([[np.pi * borders[0] ** 2], np.repeat(cell, angles)])
     heights = [-half_thickness if face == "-z" else half_thickness for face in faces]
     points = np.concatenate([np.column_stack([flat, np.full(len(flat), z)]) for z in heights])
-    return points, np.tile(areas, len(heights))
+    return points, np.tile(areas, len(heights))[:, None] * [0.0, 0.0, 1.0]
 
 
 def cylinder(
@@ -104,30 +106,30 @@ def cylinder(
 
     Returns
     -------
-    points [m], shape (n, 3); weights [m²], shape (n,), whose sum is the area of the faces.
+    points [m], shape (n, 3); areas across x, y, z [m²], shape (n, 3), in all those of the faces.
     Raises UsageError when there are fewer than 3 angles, 1 ring or 2 heights, or on an unknown face.
     """
     _check_faces("a cylinder", faces, (*ENDS, "wall"))
     ends = [face for face in faces if face != "wall"]
-    points, weights = np.zeros((0, 3)), np.zeros(0)
+    points, areas = np.zeros((0, 3)), np.zeros((0, 3))
     if ends:
-        points, weights = disc(radius, half_length, angles=angles, radii=radii, faces=ends)
+        points, areas = disc(radius, half_length, angles=angles, radii=radii, faces=ends)
     if "wall" not in faces:
-        return points, weights
+        return points, areas
     if angles < 3 or heights < 2:
         raise UsageError(f"a cylinder's wall needs at least 3 angles and 2 heights, got {angles} and {heights}")
     strip = _trapezoid(2 * half_length, heights) * (2 * np.pi * radius / angles)
     rows = np.linspace(-half_length, half_length, heights)
     per_end = len(points) // max(len(ends), 1)
+    phi = 2 * np.pi * np.arange(angles) / angles
+    outwards = np.column_stack([np.cos(phi), np.sin(phi), np.zeros(angles)])
     for row, end in ((0, "-z"), (-1, "+z")):
         if end in ends:  # the outermost ring is the last of an end's points
             last = (ends.index(end) + 1) * per_end
-            weights[last - angles : last] += strip[row]
+            areas[last - angles : last] += strip[row] * outwards**2
     kept = slice(1 if "-z" in ends else 0, heights - 1 if "+z" in ends else heights)
-    phi = 2 * np.pi * np.arange(angles) / angles
-    ring = radius * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
-    wall = [np.column_stack([ring, np.full(angles, z)]) for z in rows[kept]]
-    return np.concatenate([points, *wall]), np.concatenate([weights, np.repeat(strip[kept], angles)])
+    wall = [radius * outwards + [0, 0, z] for z in rows[kept]]
+    return np.concatenate([points, *wall]), np.concatenate([areas, *(cell * outwards**2 for cell in strip[kept])])
 
 
 def capsule(radius: float, half_length: float, *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
@@ -137,14 +139,16 @@ def capsule(radius: float, half_length: float, *, count: int, faces: Sequence[st
 
     Returns
     -------
-    points [m], shape (count, 3); weights [m²], shape (count,), whose sum is the area of the chosen halves.
+    points [m], shape (count, 3); areas across x, y, z [m²], shape (count, 3), in all that of the chosen halves.
     Raises UsageError on a count below 1 or an unknown face.
     """
     height = _heights("a capsule", count, faces) * (radius + half_length)
     along = np.clip(height, -half_length, half_length)
     around = np.sqrt(np.maximum(radius**2 - (height - along) ** 2, 0))
     area = 2 * np.pi * radius * (radius + half_length) * len(faces)
-    return np.column_stack([around[:, None] * _spiral(count), height]), np.full(count, area / count)
+    points = np.column_stack([around[:, None] * _spiral(count), height])
+    outwards = np.column_stack([points[:, :2], height - along]) / radius
+    return points, outwards**2 * (area / count)
 
 
 def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
@@ -154,7 +158,7 @@ def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS)
 
     Returns
     -------
-    points [m], shape (count, 3); weights [m²], shape (count,), whose sum is the area of the chosen halves.
+    points [m], shape (count, 3); areas across x, y, z [m²], shape (count, 3), in all that of the chosen halves.
     Raises UsageError on a count below 1 or an unknown face.
     """
     height = _heights("an ellipsoid", count, faces)
@@ -162,7 +166,8 @@ def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS)
     a, b, c = axes
     enlarged = np.linalg.norm(sphere / axes, axis=1)
     whole = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)  # Carlson's symmetric integral
-    return sphere * axes, enlarged * (whole * len(faces) / 2 / enlarged.sum())
+    outwards = sphere / axes / enlarged[:, None]
+    return sphere * axes, outwards**2 * (enlarged * (whole * len(faces) / 2 / enlarged.sum()))[:, None]
 
 
 def disc_lattice(radius: float, count: int) -> Array:

@@ -136,7 +136,19 @@ class Scene:
             shape.name: spec.add_shape(shape.name, shape.body, shape.kind, shape.pose.pos, shape.pose.quat, shape.size)
             for shape in self.shapes
         }
-        points = {p.name: spec.add_points(p.name, p.body, p.points, p.weights, radius=p.radius) for p in self.points}
+        points = {
+            p.name: spec.add_points(
+                p.name,
+                p.body,
+                p.points,
+                p.weights,
+                radius=p.radius,
+                pos=p.pose.pos,
+                quat=p.pose.quat,
+                areas=p.areas if p.per_area else None,
+            )
+            for p in self.points
+        }
         for contact in self.contacts:
             spec.add_contact(
                 contact.name,
@@ -156,6 +168,8 @@ class Scene:
                 shapes=[shapes[name] for name in pad.against],
                 law=pad.law,
                 weights=pad.weights,
+                pos=pad.pose.pos,
+                quat=pad.pose.quat,
                 **pad.numbers,
             )
         for a in self.actuators:

@@ -50,9 +50,11 @@ class PointsDef:
     geom: str
     body: int
     points: Array  # [m], shape (n, 3)
-    areas: Array  # [m²], shape (n,)
-    weights: Array  # what multiplies the contact's numbers: ones, or the areas
+    areas: Array  # across x, y, z of the geometry's frame [m²], shape (n, 3); their sum is a point's area
+    weights: Array  # what multiplies the contact's numbers: ones, or the areas; shape (n,)
     radius: float  # > 0: one point, the centre of a sphere of this radius [m]
+    pose: Pose  # of the geometry, in the body's frame
+    per_area: bool
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class PadDef:
     name: str
     body: int
     shape: str  # "rectangle", "disc", "hemisphere" or "points"
+    pose: Pose  # of the site, in the body's frame
     positions: Array  # of the markers, in the body's frame [m], shape (n, 3)
     axes: Array  # columns x, y, z of each marker in the body's frame, shape (n, 3, 3)
     weights: Array  # shape (n,)
@@ -113,18 +116,19 @@ def _sample(name: str, table: Table, geoms: Mapping[str, GeomDef]) -> PointsDef:
     if geom.kind == "sphere" and "count" not in table.data:
         if len(table.data) > 1:
             raise UsageError(f"{table.where}: without a count {geom.name!r} is one exact point, which takes geom alone")
-        return PointsDef(name, geom.name, geom.body, geom.pose.pos[None], np.ones(1), np.ones(1), float(geom.size[0]))
+        radius, center = float(geom.size[0]), geom.pose.pos[None]
+        return PointsDef(name, geom.name, geom.body, center, np.ones((1, 3)), np.ones(1), radius, geom.pose, False)
     try:
         local, areas = _surface(table, geom)
     except UsageError as error:
         raise UsageError(str(error) if str(error).startswith(table.where) else f"{table.where}: {error}") from None
     per_area = table.word("stiffness", "per point", among=_PER_UNIT) == "per area"
-    weights = areas if per_area else np.ones(len(areas))
-    return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, 0.0)
+    weights = areas.sum(1) if per_area else np.ones(len(areas))
+    return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, 0.0, geom.pose, per_area)
 
 
 def _surface(table: Table, geom: GeomDef) -> tuple[Array, Array]:
-    """Points on a geometry's surface, in its frame [m], and the area of each [m²]."""
+    """Points on a geometry's surface, in its frame [m], and the area of each across x, y, z [m²]."""
     size = geom.size.tolist()
     if geom.kind == "box":
         table.only(("geom", "resolution", "faces", "stiffness"))
@@ -202,6 +206,7 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
                 name=name,
                 body=body,
                 shape=shape,
+                pose=frame,
                 positions=frame.points(markers.positions),
                 axes=frame.matrix() @ markers.axes,
                 weights=np.full(len(markers.positions), markers.area if per_area and markers.area else 1.0),

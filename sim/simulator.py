@@ -96,7 +96,8 @@ class Simulator:
         self._tactile = np.zeros((num_envs, self.model.markers, 3), self.dtype)
 
     @cached_property
-    def _param_index(self) -> dict[str, int]:
+    def param_index(self) -> dict[str, int]:
+        """Which column of `params` a parameter is."""
         return {name: i for i, name in enumerate(self.model.param_names)}
 
     def param(self, name: str) -> NDArray[Any]:
@@ -104,13 +105,13 @@ class Simulator:
 
         Raises UsageError for a name that the scene does not have.
         """
-        if name not in self._param_index:
+        if name not in self.param_index:
             owner = name.split(".")[0]
-            near = [n for n in self._param_index if n.startswith(owner + ".")] or sorted(
-                {n.split(".")[0] for n in self._param_index}
+            near = [n for n in self.param_index if n.startswith(owner + ".")] or sorted(
+                {n.split(".")[0] for n in self.param_index}
             )
             raise UsageError(f"no parameter {name!r}; there are {', '.join(near)}")
-        column: NDArray[Any] = self.params[:, self._param_index[name]]
+        column: NDArray[Any] = self.params[:, self.param_index[name]]
         return column
 
     def reset(self, which: ArrayLike | None = None) -> None:

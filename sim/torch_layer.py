@@ -2,14 +2,19 @@
 
 Tensors are on the CPU and in the simulator's precision. The state is explicit, so that graphs may branch: nothing here
 changes the simulator's own state. A quaternion's gradient is its tangent gradient mapped back.
+
+Physical parameters may be given by name, as tensors: what they are fitted to is then a rollout away. Only those that
+require a gradient cost anything.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.autograd.function import once_differentiable
 
 from gelflow.errors import UsageError
@@ -44,26 +49,51 @@ def state_of(sim: Simulator) -> TorchState:
     return TorchState(*(torch.from_numpy(np.array(array)) for array in arrays))
 
 
-def rollout(sim: Simulator, state: TorchState, u: torch.Tensor, *, read_after: Sequence[int] = ()) -> TorchRollout:
+def rollout(
+    sim: Simulator,
+    state: TorchState,
+    u: torch.Tensor,
+    *,
+    read_after: Sequence[int] = (),
+    params: Mapping[str, torch.Tensor] | None = None,
+) -> TorchRollout:
     """Steps under controls u (steps, N, nu) from `state`; markers are read after the steps in `read_after`.
 
-    Differentiable in u, state.q, state.v, state.anchors and state.history. Raises UsageError on wrong shapes, another
-    precision than the simulator's, and numbers that are not finite.
+    `params` are used instead of the simulator's own, by name: each of shape (N,), or () for all environments alike.
+
+    Differentiable in u, state.q, state.v, state.anchors, state.history and params. Raises UsageError on wrong shapes,
+    another precision than the simulator's, unknown parameters, and numbers that are not finite.
     """
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
-    named = (("u", u), ("q", state.q), ("v", state.v), ("anchors", state.anchors), ("history", state.history))
-    for name, tensor in named:
+    named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
+    for name, tensor in named.items():
         if tensor.dtype != expected or tensor.device.type != "cpu":
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
-    inputs = (u, state.q, state.v, state.anchors, state.history, state.anchored)
+    numbers = None if params is None else _all_params(sim, params)
+    inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
     outputs = _Rollout.apply(*inputs, sim, tuple(read_after))  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, history, anchored, ok = outputs
     return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok)
 
 
-def step(sim: Simulator, state: TorchState, u: torch.Tensor) -> tuple[TorchState, torch.Tensor]:
+def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """The simulator's parameters (N, parameters) with some replaced."""
+    numbers = torch.from_numpy(sim.params.copy())
+    for name, values in params.items():
+        sim.param(name)  # raises where there is none
+        if values.shape not in ((), (sim.num_envs,)):
+            raise UsageError(f"{name} must have shape ({sim.num_envs},) or (), got {tuple(values.shape)}")
+        if not torch.isfinite(values).all():
+            raise UsageError(f"{name} is not finite")
+        numbers[:, sim.param_index[name]] = values
+    return numbers
+
+
+def step(
+    sim: Simulator, state: TorchState, u: torch.Tensor, *, params: Mapping[str, torch.Tensor] | None = None
+) -> tuple[TorchState, torch.Tensor]:
     """One step under controls u (N, nu): the state after it, and what the markers then feel (N, markers, 3) [N]."""
-    result = rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else ())
+    result = rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else (), params=params)
     tactile = result.tactile[0] if sim.model.markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
 
@@ -77,23 +107,25 @@ class _Rollout(torch.autograd.Function):
         v: torch.Tensor,
         anchors: torch.Tensor,
         history: torch.Tensor,
+        params: torch.Tensor | None,
         anchored: torch.Tensor,
         sim: Simulator,
         read_after: tuple[int, ...],
     ) -> tuple[torch.Tensor, ...]:
-        trajectory = sim.rollout(
-            u.detach().numpy(),
-            q=q.detach().numpy(),
-            v=v.detach().numpy(),
-            anchors=anchors.detach().numpy(),
-            anchored=anchored.numpy(),
-            history=history.detach().numpy(),
-            read_after=read_after,
-        )
+        # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
+        ctx.params = sim.params.copy() if params is None else params.detach().numpy()
+        with _using(sim, ctx.params):
+            trajectory = sim.rollout(
+                u.detach().numpy(),
+                q=q.detach().numpy(),
+                v=v.detach().numpy(),
+                anchors=anchors.detach().numpy(),
+                anchored=anchored.numpy(),
+                history=history.detach().numpy(),
+                read_after=read_after,
+            )
         ctx.sim = sim
         ctx.trajectory = trajectory
-        # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
-        ctx.params = sim.params.copy()
         ends = (torch.from_numpy(array[-1].copy()) for array in (trajectory.anchors, trajectory.history))
         set_at_end = torch.from_numpy(trajectory.anchored[-1].copy())
         ok = torch.from_numpy(trajectory.status == 0)
@@ -114,9 +146,8 @@ class _Rollout(torch.autograd.Function):
     ) -> tuple[torch.Tensor | None, ...]:
         sim: Simulator = ctx.sim
         trajectory: Trajectory = ctx.trajectory
-        kept = sim.params.copy()
-        sim.params[:] = ctx.params
-        try:
+        wanted = ctx.needs_input_grad[5]
+        with _using(sim, ctx.params):
             gradient = sim.rollout_gradient(
                 trajectory,
                 q=by_q.numpy(),
@@ -124,8 +155,19 @@ class _Rollout(torch.autograd.Function):
                 tactile=by_tactile.numpy(),
                 anchors_end=by_anchors.numpy(),
                 history_end=by_history.numpy(),
+                params=wanted,
             )
-        finally:
-            sim.params[:] = kept
         arrays = (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history)
-        return (*(torch.from_numpy(array) for array in arrays), None, None, None)
+        by_params = torch.from_numpy(gradient.params.astype(sim.dtype)) if wanted else None
+        return (*(torch.from_numpy(array) for array in arrays), by_params, None, None, None)
+
+
+@contextmanager
+def _using(sim: Simulator, params: NDArray[Any]) -> Iterator[None]:
+    """The simulator with other parameters, for a while."""
+    kept = sim.params.copy()
+    sim.params[:] = params
+    try:
+        yield
+    finally:
+        sim.params[:] = kept

@@ -82,8 +82,8 @@ void Batch<T>::step(const T* u, int steps) {
   const std::size_t nu = model->actuators.size();
   pool_.run(n, [&](int e, int thread) {
     for (int i = 0; i < steps && status[e] == 0; ++i) {
-      const StepReport report =
-          gelflow::step<T>(*model, params_of(e), u + static_cast<std::size_t>(e) * nu, 0, state(e), memory_[thread]);
+      const StepReport report = gelflow::step<T>(*model, params_of(e), u + static_cast<std::size_t>(e) * nu,
+                                                 model->polish, state(e), memory_[thread]);
       status[e] = static_cast<std::int32_t>(report.status);
       iterations[e] += report.iterations;
       halved[e] += report.halvings > 0 ? 1 : 0;
@@ -102,10 +102,10 @@ void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
     const T* const control = u + static_cast<std::size_t>(e) * nu;
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
     int iterations = 0;
-    Status status = gelflow::step<T>(m, params_of(e), control, 0, whole.view(), memory).status;
+    Status status = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory).status;
     if (status == Status::ok) {
-      status =
-          substeps<T>(m, params_of(e), T(m.step / 2), 2, control, 0, halves.view(), memory, iterations, NoObserver{});
+      status = substeps<T>(m, params_of(e), T(m.step / 2), 2, control, m.polish, halves.view(), memory, iterations,
+                           NoObserver{});
     }
     failures[e] = static_cast<std::int32_t>(status);
     T* const difference = out + static_cast<std::size_t>(e) * m.nv;
@@ -229,7 +229,7 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       std::copy(now.anchored, now.anchored + na, next.anchored);
       std::copy(now.history, now.history + m.nh, next.history);
       if (r.status[e] != 0) continue;
-      const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, 0, next, memory);
+      const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, m.polish, next, memory);
       r.status[e] = static_cast<std::int32_t>(report.status);
       r.halvings[t * N + e] = static_cast<std::int8_t>(report.halvings);
     }
@@ -347,7 +347,7 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
     } else {
       StateCopy<T> scratch(m, old);
       int iterations = 0;
-      substeps<T>(m, params, T(m.step / count), count, u, 0, scratch.view(), memory, iterations,
+      substeps<T>(m, params, T(m.step / count), count, u, m.polish, scratch.view(), memory, iterations,
                   [&](const StepStart<T>& from, const StepMemory<T>& taken) {
                     records.emplace_back(m, from, taken.v_new, false);
                   });

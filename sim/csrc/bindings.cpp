@@ -258,6 +258,8 @@ std::vector<std::string> names(const std::vector<Item>& items) {
 PYBIND11_MODULE(GELFLOW_CORE, module) {
   module.doc() = "C++ core of the simulator; use gelflow.sim.Simulator.";
   constexpr double inf = ModelSpec::inf;
+  const V3<double> origin = V3<double>::Zero();
+  const V4<double> upright = V4<double>::Unit(0);
 
   py::class_<ModelSpec>(module, "ModelSpec")
       .def(py::init<>())
@@ -266,6 +268,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def_readwrite("tolerance", &ModelSpec::tolerance)
       .def_readwrite("max_iterations", &ModelSpec::max_iterations)
       .def_readwrite("max_halvings", &ModelSpec::max_halvings)
+      .def_readwrite("polish", &ModelSpec::polish)
       .def_readwrite("integrator", &ModelSpec::integrator)
       .def("add_body", &ModelSpec::add_body, py::arg("name"), py::arg("parent"), py::arg("pos"), py::arg("quat"),
            py::arg("mass"), py::arg("com"), py::arg("inertia"))
@@ -278,9 +281,13 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def(
           "add_points",
           [](ModelSpec& s, const std::string& name, int body, const Array<double>& points,
-             const std::vector<double>& weights,
-             double radius) { return s.add_points(name, body, points_of(points, "points"), weights, radius); },
-          py::arg("name"), py::arg("body"), py::arg("points"), py::arg("weights"), py::arg("radius") = 0.)
+             const std::vector<double>& weights, double radius, const V3<double>& pos, const V4<double>& quat,
+             const std::optional<Array<double>>& areas) {
+            return s.add_points(name, body, points_of(points, "points"), weights, radius, pos, quat,
+                                areas ? points_of(*areas, "areas") : std::vector<V3<double>>{});
+          },
+          py::arg("name"), py::arg("body"), py::arg("points"), py::arg("weights"), py::arg("radius") = 0.,
+          py::arg("pos") = origin, py::arg("quat") = upright, py::arg("areas") = py::none())
       .def(
           "add_contact",
           [](ModelSpec& s, const std::string& name, int points, int shape, const std::string& law,
@@ -293,7 +300,8 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
           [](ModelSpec& s, const std::string& name, int body, const Array<double>& positions,
              const Array<double>& axes_x, const Array<double>& axes_y, const Array<double>& axes_z,
              const std::vector<int>& shapes, const std::string& law, double kn, double kt, double mu, double kd,
-             double ks, const std::optional<std::vector<double>>& weights) {
+             double ks, const std::optional<std::vector<double>>& weights, const V3<double>& pos,
+             const V4<double>& quat) {
             const auto p = points_of(positions, "positions");
             const auto x = points_of(axes_x, "axes_x"), y = points_of(axes_y, "axes_y"),
                        z = points_of(axes_z, "axes_z");
@@ -303,11 +311,12 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
             std::vector<M3<double>> frames(p.size());
             for (std::size_t i = 0; i < p.size(); ++i) frames[i] << x[i], y[i], z[i];
             return s.add_pad(name, body, p, frames, shapes, law, {kn, kt, mu, kd, ks},
-                             weights ? *weights : std::vector<double>(p.size(), 1.0));
+                             weights ? *weights : std::vector<double>(p.size(), 1.0), pos, quat);
           },
           py::arg("name"), py::arg("body"), py::arg("positions"), py::arg("axes_x"), py::arg("axes_y"),
           py::arg("axes_z"), py::arg("shapes"), py::arg("law") = "viscous", py::arg("kn"), py::arg("kt"), py::arg("mu"),
-          py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none())
+          py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none(), py::arg("pos") = origin,
+          py::arg("quat") = upright)
       .def("add_actuator", &ModelSpec::add_actuator, py::arg("name"), py::arg("joint"), py::arg("kind"),
            py::arg("gear") = 1., py::arg("kp") = 0., py::arg("kd") = 0., py::arg("force_lower") = -inf,
            py::arg("force_upper") = inf, py::arg("ctrl_lower") = -inf, py::arg("ctrl_upper") = inf,

@@ -50,14 +50,14 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   for (const Contact& contact : m.contacts) {
     ++pair;
     const PointSet& set = m.point_sets[contact.points];
-    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
     for_touching_points<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), visit);
   }
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
-      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       for_touching_points<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), visit);
     }
   }

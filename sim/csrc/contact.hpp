@@ -13,8 +13,9 @@ template <class T>
 TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const V3<T>* anchors,
                         const std::uint8_t* anchored) {
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
-  return {params + contact.param, contact.law,    contact.damping, m.point_sets[contact.points].radius,
-          anchors + slot,         anchored + slot};
+  const PointSet& set = m.point_sets[contact.points];
+  const T radius = T(set.radius) * params[set.mount.place + 6];  // a sphere's size is its first scale
+  return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot};
 }
 
 // The wrench of all touching points on the first body, about the shape's origin in its frame, and with derivatives the
@@ -67,7 +68,7 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
   PairColumns<T> c;
   for (const Contact& contact : m.contacts) {
     const Shape& shape = m.shapes[contact.shape];
-    const int first = m.point_sets[contact.points].body;
+    const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, shape, w);
     V6<T> wrench = V6<T>::Zero();
     // The blocks of K and D: rows moment, force; columns turn, shift.
@@ -75,8 +76,11 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud,
                                                      touch_rule<T>(m, contact, params, anchors, anchored), wrench,
                                                      {&k_mm, &k_mf, &k_fm, &k_ff, &d_mm, &d_mf, &d_fm, &d_ff});
-    if (!touching) continue;
-    pair_columns<derivatives, T>(contact.pair, first, frame, w, c);
+    if (!touching) {
+      if (!is_finite(frame.check())) w.residual[0] = frame.check();
+      continue;
+    }
+    pair_columns<derivatives, T>(contact.pair, first.body, frame, w, c);
     for (int i = 0; i < c.n; ++i) {
       const T force_i = c.s[i].dot(wrench);
       w.residual[contact.pair.dof[i]] -= h * force_i;
@@ -124,7 +128,7 @@ void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, con
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
-    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
     V6<T> wrench = V6<T>::Zero();
     sum_forces<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), wrench, {});
     const V3<T> moment = frame.to_world * top(wrench), push = frame.to_world * bottom(wrench);
@@ -140,7 +144,7 @@ void advance_contact_anchors(const Model& m, const T* params, const V3<T>* ancho
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
-    const PairFrame<T> frame = pair_frame<T>(params, set.body, m.shapes[contact.shape], w);
+    const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
     advance_anchors<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), w.kept,
                        next + contact.anchor, next_set + contact.anchor);
   }
@@ -157,9 +161,9 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
   PairColumns<T> c;
   for (const Contact& contact : m.contacts) {
     if (contact.anchor < 0) continue;
-    const int first = m.point_sets[contact.points].body;
+    const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
-    pair_columns<true, T>(contact.pair, first, frame, w, c);
+    pair_columns<true, T>(contact.pair, first.body, frame, w, c);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
     const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     V3<T>* const by_own = by_anchor + contact.anchor;

@@ -68,6 +68,12 @@ FrictionLaw friction_law(const std::string& owner, const std::string& name) {
   refuse(owner + ": friction law '" + name + "' is not one of viscous, elastic");
 }
 
+// Of a unit quaternion.
+M3<double> rotation_from(const std::string& owner, const V4<double>& quat) {
+  if (!(std::abs(quat.norm() - 1) < 1e-6)) refuse(owner + ": quat must have length 1");
+  return rotation_of<double>(quat.normalized());
+}
+
 void check_law(const std::string& owner, const std::array<double, 5>& numbers, FrictionLaw law) {
   static const char* names[5] = {"kn", "kt", "mu", "kd", "ks"};
   for (int i = 0; i < 5; ++i) {
@@ -136,6 +142,14 @@ void ModelSpec::check_body(const std::string& what, int body, bool world_allowed
   if (body >= next_index(model_.bodies) || body < (world_allowed ? world : 0)) {
     refuse(what + ": body " + std::to_string(body) + " does not exist");
   }
+}
+
+int ModelSpec::add_place(const std::string& owner, const V3<double>& pos, bool scales) {
+  check_finite(owner, "pos", pos.data(), 3);
+  const int offset =
+      add_params(owner, {"pos.x", "pos.y", "pos.z", "turn.x", "turn.y", "turn.z"}, {pos[0], pos[1], pos[2], 0, 0, 0});
+  if (scales) add_params(owner, {"scale.x", "scale.y", "scale.z"}, {1, 1, 1});
+  return offset;
 }
 
 int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat, double mass,
@@ -236,8 +250,7 @@ int ModelSpec::add_shape(const std::string& name, int body, const std::string& k
   Shape shape;
   shape.name = name;
   shape.body = body;
-  shape.pos = pos;
-  shape.rotation = rotation_of<double>(quat.normalized());
+  shape.rotation = rotation_from("shape '" + name + "'", quat);
   struct Kind {
     const char* name;
     ShapeKind kind;
@@ -256,12 +269,14 @@ int ModelSpec::add_shape(const std::string& name, int body, const std::string& k
     if (!(size[i] > 0)) refuse("shape '" + name + "': size must be positive");
   }
   shape.size = add_params(name, {"size.x", "size.y", "size.z"}, {size[0], size[1], size[2]});
+  shape.place = add_place(name + ".shape", pos, false);
   model_.shapes.push_back(shape);
   return next_index(model_.shapes) - 1;
 }
 
 int ModelSpec::add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
-                          const std::vector<double>& weights, double radius) {
+                          const std::vector<double>& weights, double radius, const V3<double>& pos,
+                          const V4<double>& quat, const std::vector<V3<double>>& areas) {
   check_body("points '" + name + "'", body, true);
   if (points.empty()) refuse("points '" + name + "': at least one point is needed");
   if (points.size() != weights.size()) refuse("points '" + name + "': as many weights as points are needed");
@@ -272,7 +287,13 @@ int ModelSpec::add_points(const std::string& name, int body, const std::vector<V
   if (!(radius >= 0) || (radius > 0 && points.size() != 1)) {
     refuse("points '" + name + "': a radius goes with a single point, the sphere's centre");
   }
-  model_.point_sets.push_back({name, body, radius, PointCloud(points, weights)});
+  if (!areas.empty() && areas.size() != points.size())
+    refuse("points '" + name + "': as many areas as points are needed");
+  const M3<double> rotation = rotation_from("points '" + name + "'", quat);
+  const Mount mount{body, pos, rotation, add_place(name + ".points", pos, true), true};
+  PointCloud cloud(points, weights);
+  for (std::size_t i = 0; i < areas.size(); ++i) cloud.areas.push_back(areas[cloud.original[i]]);
+  model_.point_sets.push_back({name, mount, radius, std::move(cloud)});
   return next_index(model_.point_sets) - 1;
 }
 
@@ -307,7 +328,8 @@ int ModelSpec::add_contact(const std::string& name, int points, int shape, const
 
 int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
                        const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
-                       const std::array<double, 5>& law_numbers, const std::vector<double>& weights) {
+                       const std::array<double, 5>& law_numbers, const std::vector<double>& weights,
+                       const V3<double>& pos, const V4<double>& quat) {
   const std::string owner = "pad '" + name + "'";
   check_body(owner, body, true);
   if (positions.empty()) refuse(owner + ": at least one marker is needed");
@@ -319,13 +341,14 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   }
   Pad pad;
   pad.name = name;
-  pad.body = body;
+  const M3<double> rotation = rotation_from(owner, quat);
   pad.cloud = PointCloud(positions, weights);
   for (const int i : pad.cloud.original) pad.frames.push_back(frames[i]);
   pad.shapes = shapes;
   pad.law = friction_law(owner, law);
   check_law(owner, law_numbers, pad.law);
   pad.param = add_params(name, {"kn", "kt", "mu", "kd", "ks"}, {law_numbers.begin(), law_numbers.end()});
+  pad.mount = {body, pos, rotation, add_place(name + ".markers", pos, false), false};
   pad.anchor = -1;
   if (pad.law == FrictionLaw::elastic) {
     pad.anchor = model_.na;
@@ -381,6 +404,7 @@ Model ModelSpec::build() const {
   model.tolerance = tolerance;
   model.max_iterations = max_iterations;
   model.max_halvings = max_halvings;
+  model.polish = polish;
   if (integrator != "bdf1" && integrator != "bdf2") refuse("integrator '" + integrator + "' is not bdf1 or bdf2");
   model.nh = integrator == "bdf2" ? 2 * model.nv + 1 : 0;
   const int nv = model.nv;
@@ -400,10 +424,10 @@ Model ModelSpec::build() const {
     }
   }
   for (auto& contact : model.contacts) {
-    contact.pair = model.pair_dofs(model.point_sets[contact.points].body, model.shapes[contact.shape].body);
+    contact.pair = model.pair_dofs(model.point_sets[contact.points].mount.body, model.shapes[contact.shape].body);
   }
   for (auto& pad : model.pads) {
-    for (const int s : pad.shapes) pad.pairs.push_back(model.pair_dofs(pad.body, model.shapes[s].body));
+    for (const int s : pad.shapes) pad.pairs.push_back(model.pair_dofs(pad.mount.body, model.shapes[s].body));
   }
   return model;
 }

@@ -51,9 +51,9 @@ struct Shape {
   std::string name;
   ShapeKind kind;
   int body;
-  V3<double> pos;
-  M3<double> rotation;
-  int size;  // offset in Params (3): half sizes or half axes; radius, then half length along z
+  M3<double> rotation;  // in the body's frame, before it is turned
+  int size;             // offset in Params (3): half sizes or half axes; radius, then half length along z
+  int place;            // offset in Params (6): pos, turn
 };
 
 // Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
@@ -66,6 +66,7 @@ struct PointCloud {
   };
   std::vector<V3<double>> points;  // sorted
   std::vector<double> weights;     // sorted
+  std::vector<V3<double>> areas;   // sorted; of weights that are areas, by the axis across them; empty: they are not
   std::vector<int> original;       // sorted index → index as given
   std::vector<Block> leaves, groups;
 
@@ -74,9 +75,19 @@ struct PointCloud {
   int size() const { return static_cast<int>(points.size()); }
 };
 
+// The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and
+// scaled: then the points follow (pair.hpp).
+struct Mount {
+  int body;
+  V3<double> pos;
+  M3<double> rotation;
+  int place;    // offset in Params (6): pos, turn; (9) where it scales: scale
+  bool scales;  // points do, pads do not
+};
+
 struct PointSet {
   std::string name;
-  int body;
+  Mount mount;
   double radius;  // > 0: one point, the centre of a sphere whose lowest point touches planes
   PointCloud cloud;
 };
@@ -99,7 +110,7 @@ struct Contact {
 
 struct Pad {
   std::string name;
-  int body;
+  Mount mount;
   PointCloud cloud;
   std::vector<M3<double>> frames;  // sorted like the cloud; columns x, y, z
   std::vector<int> shapes;
@@ -146,6 +157,7 @@ struct Model {
   double tolerance = 1e-7;  // Newton: residual relative to the forces at work
   int max_iterations = 50;
   int max_halvings = 6;
+  int polish = 0;  // Newton iterations after it has converged
 
   PairDofs pair_dofs(int first, int second) const;
 };
@@ -158,6 +170,7 @@ class ModelSpec {
   double tolerance = 1e-7;
   int max_iterations = 50;
   int max_halvings = 6;
+  int polish = 0;
   std::string integrator = "bdf1";
 
   static constexpr double inf = std::numeric_limits<double>::infinity();
@@ -171,12 +184,14 @@ class ModelSpec {
   int add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
                 const V4<double>& quat, const V3<double>& size);
   int add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
-                 const std::vector<double>& weights, double radius);
+                 const std::vector<double>& weights, double radius, const V3<double>& pos, const V4<double>& quat,
+                 const std::vector<V3<double>>& areas);
   int add_contact(const std::string& name, int points, int shape, const std::string& law, const std::string& damping,
                   const std::array<double, 5>& law_numbers);
   int add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
               const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
-              const std::array<double, 5>& law_numbers, const std::vector<double>& weights);
+              const std::array<double, 5>& law_numbers, const std::vector<double>& weights, const V3<double>& pos,
+              const V4<double>& quat);
   int add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
                    double force_lower, double force_upper, double ctrl_lower, double ctrl_upper, double gain,
                    double bias);
@@ -186,6 +201,7 @@ class ModelSpec {
   Model model_;
   int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
   void check_body(const std::string& what, int body, bool world_allowed) const;
+  int add_place(const std::string& owner, const V3<double>& pos, bool scales);
 };
 
 }  // namespace gelflow

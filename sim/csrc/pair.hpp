@@ -9,6 +9,8 @@
 //                     first and j the second, +1 if both move the second and j does not carry k, else 0.
 #pragma once
 
+#include <type_traits>
+
 #include "contact_law.hpp"
 #include "kinematics.hpp"
 
@@ -25,20 +27,29 @@ struct PairFrame {
   ShapeKind kind;
   V3<T> local;    // in the first body's frame: a sphere's centre, a plane's normal
   T local_level;  // height of the first body's origin above a plane
+  // Where the points are scaled (then `rotation` holds that too):
+  bool scaled;
+  T stretch;       // the largest scale
+  V3<T> enlarged;  // by how much faces across x, y, z are larger, less 1
 
-  // Whether a ball of this radius about a point of the first body may reach into the shape. May say yes to a ball that
-  // just does not; costs less than the point's place in the shape's frame.
-  GELFLOW_INLINE bool may_reach(const V3<double>& center, double radius) const {
-    constexpr double slack = 1e-6;  // [m], above the rounding of single precision
-    const T reach = T(radius + slack);
+  // Whether a ball of this radius about a point of the first body, and a margin around it, may reach into the shape.
+  // May say yes to a ball that just does not; costs less than the point's place in the shape's frame.
+  template <bool scaled>
+  GELFLOW_INLINE bool may_reach(const V3<double>& center, double radius, const T& margin) const {
+    T reach = T(radius);
+    if constexpr (scaled) reach *= stretch;
+    reach += margin;
     const V3<T> c = center.template cast<T>();
-    if (kind == ShapeKind::sphere) {
+    if (!scaled && kind == ShapeKind::sphere) {
       const T limit = size[0] + reach;
       return (c - local).squaredNorm() < limit * limit;
     }
     if (kind == ShapeKind::plane) return local.dot(c) + local_level < reach;
     return distance_only<T>(kind, size, point(center)) < reach;
   }
+
+  // Not finite where a parameter is not: then no point touches, and that must not pass for no contact.
+  T check() const { return offset[0] + offset[1] + offset[2] + size[0] + size[1] + size[2]; }
 
   GELFLOW_INLINE V3<T> point(const V3<double>& local) const { return rotation * local.template cast<T>() + offset; }
   GELFLOW_INLINE V3<T> velocity(const V3<T>& x) const { return linear + cross<T>(angular, x); }
@@ -48,21 +59,65 @@ struct PairFrame {
   }
 };
 
+// Whether these numbers are others than the nominal ones. Numbers that carry derivatives always are.
 template <class T>
-PairFrame<T> pair_frame(const T* params, int first, const Shape& shape, const Workspace<T>& w) {
+GELFLOW_INLINE bool differs(const T* numbers, const V3<double>& nominal) {
+  if constexpr (!std::is_floating_point_v<T>) return true;
+  return numbers[0] != T(nominal[0]) || numbers[1] != T(nominal[1]) || numbers[2] != T(nominal[2]);
+}
+
+template <class T>
+M3<T> turn_of(const T* turn) {
+  return rotation_of<T>(quaternion_exp<T>(vec3(turn)));
+}
+
+// With R, p the nominal frame in the body and Params' place p', turn φ, scale S, a point x of the body moves to
+//     x' = p' + R exp(φ) S Rᵀ (x − p) = A x + b,    A − 1 = R (exp(φ) S − 1) Rᵀ,    b = (p' − p) − (A − 1) p
+// (written so that nothing is rounded where nothing moves): the body's pose ∘ (A, b) takes the body's place.
+template <class T>
+__attribute__((noinline)) void move_mount(const T* place, const Mount& mount, M3<T>& rotation, V3<T>& position,
+                                          PairFrame<T>& f) {
+  const M3<T> r = mount.rotation.template cast<T>();
+  const V3<T> p = mount.pos.template cast<T>();
+  M3<T> change = turn_of<T>(place + 3);
+  if (mount.scales) {
+    const T* s = place + 6;
+    for (int a = 0; a < 3; ++a) change.col(a) *= s[a];
+    f.scaled = !std::is_floating_point_v<T> || differs<T>(s, V3<double>::Ones());
+    f.stretch = std::max({s[0], s[1], s[2]});
+    f.enlarged = V3<T>(s[1] * s[2] - T(1), s[2] * s[0] - T(1), s[0] * s[1] - T(1));
+  }
+  change -= M3<T>::Identity();
+  change = (r * change * r.transpose()).eval();
+  position += rotation * V3<T>(vec3(place) - p - change * p);
+  rotation += (rotation * change).eval();
+}
+
+template <class T>
+PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape, const Workspace<T>& w) {
   PairFrame<T> f;
+  const int first = mount.body;
   f.kind = shape.kind;
   f.size = params + shape.size;
   f.to_world = shape.rotation.template cast<T>();
-  f.origin = shape.pos.template cast<T>();
+  if (differs<T>(params + shape.place + 3, V3<double>::Zero())) {
+    f.to_world = (f.to_world * turn_of<T>(params + shape.place + 3)).eval();
+  }
+  f.origin = vec3(params + shape.place);
   V6<T> twist = first == world ? V6<T>(V6<T>::Zero()) : w.twist[first];
   if (shape.body != world) {
     f.origin = (w.position[shape.body] + w.rotation[shape.body] * f.origin).eval();
     f.to_world = (w.rotation[shape.body] * f.to_world).eval();
     twist -= w.twist[shape.body];
   }
-  const M3<T> first_rotation = first == world ? M3<T>(M3<T>::Identity()) : w.rotation[first];
-  const V3<T> first_position = first == world ? V3<T>(V3<T>::Zero()) : w.position[first];
+  M3<T> first_rotation = first == world ? M3<T>(M3<T>::Identity()) : w.rotation[first];
+  V3<T> first_position = first == world ? V3<T>(V3<T>::Zero()) : w.position[first];
+  f.scaled = false;
+  const T* place = params + mount.place;
+  if (differs<T>(place, mount.pos) || differs<T>(place + 3, V3<double>::Zero()) ||
+      (mount.scales && differs<T>(place + 6, V3<double>::Ones()))) {
+    move_mount<T>(place, mount, first_rotation, first_position, f);
+  }
   f.rotation = f.to_world.transpose() * first_rotation;
   f.offset = f.to_world.transpose() * (first_position - f.origin);
   f.local =
@@ -75,15 +130,16 @@ PairFrame<T> pair_frame(const T* params, int first, const Shape& shape, const Wo
 }
 
 // Calls visit(i) for every point that may be inside the shape grown by `margin`.
-template <class T, class Visit>
-GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, double margin, Visit&& visit) {
+template <bool scaled, class T, class Visit>
+GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+  const T around = margin + T(1e-6);  // [m], above the rounding of single precision
   for (const auto& group : cloud.groups) {
-    if (!f.may_reach(group.center, group.radius + margin)) continue;
+    if (!f.template may_reach<scaled>(group.center, group.radius, around)) continue;
     for (int l = group.begin; l < group.end; ++l) {
       const auto& leaf = cloud.leaves[l];
-      if (!f.may_reach(leaf.center, leaf.radius + margin)) continue;
+      if (!f.template may_reach<scaled>(leaf.center, leaf.radius, around)) continue;
       for (int i = leaf.begin; i < leaf.end; ++i) {
-        if (f.may_reach(cloud.points[i], margin)) visit(i);
+        if (f.template may_reach<scaled>(cloud.points[i], 0, around)) visit(i);
       }
     }
   }
@@ -117,7 +173,7 @@ struct TouchRule {
   const T* params;  // kn, kt, mu, kd, ks
   FrictionLaw law;
   DampingLaw damping;
-  double rolling_radius;         // 0: the points themselves touch
+  T rolling_radius;              // 0: the points themselves touch
   const V3<T>* anchors;          // of this cloud against this shape
   const std::uint8_t* anchored;  // both unused under the viscous law
 };
@@ -138,7 +194,7 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
   using std::abs;
   constexpr int width = pack_width<T>;
   Touching<T> t;
-  const bool elastic = rule.law == FrictionLaw::elastic;
+  const bool elastic = rule.law == FrictionLaw::elastic, weighs = frame.scaled && !cloud.areas.empty();
   const auto flush = [&]() __attribute__((noinline)) {
     L weight(0.0), remembers(0.0);
     Vec3<L> local = zero3<L>();
@@ -147,13 +203,16 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
       const int i = t.index[k < t.count ? k : 0];
       set_lane3<T>(local, k, cloud.points[i].template cast<T>());
       set_lane(weight, k, k < t.count ? T(cloud.weights[i]) : T(0));
+      if (weighs && k < t.count) {
+        set_lane(weight, k, T(T(cloud.weights[i]) + frame.enlarged.dot(cloud.areas[i].template cast<T>())));
+      }
       if (elastic && rule.anchored[i]) {
         set_lane3<T>(t.anchor, k, rule.anchors[i]);
         set_lane(remembers, k, T(1));
       }
     }
     t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
-    if (rule.rolling_radius > 0) t.x.z -= L(T(rule.rolling_radius));  // planes only: n = z
+    if (rule.rolling_radius > T(0)) t.x.z -= L(rule.rolling_radius);  // planes only: n = z
     distance<L>(frame.kind, frame.size, t.x, t.at);
     t.inside = t.at.d < L(0.0) && weight > L(0.0);
     if (any(t.inside)) {
@@ -169,10 +228,15 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
     }
     t.count = 0;
   };
-  for_near_points<T>(frame, cloud, rule.rolling_radius, [&](int i) {
+  const auto visit = [&](int i) {
     t.index[t.count++] = i;
     if (t.count == width) flush();
-  });
+  };
+  if (frame.scaled) {
+    for_near_points<true, T>(frame, cloud, rule.rolling_radius, visit);
+  } else {
+    for_near_points<false, T>(frame, cloud, rule.rolling_radius, visit);
+  }
   if (t.count > 0) flush();
 }
 

@@ -14,7 +14,7 @@ template <class T>
 TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3<T>* anchors,
                         const std::uint8_t* anchored) {
   const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
-  return {params + pad.param, pad.law, DampingLaw::depth, 0.0, anchors + slot, anchored + slot};
+  return {params + pad.param, pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot};
 }
 
 // Readings of all markers, shape (markers, 3); needs the kinematics of (q, v) in w.
@@ -24,7 +24,7 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
   std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       for_touching_points<T>(
           frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), [&](const Touching<T>& t) {
             PointForce<Pack<T>> force;
@@ -50,7 +50,7 @@ void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchor
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       advance_anchors<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), w.kept, next + slot,
                          next_set + slot);
@@ -67,7 +67,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
       V3<T>* const by_own = pad.anchor < 0 ? nullptr : by_anchor + pad.anchor + s * pad.cloud.size();
       for_touching_points<T>(
@@ -92,7 +92,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
             t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
           });
       const V6<T> by_pose = stack<T>(sum3<T>(turn), sum3<T>(shift)), by_twist = stack<T>(sum3<T>(spin), sum3<T>(slide));
-      pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
+      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
   }
@@ -107,12 +107,12 @@ void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anc
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      const PairFrame<T> frame = pair_frame<T>(params, pad.body, m.shapes[pad.shapes[s]], w);
+      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
       anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), by_next + slot, by_pose,
                             by_twist, by_anchor + slot);
-      pair_columns<true, T>(pad.pairs[s], pad.body, frame, w, c);
+      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w, c);
       pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
     }
   }
