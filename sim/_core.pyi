@@ -8,6 +8,7 @@ class ModelSpec:
     tolerance: float
     max_iterations: int
     max_halvings: int
+    polish: int  # Newton iterations after it has converged
     integrator: str
     def __getattr__(self, name: str) -> Any: ...
 

@@ -123,7 +123,10 @@ _BEGIN = {"rolling": _rolling, "insertion": _insertion, "pushing": _pushing, "gr
 
 
 def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
-    """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge; and controls."""
+    """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge.
+
+    And controls (steps, 3) to go on with, drawn at random.
+    """
     spec = _core.ModelSpec()
     spec.polish = POLISH
     spec.integrator = integrator

@@ -1,5 +1,5 @@
-"""Gradients by everything, in all scenes, on all shapes, under both laws and integrators: exact by dual numbers, right by
-central differences. `python benchmarks/gradients.py` does the same with many more states."""
+"""Gradients by everything, in all scenes and on all shapes, under both laws and integrators: exact by dual numbers,
+right by central differences. `python benchmarks/gradients.py` does the same with many more states."""
 
 import numpy as np
 import pytest

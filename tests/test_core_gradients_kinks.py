@@ -50,7 +50,9 @@ def probe(
         last = spec.add_joint(axis, body, "slide", (0, 0, 0), np.eye(3)["xyz".index(axis)], **(joint or {}))
     shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), SIZES[kind])
     all_numbers: dict[str, Any] = {**numbers, "law": law, "ks": 512.0 if law == "elastic" else 0.0}
-    spec.add_contact("touch", spec.add_points("point", body, [at], [1.0], areas=[(0.25, 0.25, 0.5)]), shape, **all_numbers)
+    spec.add_contact(
+        "touch", spec.add_points("point", body, [at], [1.0], areas=[(0.25, 0.25, 0.5)]), shape, **all_numbers
+    )
     axes = [np.array([axis]) for axis in np.eye(3)]
     spec.add_pad("pad", body, np.array([at]), *axes, shapes=[shape], **all_numbers)
     spec.add_actuator("drive", last, **({"kind": "motor"} | (actuator or {})))
@@ -67,31 +69,34 @@ def moving(sim: Simulator, v: float) -> Simulator:
     return sim
 
 
-def places() -> dict[str, Kink]:
-    """A point where a shape's distance has no gradient; it can only move along y, and nothing pushes it there."""
-    found: dict[str, Kink] = {}
-    u = UNIT
-    for kind, many in {
-        "sphere": {"centre": (0, 0, 0)},
-        "box": {
-            "centre": (0, 0, 0),
-            "medial plane": (8 * u, 0, 0),
-            "two faces equally near": (12 * u, 0, 4 * u),
-            "an edge": (16 * u, 0, 8 * u),
-            "a face": (16 * u, 0, 0),
-        },
-        "cylinder": {"axis": (0, 0, 4 * u), "centre": (0, 0, 0), "wall and end equally near": (4 * u, 0, 12 * u)},
-        "capsule": {"segment": (0, 0, 4 * u), "end of the segment": (0, 0, 16 * u), "beside its end": (u, 0, 16 * u)},
-        "ellipsoid": {"centre": (0, 0, 0), "long axis": (2 * u, 0, 0), "middle plane": (0, 0, 4 * u)},
-    }.items():
-        for where, at in many.items():
-            for law in ("viscous", "elastic"):
-                found[f"{kind}, {where}, {law}"] = lambda i, kind=kind, at=at, law=law: probe(i, kind=kind, at=at, law=law)
-    return found
+# Where a shape's distance has no gradient, in UNITs. The point can only move along y, and nothing pushes it there.
+PLACES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "sphere": {"centre": (0, 0, 0)},
+    "box": {
+        "centre": (0, 0, 0),
+        "medial plane": (8, 0, 0),
+        "two faces equally near": (12, 0, 4),
+        "an edge": (16, 0, 8),
+        "a face": (16, 0, 0),
+    },
+    "cylinder": {"axis": (0, 0, 4), "centre": (0, 0, 0), "wall and end equally near": (4, 0, 12)},
+    "capsule": {"segment": (0, 0, 4), "end of the segment": (0, 0, 16), "beside its end": (1, 0, 16)},
+    "ellipsoid": {"centre": (0, 0, 0), "long axis": (2, 0, 0), "middle plane": (0, 0, 4)},
+}
+
+
+def place(kind: str, where: str, law: str) -> Kink:
+    x, y, z = PLACES[kind][where]
+    return lambda integrator: probe(integrator, kind=kind, at=(x * UNIT, y * UNIT, z * UNIT), law=law)
 
 
 KINKS: dict[str, Kink] = {
-    **places(),
+    **{
+        f"{kind}, {where}, {law}": place(kind, where, law)
+        for kind, many in PLACES.items()
+        for where in many
+        for law in ("viscous", "elastic")
+    },
     "just touching, at rest": lambda i: probe(i, slides="xyz"),
     "just touching, elastic": lambda i: probe(i, slides="xyz", law="elastic"),
     "just touching, anchored": lambda i: anchored(probe(i, slides="xyz", law="elastic"), (0, 0, 0)),
@@ -168,7 +173,7 @@ def test_they_are_on_the_border() -> None:
         ("servo at its force", "u", 0),
         ("limit reached", "q", 0),
     ):
-        signatures = []
+        signatures: list[int] = []
         for shift in (-1e-9, 0.0, 1e-9):
             sim = KINKS[name]("bdf1")
             u = np.full((1, 1, 1), 0.5 if name in DRIVEN else 0.0)
@@ -178,11 +183,16 @@ def test_they_are_on_the_border() -> None:
                 getattr(sim, change)[..., 1 if change == "anchors" else 0] += shift
             if moves:  # read where it is: a step would take it away
                 reading = sim.tactile()[0, 0]
-                signatures.append(bool(np.hypot(*reading[:2]) < LAW["mu"] * abs(reading[2])))
+                signatures.append(int(np.hypot(*reading[:2]) < LAW["mu"] * abs(reading[2])))
             else:
                 signatures.append(int(sim.branches(sim.rollout(u))[0, 0]))
         assert len(set(signatures)) == 2, (name, signatures)
-    for name in ("sphere, centre, viscous", "cylinder, axis, elastic", "just touching, at rest", "dry friction, creeping"):
+    for name in (
+        "sphere, centre, viscous",
+        "cylinder, axis, elastic",
+        "just touching, at rest",
+        "dry friction, creeping",
+    ):
         sim = KINKS[name]("bdf1")
         start = sim.q.copy()
         u = np.full((3, 1, 1), 0.5 if name in DRIVEN else 0.0)

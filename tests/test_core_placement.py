@@ -28,8 +28,8 @@ def moved(points: Array, what: str, scale: Array) -> Array:
     """Points of FRAME, moved as parameters would."""
     pos, frame = FRAME
     if what == "as built":
-        return pos + frame.apply(points)
-    return pos + POS + (frame * Rotation.from_rotvec(TURN)).apply(points * scale)
+        return np.asarray(pos + frame.apply(points))
+    return np.asarray(pos + POS + (frame * Rotation.from_rotvec(TURN)).apply(points * scale))
 
 
 def build(law: str, shape: str, points: str, markers: str) -> Simulator:

@@ -1,10 +1,9 @@
-"""The dclaw scene: what is in it, fingers that close on the cap and turn it, and exact gradients in contact."""
+"""The dclaw scene: what is in it, fingers that close on the cap and turn it."""
 
 import numpy as np
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.sim import _core, gradient_check
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
@@ -128,24 +127,6 @@ def test_where_the_cap_is_touched_the_markers_x_runs_to_the_tip() -> None:
         towards = -places[nearest] * [1, 1, 0]
         assert axes[nearest, :, 2] @ towards / np.linalg.norm(towards) > 0.98
         assert axes[nearest, :, 0] @ (turn @ [0, 0, -1]) > 0.5
-
-
-@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
-@pytest.mark.parametrize("law", LAWS)
-def test_gradients_in_contact(law: str, integrator: str) -> None:
-    scene = load_scene("dclaw", friction=law, overrides={"integrator": integrator})
-    spec = scene.describe_to(_core.ModelSpec())
-    spec.tolerance = 1e-13
-    rng = np.random.default_rng(3)
-    sim = Simulator(_core.Model(spec))
-    u = closed(sim, scene)
-    sim.step(u + controls(scene, "swing", 0.08) + rng.normal(size=9) * 0.01, 15)
-    sim.check()
-    assert (pressures(sim, scene) > 0.05).all()
-    controlled = u + controls(scene, "swing", 0.08) + rng.normal(size=(3, 9)) * 0.01
-    for output in ("q", "v", "tactile"):
-        case = gradient_check.Case.random(sim, controlled, output, rng)
-        assert gradient_check.against_dual(case, rng).error < 1e-10
 
 
 def test_it_is_described(capsys: pytest.CaptureFixture[str]) -> None:

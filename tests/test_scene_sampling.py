@@ -42,7 +42,9 @@ def test_box_points_include_the_corners() -> None:
     assert sorted(map(tuple, points.tolist())) == sorted(
         (x, y, z) for x in (-1.0, 1.0) for y in (-2.0, 2.0) for z in (-3.0, 3.0)
     )
-    assert areas == pytest.approx(np.tile([6.0, 3.0, 2.0], (8, 1)))  # a quarter of each of the three faces that meet there
+    assert areas == pytest.approx(
+        np.tile([6.0, 3.0, 2.0], (8, 1))
+    )  # a quarter of each of the three faces that meet there
 
 
 def test_disc_has_the_published_points_and_its_area() -> None:

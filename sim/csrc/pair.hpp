@@ -32,13 +32,10 @@ struct PairFrame {
   T stretch;       // the largest scale
   V3<T> enlarged;  // by how much faces across x, y, z are larger, less 1
 
-  // Whether a ball of this radius about a point of the first body, and a margin around it, may reach into the shape.
-  // May say yes to a ball that just does not; costs less than the point's place in the shape's frame.
+  // Whether a point of the first body may be nearer to the shape than `reach`. May say yes to one that just is not; costs
+  // less than the point's place in the shape's frame.
   template <bool scaled>
-  GELFLOW_INLINE bool may_reach(const V3<double>& center, double radius, const T& margin) const {
-    T reach = T(radius);
-    if constexpr (scaled) reach *= stretch;
-    reach += margin;
+  GELFLOW_INLINE bool may_reach(const V3<double>& center, const T& reach) const {
     const V3<T> c = center.template cast<T>();
     if (!scaled && kind == ShapeKind::sphere) {
       const T limit = size[0] + reach;
@@ -133,15 +130,36 @@ PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape,
 template <bool scaled, class T, class Visit>
 GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
   const T around = margin + T(1e-6);  // [m], above the rounding of single precision
+  const auto reach = [&](double radius) { return (scaled ? T(radius) * f.stretch : T(radius)) + around; };
   for (const auto& group : cloud.groups) {
-    if (!f.template may_reach<scaled>(group.center, group.radius, around)) continue;
+    if (!f.template may_reach<scaled>(group.center, reach(group.radius))) continue;
     for (int l = group.begin; l < group.end; ++l) {
       const auto& leaf = cloud.leaves[l];
-      if (!f.template may_reach<scaled>(leaf.center, leaf.radius, around)) continue;
+      if (!f.template may_reach<scaled>(leaf.center, reach(leaf.radius))) continue;
       for (int i = leaf.begin; i < leaf.end; ++i) {
-        if (f.template may_reach<scaled>(cloud.points[i], 0, around)) visit(i);
+        if (f.template may_reach<scaled>(cloud.points[i], around)) visit(i);
       }
     }
+  }
+}
+template <class T, class Visit>
+GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+  if constexpr (std::is_floating_point_v<T>) {
+    if (f.scaled) return for_near_points<true, T>(f, cloud, margin, visit);
+    return for_near_points<false, T>(f, cloud, margin, visit);
+  } else {  // what is near is no matter of derivatives
+    const double size[3] = {real_part(f.size[0]), real_part(f.size[1]), real_part(f.size[2])};
+    PairFrame<double> real;
+    real.size = size;
+    real.kind = f.kind;
+    real.stretch = f.scaled ? real_part(f.stretch) : 1.0;
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) real.rotation(i, j) = real_part(f.rotation(i, j));
+      real.offset[i] = real_part(f.offset[i]);
+      real.local[i] = real_part(f.local[i]);
+    }
+    real.local_level = real_part(f.local_level);
+    for_near_points<true, double>(real, cloud, real_part(margin), visit);
   }
 }
 
@@ -228,15 +246,10 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
     }
     t.count = 0;
   };
-  const auto visit = [&](int i) {
+  for_near_points<T>(frame, cloud, rule.rolling_radius, [&](int i) {
     t.index[t.count++] = i;
     if (t.count == width) flush();
-  };
-  if (frame.scaled) {
-    for_near_points<true, T>(frame, cloud, rule.rolling_radius, visit);
-  } else {
-    for_near_points<false, T>(frame, cloud, rule.rolling_radius, visit);
-  }
+  });
   if (t.count > 0) flush();
 }
 
