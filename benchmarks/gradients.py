@@ -4,6 +4,7 @@
 takes as many random states in contact as --states says, each with a scalar of positions, velocities or marker readings,
 in turn. tests/test_core_gradients.py does the same with three. In the table:
 
+where       parameters count in groups of one kind: "kn", "pos", "scale", ...
 dual        largest relative difference to dual numbers, which run the same code: below 1e-10
 difference  largest relative difference to five-point central differences: below 1e-6
 left out    share of entries of the gradient that no stencil could be found for, on the middle's side of every kink
@@ -29,7 +30,7 @@ from gelflow.sim.gradient_check import Case, Output, against_differences, agains
 
 FILE = Path(__file__).parent / "results" / "gradients.json"
 OUTPUTS: tuple[Output, ...] = ("q", "v", "tactile")
-ROLLING_RUN = "rolling, 110 steps"
+ROLLING_RUN = "rolling run"
 EXACT, RIGHT, LEFT_OUT = 1e-10, 1e-6, 0.05
 
 
@@ -83,11 +84,9 @@ def check_rolling_run(row: Row) -> None:
 
 
 def table(rows: list[Row]) -> Table:
-    result = Table(box=None, padding=(0, 1), title="Relative errors, and where they are largest", title_justify="left")
-    for column in ("case", "law", "steps"):
-        result.add_column(column, no_wrap=True)
-    for column in ("dual", "", "difference", "", "left out"):
-        result.add_column(column, justify="left" if not column else "right", no_wrap=True)
+    result = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    for column in ("case", "law", "steps", "dual", "where", "difference", "where", "left out"):
+        result.add_column(column, justify="right" if column == "left out" else "left", no_wrap=True)
     for row in rows:
         difference = "" if row.difference is None else f"{row.difference:.0e}"
         left_out = "" if row.left_out is None else f"{row.left_out:.1%}"

@@ -213,10 +213,10 @@ def against_differences(case: Case, *, params: bool = True) -> Agreement:
 
     A five-point difference is made of two of three points, of sizes s and s/4. Each entry is differenced with several
     sizes; of those that stayed on the middle's branch the one counts that differs least from its smaller neighbour,
-    which is where rounding and truncation balance (a quarter of the next difference counts too: rounding grows fourfold
-    from one to the next, and two estimates may be alike by chance). Smaller sizes are tried only where the larger ones
-    crossed a branch or did not agree. The analytic gradient has no say in any of that. An entry without two such
-    stencils is left out.
+    which is where rounding and truncation balance. All smaller ones tell how large rounding errors are (they grow
+    fourfold from one to the next), since two estimates may be alike by chance. Smaller sizes are tried only where the
+    larger ones crossed a branch or did not agree. The analytic gradient has no say in any of that. An entry without two
+    such stencils is left out.
 
     The error is the largest over u, q, v and the groups of parameters, as their units differ, of norm of the difference
     over norm. Parameters count in multiples of `param_scale`; a group whose gradient is below a thousandth of that by
@@ -256,10 +256,11 @@ def against_differences(case: Case, *, params: bool = True) -> Agreement:
         estimates = (RATIO**2 * slopes[todo, 1:] - slopes[todo, :-1]) / (RATIO**2 - 1)
         differences = np.abs(np.diff(estimates, axis=1))
         doubt = differences.copy()
-        doubt[:, :-1] = np.fmax(differences[:, :-1], differences[:, 1:] / RATIO)
+        for column in range(doubt.shape[1] - 2, -1, -1):
+            doubt[:, column] = np.fmax(doubt[:, column], doubt[:, column + 1] / RATIO)
         doubt[np.isnan(differences)] = np.inf
-        row, column = np.arange(len(todo)), doubt.argmin(1)
-        spread[todo], best[todo] = doubt[row, column], estimates[row, column]
+        chosen = np.arange(len(todo)), doubt.argmin(1)
+        spread[todo], best[todo] = doubt[chosen], estimates[chosen]
     keep = np.isfinite(spread)
     allowed = norms(ours)
     errors = {
