@@ -104,7 +104,7 @@ def _grasp(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Arra
 def _dclaw(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Array, Array]:
     """Three fingers that turn the cap."""
     sim.q[:] = scene.q0
-    hold, bend, swing = (np.array([a.name.startswith(k) for a in scene.actuators]) for k in ("", "bend", "swing"))
+    bend, swing = (np.array([a.name.startswith(kind) for a in scene.actuators]) for kind in ("bend", "swing"))
     hold = scene.q0[: scene.nu].copy()
     for _ in range(40):
         hold += bend * (0.1 / 40)
