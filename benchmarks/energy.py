@@ -1,0 +1,212 @@
+"""What steps do to mechanical energy: `python benchmarks/energy.py`.
+
+First free bodies thrown on planes, where nothing may add any (`gelflow.sim.throws`): the share of the steps in which
+the energy grew, by how much at most, and how much of that is beyond what the arc of turning points explains. Then the
+scenes' motions, where motors and servos do work: what a step gained beyond their work. Servos pull with the force at
+the step's end, over the way of the step. All but the share is relative to the energy at work.
+
+Exit status: 0 when BDF1 never adds more to a free body than the arc, where the law stores nothing (viscous, or elastic
+without damping), 1 when it does.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rolling import versions
+
+from gelflow.errors import GelflowError
+from gelflow.sim.benchmark import processor
+from gelflow.sim.energy import EnergyGauge
+from gelflow.sim.motions import motion
+from gelflow.sim.scene import Scene, load_scene, scene_names
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.throws import Throw, fly
+
+Array = NDArray[np.float64]
+
+STEPS = (1e-4, 1e-3, 5e-3, 2e-2)  # [s], of free bodies
+SCENE_STEPS = (1e-3, 5e-3, 2e-2)  # [s]
+BODIES, STEPS_TAKEN = 32, 200
+ALLOWED = 1e-8  # ten times Newton's tolerance
+MATERIALS = (("depth", 0.0), ("depth", 3e3), ("plain", 0.0), ("plain", 3.0))  # damping and its k_d
+CASES = (  # body, law, k_t
+    ("sphere", "viscous", 5.0),
+    ("box", "viscous", 5.0),
+    ("cylinder", "viscous", 5.0),
+    ("box", "elastic", 0.0),
+    ("cylinder", "elastic", 0.0),
+    ("box", "elastic", 5.0),
+    ("cylinder", "elastic", 5.0),
+)
+GRID = {"rolling": {"pads.pad.rows": 5, "pads.pad.cols": 5}}
+
+
+@dataclass(frozen=True)
+class Thrown:
+    """Free bodies of all materials, by one integrator at one step; energies relative to the energy at work."""
+
+    body: str
+    law: str
+    kt: float
+    integrator: str
+    step: float
+    share: float  # of the steps in which the energy grew
+    largest: float  # growth in one step
+    beyond: float  # growth in one step beyond the arc's
+    above: float  # largest excess over the energy at the start, at any time
+    halved: float  # share of the steps that were halved; they are left out
+
+
+def throw(body: Any, law: str, kt: float, integrator: str, step: float) -> Thrown:
+    rows = []
+    for damping, kd in MATERIALS:
+        numbers = {"kn": 2e3, "kt": kt, "mu": 0.6, "kd": kd, "ks": 1e3 if law == "elastic" else 0.0}
+        rng = np.random.default_rng(1)
+        thrown = Throw(body, law, damping, step, numbers, integrator=integrator)
+        growth = fly(thrown, rng, bodies=BODIES, steps=STEPS_TAKEN)
+        whole = ~growth.halved
+        relative = (growth.change / growth.scale)[whole]
+        beyond = ((growth.change - growth.arc) / growth.scale)[whole]
+        above = (growth.total.max(0) - growth.total[0]) / growth.scale[0]
+        rows.append(((relative > ALLOWED).mean(), relative.max(), beyond.max(), above.max(), growth.halved.mean()))
+    share, largest, over, above, halved = np.array(rows).T
+    most = [float(max(x.max(), 0.0)) for x in (largest, over, above)]
+    return Thrown(body, law, kt, integrator, step, float(share.mean()), *most, halved=float(halved.mean()))
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A scene's motion; energies relative to all that motors gave and took, summed over the motion."""
+
+    scene: str
+    law: str
+    integrator: str
+    step: float
+    share: float  # of the steps that gained beyond the motors' work
+    largest: float  # gained in one step beyond their work
+    gained: float  # sum of all that was gained so
+    lost: float  # sum of all that went: friction, damping, and the integrator's own
+    halved: int
+
+
+def motor_forces(scene: Scene, sim: Simulator, u: Array) -> Array:
+    """Force of each actuator on its joint now, (nu,) [N, N m]; motors and position servos, as the scenes have."""
+    forces = np.zeros(scene.nu)
+    for i, a in enumerate(scene.actuators):
+        q, v = sim.q[0, sim.model.joint_q[a.joint]], sim.v[0, sim.model.joint_v[a.joint]]
+        control = np.clip(u[i], *a.control)
+        pull = control if a.kind == "motor" else a.kp * (control - a.gear * q) - a.kd * a.gear * v
+        forces[i] = a.gear * np.clip(pull, *a.force)
+    return forces
+
+
+def move(name: str, law: str, integrator: str, step: float) -> Moved:
+    overrides = {**GRID.get(name, {}), "step": step, "integrator": integrator}
+    scene = load_scene(name, friction=law, overrides=overrides)
+    sim, gauge, moves = Simulator(scene), EnergyGauge(scene), motion(scene)
+    sim.q[0] = moves.q0
+    at = [sim.model.joint_q[a.joint] for a in scene.actuators]
+    excess, work = [], []
+    before = gauge.read(sim).total[0]
+    for u in moves.steps(step):
+        start = sim.q[0, at].copy()
+        sim.step(u)
+        after = gauge.read(sim).total[0]
+        work.append(float(motor_forces(scene, sim, u) @ (sim.q[0, at] - start)))
+        excess.append(after - before - work[-1])
+        before = after
+    sim.check()
+    gain, scale = np.array(excess), float(np.abs(work).sum())
+    return Moved(
+        name,
+        law,
+        integrator,
+        step,
+        share=float((gain > ALLOWED * scale).mean()),
+        largest=float(max(gain.max(), 0.0) / scale),
+        gained=float(gain[gain > 0].sum() / scale),
+        lost=float(-gain[gain < 0].sum() / scale),
+        halved=int(sim.halved[0]),
+    )
+
+
+def thrown_table(found: list[Thrown]) -> Table:
+    out = Table(title="Free bodies on planes: growth of energy in a step, relative", title_justify="left")
+    for heading in ("body", "law", "k_t", "by", "step [ms]", "grew", "most", "beyond arc", "over start"):
+        out.add_column(heading, justify="left" if heading in ("body", "law", "by") else "right")
+    for r in found:
+        numbers = (f"{r.share:.1%}", *(f"{x:.0e}" if x > ALLOWED else "0" for x in (r.largest, r.beyond, r.above)))
+        out.add_row(r.body, r.law, f"{r.kt:g}", r.integrator, f"{r.step * 1e3:g}", *numbers)
+    return out
+
+
+def moved_table(found: list[Moved]) -> Table:
+    out = Table(title="Scenes: gained beyond the motors' work, relative to it", title_justify="left")
+    for heading in ("scene", "law", "by", "step [ms]", "grew", "in one step", "in all", "lost in all", "halved"):
+        out.add_column(heading, justify="left" if heading in ("scene", "law", "by") else "right")
+    for r in found:
+        numbers = (f"{x:.0e}" if x > ALLOWED else "0" for x in (r.largest, r.gained))
+        row = (f"{r.share:.1%}", *numbers, f"{r.lost:.2g}", str(r.halved))
+        out.add_row(r.scene, r.law, r.integrator, f"{r.step * 1e3:g}", *row)
+    return out
+
+
+def measure(progress: Callable[[], None]) -> tuple[list[Thrown], list[Moved]]:
+    thrown, moved = [], []
+    for body, law, kt in CASES:
+        for integrator in ("bdf1", "bdf2"):
+            for step in STEPS:
+                thrown.append(throw(body, law, kt, integrator, step))
+                progress()
+    for name in scene_names():
+        for law in ("viscous", "elastic"):
+            for integrator in ("bdf1", "bdf2"):
+                for step in SCENE_STEPS:
+                    moved.append(move(name, law, integrator, step))
+                    progress()
+    return thrown, moved
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="What steps do to mechanical energy.")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "energy.json")
+    args = parser.parse_args()
+    console = Console(width=80)
+    whole = 2 * len(CASES) * len(STEPS) + 4 * len(scene_names()) * len(SCENE_STEPS)
+    try:
+        with Progress(console=Console(stderr=True, width=80)) as progress:
+            task = progress.add_task("energy", total=whole)
+            thrown, moved = measure(lambda: progress.advance(task))
+    except GelflowError as error:
+        print(error, file=sys.stderr)
+        return 2
+    console.print(thrown_table(thrown))
+    console.print(moved_table(moved))
+    strict = [r for r in thrown if r.integrator == "bdf1" and (r.law == "viscous" or r.kt == 0)]
+    worst = max(r.beyond for r in strict)
+    console.print(f"BDF1, viscous or without k_t: beyond the arc at most {worst:.1e}; allowed {ALLOWED:g}.")
+    record = {
+        "format": 1,
+        "processor": processor(),
+        "versions": versions(),
+        "thrown": [asdict(r) for r in thrown],
+        "scenes": [asdict(r) for r in moved],
+    }
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    console.print(str(args.out), soft_wrap=True)
+    return 0 if worst <= ALLOWED else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

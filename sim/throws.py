@@ -1,0 +1,138 @@
+"""Free bodies thrown on planes, and what each step does to their energy, for measurements.
+
+What BDF1 can add. A step moves the velocities v_t at its end by the forces at its end, which act on the bodies with the
+power Σ f_i · v_i. So masses, gravity, damping and friction never give energy; masses lose ½ |change|². But in turning a
+point moves along an arc, and not by h v_i. With ω the body's angular velocity and r_i the point from its centre,
+
+    h v_i − (x_i − x_i before) = (h ω̂ − 1 + exp(−h ω̂)) r_i,     at most ½ |h ω|² |r_i|,
+
+and the springs, of depth d_i and of strain s_i, feel the arc: a step of BDF1 adds at most
+
+    ½ |h ω|² R Σ (k_n |d_i| + k_s |s_i|),      R the farthest point, d and s at the end.         (arc)
+
+Nothing for a sphere's moving point, whose place is that of its centre. Nothing is said of steps that had to be halved,
+nor of what the elastic law stores where a point slips with k_t |v_t| > µ N: its anchor then moves to the far side.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.energy import EnergyGauge
+from gelflow.sim.sampling import box_surface, cylinder
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+Kind = Literal["sphere", "box", "cylinder"]
+
+GRAVITY = 9.8  # [m/s²]
+MASS = 0.3  # [kg]
+SIZE = 0.02  # [m]
+_BOX = SIZE * np.array([1.0, 1.5, 0.6])
+_HALF_LENGTH = 1.2 * SIZE
+
+
+def _body(kind: Kind) -> tuple[Array, Array, float]:
+    """Contact points, principal moments of inertia per kilogram [m²], radius of a moving point or 0."""
+    if kind == "sphere":
+        return np.zeros((1, 3)), np.full(3, 0.4 * SIZE**2), SIZE
+    if kind == "box":
+        square = _BOX**2 / 3
+        return box_surface(_BOX, (3, 3, 3))[0], square.sum() - square, 0.0
+    across = SIZE**2 / 4 + _HALF_LENGTH**2 / 3
+    points = cylinder(SIZE, _HALF_LENGTH, angles=24, radii=2, heights=3, faces=("-z", "wall", "+z"))[0]
+    return points, np.array([across, across, SIZE**2 / 2]), 0.0
+
+
+@dataclass(frozen=True)
+class Throw:
+    """A free body over a ground, and a plane that leans at 45° beside it."""
+
+    kind: Kind
+    law: str  # of friction
+    damping: str
+    step: float  # [s]
+    numbers: Mapping[str, float]  # kn, kt, mu, kd, ks per point
+    integrator: str = "bdf1"
+    turns: bool = True  # else it is carried by three slides
+    tolerance: float = 1e-9  # of Newton's method
+
+    @property
+    def reach(self) -> float:
+        """The farthest point from the body's centre [m]."""
+        points, _, radius = _body(self.kind)
+        return float(np.linalg.norm(points, axis=1).max()) + radius
+
+    def describe_to(self, spec: Any) -> Any:
+        """Tell a model builder every part; returns it."""
+        points, moments, radius = _body(self.kind)
+        spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), self.step, self.tolerance
+        spec.integrator = self.integrator
+        still, upright = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+        body = spec.add_body("body", -1, still, upright, MASS, still, (*(MASS * moments), 0.0, 0.0, 0.0))
+        if self.turns:
+            spec.add_joint("free", body, "free", still, (0.0, 0.0, 1.0))
+        else:
+            for name, axis in zip("xyz", np.eye(3), strict=True):
+                spec.add_joint(name, body, "slide", still, axis)
+        sampled = spec.add_points("points", body, points, np.ones(len(points)), radius=radius)
+        lean = (np.cos(np.pi / 8), 0.0, -np.sin(np.pi / 8), 0.0)  # its normal is (−1, 0, 1) / √2
+        planes = {"ground": (still, upright), "slope": ((3 * SIZE, 0.0, 0.0), lean)}
+        for name, (pos, quat) in planes.items():
+            plane = spec.add_shape(name, -1, "plane", pos, quat, (1.0, 1.0, 1.0))
+            spec.add_contact(f"on {name}", sampled, plane, law=self.law, damping=self.damping, **self.numbers)
+        return spec
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What each step did; arrays (steps, N) [J] but for `halved`, of all steps but those that failed."""
+
+    change: Array  # of the whole energy
+    mechanical: Array  # of the energy without what friction stores
+    stored: Array  # by friction, before the step
+    arc: Array  # what turning can add, see above
+    scale: Array  # energy at work before the step: kinetic, stored, and the body's weight lifted by its reach
+    halved: NDArray[np.bool_]
+    total: Array  # (steps + 1, N): the energy itself
+
+
+def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> Growth:
+    """Throw bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
+    sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
+    gauge = EnergyGauge(throw, num_envs=bodies)
+    speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)
+    sim.v[:, :3] = speed * rng.normal(size=(bodies, 3))
+    if throw.turns:
+        turn = rng.normal(size=(bodies, 4))
+        turn[: bodies // 3] = 1, 0, 0, 0
+        sim.q[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        sim.v[:, 3:] = speed / SIZE * rng.normal(size=(bodies, 3)) * (rng.random((bodies, 1)) < 0.8)
+    sim.q[:, 2] = throw.reach
+    for _ in range(3):  # out of the planes, or a little into them
+        sim.q[:, 2] += gauge.points(sim)[0].max(1)
+    sim.q[:, 2] += rng.choice([-1e-4, 0.0, 0.3 * throw.reach], bodies)
+    rows: list[tuple[Array, ...]] = []
+    before = gauge.read(sim)
+    total = [before.total]
+    for _ in range(steps):
+        halvings = sim.halved.copy()
+        sim.step(np.zeros(0))
+        depth, strain = gauge.points(sim)
+        after = gauge.read(sim, (depth, strain))
+        springs = throw.numbers["kn"] * depth.sum(1) + throw.numbers["ks"] * np.linalg.norm(strain, axis=2).sum(1)
+        turned = throw.step * np.linalg.norm(sim.v[:, 3:], axis=1) if throw.turns else np.zeros(bodies)
+        arc = (throw.kind != "sphere") * 0.5 * turned**2 * throw.reach * springs
+        change = after.total - before.total
+        at_work = before.kinetic + before.contact + before.friction + MASS * GRAVITY * throw.reach
+        rows.append(
+            (change, change - (after.friction - before.friction), before.friction, arc, at_work, sim.halved > halvings)
+        )
+        total.append(after.total)
+        before = after
+    sim.check()
+    return Growth(*(np.array(column) for column in zip(*rows, strict=True)), total=np.array(total))

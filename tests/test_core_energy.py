@@ -1,0 +1,137 @@
+"""Energy: BDF1 never adds any beyond the arc that turning points take (`gelflow.sim.throws` has the bound).
+
+Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction and step. The tolerance is ten
+times Newton's, relative to the energy at work.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gelflow.sim import _core
+from gelflow.sim.energy import EnergyGauge
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.throws import GRAVITY, MASS, SIZE, Throw, fly
+
+TOLERANCE = 1e-8
+
+
+def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
+
+
+def throws(kind: Any, law: str, *, turns: bool = True, kt: bool = True) -> st.SearchStrategy[Throw]:
+    """Every material, with and without damping, at steps of 0.1 to 20 ms."""
+    damped = st.one_of(st.just(0.0), logarithmic(0.03, 30))
+    numbers = st.fixed_dictionaries(
+        {
+            "kn": logarithmic(1e2, 1e5),
+            "kt": st.one_of(st.just(0.0), logarithmic(0.1, 50)) if kt else st.just(0.0),
+            "mu": st.sampled_from([0.0, 0.3, 0.8, 2.0]),
+            "ks": logarithmic(1e2, 1e4) if law == "elastic" else st.just(0.0),
+        }
+    )
+
+    def build(damping: str, kd: float, step: float, numbers: dict[str, float]) -> Throw:
+        scaled = kd * (1e3 if damping == "depth" else 1)
+        return Throw(kind, law, damping, step, {**numbers, "kd": scaled}, turns=turns)
+
+    return st.builds(build, st.sampled_from(["depth", "plain"]), damped, logarithmic(1e-4, 2e-2), numbers)
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=15)
+@given(throw=throws("sphere", "viscous"), seed=SEEDS)
+def test_a_sphere_never_gains(throw: Throw, seed: int) -> None:
+    growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+    assert (growth.change <= TOLERANCE * growth.scale).all()
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_what_does_not_turn_never_gains(kind: str, law: str) -> None:
+    @settings(max_examples=8)
+    @given(throw=throws(kind, law, turns=False, kt=law == "viscous"), seed=SEEDS)
+    def check(throw: Throw, seed: int) -> None:
+        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+        assert (growth.change <= TOLERANCE * growth.scale).all()
+
+    check()
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_what_turns_gains_no_more_than_the_arc(kind: str, law: str) -> None:
+    @settings(max_examples=12)
+    @given(throw=throws(kind, law, kt=law == "viscous"), seed=SEEDS)
+    def check(throw: Throw, seed: int) -> None:
+        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+        whole = ~growth.halved
+        assert (growth.change <= growth.arc + TOLERANCE * growth.scale)[whole].all()
+
+    check()
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_motion_gains_no_more_than_elastic_friction_had_stored(kind: str) -> None:
+    """Under the elastic law with damping: all energy but friction's own grows by the arc and by what friction gives."""
+
+    @settings(max_examples=12)
+    @given(throw=throws(kind, "elastic"), seed=SEEDS)
+    def check(throw: Throw, seed: int) -> None:
+        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+        whole = ~growth.halved
+        assert (growth.mechanical <= growth.arc + growth.stored + TOLERANCE * growth.scale)[whole].all()
+
+    check()
+
+
+def test_the_arc_is_no_empty_bound() -> None:
+    """Boxes that spin fast over long steps do gain, by a good part of the bound; short steps leave nothing of it."""
+    numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
+    largest = []
+    for step in (2e-2, 1e-4):
+        growth = fly(Throw("box", "viscous", "depth", step, numbers), np.random.default_rng(1), bodies=24, steps=150)
+        gains = growth.change > TOLERANCE * growth.scale
+        largest.append(float((growth.change / np.maximum(growth.arc, 1e-30))[gains].max(initial=0.0)))
+    assert largest[0] > 0.3
+    assert largest[1] == 0
+
+
+def test_what_the_elastic_law_stores_in_a_fast_slip() -> None:
+    """Where k_t v > µ N the anchor of a point that slips lies ahead: −k_s s = f_t + k_t v, and ½ k_s s² appears in the
+    books. It is no motion: the block is braked by µ m g all the while."""
+    numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
+    throw = Throw("box", "elastic", "depth", 1e-3, numbers, turns=False)
+    sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
+    points = 9  # of the lower face
+    sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
+    sim.q[0, 0], sim.v[0, 0] = -10, 1.0  # far from the slope
+    for _ in range(20):
+        sim.step(np.zeros(0))
+    speed, load = sim.v[0, 0], MASS * GRAVITY / points
+    assert speed == pytest.approx(1 - 0.3 * GRAVITY * 0.02, rel=1e-6)
+    strain = (numbers["kt"] * speed - 0.3 * load) / numbers["ks"]
+    assert gauge.read(sim).friction[0] == pytest.approx(points * 0.5 * numbers["ks"] * strain**2, rel=1e-6)
+
+
+def test_the_parts_of_the_energy() -> None:
+    """A block that stands, and a scene's spring-like parts, against their formulas."""
+    numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
+    throw = Throw("box", "elastic", "depth", 1e-3, numbers)
+    sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=2), EnergyGauge(throw, num_envs=2)
+    sim.q[:, 0], sim.q[:, 2] = -10, 0.6 * SIZE - np.array([1e-4, -1.0])
+    sim.v[:, 0] = 1.0, 2.0
+    energy = gauge.read(sim)
+    np.testing.assert_allclose(energy.kinetic, 0.5 * MASS * sim.v[:, 0] ** 2)
+    np.testing.assert_allclose(energy.gravity, MASS * GRAVITY * sim.q[:, 2])
+    np.testing.assert_allclose(energy.contact, [9 * 0.5 * 2e3 * 1e-8, 0], atol=1e-15)
+    sim.v[:] = 0
+    sim.step(np.zeros(0))
+    sim.q[0, 0] += 2e-5  # a strain that all nine points share
+    np.testing.assert_allclose(gauge.read(sim).friction[0], 9 * 0.5 * 1e3 * 4e-10, rtol=1e-6)
