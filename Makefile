@@ -22,7 +22,8 @@ CXX_FILES = $(wildcard sim/csrc/*.cpp sim/csrc/*.hpp)
 SANITIZE_BUILD := build/sanitize
 # Every test of the core runs but those that repeat what others run, many times over: it is fifty times slower here.
 # test_core_order needs rest to the last bit, which not every build comes to.
-SANITIZE_TESTS = $(filter-out tests/test_core_order.py,$(wildcard tests/test_core_*.py)) tests/test_scene_simulated.py
+SANITIZE_LEFT_OUT = $(patsubst %,tests/test_core_%.py,order energy momentum motions determinism)
+SANITIZE_TESTS = $(filter-out $(SANITIZE_LEFT_OUT),$(wildcard tests/test_core_*.py)) tests/test_scene_simulated.py
 SANITIZE_CHOICE = not central_differences and not hundred_steps and not 110_steps and not found_again \
   and not ((exact_against_dual or pressed_on_a_shape) and (viscous or bdf1)) and not (depth_and_normal and ellipsoid)
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -26,13 +25,11 @@ from rolling import versions
 
 from gelflow.errors import GelflowError
 from gelflow.sim.benchmark import processor
-from gelflow.sim.energy import EnergyGauge
+from gelflow.sim.energy import EnergyGauge, motor_forces
 from gelflow.sim.motions import motion
-from gelflow.sim.scene import Scene, load_scene, scene_names
+from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.throws import Throw, fly
-
-Array = NDArray[np.float64]
 
 STEPS = (1e-4, 1e-3, 5e-3, 2e-2)  # [s], of free bodies
 SCENE_STEPS = (1e-3, 5e-3, 2e-2)  # [s]
@@ -99,17 +96,6 @@ class Moved:
     halved: int
 
 
-def motor_forces(scene: Scene, sim: Simulator, u: Array) -> Array:
-    """Force of each actuator on its joint now, (nu,) [N, N m]; motors and position servos, as the scenes have."""
-    forces = np.zeros(scene.nu)
-    for i, a in enumerate(scene.actuators):
-        q, v = sim.q[0, sim.model.joint_q[a.joint]], sim.v[0, sim.model.joint_v[a.joint]]
-        control = np.clip(u[i], *a.control)
-        pull = control if a.kind == "motor" else a.kp * (control - a.gear * q) - a.kd * a.gear * v
-        forces[i] = a.gear * np.clip(pull, *a.force)
-    return forces
-
-
 def move(name: str, law: str, integrator: str, step: float) -> Moved:
     overrides = {**GRID.get(name, {}), "step": step, "integrator": integrator}
     scene = load_scene(name, friction=law, overrides=overrides)
@@ -122,7 +108,7 @@ def move(name: str, law: str, integrator: str, step: float) -> Moved:
         start = sim.q[0, at].copy()
         sim.step(u)
         after = gauge.read(sim).total[0]
-        work.append(float(motor_forces(scene, sim, u) @ (sim.q[0, at] - start)))
+        work.append(float(motor_forces(scene, sim, u)[0] @ (sim.q[0, at] - start)))
         excess.append(after - before - work[-1])
         before = after
     sim.check()
@@ -152,7 +138,7 @@ def thrown_table(found: list[Thrown]) -> Table:
 
 def moved_table(found: list[Moved]) -> Table:
     out = Table(title="Scenes: gained beyond the motors' work, relative to it", title_justify="left")
-    for heading in ("scene", "law", "by", "step [ms]", "grew", "in one step", "in all", "lost in all", "halved"):
+    for heading in ("scene", "law", "by", "ms", "grew", "in a step", "in all", "lost", "halved"):
         out.add_column(heading, justify="left" if heading in ("scene", "law", "by") else "right")
     for r in found:
         numbers = (f"{x:.0e}" if x > ALLOWED else "0" for x in (r.largest, r.gained))

@@ -1,4 +1,4 @@
-"""Other implicit schemes than the core's two, on a reduced example and, where no change of the core is needed, on scenes.
+"""Other implicit schemes than the core's two, on a reduced example and, where the core need not change, on scenes.
 
 The example, in NumPy alone: a ball (x, z, angle) is thrown on a plane of penalty springs with depth damping and viscous
 friction that slips and sticks, and bounces until it rolls. Every scheme solves systems of one form,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.sim import _core
 from gelflow.sim.gradient_check import turning_joints
+from gelflow.sim.scene import Scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -97,6 +98,26 @@ class EnergyGauge:
             if self._parts.anchors[n] is not None:
                 friction += 0.5 * sim.param(f"{name}.ks") * ((strain[:, own] ** 2).sum(2) @ weights)
         return contact, friction
+
+
+def motor_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
+    """What each actuator pulls its joint with now, under controls u (nu,), shape (N, nu) [N, N m].
+
+    Times the way of a step it is the motor's work in it, since a step's forces are those at its end.
+    """
+    controls, forces = np.asarray(u, float), np.zeros((sim.num_envs, scene.nu))
+    for i, a in enumerate(scene.actuators):
+        length = a.gear * sim.q[:, sim.model.joint_q[a.joint]]
+        speed = a.gear * sim.v[:, sim.model.joint_v[a.joint]]
+        control = np.clip(controls[i], *a.control)
+        pull = {
+            "motor": control + 0 * length,
+            "position": a.kp * (control - length) - a.kd * speed,
+            "velocity": a.kd * (control - speed),
+            "general": a.gain * control + a.bias - a.kp * length - a.kd * speed,
+        }[a.kind]
+        forces[:, i] = a.gear * np.clip(pull, *a.force)
+    return forces
 
 
 def _gravity(sim: Simulator) -> Array:

@@ -6,6 +6,7 @@ of its end.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,7 +54,7 @@ def _follow(scene: Scene, tracks: dict[str, list[tuple[float, float]]]) -> Calla
         u = np.zeros((len(t), scene.nu))
         for name, points in tracks.items():
             column = np.full(len(t), points[0][1])
-            for (start, before), (end, after) in zip(points, points[1:], strict=False):
+            for (start, before), (end, after) in pairwise(points):
                 column += (after - before) * _ramp(t, start, end)
             u[:, scene.u(name)] = column
         return u
@@ -84,7 +85,7 @@ def _pushing(scene: Scene) -> Motion:
 
 
 def _insertion(scene: Scene) -> Motion:
-    """A held part comes down on the rim beside its hole, slides over it, is lifted off, goes in, and leans on a wall."""
+    """A held part comes down on the rim beside its hole, slides over it, is lifted off, goes in and leans on a wall."""
     q0, force, lift, shift = scene.q0.copy(), 5.0, 0.5e-3, 4.5e-3
     q0[scene.q("arm_z")] += lift
     q0[scene.q("part").start + 2] += lift
@@ -102,7 +103,15 @@ def _insertion(scene: Scene) -> Motion:
         "finger_right": [(0.0, force)],
         "hold_left": [(0.0, q0[scene.q("finger_left").start])],
         "hold_right": [(0.0, q0[scene.q("finger_right").start])],
-        "arm_x": [(0.0, shift), (0.2, shift), (0.35, 2.7e-3), (0.42, 2.7e-3), (0.5, 2.0e-3), (0.64, 2.0e-3), (0.72, 2.7e-3)],
+        "arm_x": [
+            (0.0, shift),
+            (0.2, shift),
+            (0.35, 2.7e-3),
+            (0.42, 2.7e-3),
+            (0.5, 2.0e-3),
+            (0.64, 2.0e-3),
+            (0.72, 2.7e-3),
+        ],
         "arm_yaw": [(0.3, 0.0), (0.35, 0.01), (0.42, 0.0)],
         "arm_z": [(0.0, top), (0.2, top - 1.6e-3), (0.36, top - 1.6e-3), (0.44, top), (0.48, top), (0.66, top - 3e-3)],
     }
@@ -128,7 +137,7 @@ def _dclaw(scene: Scene) -> Motion:
     """Three fingers close on the cap, turn it, open and swing back, and close again."""
     q0 = scene.q0.copy()
     start = dict(zip((a.name for a in scene.actuators), q0, strict=False))
-    tracks = {}
+    tracks: dict[str, list[tuple[float, float]]] = {}
     for finger in (1, 2, 3):
         bend = start[f"bend{finger}"]
         tracks |= {

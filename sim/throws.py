@@ -42,7 +42,7 @@ def _body(kind: Kind) -> tuple[Array, Array, float]:
         return np.zeros((1, 3)), np.full(3, 0.4 * SIZE**2), SIZE
     if kind == "box":
         square = _BOX**2 / 3
-        return box_surface(_BOX, (3, 3, 3))[0], square.sum() - square, 0.0
+        return box_surface(_BOX.tolist(), (3, 3, 3))[0], square.sum() - square, 0.0
     across = SIZE**2 / 4 + _HALF_LENGTH**2 / 3
     points = cylinder(SIZE, _HALF_LENGTH, angles=24, radii=2, heights=3, faces=("-z", "wall", "+z"))[0]
     return points, np.array([across, across, SIZE**2 / 2]), 0.0
@@ -116,7 +116,7 @@ def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> G
     for _ in range(3):  # out of the planes, or a little into them
         sim.q[:, 2] += gauge.points(sim)[0].max(1)
     sim.q[:, 2] += rng.choice([-1e-4, 0.0, 0.3 * throw.reach], bodies)
-    rows: list[tuple[Array, ...]] = []
+    rows: list[tuple[NDArray[Any], ...]] = []
     before = gauge.read(sim)
     total = [before.total]
     for _ in range(steps):
@@ -129,10 +129,10 @@ def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> G
         arc = (throw.kind != "sphere") * 0.5 * turned**2 * throw.reach * springs
         change = after.total - before.total
         at_work = before.kinetic + before.contact + before.friction + MASS * GRAVITY * throw.reach
-        rows.append(
-            (change, change - (after.friction - before.friction), before.friction, arc, at_work, sim.halved > halvings)
-        )
+        mechanical = change - (after.friction - before.friction)
+        rows.append((change, mechanical, before.friction, arc, at_work, sim.halved > halvings))
         total.append(after.total)
         before = after
     sim.check()
-    return Growth(*(np.array(column) for column in zip(*rows, strict=True)), total=np.array(total))
+    change, mechanical, stored, arc, scale, halved = (np.array(column) for column in zip(*rows, strict=True))
+    return Growth(change, mechanical, stored, arc, scale, halved, np.array(total))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gelflow.sim import _core
 from gelflow.sim.motions import motion
-from gelflow.sim.scene import Scene, load_scene, scene_names
+from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -63,9 +63,7 @@ class Loose:
     add_actuator = add_pad = add_joint
 
 
-def cut_loose(
-    name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True
-) -> Simulator:
+def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True) -> Simulator:
     """The scene's bodies afloat in the middle of its motion, moving as they did there."""
     scene = load_scene(name, friction=law)
     sim, moves = Simulator(scene), motion(scene)
@@ -154,7 +152,7 @@ def drift_of(law: str, step: float, *, centred: bool) -> Array:
     start = momentum(sim).sum(0)
     sim.step(np.zeros(0), round(0.02 / step))
     sim.check()
-    return np.linalg.norm((momentum(sim).sum(0) - start).reshape(2, 3), axis=1)
+    return np.asarray(np.linalg.norm((momentum(sim).sum(0) - start).reshape(2, 3), axis=1))
 
 
 def test_off_the_centre_of_mass_linear_momentum_is_kept_to_first_order() -> None:

@@ -103,3 +103,28 @@ def test_a_step_tells_its_error(at_rest: Array, integrator: str) -> None:
     assert all(1.5 < np.log2(big / small) < 3 for big, small in itertools.pairwise(estimates))
     with pytest.raises(UsageError, match="not finite"):
         sim.error_estimate([np.nan, 0, 0])
+
+
+def test_the_elastic_law_knows_the_time_of_touch_to_a_step() -> None:
+    """An anchor is where the point is at the end of the step in which it touched: the shear lacks what was covered
+    between the touch and there. That is of first order under BDF2 too; and since the rest of a step can stay the same
+    while steps are halved, so can the error."""
+    speed, fall, height = 0.2, 0.1, 1.039e-3
+    touched, time = height / fall, 0.0256
+    lacks = {}
+    for step in (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4):
+        spec = _core.ModelSpec()
+        spec.gravity, spec.step, spec.integrator = (0.0, 0.0, 0.0), step, "bdf2"
+        body = spec.add_body("block", -1, (0, 0, height), (1, 0, 0, 0), 1e6, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+        for name, axis in zip("xz", ((1, 0, 0), (0, 0, 1)), strict=True):  # so heavy that nothing stops it
+            spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+        plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (1, 1, 1))
+        axes = [[axis] for axis in np.eye(3)]
+        spec.add_pad("pad", body, [(0, 0, 0)], *axes, shapes=[plane], law="elastic", kn=1e3, kt=0, mu=1e6, kd=0, ks=1.0)
+        sim = Simulator(_core.Model(spec))
+        sim.v[0] = speed, -fall
+        sim.step([], round(time / step))
+        shear = -sim.tactile()[0, 0, 0]  # of a spring of 1 N/m: a length
+        lacks[step] = speed * (time - touched) - shear
+        assert lacks[step] == pytest.approx(speed * (np.ceil(touched / step) * step - touched), abs=1e-9)
+    assert lacks[4e-4] == pytest.approx(lacks[1e-4], abs=1e-9)  # 10.4 ms each time, after 10.39
