@@ -183,7 +183,7 @@ def test_a_failed_environment_keeps_its_last_good_state_and_its_neighbours_do_no
 
 def test_newton_that_may_not_iterate_says_so(insertion: Scene) -> None:
     spec = insertion.describe_to(_core.ModelSpec())
-    spec.max_iterations, spec.max_halvings = 1, 0
+    spec.max_step_iterations = 1
     sim = Simulator(_core.Model(spec))
     sim.q[:] = start = insertion.q0
     sim.step(controls(insertion)[0, :1])

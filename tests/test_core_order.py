@@ -26,7 +26,7 @@ def rolling(step: float, integrator: str) -> Simulator:
 @pytest.fixture(scope="module")
 def at_rest() -> Array:
     sim = rolling(5e-3, "bdf1")
-    sim.step([0, 0, 0.2], 20_000)
+    sim.step([0, 0, 0.2], 4_000)
     assert np.abs(sim.v).max() < 1e-14
     return sim.q.copy()
 

@@ -104,8 +104,10 @@ void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
     int iterations = 0;
     Status status = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory).status;
     if (status == Status::ok) {
-      status = substeps<T>(m, params_of(e), T(m.step / 2), 2, control, m.polish, halves.view(), memory, iterations,
-                           NoObserver{});
+      for (int half = 0; half < 2 && status == Status::ok; ++half) {
+        status = substep<T>(m, params_of(e), T(m.step / 2), false, control, m.polish, halves.view(), memory, iterations,
+                            NoObserver{});
+      }
     }
     failures[e] = static_cast<std::int32_t>(status);
     T* const difference = out + static_cast<std::size_t>(e) * m.nv;
@@ -339,18 +341,16 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
     const StateView<T> old{r.q + before * m.nq, r.v + before * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + before * na,
                            r.anchored + before * na, r.history + before * m.nh};
     const T* u = r.u + before * nu;
-    const int count = 1 << r.halvings[before];
     records.clear();
-    if (count == 1) {
-      const StepStart<T> from = start_of<T>(m, T(m.step), 1, old, u, memory);
+    if (r.halvings[before] == 0) {
+      const StepStart<T> from = start_of<T>(m, T(m.step), true, old, u, memory);
       records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
     } else {
       StateCopy<T> scratch(m, old);
-      int iterations = 0;
-      substeps<T>(m, params, T(m.step / count), count, u, m.polish, scratch.view(), memory, iterations,
-                  [&](const StepStart<T>& from, const StepMemory<T>& taken) {
-                    records.emplace_back(m, from, taken.v_new, false);
-                  });
+      gelflow::step<T>(m, params, u, m.polish, scratch.view(), memory,
+                       [&](const StepStart<T>& from, const StepMemory<T>& taken) {
+                         records.emplace_back(m, from, taken.v_new, false);
+                       });
     }
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
       substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {

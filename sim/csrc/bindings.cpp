@@ -269,6 +269,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def_readwrite("max_iterations", &ModelSpec::max_iterations)
       .def_readwrite("max_halvings", &ModelSpec::max_halvings)
       .def_readwrite("polish", &ModelSpec::polish)
+      .def_readwrite("max_step_iterations", &ModelSpec::max_step_iterations)
       .def_readwrite("integrator", &ModelSpec::integrator)
       .def("add_body", &ModelSpec::add_body, py::arg("name"), py::arg("parent"), py::arg("pos"), py::arg("quat"),
            py::arg("mass"), py::arg("com"), py::arg("inertia"))

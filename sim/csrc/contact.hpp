@@ -60,10 +60,10 @@ bool sum_forces(const PairFrame<T>& frame, const PointCloud& cloud, const TouchR
 }
 
 // Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `scale`: adds the
-// forces' size to w.scale.
+// impulses' size to w.forces.
 template <bool derivatives, class T>
 void subtract_contact_forces(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                             const std::uint8_t* anchored, bool scale, Workspace<T>& w) {
+                             const std::uint8_t* anchored, double softness, bool scale, Workspace<T>& w) {
   using std::abs;
   PairColumns<T> c;
   for (const Contact& contact : m.contacts) {
@@ -73,8 +73,9 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     V6<T> wrench = V6<T>::Zero();
     // The blocks of K and D: rows moment, force; columns turn, shift.
     M3<T> k_mm, k_mf, k_fm, k_ff, d_mm, d_mf, d_fm, d_ff;
-    const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud,
-                                                     touch_rule<T>(m, contact, params, anchors, anchored), wrench,
+    TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
+    rule.softness = softness;
+    const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud, rule, wrench,
                                                      {&k_mm, &k_mf, &k_fm, &k_ff, &d_mm, &d_mf, &d_fm, &d_ff});
     if (!touching) {
       if (!is_finite(frame.check())) w.residual[0] = frame.check();
@@ -84,7 +85,7 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
     for (int i = 0; i < c.n; ++i) {
       const T force_i = c.s[i].dot(wrench);
       w.residual[contact.pair.dof[i]] -= h * force_i;
-      if (scale) w.scale[contact.pair.dof[i]] += h * abs(force_i);
+      if (scale) w.forces[contact.pair.dof[i]] += h * abs(force_i);
     }
     if constexpr (derivatives) {
       M6<T> k, d;

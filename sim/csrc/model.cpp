@@ -342,6 +342,7 @@ Model ModelSpec::build() const {
   model.max_iterations = max_iterations;
   model.max_halvings = max_halvings;
   model.polish = polish;
+  model.max_step_iterations = max_step_iterations;
   if (integrator != "bdf1" && integrator != "bdf2") refuse("integrator '" + integrator + "' is not bdf1 or bdf2");
   model.nh = integrator == "bdf2" ? 2 * model.nv + 1 : 0;
   const int nv = model.nv;

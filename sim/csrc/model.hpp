@@ -156,6 +156,7 @@ struct Model {
   double step = 5e-3;       // h [s]
   double tolerance = 1e-7;  // Newton: residual relative to the forces at work
   int max_iterations = 50;
+  int max_step_iterations = 1000;  // of all attempts and substeps of one step
   int max_halvings = 6;
   int polish = 0;  // Newton iterations after it has converged
 
@@ -169,6 +170,7 @@ class ModelSpec {
   double step = 5e-3;
   double tolerance = 1e-7;
   int max_iterations = 50;
+  int max_step_iterations = 1000;  // of all attempts and substeps of one step
   int max_halvings = 6;
   int polish = 0;
   std::string integrator = "bdf1";

@@ -194,6 +194,7 @@ struct TouchRule {
   T rolling_radius;              // 0: the points themselves touch
   const V3<T>* anchors;          // of this cloud against this shape
   const std::uint8_t* anchored;  // both unused under the viscous law
+  double softness = 1;           // share of k_t and k_s that is at work
 };
 
 template <class T>
@@ -202,7 +203,15 @@ GELFLOW_INLINE PointLaw<Pack<T>> weighted(const TouchRule<T>& rule, const Pack<T
   const T* p = rule.params;
   const bool elastic = rule.law == FrictionLaw::elastic;
   const L none(0.0);  // rounding: set where it is needed
-  return {weight * L(p[0]), weight * L(p[1]), L(p[2]), weight * L(p[3]), weight * L(p[4]), none, rule.damping, elastic};
+  const L share(T(rule.softness));
+  return {weight * L(p[0]),
+          share * weight * L(p[1]),
+          L(p[2]),
+          weight * L(p[3]),
+          share * weight * L(p[4]),
+          none,
+          rule.damping,
+          elastic};
 }
 
 // Calls f(touching) for all points that are inside the shape, a pack at a time.

@@ -9,6 +9,7 @@
 #pragma once
 
 #include <algorithm>
+#include <bit>
 #include <cstring>
 
 #include "contact.hpp"
@@ -39,12 +40,13 @@ struct StepStart {
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
+  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
 };
 
 struct StepReport {
   Status status = Status::ok;
   int iterations = 0;  // Newton iterations, substeps included
-  int halvings = 0;    // the step was taken as 2^halvings substeps
+  int halvings = 0;    // of the step, to get the shortest of its substeps
 };
 
 // Below this speed dry friction in a joint is viscous [m/s or rad/s].
@@ -71,7 +73,8 @@ struct ActuatorPull {
   int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
 };
 template <class T>
-ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const T* q, const T* v) {
+ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const T* q, const T* v,
+                              double softness = 1) {
   const T gear = p[0], kp = p[1], kd = p[2];
   ActuatorPull<T> pull{T(0), T(1), T(0), T(0), 0};
   T bias = T(0);
@@ -98,6 +101,11 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
   }
   pull.force =
       gain * control + bias + pull.by_length * (gear * q[actuator.q]) + pull.by_speed * (gear * v[actuator.dof]);
+  if (softness < 1) {
+    pull.force *= T(softness);
+    pull.by_length *= T(softness);
+    pull.by_speed *= T(softness);
+  }
   if (pull.force < p[3] || pull.force > p[4]) {
     const bool below = pull.force < p[3];
     return {below ? p[3] : p[4], T(0), T(0), T(0), pull.clipped | (below ? 4 : 8)};
@@ -107,9 +115,10 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
 
 // Joint-space forces: damping, friction, springs, limits, actuators. Adds −h f and its derivatives to the residual.
 template <bool derivatives, class T>
-void subtract_joint_forces(const Model& m, const T* params, const T& h, const T* q, const T* v, const T* u, bool scale,
-                           Workspace<T>& w) {
+void subtract_joint_forces(const Model& m, const T* params, const T& h, const T* q, const T* v, const T* u,
+                           double softness, bool scale, Workspace<T>& w) {
   using std::abs;
+  const T creep(friction_creep / softness);
   for (const Joint& joint : m.joints) {
     const T* p = params + joint.param;
     const T damping = p[0], armature = p[1], stiffness = p[2], rest = p[3];
@@ -117,11 +126,11 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
       w.residual[k] += h * damping * v[k];
       if constexpr (derivatives) w.by_v(k, k) += h * damping;
       if (p[8] != T(0)) {  // dry friction: viscous below this speed, constant above
-        const bool slides = abs(v[k]) > T(friction_creep);
-        const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / T(friction_creep) * v[k]);
+        const bool slides = abs(v[k]) > creep;
+        const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / creep * v[k]);
         w.residual[k] += h * force;
-        if (scale) w.scale[k] += h * p[8];
-        if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / T(friction_creep));
+        if (scale) w.forces[k] += h * p[8];
+        if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / creep);
       }
       if (armature != T(0)) {
         w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
@@ -148,9 +157,9 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
     const T* p = params + actuator.param;
     const T gear = p[0];
     const int k = actuator.dof;
-    const ActuatorPull<T> pull = actuator_pull<T>(actuator, p, u[a], q, v);
+    const ActuatorPull<T> pull = actuator_pull<T>(actuator, p, u[a], q, v, softness);
     w.residual[k] -= h * gear * pull.force;
-    if (scale) w.scale[k] += h * abs(gear * pull.force);
+    if (scale) w.forces[k] += h * abs(gear * pull.force);
     if constexpr (derivatives) {
       w.by_u[a] = -h * gear * pull.by_u;
       w.by_q(k, k) -= h * gear * gear * pull.by_length;
@@ -159,8 +168,8 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
   }
 }
 
-// Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.scale, the size of
-// the forces at work, which Newton's tolerance refers to.
+// Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.forces, the impulses at
+// work there, which Newton's tolerance refers to (they take the mass matrix of the last evaluation with derivatives).
 template <bool derivatives, class T>
 void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, bool scale, Workspace<T>& w) {
   const T& h = from.h;
@@ -182,10 +191,10 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   add_inverse_dynamics<derivatives, T>(m, params, h, w);
   if constexpr (derivatives) w.by_v += w.mass;
   if (scale) {
-    for (int k = 0; k < m.nv; ++k) w.scale[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
+    for (int k = 0; k < m.nv; ++k) w.forces[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
-  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, scale, w);
-  subtract_contact_forces<derivatives, T>(m, params, h, from.anchors, from.anchored, scale, w);
+  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.softness, scale, w);
+  subtract_contact_forces<derivatives, T>(m, params, h, from.anchors, from.anchored, from.softness, scale, w);
   if constexpr (derivatives) {
     w.tangent = h * w.by_q;
     times_position_by_increment<T>(m, w.increment, w.tangent);
@@ -193,28 +202,38 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   }
 }
 
+// Size of the residual relative to impulses.
 template <class T>
-double merit(const Workspace<T>& w) {
-  double worst = 0;
-  for (Eigen::Index k = 0; k < w.residual.size(); ++k) {
-    const double value = real_part(w.residual[k]) / std::max<double>(real_part(w.scale[k]), 1e-30);
+double relative(const VX<T>& residual, const VX<T>& impulses) {
+  double sum = 0;
+  for (Eigen::Index k = 0; k < residual.size(); ++k) {
+    const double value = real_part(residual[k]) / std::max<double>(real_part(impulses[k]), 1e-30);
     if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
-    worst += value * value;
+    sum += value * value;
   }
-  return std::sqrt(worst);
+  return std::sqrt(sum);
 }
 
-// Whether the residual may be rounding errors alone: those of the forces that displacements of one rounding unit make.
+// Whether the residual may be rounding errors alone: those of the impulses, of the momenta (whose moments are taken about
+// the world's origin), and of the forces that displacements of one rounding unit make.
 template <class T>
-bool at_rounding_floor(const Model& m, const Workspace<T>& w) {
+bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
+                       const Workspace<T>& w) {
   using std::abs;
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
-  double reach = 0;
+  double reach = 0, mass = 0, speed = 0, spin = 0;
   for (const T& x : w.q) reach = std::max(reach, std::abs(real_part(x)));
+  for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
+  const auto both = [&](int k) { return std::abs(real_part(v[k])) + std::abs(real_part(from.v_star[k])); };
+  for (int k = 0; k < m.nv; ++k) (m.angular[k] ? spin : speed) = std::max(m.angular[k] ? spin : speed, both(k));
+  const double momentum = mass * (speed + reach * spin) * (1 + real_part(from.h) * spin);
   for (int i = 0; i < m.nv; ++i) {
-    double stiffness = 0;
-    for (int j = 0; j < m.nv; ++j) stiffness += std::abs(real_part(w.by_q(i, j)));
-    const double bound = unit * (stiffness * reach + real_part(w.scale[i]));
+    double own = m.angular[i] ? reach * momentum : momentum, stiffness = 0;
+    for (int j = 0; j < m.nv; ++j) {
+      stiffness += std::abs(real_part(w.by_q(i, j)));
+      own += std::abs(real_part(w.mass(i, j))) * both(j);
+    }
+    const double bound = unit * (stiffness * reach + own + real_part(w.forces[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
   }
   return true;
@@ -226,57 +245,98 @@ bool at_rounding_floor(const Model& m, const Workspace<T>& w) {
 // The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
 // close to piecewise linear, and a full step into the right piece often makes the residual larger before the next one
 // solves it, while a search along the line would stop at the first edge. Where that does not lead home, the search
-// starts from the best point seen.
+// starts from the best point seen. Where the search gets stuck at an edge, the derivatives just past it say where to go.
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
-  constexpr int full_steps = 8;
-  const double tolerance = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  constexpr int full_steps = 6, patience = 6;
+  const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
   bool fresh = false;  // w holds the derivatives at v
-  const auto measure = [&](bool derivatives, bool scale) {
+  const auto measure = [&](bool derivatives) {
     if (derivatives) {
-      evaluate<true, T>(m, params, from, v.data(), scale, w);
+      evaluate<true, T>(m, params, from, v.data(), true, w);
     } else {
-      evaluate<false, T>(m, params, from, v.data(), scale, w);
+      evaluate<false, T>(m, params, from, v.data(), true, w);
     }
     fresh = derivatives;
-    return merit(w);
+    return relative(w.residual, w.scale);
   };
-  double size = measure(true, true), best = size;
+  measure(true);
+  w.scale = w.forces;  // what residuals are compared by
+  double size = relative(w.residual, w.scale), best = size, before = size, mark = size;
   if (!std::isfinite(size)) return Status::not_finite;
   w.best = v;
   bool settled = false;  // no better residual can be had
-  for (int k = 0; k < m.max_iterations; ++k) {
-    const bool converged = settled || size <= tolerance;
+  bool past = false;     // v lies just past an edge; the search goes on from w.start before it
+  for (int k = 0; k <= m.max_iterations; ++k) {
+    const bool converged = settled || relative(w.residual, w.forces) <= tolerance;
     if (converged && polish-- <= 0) return Status::ok;
-    if (!fresh) size = measure(true, false);
+    if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
+    if (!fresh) size = measure(true);
     w.lu.compute(w.tangent);
     w.direction = w.lu.solve(w.residual);
-    w.start = v;
+    if (past) {
+      w.direction += w.start - v;
+    } else {
+      w.start = v;
+      before = size;
+    }
     ++iterations;
-    const double before = size;
+    const bool search = k >= full_steps && !converged;
     double fraction = 1;
-    for (int tries = 0;; ++tries) {
+    bool better = false;
+    for (int tries = 0; tries < 13; ++tries, fraction *= 0.5) {
       v = w.start - w.direction * T(fraction);
-      size = measure(k == 0, false);  // the first update is seldom the last: its derivatives will be needed
-      if (converged || size <= (1 - 1e-4 * fraction) * before) break;
-      if (std::isfinite(size) && at_rounding_floor<T>(m, w)) {
-        settled = true;
-        break;
-      }
-      if (std::isfinite(size) && k < full_steps) break;
-      if (tries == 12) return Status::newton;  // a kink that Newton can not cross
-      fraction *= 0.5;
+      size = measure(k == 0);  // the first update is seldom the last: its derivatives will be needed
+      better = size <= (1 - 1e-4 * fraction) * before;
+      if (better || converged) break;
+      settled = std::isfinite(size) && at_rounding_floor<T>(m, params, from, v, w);
+      if (settled || (std::isfinite(size) && !search)) break;
     }
     if (size < best) {
       best = size;
       w.best = v;
-    } else if (k + 1 == full_steps && !settled && size > tolerance) {
+    } else if (k + 1 == full_steps && !settled) {
       v = w.best;
-      size = measure(true, false);
+      mark = best;
+      size = measure(true);
+    }
+    if (!search || settled) continue;
+    if (!better && (past || !std::isfinite(size))) break;
+    past = !better;
+    if ((k - full_steps) % patience == patience - 1) {
+      if (best > 0.5 * mark) break;
+      mark = best;
     }
   }
-  return settled || size <= tolerance ? Status::ok : Status::newton;
+  return Status::newton;
+}
+
+// Where Newton did not converge. Mostly something saturates: points stick below a tiny speed and slip above it, a servo
+// follows within a tiny error and pulls with its limit beyond. Full steps jump back and forth over that narrow range,
+// and a search gets stuck beside it. So k_t, k_s and the gains start soft, which makes the range wide, and grow to what
+// they are, each solution being the next one's start.
+template <class T>
+Status newton_from_softer(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
+                          int& iterations, Workspace<T>& w) {
+  constexpr double softest = 1e-8, least_growth = 1.3;
+  StepStart<T> soft = from;
+  VX<T> reached = v;
+  double solved = 0, growth = 100;
+  for (soft.softness = softest;;) {
+    v = reached;
+    const Status status = newton<T>(m, params, soft, soft.softness < 1 ? 0 : polish, v, iterations, w);
+    if (status == Status::ok) {
+      if (soft.softness == 1) return status;
+      reached = v;
+      solved = soft.softness;
+    } else {
+      growth = std::sqrt(growth);
+      if (solved == 0 || growth < least_growth) return status;
+    }
+    soft.softness = std::min(1.0, solved * growth);
+  }
 }
 
 // One environment's memory for steps: the state to fall back on, and the state in the making.
@@ -315,12 +375,13 @@ struct StepMemory {
   }
 };
 
-// How a substep of length h, one of `count`, starts from state s: β, v* and γ δ, which are kept in `memory`.
+// How a substep of length h, `whole` or a part of the step, starts from state s: β, v* and γ δ, which are kept in `memory`.
 template <class T>
-StepStart<T> start_of(const Model& m, const T& h, int count, const StateView<T>& s, const T* u, StepMemory<T>& memory) {
+StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
+                      StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
   StepStart<T> from{h, s.q, memory.v_star.data(), nullptr, s.anchors, s.anchored, u};
-  if (m.nh == 0 || count > 1 || !(s.history[2 * m.nv] > T(0))) return from;
+  if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
   for (int k = 0; k < m.nv; ++k) {
     memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
     memory.shift[k] = s.history[k] / T(3);
@@ -336,46 +397,58 @@ struct NoObserver {
   void operator()(const A&...) const {}
 };
 
-// Takes `count` substeps of length h. On failure the state is left in the middle: the caller restores it.
+// One substep of length h from state s, which moves on only if the substep succeeds. `whole`: it is the step itself, not
+// a part of it.
 template <class T, class Observer>
-Status substeps(const Model& m, const T* params, const T& h, int count, const T* u, int polish, const StateView<T>& s,
-                StepMemory<T>& memory, int& iterations, Observer&& accepted) {
-  for (int i = 0; i < count; ++i) {
-    const StepStart<T> from = start_of<T>(m, h, count, s, u, memory);
+Status substep(const Model& m, const T* params, const T& h, bool whole, const T* u, int polish, const StateView<T>& s,
+               StepMemory<T>& memory, int& iterations, Observer&& accepted) {
+  const StepStart<T> from = start_of<T>(m, h, whole, s, u, memory);
+  memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
+  Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+  if (status != Status::ok) {
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-    const Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
-    if (status != Status::ok) return status;
-    accepted(from, memory);
-    advance_contact_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-    advance_marker_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-    if (m.nh > 0) {
-      std::fill(s.history, s.history + m.nh, T(0));
-      if (count == 1) {
-        std::copy(memory.work.increment.data(), memory.work.increment.data() + m.nv, s.history);
-        std::copy(s.v, s.v + m.nv, s.history + m.nv);
-        s.history[2 * m.nv] = T(1);
-      }
-    }
-    std::copy(memory.work.q.data(), memory.work.q.data() + m.nq, s.q);
-    std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
+    status = newton_from_softer<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
   }
+  if (status != Status::ok) return status;
+  accepted(from, memory);
+  advance_contact_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_marker_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  if (m.nh > 0) {
+    std::fill(s.history, s.history + m.nh, T(0));
+    if (whole) {
+      std::copy(memory.work.increment.data(), memory.work.increment.data() + m.nv, s.history);
+      std::copy(s.v, s.v + m.nv, s.history + m.nv);
+      s.history[2 * m.nv] = T(1);
+    }
+  }
+  std::copy(memory.work.q.data(), memory.work.q.data() + m.nq, s.q);
+  std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
   return Status::ok;
 }
 
-// One step of length m.step. Where Newton does not converge the step is taken as 2, 4, … substeps; where even the
-// shortest fail, the state is left as it was and the report says why.
+// One step of length m.step. Where Newton does not converge, a substep of half the length is tried, down to
+// step / 2^max_halvings, and after two that succeed one of twice the length again. Where even the shortest fails, the
+// state is left as it was and the report says why.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 Observer&& accepted = {}) {
   StepReport report;
   memory.keep(m, s);
-  for (; report.halvings <= m.max_halvings; ++report.halvings) {
-    const int count = 1 << report.halvings;
-    report.status = substeps<T>(m, params, T(m.step / count), count, u, polish, s, memory, report.iterations, accepted);
-    if (report.status == Status::ok) return report;
-    memory.give_back(m, s);
+  const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep
+  for (int at = 0, length = whole; at < whole;) {
+    const T h = length == whole ? T(m.step) : T(m.step * length / whole);
+    report.status = substep<T>(m, params, h, length == whole, u, polish, s, memory, report.iterations, accepted);
+    if (report.status == Status::ok) {
+      at += length;
+      if (at % (2 * length) == 0 && at + 2 * length <= whole) length *= 2;
+    } else if (length > 1 && report.iterations < m.max_step_iterations) {
+      length /= 2;
+      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(whole / length)));
+    } else {
+      memory.give_back(m, s);
+      return report;
+    }
   }
-  --report.halvings;
   return report;
 }
 

@@ -27,7 +27,8 @@ struct Workspace {
         q_missing(m.nv),
         v_missing(m.nv),
         residual(m.nv),
-        scale(m.nv),
+        forces(m.nv),
+        scale(VX<T>::Ones(m.nv)),
         increment(m.nv),
         update(m.nv),
         trial(m.nv),
@@ -53,7 +54,7 @@ struct Workspace {
   std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
 
   // The step's residual g and its derivatives.
-  VX<T> residual, scale;
+  VX<T> residual, forces, scale;
   VX<T> increment;               // q_t = q_{t-1} ⊕ increment
   VX<T> update, trial;           // accelerations; v_t − v*
   VX<T> direction, start, best;  // Newton's
