@@ -214,24 +214,26 @@ double relative(const VX<T>& residual, const VX<T>& impulses) {
   return std::sqrt(sum);
 }
 
-// Whether the residual may be rounding errors alone: those of the impulses, of the momenta (whose moments are taken about
-// the world's origin), and of the forces that displacements of one rounding unit make.
+// Whether the residual may be rounding errors alone: those of the impulses, of the momenta before the step (whose moments
+// are taken about the world's origin), and of what one rounding unit of every position and velocity makes.
 template <class T>
 bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
                        const Workspace<T>& w) {
   using std::abs;
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
   double reach = 0, mass = 0, speed = 0, spin = 0;
-  for (const T& x : w.q) reach = std::max(reach, std::abs(real_part(x)));
+  for (int k = 0; k < m.nq; ++k) reach = std::max(reach, std::abs(real_part(from.q0[k])));
   for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
-  const auto both = [&](int k) { return std::abs(real_part(v[k])) + std::abs(real_part(from.v_star[k])); };
-  for (int k = 0; k < m.nv; ++k) (m.angular[k] ? spin : speed) = std::max(m.angular[k] ? spin : speed, both(k));
+  for (int k = 0; k < m.nv; ++k) {
+    double& fastest = m.angular[k] ? spin : speed;
+    fastest = std::max(fastest, std::abs(real_part(from.v_star[k])));
+  }
   const double momentum = mass * (speed + reach * spin) * (1 + real_part(from.h) * spin);
   for (int i = 0; i < m.nv; ++i) {
     double own = m.angular[i] ? reach * momentum : momentum, stiffness = 0;
     for (int j = 0; j < m.nv; ++j) {
       stiffness += std::abs(real_part(w.by_q(i, j)));
-      own += std::abs(real_part(w.mass(i, j))) * both(j);
+      own += std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
     }
     const double bound = unit * (stiffness * reach + own + real_part(w.forces[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
