@@ -5,6 +5,7 @@
 #include <pybind11/stl.h>
 
 #include "batch.hpp"
+#include "shapes.hpp"
 
 namespace py = pybind11;
 using namespace gelflow;
@@ -53,6 +54,45 @@ std::vector<V3<double>> points_of(const Array<double>& array, const char* name) 
   std::vector<V3<double>> points;
   for (py::ssize_t i = 0; i < array.shape(0); ++i) points.emplace_back(array.at(i, 0), array.at(i, 1), array.at(i, 2));
   return points;
+}
+
+std::shared_ptr<const DistanceGrid> grid_of(const V3<double>& origin, double spacing,
+                                            const std::optional<Array<float>>& coefficients) {
+  if (!coefficients) return nullptr;
+  if (coefficients->ndim() != 3) throw std::invalid_argument("coefficients must have shape (x, y, z)");
+  std::array<int, 3> cells;
+  for (int a = 0; a < 3; ++a) cells[a] = static_cast<int>(coefficients->shape(a)) - 3;
+  const float* data = coefficients->data();
+  return std::make_shared<DistanceGrid>(cells, origin, spacing, std::vector<float>(data, data + coefficients->size()));
+}
+
+// Distance, normal and curvature at points of a shape's frame, by the packs that the simulator uses.
+py::tuple distance_at(const Model& m, const std::string& name, const Array<double>& points) {
+  using L = Pack<double>;
+  constexpr int width = pack_width<double>;
+  const auto found =
+      std::find_if(m.shapes.begin(), m.shapes.end(), [&](const Shape& shape) { return shape.name == name; });
+  if (found == m.shapes.end()) throw std::invalid_argument("no shape '" + name + "'");
+  const std::vector<V3<double>> x = points_of(points, "points");
+  const auto n = static_cast<py::ssize_t>(x.size());
+  py::array_t<double> d(n), normal({n, py::ssize_t{3}}), hessian({n, py::ssize_t{3}, py::ssize_t{3}});
+  double *to_d = d.mutable_data(), *to_normal = normal.mutable_data(), *to_hessian = hessian.mutable_data();
+  for (py::ssize_t begin = 0; begin < n; begin += width) {
+    Vec3<L> at;
+    for (int k = 0; k < width; ++k) set_lane3<double>(at, k, x[std::min(begin + k, n - 1)]);
+    Distance<L> found_at;
+    distance<L>(found->kind, m.param_defaults.data() + found->size, found->grid.get(), at, found_at);
+    if (found_at.bend == Bend::flat) found_at.hessian = zero33<L>();
+    for (int k = 0; k < width && begin + k < n; ++k) {
+      const py::ssize_t i = begin + k;
+      to_d[i] = lane(found_at.d, k);
+      for (int a = 0; a < 3; ++a) {
+        to_normal[3 * i + a] = lane(found_at.n[a], k);
+        for (int b = 0; b < 3; ++b) to_hessian[9 * i + 3 * a + b] = lane(found_at.hessian.row[a][b], k);
+      }
+    }
+  }
+  return py::make_tuple(d, normal, hessian);
 }
 
 template <class T>
@@ -276,8 +316,16 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
            py::arg("axis"), py::arg("damping") = 0., py::arg("armature") = 0., py::arg("stiffness") = 0.,
            py::arg("springref") = 0., py::arg("lower") = -inf, py::arg("upper") = inf, py::arg("limit_stiffness") = 0.,
            py::arg("limit_damping") = 0., py::arg("ref") = 0., py::arg("frictionloss") = 0.)
-      .def("add_shape", &ModelSpec::add_shape, py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"),
-           py::arg("quat"), py::arg("size"))
+      .def(
+          "add_shape",
+          [](ModelSpec& s, const std::string& name, int body, const std::string& kind, const V3<double>& pos,
+             const V4<double>& quat, const V3<double>& size, double rounding, const V3<double>& origin, double spacing,
+             const std::optional<Array<float>>& coefficients) {
+            return s.add_shape(name, body, kind, pos, quat, size, rounding, grid_of(origin, spacing, coefficients));
+          },
+          py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"), py::arg("quat"), py::arg("size"),
+          py::arg("rounding") = 0., py::arg("origin") = V3<double>(0, 0, 0), py::arg("spacing") = 0.,
+          py::arg("coefficients") = py::none())
       .def(
           "add_points",
           [](ModelSpec& s, const std::string& name, int body, const Array<double>& points,
@@ -333,6 +381,8 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def_readonly("q0", &Model::q0)
       .def_readonly("param_names", &Model::param_names)
       .def_readonly("param_defaults", &Model::param_defaults)
+      .def("distance", &distance_at, py::arg("shape"), py::arg("points"),
+           "Distance (n), normal (n, 3) and curvature (n, 3, 3) of a shape at points (n, 3) of its frame.")
       .def_property_readonly("body_names", [](const Model& m) { return names(m.bodies); })
       .def_property_readonly("joint_names", [](const Model& m) { return names(m.joints); })
       .def_property_readonly("contact_names", [](const Model& m) { return names(m.contacts); })
