@@ -29,6 +29,7 @@ CELLS_PER_ROUNDING = 2  # at least
 _VERSION = 1  # of how a grid is built: with it old grids in the cache are passed over
 _MARGIN = 3  # cells around the mesh
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # of a cell
+_LOOKS = 4
 _PUSHES, _SETTLED = 60, 1e-9  # rounds at most; [m] that none of a round's moves is longer than
 _PAD = 8  # nodes beyond those, straight on: the filter forgets the end of the grid on the way
 
@@ -117,13 +118,19 @@ def _nodes(origin: Array, spacing: float, counts: Array) -> Array:
 
 
 def _opened(
-    name: str, nodes: Array, distances: Array, nearest: Array, counts: NDArray[np.int64], spacing: float, rounding: float
+    name: str,
+    nodes: Array,
+    distances: Array,
+    nearest: Array,
+    counts: NDArray[np.int64],
+    spacing: float,
+    rounding: float,
 ) -> Array:
     """Distances at the nodes to the part of the solid that a ball of this radius reaches: edges and corners are round.
 
     Where the ball's centre can be, the inner solid, the distance is as it was; elsewhere it is the distance to the
-    inner solid less the rounding. The inner solid's surface is first triangulated, which cuts its edges off. Where that
-    matters the nearest point is then found anew on what the distances at the eight nodes about it say exactly.
+    inner solid less the rounding. The inner solid's surface is first triangulated, which cuts its edges off; then the
+    nearest point is found anew from what the distances at the eight nodes about it say.
     """
     from skimage import measure
 
@@ -136,15 +143,17 @@ def _opened(
     outside = np.flatnonzero(distances > -rounding)
     x = nodes[outside]
     y = nearest_points(inner, x, name)
-    close = np.linalg.norm(x - y, axis=1) < rounding + 2 * spacing
     normals = (nodes - nearest) / np.where(distances == 0, 1, distances)[:, None]
     levels = distances - (normals * nodes).sum(1)  # the distance is nearly normal · point + level
-    for _ in range(2):
-        first = np.floor((y[close] - nodes[0]) / spacing).astype(int).clip(0, counts - 2)
+    start, moves = y.copy(), np.zeros(len(x))
+    for _ in range(_LOOKS):  # a cell at a time: the eight do not see what is further away
+        first = np.floor((y - nodes[0]) / spacing).astype(int).clip(0, counts - 2)
         about = np.ravel_multi_index(tuple((first[:, None] + _CORNERS).T), tuple(counts)).T
-        moved = _into_half_spaces(x[close], normals[about], -rounding - levels[about])
-        small = np.linalg.norm(moved - y[close], axis=1) < 2 * spacing
-        y[np.flatnonzero(close)[small]] = moved[small]
+        way = _into_half_spaces(x, normals[about], -rounding - levels[about]) - y
+        moves = np.linalg.norm(way, axis=1) / spacing
+        y += way / np.maximum(moves, 1)[:, None]
+    lost = (moves > 0.5) | (np.linalg.norm(y - start, axis=1) > 2 * spacing)
+    y[lost] = start[lost]
     result = distances.copy()
     result[outside] = np.linalg.norm(x - y, axis=1) - rounding
     return result

@@ -23,9 +23,9 @@ FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 ENDS = ("-z", "+z")
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # powers of 1/1.3247…: they fill a square evenly
-_PIECES = 16  # per point of a mesh, at least
+_PIECES = 24  # per point of a mesh, at least
 _LEAST_PIECES = 20_000
-_MOVES = 12
+_MOVES = 8
 
 Array = NDArray[np.float64]
 
@@ -199,8 +199,8 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
     pieces = a + u[:, None] * (b - a) + v[:, None] * (c - a)
     space = np.column_stack([pieces / np.sqrt(whole / count), normals[face]])
-    chosen = ((np.arange(count) + 0.5) * number / count).astype(int)
-    tree = cKDTree(space)
+    tree = cKDTree(space)  # in its order neighbours are near
+    chosen = tree.indices[((np.arange(count) + 0.5) * number / count).astype(int)]
     for _ in range(_MOVES):
         _, owner = cKDTree(space[chosen]).query(space)
         middle = np.stack([np.bincount(owner, along, count) for along in space.T], axis=-1)

@@ -284,9 +284,7 @@ GRID_FAULTS: list[tuple[dict[str, Any], str]] = [
 @pytest.mark.parametrize(("numbers", "says"), GRID_FAULTS, ids=[says for _, says in GRID_FAULTS])
 def test_a_wrong_grid_is_refused(numbers: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        _core.ModelSpec().add_shape(
-            "s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers}
-        )
+        _core.ModelSpec().add_shape("s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers})
 
 
 @pytest.mark.parametrize(("kind", "rounding"), list(itertools.product(ROUNDED, (-1e-3, 0.05, float("nan")))))
