@@ -17,7 +17,7 @@ from gelflow.errors import UsageError
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-_CHUNK = 50_000  # points whose distances are asked for at once
+_CHUNK = 50_000  # points whose distances are asked for at once, or more where the mesh is large: each time it is sorted
 _PATIENCE = 2.0  # [s] that pass before a bar is shown
 
 
@@ -78,11 +78,12 @@ def signed_distances(mesh: TriangleMesh, points: Array, name: str) -> tuple[Arra
     Raises UsageError when libigl is not installed, and where parts of the mesh overlap.
     """
     igl = _igl(name)
+    far = 1e-3 * float(np.ptp(mesh.vertices, axis=0).max())  # on the surface itself turns may be anything
     parts = []
-    for some in with_progress(f"distances to mesh {name}", _chunks(points)):
+    for some in with_progress(f"distances to mesh {name}", _chunks(points, mesh)):
         squared, _, nearest = igl.point_mesh_squared_distance(some, mesh.vertices, mesh.faces)
         turns = igl.fast_winding_number(mesh.vertices, mesh.faces, some)  # about: 1 inside, 0 outside
-        if (turns > 1.5).any():
+        if (turns[squared > far**2] > 1.5).any():
             raise UsageError(f"mesh {name!r}: its parts overlap; unite them to one surface")
         parts.append((np.where(turns > 0.5, -1.0, 1.0) * np.sqrt(squared), nearest))
     distances, nearest_points = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -90,9 +91,9 @@ def signed_distances(mesh: TriangleMesh, points: Array, name: str) -> tuple[Arra
 
 
 def nearest_points(mesh: TriangleMesh, points: Array, name: str) -> Array:
-    """Of the surface of any mesh, those nearest to points (n, 3) [m], shape (n, 3). Raises UsageError without libigl."""
+    """The points of a mesh nearest to points (n, 3) [m], shape (n, 3). Raises UsageError without libigl."""
     igl = _igl(name)
-    chunks = with_progress(f"rounding of mesh {name}", _chunks(points))
+    chunks = with_progress(f"rounding of mesh {name}", _chunks(points, mesh))
     return np.concatenate([igl.point_mesh_squared_distance(some, mesh.vertices, mesh.faces)[2] for some in chunks])
 
 
@@ -110,8 +111,8 @@ def with_progress(what: str, items: Sequence[T]) -> Iterator[T]:
             bar.update(task, advance=1, visible=time.monotonic() - begin > _PATIENCE)
 
 
-def _chunks(points: Array) -> list[Array]:
-    return np.array_split(np.ascontiguousarray(points), max(1, -(-len(points) // _CHUNK)))
+def _chunks(points: Array, mesh: TriangleMesh) -> list[Array]:
+    return np.array_split(np.ascontiguousarray(points), max(1, -(-len(points) // max(_CHUNK, 2 * len(mesh.faces)))))
 
 
 def _igl(name: str) -> Any:

@@ -12,6 +12,7 @@ import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +139,8 @@ def _opened(
         raise UsageError(
             f"mesh {name!r}: a rounding of {rounding:g} m leaves nothing of it; it must be below half its thickness"
         )
-    vertices, faces, *_ = measure.marching_cubes(distances.reshape(counts), -rounding, spacing=(spacing,) * 3)
+    marching_cubes: Any = measure.marching_cubes
+    vertices, faces, *_ = marching_cubes(distances.reshape(counts), -rounding, spacing=(spacing,) * 3)
     inner = TriangleMesh(vertices.astype(float) + nodes[0], faces.astype(np.int64))
     outside = np.flatnonzero(distances > -rounding)
     x = nodes[outside]

@@ -33,6 +33,37 @@ def sphere(radius: float, count: int = 4000) -> TriangleMesh:
     return hull(radius * np.column_stack([around * np.cos(angle), around * np.sin(angle), height]))
 
 
+def cylinder(radius: float, half_length: float, around: int = 720) -> TriangleMesh:
+    """A prism about z with its corners on a cylinder, in triangles that are not much longer than wide."""
+    step = 2 * np.pi * radius / around
+    rings, rows = round(radius / step / 4), round(2 * half_length / step / 4) + 1
+    inwards = radius * np.arange(1, rings + 1) / rings
+    heights = np.linspace(-half_length, half_length, rows)
+    profile = np.concatenate(  # (distance from the axis, height), from the middle of one end to that of the other
+        [
+            np.column_stack([inwards[:-1], np.full(rings - 1, -half_length)]),
+            np.column_stack([np.full(rows, radius), heights]),
+            np.column_stack([inwards[-2::-1], np.full(rings - 1, half_length)]),
+        ]
+    )
+    n, turn = len(profile), 2 * np.pi * np.arange(around) / around
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    ring = profile[:, None, :1] * circle
+    corners = np.concatenate([ring, np.broadcast_to(profile[:, None, 1:], (n, around, 1))], axis=-1).reshape(-1, 3)
+    vertices = np.concatenate([corners, [[0, 0, -half_length], [0, 0, half_length]]])
+    row, i = np.meshgrid(np.arange(n - 1), np.arange(around), indexing="ij")
+    a, b = row * around + i, row * around + (i + 1) % around
+    quads = [np.stack([a, b, b + around], axis=-1), np.stack([a, b + around, a + around], axis=-1)]
+    first, second = np.arange(around), np.roll(np.arange(around), -1)
+    low, high, top = n * around, n * around + 1, (n - 1) * around
+    ends = [
+        np.stack([second, first, np.full(around, low)], axis=-1),
+        np.stack([top + first, top + second, np.full(around, high)], axis=-1),
+    ]
+    faces = np.concatenate([*(q.reshape(-1, 3) for q in quads), *ends])
+    return TriangleMesh(vertices, faces.astype(np.int64))
+
+
 def bracket(arm: float, thick: float, depth: float) -> TriangleMesh:
     """An L: two arms from the origin along x and y, its outline extruded from −depth/2 to depth/2 along z."""
     outline = np.array([[0, 0], [arm, 0], [arm, thick], [thick, thick], [thick, arm], [0, arm]], dtype=float)

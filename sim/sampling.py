@@ -208,7 +208,9 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
         chosen = _distinct(chosen, number)
     _, owner = cKDTree(space[chosen]).query(space)
     shares = np.stack([np.bincount(owner, share, count) for share in (normals[face] ** 2).T], axis=-1)
-    return pieces[chosen], shares * (whole / number)
+    points: Array = pieces[chosen]
+    areas_across: Array = shares * (whole / number)
+    return points, areas_across
 
 
 def _distinct(chosen: NDArray[np.int64], number: int) -> NDArray[np.int64]:

@@ -68,7 +68,8 @@ def shape_of(kind: str) -> Any:
 def inside_points(kind: str, count: int, seed: int = 0) -> Array:
     reach = (RADIUS,) * 3 if kind == "grid" else (0.02, 0.02, 0.03) if kind == "cylinder" else ROUNDED[kind]
     points = np.random.default_rng(seed).uniform(-1.05, 1.05, (count, 3)) * reach
-    return points[np.linalg.norm(points, axis=1) > 2e-3]  # not near a sphere's centre, where all bends
+    kept: Array = points[np.linalg.norm(points, axis=1) > 2e-3]
+    return kept  # not near a sphere's centre, where all bends
 
 
 def differenced(model: Any, points: Array, step: float = 1e-7) -> tuple[Array, Array]:

@@ -182,11 +182,11 @@ def test_what_a_grid_can_not_show_is_refused() -> None:
     )
     with pytest.raises(UsageError, match="its parts overlap"):
         build_grid(moved, "m", resolution=8)
-    with pytest.raises(UsageError, match="thinner than the cells of 0.0075 m"):
+    with pytest.raises(UsageError, match=r"thinner than the cells of 0\.0075 m"):
         build_grid(mesh_solids.box((0.03, 0.02, 0.001)), "m", resolution=8)
     with pytest.raises(UsageError, match="resolution must be from 4 to 512 cells, got 600"):
         distance_grid(box, "m", resolution=600)
-    with pytest.raises(UsageError, match=r"below 2 cells of 0.0075 m; set resolution = 40 or more"):
+    with pytest.raises(UsageError, match=r"below 2 cells of 0\.0075 m; set resolution = 40 or more"):
         build_grid(box, "m", resolution=8, rounding=0.003)
     with pytest.raises(UsageError, match="leaves nothing of it"):
         build_grid(box, "m", resolution=16, rounding=0.012)
