@@ -201,7 +201,7 @@ def test_without_rounding_edges_are_sharp(kind: str) -> None:
 
 
 def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "double") -> tuple[Simulator, Array]:
-    """A cloud of points on a ball joint, pressed onto a shape on a hinge."""
+    """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge on a grid."""
     spec = _core.ModelSpec()
     spec.tolerance = 1e-13
     turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
@@ -212,9 +212,16 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
         for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
     ]
     spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
-    size: Any = (1.2, 0, 0) if kind == "grid" else ROUNDED[kind]
-    rest = told(sphere_grid(10)) if kind == "grid" else {"rounding": ROUNDING}
-    shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), size, **rest)
+    if kind in ROUNDED:
+        shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=ROUNDING)
+    elif kind == "grid":
+        shape = spec.add_shape(
+            "shape", turret, "grid", (1e-3, 0, 0), (1, 0, 0, 0), (1.2, 0, 0), **told(sphere_grid(10))
+        )
+    else:
+        shape = spec.add_shape(
+            "shape", turret, "grid", (-0.01, -0.006, -0.01), (1, 0, 0, 0), (1, 0, 0), **told(bracket_grid(16))
+        )
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
     numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.3, "kd": 20.0}
@@ -225,9 +232,9 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
     spec.add_actuator("x", slides[0], "position", kp=100.0, kd=1.0)
     spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0)
     sim = Simulator(_core.Model(spec), precision=precision)
-    top = {"grid": 1.2 * RADIUS, "box": 0.01, "cylinder": 0.03}[kind]
+    top = {"grid": 1.2 * RADIUS, "box": 0.01, "cylinder": 0.03, "edge": -1e-3}[kind]
     # On a rounded solid, near the edge: over face and round at once.
-    aside = {"grid": 0.0, "box": 0.024, "cylinder": 0.015}[kind]
+    aside = {"grid": 0.0, "box": 0.024, "cylinder": 0.015, "edge": -0.012}[kind]
     height = top + 0.012
     sim.q[0, sim.model.joint_q[1]], sim.q[0, sim.model.joint_q[2]] = aside, height
     hold = np.array([aside, height - 2e-3])
@@ -237,7 +244,7 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
 
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "edge"])
 def test_gradients_in_contact(kind: str, law: str) -> None:
     """By controls, state and parameters: a grid's scale and a solid's rounding are among these."""
     left_out = []
@@ -248,6 +255,10 @@ def test_gradients_in_contact(kind: str, law: str) -> None:
         for output in OUTPUTS:
             case = gradient_check.Case.random(sim, u, output, rng)
             assert gradient_check.against_dual(case, rng, directions=1).error < 1e-10
+        if kind == "edge":
+            # Where the normal is short, an elastic marker that has just slipped may be read as sticking or slipping:
+            # a kink that no signature tells. Positions and velocities have none.
+            case = gradient_check.Case.random(sim, u, OUTPUTS[seed % 2], rng)
         agreement = gradient_check.against_differences(case)
         left_out.append(agreement.left_out)
         assert agreement.error < 1e-6
