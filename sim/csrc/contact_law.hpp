@@ -93,7 +93,7 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     out.friction_by_v = -law.kt * project + outer(lever, normal_by_v);
     out.friction_by_x = law.elastic ? -memory * project : zero33<L>();
     if (at.bend != Bend::flat) {
-      if (at.bend == Bend::field) {
+      if (at.bend == Bend::field) [[unlikely]] {
         const Mat3<L> lean = ratio * dot(direction, n) * outer(direction, n);
         project += lean;
         out.friction_by_v -= law.kt * lean;

@@ -238,7 +238,7 @@ GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* 
       return capsule_distance<L>(x, L(size[0]), L(size[1]), out);
     case ShapeKind::ellipsoid:
       return ellipsoid_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
-    default:
+    [[unlikely]] default:
       return rarer_distance<L, T>(kind, size, grid, x, out);
   }
 }
@@ -268,7 +268,8 @@ GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const DistanceGrid
   using std::sqrt;
   if (kind == ShapeKind::plane) return x[2];
   if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];
-  if (kind >= ShapeKind::ellipsoid) return rarer_distance_only<T>(kind, size, grid, x[0], x[1], x[2]);
+  if (kind >= ShapeKind::ellipsoid) [[unlikely]]
+    return rarer_distance_only<T>(kind, size, grid, x[0], x[1], x[2]);
   if (kind == ShapeKind::cylinder || kind == ShapeKind::capsule) {
     const T across = sqrt(x[0] * x[0] + x[1] * x[1]), along = (x[2] < T(0) ? -x[2] : x[2]) - size[1];
     if (kind == ShapeKind::capsule) {
