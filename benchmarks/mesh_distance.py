@@ -144,7 +144,8 @@ def places(solid: Solid) -> Array:
 
 def force_errors(solid: Solid, grid: DistanceGrid) -> tuple[float, float, float]:
     """Of the force on the ball, relative to the exact one: median, root mean square, worst."""
-    ball, areas = capsule(BALL, 0.0, count=POINTS_ON_BALL)
+    ball, across = capsule(BALL, 0.0, count=POINTS_ON_BALL)
+    areas = across.sum(1)
     spec, shape = spec_with("grid", (1, 0, 0), grid=grid)
     stiffness = 1e7  # [N/m³]
     spec.add_contact("press", spec.add_points("ball", 0, ball, areas), shape, kn=stiffness, kt=0.0, mu=0.0, kd=0.0)

@@ -21,7 +21,7 @@ from gelflow.sim.sampling import (
     mesh_surface,
     turned_frames,
 )
-from gelflow.sim.scene_mjcf import GeomDef, Mechanics
+from gelflow.sim.scene_mjcf import GeomDef, Mechanics, Pose
 from gelflow.sim.scene_shapes import SHAPES
 from gelflow.sim.scene_toml import Table, nearest
 

@@ -245,7 +245,7 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
 @pytest.mark.parametrize("kind", [*KINDS, "edge"])
-def test_gradients_in_contact(kind: str, law: str) -> None:
+def test_gradients_pressed_on_a_shape(kind: str, law: str) -> None:
     """By controls, state and parameters: a grid's scale and a solid's rounding are among these."""
     left_out = []
     for seed in range(3):

@@ -262,14 +262,19 @@ def test_distances_to_a_bracket_are_exact() -> None:
 @pytest.mark.parametrize("count", [1, 50, 700])
 def test_points_on_a_mesh_are_spread_evenly_and_stand_for_its_area(count: int) -> None:
     mesh = mesh_solids.bracket(*BRACKET)
-    points, areas = mesh_surface(mesh, count=count)
+    points, across = mesh_surface(mesh, count=count)
+    areas = across.sum(1)
     whole = float(mesh.areas_and_normals()[0].sum())
     assert points.shape == (count, 3)
     assert areas.sum() == pytest.approx(whole, rel=1e-12)
     np.testing.assert_allclose(mesh_solids.bracket_distance(points, *BRACKET), 0, atol=1e-12)
     again = mesh_surface(mesh, count=count)
     np.testing.assert_array_equal(points, again[0])
-    np.testing.assert_array_equal(areas, again[1])
+    np.testing.assert_array_equal(across, again[1])
+    # Faces across x, y, z.
+    arm, thick, depth = BRACKET
+    faces = [2 * arm * depth, 2 * arm * depth, 2 * (2 * arm - thick) * thick]
+    np.testing.assert_allclose(across.sum(0), faces, rtol=2e-3)
     if count > 1:
         assert areas.min() > 0.3 * whole / count
         assert areas.max() < 2 * whole / count
@@ -279,7 +284,8 @@ def test_points_on_a_mesh_are_spread_evenly_and_stand_for_its_area(count: int) -
 
 def test_both_sides_of_a_sheet_have_their_own_points() -> None:
     half = (0.03, 0.03, 1e-4)
-    points, areas = mesh_surface(mesh_solids.box(half), count=200)
+    points, across = mesh_surface(mesh_solids.box(half), count=200)
+    areas = across.sum(1)
     side = 4 * half[0] * half[1]
     for way in (-1, 1):
         assert areas[points[:, 2] * way > 0.99e-4].sum() == pytest.approx(side, rel=0.03)
