@@ -186,7 +186,8 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
     Returns
     -------
     points [m], shape (count, 3), on the surface but not on purpose on its edges; areas across x, y, z [m²], shape
-    (count, 3): the pieces nearest to each, in all the mesh's area. Raises UsageError on a count below 1 or above 20 000.
+    (count, 3): the pieces nearest to each, in all the mesh's area.
+    Raises UsageError on a count below 1 or above 20 000.
     """
     if not 1 <= count <= _LEAST_PIECES:
         raise UsageError(f"a mesh needs a count of 1 to {_LEAST_PIECES}, got {count}")
@@ -207,9 +208,9 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
         _, chosen = tree.query(middle / np.bincount(owner, minlength=count).clip(min=1)[:, None])
         chosen = _distinct(chosen, number)
     _, owner = cKDTree(space[chosen]).query(space)
-    shares = np.stack([np.bincount(owner, share, count) for share in (normals[face] ** 2).T], axis=-1)
+    shares: Array = np.stack([np.bincount(owner, share, count) for share in (normals[face] ** 2).T], axis=-1)
     points: Array = pieces[chosen]
-    areas_across: Array = shares * (whole / number)
+    areas_across: Array = (shares * (whole / number)).astype(float)
     return points, areas_across
 
 
