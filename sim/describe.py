@@ -58,6 +58,18 @@ class BodyPart:
 
 
 @dataclass(frozen=True)
+class ShapePart:
+    """A geometry that is touched otherwise than as the model file has it."""
+
+    name: str
+    kind: str  # "box", "cylinder" or "mesh"
+    rounding: float  # radius of the edges [m]
+    cells: tuple[int, int, int] | None  # of a mesh's grid, along x, y, z
+    spacing: float | None  # [m], edge of a cell
+    bytes: int | None  # of the grid, shared by all environments
+
+
+@dataclass(frozen=True)
 class ContactPart:
     name: str
     points: str  # kind and name of the sampled geometry
@@ -111,6 +123,7 @@ class Description:
     friction: str
     gravity: tuple[float, ...]  # [m/s²]
     bodies: tuple[BodyPart, ...]  # the world first
+    shapes: tuple[ShapePart, ...]  # meshes and rounded ones
     contacts: tuple[ContactPart, ...]
     pads: tuple[PadPart, ...]
     left_out: tuple[str, ...]
@@ -136,6 +149,7 @@ def describe(scene: Scene) -> Description:
         friction=scene.friction,
         gravity=_plain(scene.gravity),
         bodies=bodies,
+        shapes=_shapes(scene),
         contacts=_contacts(scene, kinds),
         pads=tuple(
             PadPart(
@@ -209,6 +223,21 @@ def _actuators(scene: Scene, joint: JointDef) -> tuple[ActuatorPart, ...]:
         ActuatorPart(a.name, a.kind, a.gear, a.kp, a.kd, a.gain, a.bias, bounds(a.force), bounds(a.control))
         for a in scene.actuators
         if scene.joints[a.joint] is joint
+    )
+
+
+def _shapes(scene: Scene) -> tuple[ShapePart, ...]:
+    return tuple(
+        ShapePart(
+            name=shape.name,
+            kind=shape.kind,
+            rounding=shape.rounding,
+            cells=shape.grid.cells if shape.grid else None,
+            spacing=shape.grid.spacing if shape.grid else None,
+            bytes=shape.grid.nbytes if shape.grid else None,
+        )
+        for shape in scene.shapes
+        if not shape.sharp
     )
 
 

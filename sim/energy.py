@@ -171,9 +171,9 @@ class _Parts:
     def add_actuator(self, *args: Any, **more: Any) -> None:
         pass
 
-    def add_shape(self, name: str, body: int, kind: str, pos: Any, quat: Any, size: Any) -> int:
+    def add_shape(self, name: str, body: int, kind: str, pos: Any, quat: Any, size: Any, **more: Any) -> int:
         self._shapes.append((name, body, kind, pos, quat, size))
-        self.spec.add_shape(name, body, kind, pos, quat, size)
+        self.spec.add_shape(name, body, kind, pos, quat, size, **more)
         return len(self._shapes) - 1
 
     def add_points(self, name: str, body: int, points: ArrayLike, weights: ArrayLike, radius: float = 0.0) -> int:

@@ -13,13 +13,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import elliprg
 
 from gelflow.errors import UsageError
+from gelflow.sim.mesh import TriangleMesh
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 ENDS = ("-z", "+z")
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+_PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # powers of 1/1.3247…: they fill a square evenly
+_PIECES = 24  # per point of a mesh, at least
+_LEAST_PIECES = 20_000
+_MOVES = 8
 
 Array = NDArray[np.float64]
 
@@ -168,6 +174,54 @@ def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS)
     whole = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)  # Carlson's symmetric integral
     outwards = sphere / axes / enlarged[:, None]
     return sphere * axes, outwards**2 * (enlarged * (whole * len(faces) / 2 / enlarged.sum()))[:, None]
+
+
+def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
+    """`count` points on a mesh, spread near-uniformly; the same ones each time.
+
+    The surface is cut into many pieces of equal area, each standing at one place. Points start at every so many pieces
+    and move to the middle of the pieces nearest to them, some times over. Sides that face different ways count as
+    further apart, so that a point does not stand for both sides of a sheet or of an edge.
+
+    Returns
+    -------
+    points [m], shape (count, 3), on the surface but not on purpose on its edges; areas across x, y, z [m²], shape
+    (count, 3): the pieces nearest to each, in all the mesh's area.
+    Raises UsageError on a count below 1 or above 20 000.
+    """
+    if not 1 <= count <= _LEAST_PIECES:
+        raise UsageError(f"a mesh needs a count of 1 to {_LEAST_PIECES}, got {count}")
+    areas, normals = mesh.areas_and_normals()
+    number = max(_PIECES * count, _LEAST_PIECES)
+    whole = float(areas.sum())
+    face = np.searchsorted(np.cumsum(areas), (np.arange(number) + 0.5) / number * whole).clip(max=len(areas) - 1)
+    u, v = (np.outer(_PLASTIC, np.arange(number)) + 0.5) % 1
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
+    pieces = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    space = np.column_stack([pieces / np.sqrt(whole / count), normals[face]])
+    tree = cKDTree(space)  # in its order neighbours are near
+    chosen = tree.indices[((np.arange(count) + 0.5) * number / count).astype(int)]
+    for _ in range(_MOVES):
+        _, owner = cKDTree(space[chosen]).query(space)
+        middle = np.stack([np.bincount(owner, along, count) for along in space.T], axis=-1)
+        _, chosen = tree.query(middle / np.bincount(owner, minlength=count).clip(min=1)[:, None])
+        chosen = _distinct(chosen, number)
+    _, owner = cKDTree(space[chosen]).query(space)
+    shares: Array = np.stack([np.bincount(owner, share, count) for share in (normals[face] ** 2).T], axis=-1)
+    points: Array = pieces[chosen]
+    areas_across: Array = (shares * (whole / number)).astype(float)
+    return points, areas_across
+
+
+def _distinct(chosen: NDArray[np.int64], number: int) -> NDArray[np.int64]:
+    """The same numbers below `number`, but what is there twice replaced by ones that are not there."""
+    _, first = np.unique(chosen, return_index=True)
+    again = np.setdiff1d(np.arange(len(chosen)), first)
+    free = np.setdiff1d(np.arange(number), chosen)
+    chosen = chosen.copy()
+    chosen[again] = free[np.linspace(0, len(free) - 1, len(again)).astype(int)]
+    return chosen
 
 
 def disc_lattice(radius: float, count: int) -> Array:

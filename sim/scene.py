@@ -25,19 +25,18 @@ from gelflow.sim.scene_parts import (
     Limit,
     PadDef,
     PointsDef,
-    ShapeDef,
     read_contacts,
     read_limits,
     read_pads,
     read_points,
-    used_shapes,
 )
+from gelflow.sim.scene_shapes import ShapeDef, used_shapes
 from gelflow.sim.scene_toml import Table, nearest, read_toml, set_path
 
 Array = NDArray[np.float64]
 
 INTEGRATORS = ("bdf1", "bdf2")
-SECTIONS = ("format", "model", "step", "integrator", "friction", "joints", "points", "contacts", "pads")
+SECTIONS = ("format", "model", "step", "integrator", "friction", "joints", "shapes", "points", "contacts", "pads")
 
 
 @dataclass(frozen=True)
@@ -132,10 +131,7 @@ class Scene:
             for joint, limit in zip(self.joints, self.limits, strict=True):
                 if joint.body == index:
                     _tell_joint(spec, joint, limit)
-        shapes = {
-            shape.name: spec.add_shape(shape.name, shape.body, shape.kind, shape.pose.pos, shape.pose.quat, shape.size)
-            for shape in self.shapes
-        }
+        shapes = {shape.name: _tell_shape(spec, shape) for shape in self.shapes}
         points = {
             p.name: spec.add_points(
                 p.name,
@@ -193,6 +189,23 @@ class Scene:
         return self.joints[_index("joint", name, [j.name for j in self.joints])]
 
 
+def _tell_shape(spec: Any, shape: ShapeDef) -> int:
+    place = (shape.pose.pos, shape.pose.quat, shape.size)
+    if shape.grid is None:
+        return int(spec.add_shape(shape.name, shape.body, shape.kind, *place, rounding=shape.rounding))
+    return int(
+        spec.add_shape(
+            shape.name,
+            shape.body,
+            "grid",
+            *place,
+            origin=shape.grid.origin,
+            spacing=shape.grid.spacing,
+            coefficients=shape.grid.coefficients,
+        )
+    )
+
+
 def _tell_joint(spec: Any, joint: JointDef, limit: Limit) -> None:
     low, high = joint.range or (-np.inf, np.inf)
     spec.add_joint(
@@ -246,7 +259,9 @@ def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Map
     points = read_points(top.tables("points"), mechanics)
     contacts = read_contacts(top.tables("contacts"), points, mechanics, law)
     pads = read_pads(top.tables("pads"), mechanics, law, path.parent)
-    shapes, unused = used_shapes(mechanics, points, contacts, pads)
+    wanted = {contact.shape for contact in contacts} | {name for pad in pads for name in pad.against}
+    sampled = {points[contact.points].geom for contact in contacts}
+    shapes, unused = used_shapes(mechanics, top.tables("shapes"), wanted, sampled)
     idle = tuple(f"points {name}: in no contact" for name in points if all(c.points != name for c in contacts))
     return Scene(
         name=path.stem,

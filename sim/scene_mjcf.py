@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.sim.mesh import TriangleMesh
 from gelflow.sim.mjcf_actuators import ActuatorDef as ActuatorDef
 from gelflow.sim.mjcf_actuators import default_limit, joint_extra, read_actuators
 from gelflow.sim.mjcf_file import compile_model, names
@@ -92,6 +93,7 @@ class GeomDef:
     kind: str  # MuJoCo's name of the type: "box", "cylinder", …
     pose: Pose  # in the moving body's frame
     size: Array  # MuJoCo's three sizes [m]
+    mesh: TriangleMesh | None = None  # of the kind "mesh", in the geometry's frame, as MuJoCo compiled it
 
 
 @dataclass(frozen=True)
@@ -224,5 +226,14 @@ def _geoms(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[G
         b = model.geom_bodyid[g]
         pose = poses[b] @ Pose(model.geom_pos[g].copy(), model.geom_quat[g].copy())
         kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
-        geoms.append(GeomDef(name, int(carrier[b]), kind, pose, model.geom_size[g].copy()))
+        mesh = _mesh(model, int(model.geom_dataid[g])) if kind == "mesh" else None
+        geoms.append(GeomDef(name, int(carrier[b]), kind, pose, model.geom_size[g].copy(), mesh))
     return tuple(geoms)
+
+
+def _mesh(model: Any, m: int) -> TriangleMesh:
+    """A compiled mesh: scaled, and in its own principal axes, which the geometry's pose makes up for."""
+    first, count = model.mesh_vertadr[m], model.mesh_vertnum[m]
+    face, faces = model.mesh_faceadr[m], model.mesh_facenum[m]
+    vertices = model.mesh_vert[first : first + count].astype(float)
+    return TriangleMesh(vertices, model.mesh_face[face : face + faces].astype(np.int64))

@@ -10,8 +10,19 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.sampling import ENDS, FACES, box_surface, capsule, cylinder, disc_lattice, ellipsoid, turned_frames
+from gelflow.sim.sampling import (
+    ENDS,
+    FACES,
+    box_surface,
+    capsule,
+    cylinder,
+    disc_lattice,
+    ellipsoid,
+    mesh_surface,
+    turned_frames,
+)
 from gelflow.sim.scene_mjcf import GeomDef, Mechanics, Pose
+from gelflow.sim.scene_shapes import SHAPES
 from gelflow.sim.scene_toml import Table, nearest
 
 Array = NDArray[np.float64]
@@ -20,7 +31,6 @@ T = TypeVar("T")
 LAWS = ("viscous", "elastic")
 _NUMBERS = ("kn", "kt", "mu", "kd", "ks")
 _PER_UNIT = ("per point", "per area")
-_SHAPES = ("plane", "sphere", "box", "cylinder", "capsule", "ellipsoid")
 _GIVEN = ("positions", "normals", "x_axes")
 # Keys of a pad's table that only its shape has.
 _PAD_KEYS: Mapping[str, tuple[str, ...]] = {
@@ -29,17 +39,6 @@ _PAD_KEYS: Mapping[str, tuple[str, ...]] = {
     "hemisphere": ("radius", "count"),
     "points": (*_GIVEN, "file"),
 }
-
-
-@dataclass(frozen=True)
-class ShapeDef:
-    """A geometry that points are tested against."""
-
-    name: str
-    body: int
-    kind: str  # "plane", "sphere", "box", "cylinder", "capsule" or "ellipsoid"
-    pose: Pose  # in the body's frame; a plane's normal is its z
-    size: Array  # MuJoCo's three: half sizes or half axes; radius; radius and half length [m]
 
 
 @dataclass(frozen=True)
@@ -141,8 +140,11 @@ def _surface(table: Table, geom: GeomDef) -> tuple[Array, Array]:
         if "heights" in table.data and "wall" not in faces:
             raise UsageError('heights are those of the wall; add faces = ["-z", "+z", "wall"]')
         return cylinder(*size[:2], angles=angles, radii=radii, heights=heights, faces=faces)
+    if geom.mesh is not None:
+        table.only(("geom", "count", "stiffness"))
+        return mesh_surface(geom.mesh, count=table.integer("count"))
     if geom.kind not in ("sphere", "capsule", "ellipsoid"):
-        known = "box, cylinder, sphere, capsule, ellipsoid"
+        known = "box, cylinder, sphere, capsule, ellipsoid, mesh"
         raise UsageError(f"{geom.kind} {geom.name!r} can't be sampled; {known} can")
     table.only(("geom", "count", "faces", "stiffness"))
     count, faces = table.integer("count"), table.words("faces", ENDS)
@@ -352,28 +354,6 @@ def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -
     return tuple(limits)
 
 
-def used_shapes(
-    mechanics: Mechanics,
-    points: Mapping[str, PointsDef],
-    contacts: tuple[ContactDef, ...],
-    pads: tuple[PadDef, ...],
-) -> tuple[tuple[ShapeDef, ...], tuple[str, ...]]:
-    """The shapes that something is tested against, and a line on every geometry that is in nothing at all."""
-    wanted = {contact.shape for contact in contacts} | {name for pad in pads for name in pad.against}
-    sampled = {points[contact.points].geom for contact in contacts}
-    shapes = tuple(
-        ShapeDef(geom.name, geom.body, geom.kind, geom.pose, geom.size)
-        for geom in mechanics.geoms
-        if geom.name in wanted
-    )
-    unused = tuple(
-        f"{geom.kind} {geom.name}: in no contact and under no pad"
-        for geom in mechanics.geoms
-        if geom.name not in wanted | sampled
-    )
-    return shapes, unused
-
-
 def _law_numbers(table: Table, law: str) -> dict[str, float]:
     """The force law's numbers: those of the law's own table before the common ones; no k_s under the viscous law."""
     for name in LAWS:
@@ -385,8 +365,8 @@ def _law_numbers(table: Table, law: str) -> dict[str, float]:
 
 def _shape(geoms: Mapping[str, GeomDef], name: str, table: Table) -> GeomDef:
     geom = _named(geoms, name, table, "geometry")
-    if geom.kind not in _SHAPES:
-        raise UsageError(f"{table.where}: {name!r} is a {geom.kind}; contact is computed against {', '.join(_SHAPES)}")
+    if geom.kind not in SHAPES:
+        raise UsageError(f"{table.where}: {name!r} is a {geom.kind}; contact is computed against {', '.join(SHAPES)}")
     return geom
 
 

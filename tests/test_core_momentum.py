@@ -44,10 +44,10 @@ class Loose:
         self.spec.add_joint(f"{name} floats", body, "free", (0, 0, 0), (0, 0, 1))
         return body
 
-    def add_shape(self, name: str, body: int, kind: str, pos: Any, *args: Any) -> int:
+    def add_shape(self, name: str, body: int, kind: str, pos: Any, *args: Any, **more: Any) -> int:
         self._on.append(body)
         shift = self._shift[body] if body >= 0 else 0.0
-        return int(self.spec.add_shape(name, body, kind, np.asarray(pos) - shift, *args))
+        return int(self.spec.add_shape(name, body, kind, np.asarray(pos) - shift, *args, **more))
 
     def add_points(self, name: str, body: int, points: Array, *args: Any, **more: Any) -> int:
         self._of.append(body)

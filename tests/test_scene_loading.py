@@ -315,7 +315,7 @@ TOML_FAULTS = [
     (
         'geom = "block"',
         'geom = "ground"',
-        "plane 'ground' can't be sampled; box, cylinder, sphere, capsule, ellipsoid can",
+        "plane 'ground' can't be sampled; box, cylinder, sphere, capsule, ellipsoid, mesh can",
     ),
     ('geom = "block"', 'geom = "ornament"', "unknown key 'resolution'; known are count, faces, geom, stiffness"),
     ('against = "ground"', 'against = "top"', "on one body"),

@@ -250,11 +250,8 @@ def test_urdf_refusals(change: tuple[str, str], message: str, tmp_path: Path) ->
     check_refused(tmp_path, "arm.urdf", message)
 
 
-def test_a_mesh_is_in_no_contact(tmp_path: Path) -> None:
+def test_a_mesh_that_is_sampled_needs_a_count(tmp_path: Path) -> None:
     mesh = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
     text = MODEL.replace("<worldbody>", mesh).replace('name="ball" size="0.1"', 'name="ball" type="mesh" mesh="m"')
     (tmp_path / "robot.xml").write_text(text)
-    sphere = '[points.p]\ngeom = "ball"\n'
-    check_refused(tmp_path, "robot.xml", "mesh 'ball' can't be sampled", sphere)
-    pad = '[pads.p]\nsite = "tip"\nrows = 2\ncols = 2\npitch = 1e-3\nagainst = "ball"\nkn = 1\nkt = 1\nmu = 1\nkd = 1\n'
-    check_refused(tmp_path, "robot.xml", "'ball' is a mesh; contact is computed against", pad)
+    check_refused(tmp_path, "robot.xml", "points.p: count is missing", '[points.p]\ngeom = "ball"\n')

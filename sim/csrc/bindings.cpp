@@ -5,14 +5,12 @@
 #include <pybind11/stl.h>
 
 #include "batch.hpp"
+#include "shape_bindings.hpp"
 
 namespace py = pybind11;
 using namespace gelflow;
 
 namespace {
-
-template <class T>
-using Array = py::array_t<T, py::array::c_style>;
 
 std::string shape_text(const std::vector<py::ssize_t>& shape) {
   std::string text = "(";
@@ -44,15 +42,6 @@ T* writable(py::array& array, const std::vector<py::ssize_t>& shape, const char*
 template <class T>
 py::array view(T* data, const std::vector<py::ssize_t>& shape, const py::object& owner) {
   return py::array_t<T>(shape, data, owner);
-}
-
-std::vector<V3<double>> points_of(const Array<double>& array, const char* name) {
-  if (array.ndim() != 2 || array.shape(1) != 3) {
-    throw std::invalid_argument(std::string(name) + " must have shape (n, 3)");
-  }
-  std::vector<V3<double>> points;
-  for (py::ssize_t i = 0; i < array.shape(0); ++i) points.emplace_back(array.at(i, 0), array.at(i, 1), array.at(i, 2));
-  return points;
 }
 
 template <class T>
@@ -277,8 +266,16 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
            py::arg("axis"), py::arg("damping") = 0., py::arg("armature") = 0., py::arg("stiffness") = 0.,
            py::arg("springref") = 0., py::arg("lower") = -inf, py::arg("upper") = inf, py::arg("limit_stiffness") = 0.,
            py::arg("limit_damping") = 0., py::arg("ref") = 0., py::arg("frictionloss") = 0.)
-      .def("add_shape", &ModelSpec::add_shape, py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"),
-           py::arg("quat"), py::arg("size"))
+      .def(
+          "add_shape",
+          [](ModelSpec& s, const std::string& name, int body, const std::string& kind, const V3<double>& pos,
+             const V4<double>& quat, const V3<double>& size, double rounding, const V3<double>& origin, double spacing,
+             const std::optional<Array<float>>& coefficients) {
+            return s.add_shape(name, body, kind, pos, quat, size, rounding, grid_of(origin, spacing, coefficients));
+          },
+          py::arg("name"), py::arg("body"), py::arg("kind"), py::arg("pos"), py::arg("quat"), py::arg("size"),
+          py::arg("rounding") = 0., py::arg("origin") = V3<double>(0, 0, 0), py::arg("spacing") = 0.,
+          py::arg("coefficients") = py::none())
       .def(
           "add_points",
           [](ModelSpec& s, const std::string& name, int body, const Array<double>& points,
@@ -334,6 +331,8 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
       .def_readonly("q0", &Model::q0)
       .def_readonly("param_names", &Model::param_names)
       .def_readonly("param_defaults", &Model::param_defaults)
+      .def("distance", &distance_at, py::arg("shape"), py::arg("points"),
+           "Distance (n), normal (n, 3) and curvature (n, 3, 3) of a shape at points (n, 3) of its frame.")
       .def_property_readonly("body_names", [](const Model& m) { return names(m.bodies); })
       .def_property_readonly("joint_names", [](const Model& m) { return names(m.joints); })
       .def_property_readonly("contact_names", [](const Model& m) { return names(m.contacts); })

@@ -43,7 +43,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     const auto pulls = dot(force.force, t.at.n);
     t.for_each_inside([&](int k, int i) {
       hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
-      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.curved) * 16 + (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) +
+      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.bend != Bend::flat) * 16 + (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) +
                (is_set(force.slips, k) ? 4 : 0) + (is_set(t.remembers, k) ? 2 : 0) + (lane(pulls, k) > T(0) ? 0 : 1));
     });
   };

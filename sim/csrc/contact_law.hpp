@@ -87,12 +87,18 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     const Vec3<L> direction = select(out.slips, inverse, zero) * wanted;
     Vec3<L> normal_by_x = by_d * n;
     const Vec3<L> normal_by_v = by_rate * n;
-    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ), as t is tangential.
-    const Mat3<L> project = ratio * (identity_minus_outer(n) - outer(direction, direction));
+    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ), where t·n = 0 but for a field, whose ‖n‖ is not quite 1.
+    Mat3<L> project = ratio * (identity_minus_outer(n) - outer(direction, direction));
     const Vec3<L> lever = law.mu * direction;
     out.friction_by_v = -law.kt * project + outer(lever, normal_by_v);
     out.friction_by_x = law.elastic ? -memory * project : zero33<L>();
-    if (at.curved) {
+    if (at.bend != Bend::flat) {
+      if (at.bend == Bend::field) [[unlikely]] {
+        const Mat3<L> lean = ratio * dot(direction, n) * outer(direction, n);
+        project += lean;
+        out.friction_by_v -= law.kt * lean;
+        if (law.elastic) out.friction_by_x -= memory * lean;
+      }
       const Vec3<L> hv = at.hessian * v;
       normal_by_x += by_rate * hv;
       Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + rate * at.hessian);
@@ -101,13 +107,13 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
     }
     out.friction_by_x += outer(lever, normal_by_x);
     out.by_x = out.friction_by_x + outer(n, normal_by_x);
-    if (at.curved) out.by_x += normal * at.hessian;
+    if (at.bend != Bend::flat) out.by_x += normal * at.hessian;
     out.by_v = out.friction_by_v + outer(n, normal_by_v);
     if constexpr (derivatives > 1) {
       out.by_anchor = memory * project;  // ∂f*/∂X = k_s (1 − n nᵀ)
       out.slip_by_v = identity_minus_outer(n);
       out.slip_by_x = zero33<L>();
-      if (at.curved) out.slip_by_x -= outer(n, at.hessian * v) + rate * at.hessian;
+      if (at.bend != Bend::flat) out.slip_by_x -= outer(n, at.hessian * v) + rate * at.hessian;
     }
   }
 }

@@ -72,6 +72,22 @@ struct MaskOf<Lanes<T, W>> {
 template <class L>
 using Mask = typename MaskOf<L>::type;
 
+template <class L>
+struct LaneShape {
+  using Scalar = L;
+  static constexpr int count = 1;
+};
+template <class T, int W>
+struct LaneShape<Lanes<T, W>> {
+  typedef float Reading __attribute__((vector_size(W * sizeof(float))));
+  using Scalar = T;
+  static constexpr int count = W;
+};
+template <class L>
+using LaneScalar = typename LaneShape<L>::Scalar;
+template <class L>
+constexpr int lane_count = LaneShape<L>::count;
+
 // One number as a pack of one.
 template <class T>
 GELFLOW_INLINE T select(bool choice, const T& yes, const T& no) {
@@ -131,6 +147,18 @@ GELFLOW_INLINE Lanes<T, W> sqrt(const Lanes<T, W>& x) {
 template <class T, int W>
 GELFLOW_INLINE Lanes<T, W> abs(const Lanes<T, W>& x) {
   return select<T, W>(x < Lanes<T, W>(T(0)), -x, x);
+}
+
+// Numbers at one place of as many tables as there are lanes.
+template <class L>
+GELFLOW_INLINE L gather(const float* const* tables, std::ptrdiff_t at) {
+  if constexpr (lane_count<L> == 1) {
+    return L(tables[0][at]);
+  } else {
+    typename LaneShape<L>::Reading found;
+    for (int l = 0; l < lane_count<L>; ++l) found[l] = tables[l][at];
+    return L(__builtin_convertvector(found, typename L::Vector));
+  }
 }
 
 template <class L>

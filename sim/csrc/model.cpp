@@ -181,31 +181,46 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
 }
 
 int ModelSpec::add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
-                         const V4<double>& quat, const V3<double>& size) {
-  check_body("shape '" + name + "'", body, true);
-  check_finite("shape '" + name + "'", "size", size.data(), 3);
+                         const V4<double>& quat, const V3<double>& size, double rounding,
+                         std::shared_ptr<const DistanceGrid> grid) {
+  const std::string owner = "shape '" + name + "'";
+  check_body(owner, body, true);
+  check_finite(owner, "size", size.data(), 3);
   Shape shape;
   shape.name = name;
   shape.body = body;
   shape.rotation = rotation_from("shape '" + name + "'", quat);
   struct Kind {
     const char* name;
-    ShapeKind kind;
+    ShapeKind kind, rounded;
     int sizes;
   };
-  constexpr Kind kinds[] = {{"plane", ShapeKind::plane, 0},     {"sphere", ShapeKind::sphere, 1},
-                            {"box", ShapeKind::box, 3},         {"cylinder", ShapeKind::cylinder, 2},
-                            {"capsule", ShapeKind::capsule, 2}, {"ellipsoid", ShapeKind::ellipsoid, 3}};
+  constexpr ShapeKind none = ShapeKind::plane;  // can't be rounded
+  constexpr Kind kinds[] = {{"plane", ShapeKind::plane, none, 0},
+                            {"sphere", ShapeKind::sphere, none, 1},
+                            {"box", ShapeKind::box, ShapeKind::rounded_box, 3},
+                            {"cylinder", ShapeKind::cylinder, ShapeKind::rounded_cylinder, 2},
+                            {"capsule", ShapeKind::capsule, none, 2},
+                            {"ellipsoid", ShapeKind::ellipsoid, none, 3},
+                            {"grid", ShapeKind::grid, none, 1}};
   const auto* found = std::find_if(std::begin(kinds), std::end(kinds), [&](const Kind& k) { return kind == k.name; });
   if (found == std::end(kinds)) {
-    refuse("shape '" + name + "': kind '" + kind + "' is not one of plane, sphere, box, cylinder, capsule, ellipsoid");
+    refuse(owner + ": kind '" + kind + "' is not one of plane, sphere, box, cylinder, capsule, ellipsoid, grid");
   }
-  shape.kind = found->kind;
   const int sizes = found->sizes;
   for (int i = 0; i < sizes; ++i) {
-    if (!(size[i] > 0)) refuse("shape '" + name + "': size must be positive");
+    if (!(size[i] > 0)) refuse(owner + ": size must be positive");
   }
+  if ((found->kind == ShapeKind::grid) != (grid != nullptr)) refuse(owner + ": a grid goes with the kind grid");
+  if (!(rounding >= 0)) refuse(owner + ": rounding must not be negative");
+  if (rounding > 0 && found->rounded == none) refuse(owner + ": only a box or a cylinder can be rounded");
+  if (rounding > 0 && !(rounding < size.head(sizes).minCoeff())) {
+    refuse(owner + ": rounding must be below the smallest half size");
+  }
+  shape.kind = rounding > 0 ? found->rounded : found->kind;
+  shape.grid = std::move(grid);
   shape.size = add_params(name, {"size.x", "size.y", "size.z"}, {size[0], size[1], size[2]});
+  if (rounding > 0) add_params(name, {"rounding"}, {rounding});
   shape.place = add_place(name + ".shape", pos, false);
   model_.shapes.push_back(shape);
   return next_index(model_.shapes) - 1;

@@ -5,15 +5,26 @@
 #include <array>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <string>
 #include <vector>
 
-#include "spatial.hpp"
+#include "distance_grid.hpp"
 
 namespace gelflow {
 
 enum class JointType : std::uint8_t { slide, hinge, ball, free };
-enum class ShapeKind : std::uint8_t { plane, sphere, box, cylinder, capsule, ellipsoid };
+enum class ShapeKind : std::uint8_t {
+  plane,
+  sphere,
+  box,
+  cylinder,
+  capsule,
+  ellipsoid,
+  rounded_box,
+  rounded_cylinder,
+  grid
+};
 enum class FrictionLaw : std::uint8_t { viscous, elastic };
 enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not (ground)
 enum class ActuatorKind : std::uint8_t { motor, position, velocity, general };
@@ -52,8 +63,10 @@ struct Shape {
   ShapeKind kind;
   int body;
   M3<double> rotation;  // in the body's frame, before it is turned
-  int size;             // offset in Params (3): half sizes or half axes; radius, then half length along z
-  int place;            // offset in Params (6): pos, turn
+  int size;   // offset in Params (3): half sizes or half axes; radius, then half length along z; a grid's scale. The
+              // rounding is the fourth, where there is one
+  int place;  // offset in Params (6): pos, turn
+  std::shared_ptr<const DistanceGrid> grid;  // of the kind grid
 };
 
 // Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
@@ -184,7 +197,8 @@ class ModelSpec {
                 double lower, double upper, double limit_stiffness, double limit_damping, double ref,
                 double frictionloss);
   int add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
-                const V4<double>& quat, const V3<double>& size);
+                const V4<double>& quat, const V3<double>& size, double rounding,
+                std::shared_ptr<const DistanceGrid> grid);
   int add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
                  const std::vector<double>& weights, double radius, const V3<double>& pos, const V4<double>& quat,
                  const std::vector<V3<double>>& areas);

@@ -24,6 +24,7 @@ struct PairFrame {
   V3<T> origin;           // of the shape, in the world
   V3<T> angular, linear;  // V, at the shape's origin
   const T* size;
+  const DistanceGrid* grid;
   ShapeKind kind;
   V3<T> local;    // in the first body's frame: a sphere's centre, a plane's normal
   T local_level;  // height of the first body's origin above a plane
@@ -42,11 +43,14 @@ struct PairFrame {
       return (c - local).squaredNorm() < limit * limit;
     }
     if (kind == ShapeKind::plane) return local.dot(c) + local_level < reach;
-    return distance_only<T>(kind, size, point(center)) < reach;
+    return distance_only<T>(kind, size, grid, point(center)) < reach;
   }
 
   // Not finite where a parameter is not: then no point touches, and that must not pass for no contact.
-  T check() const { return offset[0] + offset[1] + offset[2] + size[0] + size[1] + size[2]; }
+  T check() const {
+    const bool rounded = kind == ShapeKind::rounded_box || kind == ShapeKind::rounded_cylinder;
+    return offset[0] + offset[1] + offset[2] + size[0] + size[1] + size[2] + (rounded ? size[3] : T(0));
+  }
 
   GELFLOW_INLINE V3<T> point(const V3<double>& local) const { return rotation * local.template cast<T>() + offset; }
   GELFLOW_INLINE V3<T> velocity(const V3<T>& x) const { return linear + cross<T>(angular, x); }
@@ -96,6 +100,7 @@ PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape,
   const int first = mount.body;
   f.kind = shape.kind;
   f.size = params + shape.size;
+  f.grid = shape.grid.get();
   f.to_world = shape.rotation.template cast<T>();
   if (differs<T>(params + shape.place + 3, V3<double>::Zero())) {
     f.to_world = (f.to_world * turn_of<T>(params + shape.place + 3)).eval();
@@ -152,6 +157,7 @@ GELFLOW_INLINE void for_near_points(const PairFrame<T>& f, const PointCloud& clo
     PairFrame<double> real;
     real.size = size;
     real.kind = f.kind;
+    real.grid = f.grid;
     real.stretch = f.scaled ? real_part(f.stretch) : 1.0;
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) real.rotation(i, j) = real_part(f.rotation(i, j));
@@ -240,7 +246,7 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
     }
     t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
     if (rule.rolling_radius > T(0)) t.x.z -= L(rule.rolling_radius);  // planes only: n = z
-    distance<L>(frame.kind, frame.size, t.x, t.at);
+    distance<L>(frame.kind, frame.size, frame.grid, t.x, t.at);
     t.inside = t.at.d < L(0.0) && weight > L(0.0);
     if (any(t.inside)) {
       t.law = weighted<T>(rule, select(t.inside, weight, L(0.0)));

@@ -4,29 +4,21 @@
 // no gradient one branch is taken, always the same: +x at the centre of a sphere and on the axis of a cylinder or capsule;
 // inside a box the face with the largest (least negative) distance, x before y before z; in a cylinder the wall before
 // the ends. Cylinders, capsules and ellipsoids have their sizes in MuJoCo's order: radius and half length along z; half
-// axes.
+// axes. A shape that a grid describes has a smooth field in place of a distance (grid_shape.hpp).
 #pragma once
 
 #include <algorithm>
 
-#include "lanes.hpp"
+#include "grid_shape.hpp"
 #include "model.hpp"
 
 namespace gelflow {
 
 template <class L>
-struct Distance {
-  L d;
-  Vec3<L> n;
-  Mat3<L> hessian;  // only written where curved
-  bool curved;      // of the shape's kind, the same for all its points
-};
-
-template <class L>
 GELFLOW_INLINE void plane_distance(const Vec3<L>& x, Distance<L>& out) {  // the half space z < 0
   out.d = x.z;
   out.n = {L(0.0), L(0.0), L(1.0)};
-  out.curved = false;
+  out.bend = Bend::flat;
 }
 
 template <class L>
@@ -38,7 +30,7 @@ GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<
   out.d = select(center, -radius, length - radius);
   out.n = select3<L>(center, Vec3<L>{one, zero, zero}, inverse * x);
   out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
-  out.curved = true;
+  out.bend = Bend::curved;
 }
 
 template <class L>
@@ -54,7 +46,7 @@ GELFLOW_INLINE void box_distance(const Vec3<L>& x, const Vec3<L>& half, Distance
   const Mask<L> z = beyond.z > larger;
   out.d = select(z, beyond.z, larger);
   out.n = {select(y || z, zero, sign.x), select(z, zero, select(y, sign.y, zero)), select(z, sign.z, zero)};
-  out.curved = false;
+  out.bend = Bend::flat;
 }
 
 // Length of (x, y) and its direction, +x on the axis; `inverse` is 1/length, 0 on the axis.
@@ -80,7 +72,7 @@ GELFLOW_INLINE void cylinder_distance(const Vec3<L>& x, const L& radius, const L
   out.n = select3<L>(flat, {zero, zero, sign}, outwards);
   const Vec3<L> around{-outwards.y, outwards.x, zero};
   out.hessian = select(flat, zero, inverse) * outer(around, around);
-  out.curved = true;
+  out.bend = Bend::curved;
 }
 
 template <class L>
@@ -162,11 +154,77 @@ __attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L
     const Vec3<L> row = transposed_times(surface, cofactors.row[a]);
     out.hessian.row[a] = select3<L>(regular, scale * row, surface.row[a]);
   }
-  out.curved = true;
+  out.bend = Bend::curved;
+}
+
+// A rounded solid is a smaller one, of sizes less r, grown by r. Beyond the smaller one it is r less than the distance
+// to that, and smooth there: flat beside a face, round beside an edge or a corner. Inside the smaller one the nearest
+// point lies on a face, as without rounding. The normal jumps inside the smaller solid alone, at least r deep.
+template <class L>
+GELFLOW_INLINE void rounded_box_distance(const Vec3<L>& x, const Vec3<L>& half, const L& rounding, Distance<L>& out) {
+  using std::sqrt;
+  const L zero(0.0), one(1.0);
+  const Vec3<L> inner{half.x - rounding, half.y - rounding, half.z - rounding};
+  box_distance<L>(x, inner, out);  // what holds inside the smaller box
+  Vec3<L> gap, round;              // to the smaller box; 1 along the axes that have one
+  for (int a = 0; a < 3; ++a) {
+    const Mask<L> below = x[a] < zero;
+    const L over = select(below, -x[a], x[a]) - inner[a];
+    const Mask<L> beyond = over > zero;
+    gap[a] = select(beyond, select(below, -over, over), zero);
+    round[a] = select(beyond, one, zero);
+  }
+  const L squared = dot(gap, gap);
+  const Mask<L> deep = squared < L(1e-30);
+  const L length = sqrt(select(deep, one, squared)), inverse = select(deep, zero, one / length);
+  out.d = select(deep, out.d, length) - rounding;
+  out.n = select3<L>(deep, out.n, inverse * gap);
+  out.hessian = -inverse * outer(out.n, out.n);
+  for (int a = 0; a < 3; ++a) out.hessian.row[a][a] += inverse * round[a];
+  out.bend = Bend::curved;
+}
+
+template <class L>
+GELFLOW_INLINE void rounded_cylinder_distance(const Vec3<L>& x, const L& radius, const L& half, const L& rounding,
+                                              Distance<L>& out) {
+  using std::sqrt;
+  const L zero(0.0), one(1.0);
+  L length, around;
+  const Vec3<L> outwards = radial(x, length, around);
+  const L sign = select(x.z < zero, -one, one);
+  const L wall = length - (radius - rounding), end = sign * x.z - (half - rounding);
+  const Mask<L> flat = end > wall, beside = wall > zero, above = end > zero;
+  const L gap_wall = select(beside, wall, zero), gap_end = select(above, end, zero);
+  const L squared = gap_wall * gap_wall + gap_end * gap_end;
+  const Mask<L> deep = squared < L(1e-30);
+  const L root = sqrt(select(deep, one, squared)), inverse = one / root;
+  const L across = select(deep, select(flat, zero, one), inverse * gap_wall);
+  const L along = sign * select(deep, select(flat, one, zero), inverse * gap_end);
+  out.d = select(deep, select(flat, end, wall), root) - rounding;
+  out.n = {across * outwards.x, across * outwards.y, along};
+  // Round about the axis, and about the edge of the smaller cylinder.
+  const Vec3<L> ring{-outwards.y, outwards.x, zero}, edge{-along * outwards.x, -along * outwards.y, across};
+  out.hessian =
+      across * around * outer(ring, ring) + select(beside && above && !deep, inverse, zero) * outer(edge, edge);
+  out.bend = Bend::curved;
+}
+
+// Kinds that are rarer and longer stay out of the loops of the others.
+template <class L, class T>
+__attribute__((noinline)) void rarer_distance(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x,
+                                              Distance<L>& out) {
+  if (kind == ShapeKind::rounded_box) {
+    return rounded_box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, L(size[3]), out);
+  }
+  if (kind == ShapeKind::rounded_cylinder) {
+    return rounded_cylinder_distance<L>(x, L(size[0]), L(size[1]), L(size[3]), out);
+  }
+  grid_distance<L>(*grid, L(size[0]), x, out);
 }
 
 template <class L, class T>
-GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const Vec3<L>& x, Distance<L>& out) {
+GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x,
+                             Distance<L>& out) {
   switch (kind) {
     case ShapeKind::plane:
       return plane_distance<L>(x, out);
@@ -180,20 +238,38 @@ GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const Vec3<L>& x, Di
       return capsule_distance<L>(x, L(size[0]), L(size[1]), out);
     case ShapeKind::ellipsoid:
       return ellipsoid_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
+    [[unlikely]] default:
+      return rarer_distance<L, T>(kind, size, grid, x, out);
   }
 }
 
-// A distance that nothing is nearer than, for culling: exact outside but for the ellipsoid, negative inside.
 template <class T>
-GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const V3<T>& x) {
+GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, const V3<T>& x);
+
+// The place comes by value: its address would keep it out of registers where this is not called.
+template <class T>
+__attribute__((noinline)) T rarer_distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, T x, T y,
+                                                T z) {
   using std::sqrt;
-  if (kind == ShapeKind::plane) return x[2];
-  if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];
+  if (kind == ShapeKind::grid) return grid_bound<T>(*grid, size[0], {x, y, z});
   if (kind == ShapeKind::ellipsoid) {
-    const V3<T> scaled(x[0] / size[0], x[1] / size[1], x[2] / size[2]);
+    const V3<T> scaled(x / size[0], y / size[1], z / size[2]);
     const T least = std::min({size[0], size[1], size[2]});
     return (sqrt(scaled.squaredNorm()) - T(1)) * least;
   }
+  const ShapeKind sharp = kind == ShapeKind::rounded_box ? ShapeKind::box : ShapeKind::cylinder;
+  return distance_only<T>(sharp, size, nullptr, {x, y, z});
+}
+
+// A distance that nothing is nearer than, for culling: exact outside but for the ellipsoid, the grid, and rounded
+// edges, which count as sharp; negative inside.
+template <class T>
+GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, const V3<T>& x) {
+  using std::sqrt;
+  if (kind == ShapeKind::plane) return x[2];
+  if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];
+  if (kind >= ShapeKind::ellipsoid) [[unlikely]]
+    return rarer_distance_only<T>(kind, size, grid, x[0], x[1], x[2]);
   if (kind == ShapeKind::cylinder || kind == ShapeKind::capsule) {
     const T across = sqrt(x[0] * x[0] + x[1] * x[1]), along = (x[2] < T(0) ? -x[2] : x[2]) - size[1];
     if (kind == ShapeKind::capsule) {

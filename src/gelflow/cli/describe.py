@@ -15,7 +15,16 @@ from rich.tree import Tree
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
-    from gelflow.sim.describe import ActuatorPart, BodyPart, ContactPart, Description, JointPart, PadPart, Size
+    from gelflow.sim.describe import (
+        ActuatorPart,
+        BodyPart,
+        ContactPart,
+        Description,
+        JointPart,
+        PadPart,
+        ShapePart,
+        Size,
+    )
     from gelflow.sim.scene import Scene
     from gelflow.sim.step_times import StepTimes
 
@@ -68,6 +77,10 @@ def tree(d: "Description") -> Tree:
     bodies = root.add("[bold]bodies[/bold]")
     for body in d.bodies:
         _add_body(bodies, body)
+    if d.shapes:
+        shapes = root.add("[bold]shapes[/bold]")
+        for shape in d.shapes:
+            shapes.add(_shape(shape))
     contacts = root.add("[bold]contacts[/bold]" if d.contacts else "[bold]contacts[/bold]: none")
     for contact in d.contacts:
         _add_contact(contacts, contact)
@@ -123,6 +136,16 @@ def _actuator(actuator: "ActuatorPart", unit: str) -> str:
         if low is not None or high is not None:
             words.append(f"{what} {'-∞' if low is None else f'{low:g}'} to {'∞' if high is None else f'{high:g}'}{of}")
     return f"actuator [yellow]{escape(actuator.name)}[/yellow]: {', '.join(words)}"
+
+
+def _shape(shape: "ShapePart") -> str:
+    words = []
+    if shape.cells is not None and shape.spacing is not None and shape.bytes is not None:
+        size = f"{shape.bytes / 1e6:.1f} MB"
+        words.append(f"grid of {' × '.join(map(str, shape.cells))} cells of {shape.spacing * 1e3:.3g} mm, {size}")
+    if shape.rounding:
+        words.append(f"edges rounded by {shape.rounding * 1e3:.3g} mm")
+    return f"[cyan]{escape(shape.name)}[/cyan]: {shape.kind}, {', '.join(words)}"
 
 
 def _add_contact(at: Tree, contact: "ContactPart") -> None:
