@@ -62,7 +62,8 @@ def main() -> int:
     for status, count in sorted(total.reasons.items()):
         print(f"failed, {STATUS[status]}: {count}")
     print(f"{total.steps} steps in {wall:.0f} s; Newton iterations of a step are capped at {cap}")
-    args.out.write_text(json.dumps({"processor": processor(), "seconds": round(wall, 1), "rows": table}, indent=1) + "\n")
+    result = {"processor": processor(), "seconds": round(wall, 1), "rows": table}
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
     good = normal.failed == 0 and total.failed <= 0.01 * total.steps and total.most_iterations <= cap
     return 0 if good else 1
 

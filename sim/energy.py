@@ -159,7 +159,7 @@ class _Parts:
         self.counts: list[int] = []  # points
         self.weights: list[Array] = []
         self._anchors = 0
-        self._points: list[tuple[int, Array, Array, float]] = []
+        self._points: list[tuple[int, Array, Array, float, dict[str, Array]]] = []
         self._shapes: list[tuple[Any, ...]] = []
 
     def add_body(self, *args: Any, **more: Any) -> int:
@@ -176,12 +176,23 @@ class _Parts:
         self.spec.add_shape(name, body, kind, pos, quat, size, **more)
         return len(self._shapes) - 1
 
-    def add_points(self, name: str, body: int, points: ArrayLike, weights: ArrayLike, radius: float = 0.0) -> int:
-        self._points.append((body, np.array(points, float), np.array(weights, float), radius))
+    def add_points(
+        self,
+        name: str,
+        body: int,
+        points: ArrayLike,
+        weights: ArrayLike,
+        radius: float = 0.0,
+        pos: ArrayLike = (0, 0, 0),
+        quat: ArrayLike = (1, 0, 0, 0),
+        areas: Any = None,
+    ) -> int:
+        place = {"pos": np.array(pos, float), "quat": np.array(quat, float)}
+        self._points.append((body, np.array(points, float), np.array(weights, float), radius, place))
         return len(self._points) - 1
 
     def add_contact(self, name: str, points: int, shape: int, *, law: str = "viscous", **numbers: Any) -> None:
-        body, places, weights, radius = self._points[points]
+        body, places, weights, radius, place = self._points[points]
         if radius > 0:  # the sphere's lowest point against the plane: its centre against one that is higher
             owner, on, kind, pos, quat, size = self._shapes[shape]
             w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
@@ -189,7 +200,7 @@ class _Parts:
             shape = self.add_shape(f"{owner} below {name}", on, kind, np.asarray(pos) + radius * normal, quat, size)
         axes = [np.tile(axis, (len(places), 1)) for axis in np.eye(3)]
         self.spec.add_pad(
-            name, body, places, *axes, shapes=[shape], law="elastic", kn=1.0, kt=0.0, mu=0.0, kd=0.0, ks=1.0
+            name, body, places, *axes, shapes=[shape], law="elastic", kn=1.0, kt=0.0, mu=0.0, kd=0.0, ks=1.0, **place
         )
         self.weights.append(weights)
         self.counts.append(len(places))

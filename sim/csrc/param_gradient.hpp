@@ -5,7 +5,7 @@
 
 namespace gelflow {
 
-// A step (StepStart of step.hpp) to v1; or, for a reading, the state (q0, v0) alone.
+// A step (StepStart of residual.hpp) to v1; or, for a reading, the state (q0, v0) alone.
 struct ParamState {
   double h;
   const double *q0, *v0, *shift, *v1, *u;  // v0 is the step's v*

@@ -1,0 +1,152 @@
+// Newton's method for the velocity after a step: full steps first, then a search along the line, and where something
+// saturates, by way of softer friction and servos.
+#pragma once
+
+#include <algorithm>
+
+#include "residual.hpp"
+
+namespace gelflow {
+
+enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
+
+// Size of the residual relative to impulses.
+template <class T>
+double relative(const VX<T>& residual, const VX<T>& impulses) {
+  double sum = 0;
+  for (Eigen::Index k = 0; k < residual.size(); ++k) {
+    const double value = real_part(residual[k]) / std::max<double>(real_part(impulses[k]), 1e-30);
+    if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
+    sum += value * value;
+  }
+  return std::sqrt(sum);
+}
+
+// Whether the residual may be rounding errors alone: those of the impulses, of the momenta before the step (whose moments
+// are taken about the world's origin), and of what one rounding unit of every position and velocity makes.
+template <class T>
+bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
+                       const Workspace<T>& w) {
+  using std::abs;
+  const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
+  double reach = 0, mass = 0, speed = 0, spin = 0;
+  for (int k = 0; k < m.nq; ++k) reach = std::max(reach, std::abs(real_part(from.q0[k])));
+  for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
+  for (int k = 0; k < m.nv; ++k) {
+    double& fastest = m.angular[k] ? spin : speed;
+    fastest = std::max(fastest, std::abs(real_part(from.v_star[k])));
+  }
+  const double momentum = mass * (speed + reach * spin) * (1 + real_part(from.h) * spin);
+  for (int i = 0; i < m.nv; ++i) {
+    double own = m.angular[i] ? reach * momentum : momentum, stiffness = 0;
+    for (int j = 0; j < m.nv; ++j) {
+      stiffness += std::abs(real_part(w.by_q(i, j)));
+      own += std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
+    }
+    const double bound = unit * (stiffness * reach + own + real_part(w.forces[i]));
+    if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
+  }
+  return true;
+}
+
+// Solves one substep; on success `v` is v_t, and w holds residual and kinematics at (w.q, v).
+// `polish` more Newton updates follow convergence (dual numbers need two for their derivative part).
+//
+// The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
+// close to piecewise linear, and a full step into the right piece often makes the residual larger before the next one
+// solves it, while a search along the line would stop at the first edge. Where that does not lead home, the search
+// starts from the best point seen. Where the search gets stuck at an edge, the derivatives just past it say where to go.
+template <class T>
+Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
+              Workspace<T>& w) {
+  constexpr int full_steps = 6, patience = 6;
+  const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
+  bool fresh = false;  // w holds the derivatives at v
+  const auto measure = [&](bool derivatives) {
+    if (derivatives) {
+      evaluate<true, T>(m, params, from, v.data(), true, w);
+    } else {
+      evaluate<false, T>(m, params, from, v.data(), true, w);
+    }
+    fresh = derivatives;
+    return relative(w.residual, w.scale);
+  };
+  measure(true);
+  w.scale = w.forces;  // what residuals are compared by
+  double size = relative(w.residual, w.scale), best = size, before = size, mark = size;
+  if (!std::isfinite(size)) return Status::not_finite;
+  w.best = v;
+  bool settled = false;  // no better residual can be had
+  bool past = false;     // v lies just past an edge; the search goes on from w.start before it
+  for (int k = 0; k <= m.max_iterations; ++k) {
+    const bool converged = settled || relative(w.residual, w.forces) <= tolerance;
+    if (converged && polish-- <= 0) return Status::ok;
+    if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
+    if (!fresh) size = measure(true);
+    w.lu.compute(w.tangent);
+    w.direction = w.lu.solve(w.residual);
+    if (past) {
+      w.direction += w.start - v;
+    } else {
+      w.start = v;
+      before = size;
+    }
+    ++iterations;
+    const bool search = k >= full_steps && !converged;
+    double fraction = 1;
+    bool better = false;
+    for (int tries = 0; tries < 13; ++tries, fraction *= 0.5) {
+      v = w.start - w.direction * T(fraction);
+      size = measure(k == 0);  // the first update is seldom the last: its derivatives will be needed
+      better = size <= (1 - 1e-4 * fraction) * before;
+      if (better || converged) break;
+      settled = std::isfinite(size) && at_rounding_floor<T>(m, params, from, v, w);
+      if (settled || (std::isfinite(size) && !search)) break;
+    }
+    if (size < best) {
+      best = size;
+      w.best = v;
+    } else if (k + 1 == full_steps && !settled) {
+      v = w.best;
+      mark = best;
+      size = measure(true);
+    }
+    if (!search || settled) continue;
+    if (!better && (past || !std::isfinite(size))) break;
+    past = !better;
+    if ((k - full_steps) % patience == patience - 1) {
+      if (best > 0.5 * mark) break;
+      mark = best;
+    }
+  }
+  return Status::newton;
+}
+
+// Where Newton did not converge. Mostly something saturates: points stick below a tiny speed and slip above it, a servo
+// follows within a tiny error and pulls with its limit beyond. Full steps jump back and forth over that narrow range,
+// and a search gets stuck beside it. So k_t, k_s and the gains start soft, which makes the range wide, and grow to what
+// they are, each solution being the next one's start.
+template <class T>
+Status newton_from_softer(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
+                          int& iterations, Workspace<T>& w) {
+  constexpr double softest = 1e-8, least_growth = 1.3;
+  StepStart<T> soft = from;
+  VX<T> reached = v;
+  double solved = 0, growth = 100;
+  for (soft.softness = softest;;) {
+    v = reached;
+    const Status status = newton<T>(m, params, soft, soft.softness < 1 ? 0 : polish, v, iterations, w);
+    if (status == Status::ok) {
+      if (soft.softness == 1) return status;
+      reached = v;
+      solved = soft.softness;
+    } else {
+      growth = std::sqrt(growth);
+      if (solved == 0 || growth < least_growth) return status;
+    }
+    soft.softness = std::min(1.0, solved * growth);
+  }
+}
+
+}  // namespace gelflow
