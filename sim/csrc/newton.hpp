@@ -100,9 +100,9 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
       v = w.start - w.direction * T(fraction);
       size = measure(k == 0);  // the first update is seldom the last: its derivatives will be needed
       better = size <= (1 - 1e-4 * fraction) * before;
-      if (better || converged) break;
-      settled = std::isfinite(size) && at_rounding_floor<T>(m, params, from, v, w);
-      if (settled || (std::isfinite(size) && !search)) break;
+      if (converged) break;
+      settled = size > 0.5 * before && std::isfinite(size) && at_rounding_floor<T>(m, params, from, v, w);
+      if (better || settled || (std::isfinite(size) && !search)) break;
     }
     if (size < best) {
       best = size;
