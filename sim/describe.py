@@ -94,6 +94,7 @@ class PadPart:
     law: str
     unit: str
     numbers: dict[str, float]
+    pushes: bool  # its markers are contact points
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,7 @@ def describe(scene: Scene) -> Description:
                 law=pad.law,
                 unit="per point" if (pad.weights == 1).all() else "per area",
                 numbers=dict(pad.numbers),
+                pushes=pad.pushes,
             )
             for pad in scene.pads
         ),
@@ -307,12 +309,14 @@ def _size(scene: Scene) -> Size:
     reading_bytes = int(model.markers) * 3 * sim.q.itemsize
     known = state_bytes + sim.params.nbytes + reading_bytes
     sizes = {p.name: len(p.points) for p in scene.points}
+    pushing = [pad for pad in scene.pads if pad.pushes]
     return Size(
         nq=model.nq,
         nv=model.nv,
         nu=model.nu,
-        contact_pairs=len(scene.contacts),
-        candidate_points=sum(sizes[c.points] for c in scene.contacts),
+        contact_pairs=len(scene.contacts) + sum(len(pad.against) for pad in pushing),
+        candidate_points=sum(sizes[c.points] for c in scene.contacts)
+        + sum(len(pad.positions) * len(pad.against) for pad in pushing),
         anchors=model.na,
         markers=model.markers,
         parameters=len(model.param_names),

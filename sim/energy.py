@@ -94,9 +94,9 @@ class EnergyGauge:
         contact, friction = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
         for n, name in enumerate(self._twin.model.pad_names):
             own, weights = self._twin.pad(name), self._parts.weights[n]
-            contact += 0.5 * sim.param(f"{name}.kn") * (depth[:, own] ** 2 @ weights)
+            contact += 0.5 * _number(sim, name, "kn") * (depth[:, own] ** 2 @ weights)
             if self._parts.anchors[n] is not None:
-                friction += 0.5 * sim.param(f"{name}.ks") * ((strain[:, own] ** 2).sum(2) @ weights)
+                friction += 0.5 * _number(sim, name, "ks") * ((strain[:, own] ** 2).sum(2) @ weights)
         return contact, friction
 
 
@@ -118,6 +118,12 @@ def motor_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
         }[a.kind]
         forces[:, i] = a.gear * np.clip(pull, *a.force)
     return forces
+
+
+def _number(sim: Simulator, contact: str, number: str) -> Array:
+    """Of a contact; those of a pad that pushes several shapes have the pad's."""
+    own = f"{contact}.{number}"
+    return sim.param(own if own in sim.model.param_names else f"{contact.split('/')[0]}.{number}")
 
 
 def _gravity(sim: Simulator) -> Array:
@@ -208,6 +214,24 @@ class _Parts:
         self._anchors += len(places) if law == "elastic" else 0
 
     def add_pad(
-        self, name: str, body: int, positions: ArrayLike, *axes: Any, shapes: Any, law: str = "viscous", **_: Any
+        self,
+        name: str,
+        body: int,
+        positions: ArrayLike,
+        *axes: Any,
+        shapes: Any,
+        law: str = "viscous",
+        weights: ArrayLike | None = None,
+        pos: ArrayLike = (0, 0, 0),
+        quat: ArrayLike = (1, 0, 0, 0),
+        pushes: bool = False,
+        **_: Any,
     ) -> None:
-        self._anchors += len(np.asarray(positions)) * len(shapes) if law == "elastic" else 0
+        count = len(np.asarray(positions))
+        if not pushes:
+            self._anchors += count * len(shapes) if law == "elastic" else 0
+            return
+        points = self.add_points(name, body, positions, np.ones(count) if weights is None else weights, 0.0, pos, quat)
+        for shape in shapes:
+            own = name if len(shapes) == 1 else f"{name}/{self._shapes[shape][0]}"
+            self.add_contact(own, points, shape, law=law)

@@ -166,6 +166,7 @@ class Scene:
                 weights=pad.weights,
                 pos=pad.pose.pos,
                 quat=pad.pose.quat,
+                pushes=pad.pushes,
                 **pad.numbers,
             )
         for a in self.actuators:

@@ -84,6 +84,7 @@ class PadDef:
     against: tuple[str, ...]
     law: str
     numbers: Mapping[str, float]
+    pushes: bool  # its markers are contact points too
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
     `folder` is where the files of markers are looked for.
     """
     geoms = {geom.name: geom for geom in mechanics.geoms}
-    common = ("site", "shape", "against", "stiffness", "law", *LAWS, *_NUMBERS)
+    common = ("site", "shape", "against", "stiffness", "law", "pushes", *LAWS, *_NUMBERS)
     pads = []
     for name, table in tables.items():
         shape = table.word("shape", "rectangle", among=tuple(_PAD_KEYS))
@@ -216,6 +217,7 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
                 against=against,
                 law=law,
                 numbers=_law_numbers(table, law),
+                pushes=table.flag("pushes", default=False),
             )
         )
     return tuple(pads)

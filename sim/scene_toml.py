@@ -103,6 +103,12 @@ class Table:
             raise UsageError(f"{self.where}: {key} must be {count} numbers, got {value!r}")
         return tuple(float(v) for v in value)
 
+    def flag(self, key: str, default: bool | None = None) -> bool:
+        value = self._get(key, default)
+        if not isinstance(value, bool):
+            raise UsageError(f"{self.where}: {key} must be true or false, got {value!r}")
+        return value
+
     def words(self, key: str, default: Sequence[str] | None = None) -> tuple[str, ...]:
         """A list of strings; a single string counts as a list of one."""
         value = self._get(key, default)

@@ -299,7 +299,7 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
              const Array<double>& axes_x, const Array<double>& axes_y, const Array<double>& axes_z,
              const std::vector<int>& shapes, const std::string& law, double kn, double kt, double mu, double kd,
              double ks, const std::optional<std::vector<double>>& weights, const V3<double>& pos,
-             const V4<double>& quat) {
+             const V4<double>& quat, bool pushes) {
             const auto p = points_of(positions, "positions");
             const auto x = points_of(axes_x, "axes_x"), y = points_of(axes_y, "axes_y"),
                        z = points_of(axes_z, "axes_z");
@@ -309,12 +309,12 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
             std::vector<M3<double>> frames(p.size());
             for (std::size_t i = 0; i < p.size(); ++i) frames[i] << x[i], y[i], z[i];
             return s.add_pad(name, body, p, frames, shapes, law, {kn, kt, mu, kd, ks},
-                             weights ? *weights : std::vector<double>(p.size(), 1.0), pos, quat);
+                             weights ? *weights : std::vector<double>(p.size(), 1.0), pos, quat, pushes);
           },
           py::arg("name"), py::arg("body"), py::arg("positions"), py::arg("axes_x"), py::arg("axes_y"),
           py::arg("axes_z"), py::arg("shapes"), py::arg("law") = "viscous", py::arg("kn"), py::arg("kt"), py::arg("mu"),
           py::arg("kd"), py::arg("ks") = 0., py::arg("weights") = py::none(), py::arg("pos") = origin,
-          py::arg("quat") = upright)
+          py::arg("quat") = upright, py::arg("pushes") = false)
       .def("add_actuator", &ModelSpec::add_actuator, py::arg("name"), py::arg("joint"), py::arg("kind"),
            py::arg("gear") = 1., py::arg("kp") = 0., py::arg("kd") = 0., py::arg("force_lower") = -inf,
            py::arg("force_upper") = inf, py::arg("ctrl_lower") = -inf, py::arg("ctrl_upper") = inf,

@@ -281,7 +281,7 @@ int ModelSpec::add_contact(const std::string& name, int points, int shape, const
 int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
                        const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
                        const std::array<double, 5>& law_numbers, const std::vector<double>& weights,
-                       const V3<double>& pos, const V4<double>& quat) {
+                       const V3<double>& pos, const V4<double>& quat, bool pushes) {
   const std::string owner = "pad '" + name + "'";
   check_body(owner, body, true);
   if (positions.empty()) refuse(owner + ": at least one marker is needed");
@@ -308,7 +308,16 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   }
   pad.first_marker = model_.markers;
   model_.markers += pad.cloud.size();
+  pad.pushes = pushes;
   model_.pads.push_back(pad);
+  if (!pushes) return next_index(model_.pads) - 1;
+  model_.point_sets.push_back({name, pad.mount, 0.0, pad.cloud});
+  for (std::size_t s = 0; s < shapes.size(); ++s) {
+    const std::string own = shapes.size() == 1 ? name : name + "/" + model_.shapes[shapes[s]].name;
+    const int anchor = pad.anchor < 0 ? -1 : pad.anchor + static_cast<int>(s) * pad.cloud.size();
+    model_.contacts.push_back({own, next_index(model_.point_sets) - 1, shapes[s], pad.law, DampingLaw::depth, pad.param,
+                               anchor, {}});
+  }
   return next_index(model_.pads) - 1;
 }
 

@@ -131,6 +131,7 @@ struct Pad {
   int param;                    // kn, kt, mu, kd, ks
   int anchor;                   // first anchor slot; shape s, marker i is at anchor + s * markers + i
   int first_marker;             // in the tactile output
+  bool pushes;                  // its markers are contact points: contacts of its own have its numbers and anchors
   std::vector<PairDofs> pairs;  // one per shape
 };
 
@@ -207,7 +208,7 @@ class ModelSpec {
   int add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
               const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
               const std::array<double, 5>& law_numbers, const std::vector<double>& weights, const V3<double>& pos,
-              const V4<double>& quat);
+              const V4<double>& quat, bool pushes);
   int add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
                    double force_lower, double force_upper, double ctrl_lower, double ctrl_upper, double gain,
                    double bias);

@@ -48,7 +48,7 @@ template <class T>
 void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                             Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
-    if (pad.anchor < 0) continue;
+    if (pad.anchor < 0 || pad.pushes) continue;  // the anchors of its contacts have moved on
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
@@ -105,7 +105,7 @@ void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anc
                                V3<T>* by_anchor) {
   PairColumns<T> c;
   for (const Pad& pad : m.pads) {
-    if (pad.anchor < 0) continue;
+    if (pad.anchor < 0 || pad.pushes) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();

@@ -166,6 +166,7 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
     else:
         markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart"
     text = f"{markers}, on {pad.body} against {', '.join(pad.against)}"
+    text += ", which they push" if pad.pushes else ""
     branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")
     branch.add(_law(pad.law, pad.unit, pad.numbers, "", damped_by_depth=True))
 
