@@ -20,12 +20,8 @@ CXX_FILES = $(wildcard sim/csrc/*.cpp sim/csrc/*.hpp)
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
 SANITIZE_BUILD := build/sanitize
-# Every test of the core runs but those that repeat what others run, many times over: it is fifty times slower here.
-# test_core_order needs rest to the last bit, which not every build comes to.
-SANITIZE_LEFT_OUT = $(patsubst %,tests/test_core_%.py,order energy momentum motions determinism)
-SANITIZE_TESTS = $(filter-out $(SANITIZE_LEFT_OUT),$(wildcard tests/test_core_*.py)) tests/test_scene_simulated.py
-SANITIZE_CHOICE = not central_differences and not hundred_steps and not 110_steps and not found_again \
-  and not ((exact_against_dual or pressed_on_a_shape) and (viscous or bdf1)) and not (depth_and_normal and ellipsoid)
+# It is fifty times slower there: one file goes through every part of the core, the others through batches and contact.
+SANITIZE_TESTS = $(patsubst %,tests/test_core_%.py,every_part batch contact)
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
 
 .PHONY: demo test check core sanitize setup clean
@@ -53,7 +49,7 @@ sanitize: core
 	  -DCMAKE_CXX_COMPILER=$(CXX) -DGELFLOW_SANITIZE=ON -DGELFLOW_INPLACE=ON > $(SANITIZE_BUILD).log 2>&1 && \
 	  .venv/bin/cmake --build $(SANITIZE_BUILD) >> $(SANITIZE_BUILD).log 2>&1 || { cat $(SANITIZE_BUILD).log; exit 1; }
 	@LD_PRELOAD="$(SANITIZE_PRELOAD)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest --capture=sys -k "$(SANITIZE_CHOICE)" $(SANITIZE_TESTS)
+	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest --capture=sys $(SANITIZE_TESTS)
 
 setup: $(SETUP)
 

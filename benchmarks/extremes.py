@@ -25,7 +25,7 @@ ENVS, STEPS = 250, 20
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Count what fails among random steps at the extremes.")
-    parser.add_argument("--rounds", type=int, default=20, metavar="N", help="100 000 steps each (%(default)s)")
+    parser.add_argument("--rounds", type=int, default=21, metavar="N", help="100 000 steps each (%(default)s)")
     parser.add_argument("--out", type=Path, default=RESULTS / "extremes.json", help="file to write (%(default)s)")
     args = parser.parse_args()
     rows: dict[tuple[str, str], Tally] = {}
