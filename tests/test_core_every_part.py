@@ -19,7 +19,7 @@ from gelflow.sim.simulator import Simulator
 
 # Elastic friction and BDF2 are the longer ways; the others take part in single precision.
 WAYS: tuple[tuple[str, str, Precision], ...] = (("elastic", "bdf2", "double"), ("viscous", "bdf1", "single"))
-FEW = {
+FEW: dict[str, dict[str, Any]] = {
     "rolling": {"pads.pad.rows": 8, "pads.pad.cols": 8, "points.pad.resolution": [8, 8, 2], "pads.pad.pushes": True},
     "pushing": {"pads.pad.rows": 8, "pads.pad.cols": 8},
     "insertion": {"pads.*.rows": 6, "pads.*.cols": 5},
@@ -29,7 +29,7 @@ FEW = {
 @pytest.mark.parametrize(("law", "integrator", "precision"), WAYS)
 @pytest.mark.parametrize("name", SCENES)
 def test_scene(name: str, law: str, integrator: str, precision: Precision) -> None:
-    overrides: dict[str, Any] = {"integrator": integrator, **FEW.get(name, {})}
+    overrides = {"integrator": integrator, **FEW.get(name, {})}
     scene = load_scene(name, friction=law, overrides=overrides)
     sim, run = Simulator(scene, num_envs=3, threads=2, precision=precision), motion(scene)
     sim.q[:] = run.q0

@@ -315,8 +315,8 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   for (std::size_t s = 0; s < shapes.size(); ++s) {
     const std::string own = shapes.size() == 1 ? name : name + "/" + model_.shapes[shapes[s]].name;
     const int anchor = pad.anchor < 0 ? -1 : pad.anchor + static_cast<int>(s) * pad.cloud.size();
-    model_.contacts.push_back({own, next_index(model_.point_sets) - 1, shapes[s], pad.law, DampingLaw::depth, pad.param,
-                               anchor, {}});
+    model_.contacts.push_back(
+        {own, next_index(model_.point_sets) - 1, shapes[s], pad.law, DampingLaw::depth, pad.param, anchor, {}});
   }
   return next_index(model_.pads) - 1;
 }
