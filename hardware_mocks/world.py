@@ -40,7 +40,6 @@ class WorldConfig:
     hole: Pose = field(default_factory=lambda: Pose(np.array([0.374, 0.05, 0.05]), yaw_quaternion(0.0)))
     tool: Pose = field(default_factory=lambda: Pose(np.array([0.0, 0.0, 0.18]), np.array([0.0, 1.0, 0.0, 0.0])))
     grid: Grid = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # markers printed on the gels [mm]
-    compliance: float = 10.0  # a marker's displacement by its shear force [mm/N]
     grasp_height: float = 0.030  # of the pads' centres above the part's lower face [m]
     load_height: float = 0.032  # of the lower face above the hole's floor where the hand holds out a part, over it [m]
     height_error: float = 0.2e-3  # the hand holds it this much too high or too low, at most [m]
@@ -179,9 +178,8 @@ class World:
     def displacements(self) -> Array:
         """Displacement of the printed markers on both pads [mm], shape (2, markers, 2)."""
         with self._lock:
-            tactile = self._sim.tactile()[0].copy()
-        pads = zip(self._weights, self._pads, strict=True)
-        return np.stack([self.config.compliance * (weights @ tactile[pad, :2]) for weights, pad in pads])
+            moved = 1e3 * self._sim.displacement()[0]
+        return np.stack([weights @ moved[pad, :2] for weights, pad in zip(self._weights, self._pads, strict=True)])
 
     # What the devices can not know
 

@@ -95,6 +95,7 @@ class PadPart:
     unit: str
     numbers: dict[str, float]
     pushes: bool  # its markers are contact points
+    gel: str | None  # None: its markers have forces only
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,7 @@ def describe(scene: Scene) -> Description:
                 unit="per point" if (pad.weights == 1).all() else "per area",
                 numbers=dict(pad.numbers),
                 pushes=pad.pushes,
+                gel=None if pad.gel is None else str(pad.gel),
             )
             for pad in scene.pads
         ),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.sim.gel import Gel, read_gel
 from gelflow.sim.sampling import (
     ENDS,
     FACES,
@@ -85,6 +86,7 @@ class PadDef:
     law: str
     numbers: Mapping[str, float]
     pushes: bool  # its markers are contact points too
+    gel: Gel | None = None  # None: forces only
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
     `folder` is where the files of markers are looked for.
     """
     geoms = {geom.name: geom for geom in mechanics.geoms}
-    common = ("site", "shape", "against", "stiffness", "law", "pushes", *LAWS, *_NUMBERS)
+    common = ("site", "shape", "against", "stiffness", "law", "pushes", "gel", *LAWS, *_NUMBERS)
     pads = []
     for name, table in tables.items():
         shape = table.word("shape", "rectangle", among=tuple(_PAD_KEYS))
@@ -218,9 +220,16 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
                 law=law,
                 numbers=_law_numbers(table, law),
                 pushes=table.flag("pushes", default=False),
+                gel=_gel(table, markers),
             )
         )
     return tuple(pads)
+
+
+def _gel(table: Table, markers: _Markers) -> Gel | None:
+    if "gel" not in table.data:
+        return None
+    return read_gel(table.table("gel"), markers.positions, markers.axes, markers.grid, markers.area)
 
 
 def _markers(table: Table, shape: str, folder: Path) -> _Markers:

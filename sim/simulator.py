@@ -176,6 +176,29 @@ class Simulator:
         self._batch.tactile(target)
         return target
 
+    def displacement(self, forces: Any = None) -> Any:
+        """How far the markers go in their gels, (…, markers, 3): along x, along y, into the pad [m].
+
+        Now, (N, markers, 3), or under other `forces` [N] (…, markers, 3), such as `Trajectory.tactile`. A tensor gives
+        a tensor, with its gradient. Raises UsageError where a pad of the scene has no gel.
+        """
+        pads = getattr(self.scene, "pads", ())
+        if not pads:
+            raise UsageError("displacement needs a scene with pads")
+        if bare := [pad.name for pad in pads if pad.gel is None]:
+            raise UsageError(f"pad {bare[0]!r} has no gel; give pads.{bare[0]}.gel in the scene")
+        felt = self.tactile() if forces is None else forces
+        if not hasattr(felt, "requires_grad"):
+            felt = np.asarray(felt, self.dtype)
+        if felt.ndim < 2 or tuple(felt.shape[-2:]) != (self.model.markers, 3):
+            raise UsageError(f"forces must have shape (…, {self.model.markers}, 3), got {tuple(felt.shape)}")
+        moved = [pad.gel.displacement(felt[..., self.pad(pad.name), :]) for pad in pads]
+        if isinstance(felt, np.ndarray):
+            return np.concatenate(moved, axis=-2)
+        import torch  # here: who has no tensors needs no torch
+
+        return torch.cat(moved, dim=-2)
+
     def pad(self, name: str) -> slice:
         """The markers of one pad, as a slice of the markers' axis."""
         names = list(self.model.pad_names)

@@ -169,6 +169,8 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
     text += ", which they push" if pad.pushes else ""
     branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")
     branch.add(_law(pad.law, pad.unit, pad.numbers, "", damped_by_depth=True))
+    if pad.gel is not None:
+        branch.add(escape(f"gel: {pad.gel}"))
 
 
 def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_by_depth: bool) -> str:
