@@ -144,7 +144,7 @@ def _cell_area(flat: Array, where: str) -> float:
     if len(flat) < 2:
         raise UsageError(f"{where}: a layer spreads a marker's load as far as to its neighbours; there is only one")
     nearest = cKDTree(flat).query(flat, k=2)[0][:, 1]
-    if nearest.min() < 1e-3 * np.median(nearest):
+    if nearest.min() <= 1e-3 * np.median(nearest):
         raise UsageError(f"{where}: markers {int(nearest.argmin())} and another one are at the same place")
     return float(np.median(nearest)) ** 2
 
@@ -173,9 +173,9 @@ def _to_distance(response: Array, weights: Array, waves: Array, distances: Array
     what it does to depth.
     """
     s, a, b, c = response * weights
-    x = np.multiply.outer(distances, waves)
+    x = np.maximum(np.multiply.outer(distances, waves), 1e-9)
     zero, one = j0(x), j1(x)
-    two = 2 * one / np.maximum(x, 1e-9) - zero
+    two = 2 * one / x - zero
     return np.stack([zero @ (a + s) / 2, two @ (s - a) / 2, -one @ b, zero @ c])
 
 
@@ -224,7 +224,7 @@ def _square_cells(rows: int, cols: int, pitch: float, poisson: float, thickness:
     load = _point_load(poisson, thickness)
     sums = np.zeros((6, rows + 1, cols + 1))  # by how many rows and columns apart; one more that is not needed
 
-    def add(m: Array, n: Array, xi: Array, eta: Array, weight: Array) -> None:
+    def add(m: NDArray[np.intp], n: NDArray[np.intp], xi: Array, eta: Array, weight: Array) -> None:
         x, y = (m[:, None] + xi) * pitch, (n[:, None] + eta) * pitch
         r = np.hypot(x, y)
         values = _blocks(load(r), x, y, r) * weight
@@ -241,15 +241,15 @@ def _square_cells(rows: int, cols: int, pitch: float, poisson: float, thickness:
     t, t_weight = _gauss(np.array([0.0, 1.0]), 24)
     along, across = np.repeat(s, t.size), np.multiply.outer(s, t).ravel()
     corner = np.multiply.outer(s_weight * s, t_weight).ravel()
-    for m in (0, -1):
-        for n in (0, -1):
+    for i in (0, -1):
+        for j in (0, -1):
             for a, b in ((along, across), (across, along)):
-                add(np.array([m]), np.array([n]), a if m == 0 else 1 - a, b if n == 0 else 1 - b, corner)
+                add(np.array([i]), np.array([j]), a if i == 0 else 1 - a, b if j == 0 else 1 - b, corner)
     # The others.
-    g, g_weight = _gauss(np.array([0.0, 1.0]), 10)
+    g, g_weight = _gauss(np.array([0.0, 1.0]), 12)
     m, n = (k.ravel() for k in np.meshgrid(np.arange(-1, rows), np.arange(-1, cols), indexing="ij"))
     others = (m > 0) | (n > 0)
-    add(m[others], n[others], np.repeat(g, 10), np.tile(g, 10), np.multiply.outer(g_weight, g_weight).ravel())
+    add(m[others], n[others], np.repeat(g, g.size), np.tile(g, g.size), np.multiply.outer(g_weight, g_weight).ravel())
 
     row, col = np.divmod(np.arange(rows * cols), cols)
     apart_x, apart_y = row[:, None] - row, col[:, None] - col
@@ -268,9 +268,13 @@ def _round_cells(positions: Array, radius: float, poisson: float, thickness: flo
     """
     from scipy.interpolate import make_interp_spline
 
+    bends = [w * radius / thickness for w in (1, 2, 4, 8, 16) if w * radius / thickness < _FINEST]
+
     def mean(distance: float) -> Array:
-        # Panels of 16 nodes, none much longer than a turn of the fastest factor.
-        x, weights = _gauss(np.linspace(0, _FINEST, int(_FINEST * (distance / radius + 2) / 8) + 2), 16)
+        # Panels of 16 nodes, none much longer than a turn of the fastest factor; shorter where a thick layer begins to
+        # differ from the half space.
+        edges = np.linspace(0, _FINEST, int(_FINEST * (distance / radius + 2) / 8) + 2)
+        x, weights = _gauss(np.unique([*edges, *bends]), 16)
         weights = weights * (2 * j1(x) / x) ** 2 / radius
         if thickness == np.inf:
             response = np.repeat(half_space_response(poisson)[:, None], x.size, axis=1)

@@ -74,22 +74,22 @@ def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.5])
-@pytest.mark.parametrize("thickness", [2e-5, 2e-4, 1e-3])
+@pytest.mark.parametrize("thickness", [2e-5, 2e-4, 6e-4])
 def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -> None:
     """u = τ h / G, and p h (1 − 2ν) / (2 G (1 − ν)) into the layer, in the middle of a wide even load."""
-    gel = on_grid(31, 31, 1e-3, thickness, nu)
-    stress, middle = 100.0, 15 * 31 + 15
+    gel = on_grid(21, 21, 1e-3, thickness, nu)
+    stress, middle = 100.0, 10 * 21 + 10
     shear_modulus = E / (2 + 2 * nu)
     for axis, yields in ((0, 1.0), (1, 1.0), (2, (1 - 2 * nu) / (2 - 2 * nu))):
-        forces = np.zeros((31 * 31, 3))
+        forces = np.zeros((21 * 21, 3))
         forces[:, axis] = stress * gel.area
         expected = np.zeros(3)
         expected[axis] = stress * thickness / shear_modulus * yields
-        np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=1e-5 * stress * thickness / G)
+        np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=2e-5 * stress * thickness / G)
     if thickness < 1e-4:  # a marker alone: all of its own cell, nothing of the others but at the cells' borders
         alone = gel.matrix[::3, 3 * middle] * shear_modulus * gel.area / thickness
         assert alone[middle] == pytest.approx(1, abs=0.1)
-        assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 31, middle + 31])).max() < 1e-3
+        assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 21, middle + 21])).max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -98,12 +98,11 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
 def test_a_thick_layer_goes_over_into_the_half_space(make: Any) -> None:
     half = make(np.inf).matrix
     away = [np.abs(make(h).matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
-    assert away[0] < 0.05 and away[2] < 2e-4
+    assert away[0] < 0.05 and away[2] < 3e-4
     np.testing.assert_allclose(np.divide(away[:2], away[1:]), 10, rtol=0.1)  # falls off as 1/h
 
 
-@pytest.mark.parametrize("nu", [-0.9, 0.0, 0.5])
-@pytest.mark.parametrize("thickness", [1e-4, 3e-3, np.inf])
+@pytest.mark.parametrize(("nu", "thickness"), [(0.5, 1e-4), (0.5, 3e-3), (0.0, 3e-3), (-0.9, 3e-3), (0.5, np.inf)])
 def test_reciprocity_and_energy(nu: float, thickness: float) -> None:
     rng = np.random.default_rng(0)
     somewhere = LayerGel(E, nu, thickness, rng.uniform(0, 0.01, (40, 2)), 1e-6, None)
@@ -121,22 +120,21 @@ def test_finer_cells_average_to_the_coarse_ones_exactly(thickness: float) -> Non
     member = np.zeros((12, 108))
     member[row // 3 * 3 + col // 3, np.arange(108)] = 1 / 9
     spread = np.kron(member, np.eye(3))
-    np.testing.assert_allclose(spread @ fine @ spread.T, coarse, atol=1e-9 * coarse.max())
+    np.testing.assert_allclose(spread @ fine @ spread.T, coarse, atol=1e-10 * coarse.max())
 
 
 def test_per_area_loads_converge_as_the_grid_is_refined() -> None:
-    """A bell of shear and pressure, 3 mm wide, on 15 × 15 mm: what the middle marker does."""
+    """A bell of shear and pressure, 3 mm wide, on 15 × 15 mm: the middle marker's error falls as the pitch squared."""
 
     def middle(cells: int) -> Any:
         gel = on_grid(cells, cells, 0.015 / cells, 4e-3)
         bell = np.exp(-(gel.positions**2).sum(1) / 0.003**2)[:, None] * [1000.0, 0.0, 2000.0]
         return gel.displacement(bell * gel.area)[cells * cells // 2]
 
-    best, errors = middle(45), []
-    for cells in (5, 9, 15, 25):
-        errors.append(np.abs(middle(cells) - best)[[0, 2]].max() / best[2])
-    assert errors[-1] < 4e-3
-    assert (np.diff(np.log(errors)) / np.diff(np.log([5, 9, 15, 25])) < -1.5).all()  # second order
+    coarse, medium, fine = middle(11), middle(17), middle(27)
+    expected = (11**-2 - 17**-2) / (17**-2 - 27**-2)
+    np.testing.assert_allclose(((coarse - medium) / (medium - fine))[[0, 2]], expected, rtol=0.15)
+    np.testing.assert_allclose(medium[[0, 2]], fine[[0, 2]], rtol=0.02)
 
 
 def test_a_turned_pad_and_one_seen_from_its_side() -> None:
@@ -238,7 +236,8 @@ def test_gradients_go_back_through_the_gel(tmp_path: Path) -> None:
     controls = torch.full((6, 2, 2), -1e-3, dtype=torch.float64, requires_grad=True)
 
     def loss(u: torch.Tensor) -> torch.Tensor:
-        return 1e6 * (sim.displacement(rollout(sim, state_of(sim), u, read_after=(4, 6)).tactile) ** 2).sum()
+        moved: torch.Tensor = sim.displacement(rollout(sim, state_of(sim), u, read_after=(4, 6)).tactile)
+        return 1e6 * (moved**2).sum()
 
     assert torch.autograd.gradcheck(loss, (controls,), eps=1e-7, rtol=1e-4)
 
@@ -248,9 +247,9 @@ def test_given_markers_on_any_plane(tmp_path: Path) -> None:
     flat = np.array([[i * 1e-3, j * 1e-3, 0] for i in range(4) for j in range(3)])
     x, y, z = np.array([0.6, 0, -0.8]), np.array([0.0, 1, 0]), np.array([0.8, 0, 0.6])
     slanted = flat @ np.stack([x, y, z]) + [1e-3, 0, 2e-3]
-    text = 'shape = "points"\npositions = {}\nnormals = {}\nx_axes = {}\n' + LAYER
+    text = 'shape = "points"\npositions = {}\nnormals = {}\nx_axes = {}\n'
     shape = text.format(slanted.tolist(), [z.tolist()] * 12, [x.tolist()] * 12)
-    gel = scene_with(tmp_path, pad=shape).pads[0].gel
+    gel = scene_with(tmp_path, pad=shape + LAYER).pads[0].gel
     assert isinstance(gel, LayerGel) and gel.grid is None
     assert gel.area == pytest.approx(1e-6)
     np.testing.assert_allclose(gel.positions, flat[:, :2], atol=1e-15)
