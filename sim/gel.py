@@ -233,7 +233,7 @@ def _square_cells(rows: int, cols: int, pitch: float, poisson: float, thickness:
                 i, j = m + right, n + up
                 inside = (i >= 0) & (j >= 0)
                 part = (values * (hat_x * hat_y)).sum(-1)
-                np.add.at(sums, (slice(None), i[inside], j[inside]), part[:, inside])
+                sums[:, i[inside], j[inside]] += part[:, inside]  # each place is there once
 
     # The four squares at the origin, where the load is: in triangles about it, so that 1/r goes away.
     near = min(1.0, 12 * thickness / pitch)
