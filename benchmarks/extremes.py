@@ -1,4 +1,4 @@
-"""Two million random steps at the extremes: `python benchmarks/extremes.py`, about 3 minutes on 2 cores.
+"""Two million random steps at the extremes: `python benchmarks/extremes.py`, a little over 3 minutes on 2 cores.
 
 What is drawn stands in `gelflow.sim.extremes`. Prints how many steps failed, needed substeps, and what they cost; the
 figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
