@@ -25,8 +25,10 @@ from rich.table import Table
 
 from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark import ROLLING_FORCES, processor
-from gelflow.sim.gradient_cases import INTEGRATORS, LAWS, SCENES, SHAPES, exact_simulator, in_contact, pressed
+from gelflow.sim.gradient_cases import SCENES, SHAPES, exact_simulator, in_contact, pressed
 from gelflow.sim.gradient_check import Case, Output, against_differences, against_dual
+from gelflow.sim.scene import INTEGRATORS
+from gelflow.sim.scene_parts import LAWS
 
 FILE = Path(__file__).parent / "results" / "gradients.json"
 OUTPUTS: tuple[Output, ...] = ("q", "v", "tactile")

@@ -29,17 +29,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import SimulationError
 from gelflow.sim import _core
 from gelflow.sim.motions import motion
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
 
 SCENES = ("rolling", "pushing", "insertion", "grasp", "dclaw")
-LAWS = ("viscous", "elastic")
-INTEGRATORS = ("bdf1", "bdf2")
 QUANTITIES = ("stiffness", "damping", "friction", "mass", "speed", "step")
 KINDS = ("normal", *QUANTITIES, "all")
 _FEW_MARKERS = {"rolling": {"pads.pad.rows": 10, "pads.pad.cols": 10}}
@@ -117,7 +117,7 @@ class Extremes:
         return sim, u
 
     def run(self, draw: Draw) -> Tally:
-        """Take the steps of a batch. Raises AssertionError where anything but finite numbers comes out."""
+        """Take the steps of a batch. Raises SimulationError where anything but finite numbers comes out."""
         sim, u = self.start(draw)
         tally = Tally()
         for control in u:
@@ -129,7 +129,8 @@ class Extremes:
             tally.iterations += int(used.sum())
             tally.most_iterations = max(tally.most_iterations, int(used.max(initial=0)))
         for values in (sim.q, sim.v, sim.anchors, sim.history, sim.tactile()):
-            assert np.isfinite(values).all(), draw
+            if not np.isfinite(values).all():
+                raise SimulationError(f"numbers that are not finite came out of {draw}")
         tally.failed = int((sim.status != 0).sum())
         tally.halved = int(sim.halved.sum())
         tally.reasons = {int(s): int((sim.status == s).sum()) for s in np.unique(sim.status) if s}

@@ -16,8 +16,6 @@ from gelflow.sim.simulator import Simulator
 Array = NDArray[np.float64]
 
 SCENES = ("rolling", "insertion", "pushing", "grasp", "dclaw")
-LAWS = ("viscous", "elastic")
-INTEGRATORS = ("bdf1", "bdf2")
 SHAPES = {  # kind: size [m]
     "plane": (0.0, 0.0, 0.0),
     "sphere": (0.02, 0.0, 0.0),

@@ -8,7 +8,7 @@ require a gradient cost anything.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,7 +114,7 @@ class _Rollout(torch.autograd.Function):
     ) -> tuple[torch.Tensor, ...]:
         # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
         ctx.params = sim.params.copy() if params is None else params.detach().numpy()
-        with _using(sim, ctx.params):
+        with nullcontext() if params is None else _using(sim, ctx.params):
             trajectory = sim.rollout(
                 u.detach().numpy(),
                 q=q.detach().numpy(),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ G = 9.8
 HALF = 0.02
 MASS = 0.3
 CORNERS = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-LAWS = ("viscous", "elastic")
 
 
 def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:

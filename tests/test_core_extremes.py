@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from gelflow.sim import _core
-from gelflow.sim.extremes import INTEGRATORS, LAWS, SCENES, Draw, Extremes, Precision, Tally, draws
-from gelflow.sim.scene import load_scene
+from gelflow.sim.extremes import SCENES, Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import STATUS, Simulator
 
 BOTH: tuple[Precision, ...] = ("double", "single")

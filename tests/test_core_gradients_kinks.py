@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.gradient_cases import INTEGRATORS
 from gelflow.sim.gradient_check import Case, against_dual
+from gelflow.sim.scene import INTEGRATORS
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ import torch
 
 from gelflow.errors import UsageError
 from gelflow.sim import gradient_check, torch_layer
-from gelflow.sim.gradient_cases import LAWS, exact_simulator, in_contact
+from gelflow.sim.gradient_cases import exact_simulator, in_contact
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
 OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gelflow.sim import _core
-from gelflow.sim.gradient_cases import INTEGRATORS, LAWS, SCENES
+from gelflow.sim.gradient_cases import SCENES
 from gelflow.sim.sampling import box_surface, capsule
-from gelflow.sim.scene import load_scene
+from gelflow.sim.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

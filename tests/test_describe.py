@@ -12,10 +12,9 @@ from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim.describe import describe
 from gelflow.sim.scene import load_scene, scene_names
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.step_times import measure, start_controls, with_twice
-
-LAWS = ("viscous", "elastic")
 
 MODEL = """
 <mujoco>

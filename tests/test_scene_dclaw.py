@@ -5,9 +5,8 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
-
-LAWS = ("viscous", "elastic")
 
 
 def controls(scene: Scene, joint: str, change: float) -> np.ndarray:

@@ -5,9 +5,9 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.sim.scene import load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
-LAWS = ("viscous", "elastic")
 GRAVITY = 9.8
 
 

@@ -12,9 +12,9 @@ from gelflow.sim.describe import describe
 from gelflow.sim.energy import EnergyGauge
 from gelflow.sim.motions import motion
 from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
-LAWS = ("viscous", "elastic")
 PUSHING: dict[str, dict[str, Any]] = {
     "rolling": {"pads.pad.pushes": True, "pads.pad.rows": 20, "pads.pad.cols": 20, "pads.pad.size": [0.04, 0.04]},
     "insertion": {"pads.*.pushes": True},

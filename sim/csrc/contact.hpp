@@ -14,7 +14,8 @@ TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params,
                         const std::uint8_t* anchored) {
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
   const PointSet& set = m.point_sets[contact.points];
-  const T radius = T(set.radius) * params[set.mount.place + 6];  // a sphere's size is its first scale
+  // A sphere's size is its first scale; what has no radius need not have scales either (a pad that pushes).
+  const T radius = set.radius > 0 ? T(T(set.radius) * params[set.mount.place + 6]) : T(0);
   return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot};
 }
 

@@ -27,7 +27,6 @@ double relative(const VX<T>& residual, const VX<T>& impulses) {
 template <class T>
 bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
                        const Workspace<T>& w) {
-  using std::abs;
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
   double reach = 0, mass = 0, speed = 0, spin = 0;
   for (int k = 0; k < m.nq; ++k) reach = std::max(reach, std::abs(real_part(from.q0[k])));
@@ -63,16 +62,19 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
   const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
   bool fresh = false;  // w holds the derivatives at v
-  const auto measure = [&](bool derivatives) {
+  const auto look = [&](bool derivatives) {
     if (derivatives) {
       evaluate<true, T>(m, params, from, v.data(), true, w);
     } else {
       evaluate<false, T>(m, params, from, v.data(), true, w);
     }
     fresh = derivatives;
+  };
+  const auto measure = [&](bool derivatives) {
+    look(derivatives);
     return relative(w.residual, w.scale);
   };
-  measure(true);
+  look(true);
   w.scale = w.forces;  // what residuals are compared by
   double size = relative(w.residual, w.scale), best = size, before = size, mark = size;
   if (!std::isfinite(size)) return Status::not_finite;

@@ -28,7 +28,7 @@ struct Workspace {
         v_missing(m.nv),
         residual(m.nv),
         forces(m.nv),
-        scale(VX<T>::Ones(m.nv)),
+        scale(m.nv),
         increment(m.nv),
         update(m.nv),
         trial(m.nv),
