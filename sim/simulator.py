@@ -267,7 +267,7 @@ class Simulator:
         steps, n = controls.shape[0], self.num_envs
 
         def along_time(start: ArrayLike | None, own: NDArray[Any]) -> NDArray[Any]:
-            array = np.empty((steps + 1, *own.shape), own.dtype)
+            array = np.zeros((steps + 1, *own.shape), own.dtype)  # of anchors only those that are set are written
             array[0] = own if start is None else start
             return array
 

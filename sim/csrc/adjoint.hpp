@@ -67,7 +67,7 @@ template <class T, class Multipliers>
 void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
                         StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.start(u), r.v1.data(), false, w);
+  evaluate<true, T>(m, params, r.start(u), r.v1.data(), false, false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,
@@ -81,11 +81,13 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
     by_v0 = g.history.segment(m.nv, m.nv);
   }
   const VX<T> b = g.v + r.h * (position_by_increment_transposed<T>(m, w.increment, g.q) + by_increment);
-  w.lu.compute(w.tangent.transpose());
-  const VX<T> c = w.lu.solve(b);
+  w.tangent.leftCols(m.nv).transposeInPlace();
+  factorize<T>(w.tangent, m.nv, w.pivots);
+  VX<T> c(m.nv);
+  solve<T>(w.tangent, m.nv, w.pivots, b, c);
   multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
-  const VX<T> by_q1 = g.q - w.by_q.transpose() * c, by_v_star = w.mass.transpose() * c;
+  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c, by_v_star = w.mass.leftCols(m.nv).transpose() * c;
   by_increment += position_by_increment_transposed<T>(m, w.increment, by_q1);
   g.q = position_by_position_transposed<T>(m, w.increment, by_q1);
   g.v = by_v0 + (r.second ? T(4) / T(3) : T(1)) * by_v_star;

@@ -177,12 +177,11 @@ void Batch<T>::mass_matrix(T* out) {
     w.residual.setZero();
     w.by_q.setZero();
     w.by_v.setZero();
-    w.mass.setZero();
-    add_inverse_dynamics<true, T>(*model, params_of(e), T(1), w);
+    add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, w);
     for (const Joint& joint : model->joints) {
       for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += params_of(e)[joint.param + 1];
     }
-    std::copy(w.mass.data(), w.mass.data() + size, out);  // symmetric: storage order does not matter
+    for (int k = 0; k < model->nv; ++k) std::copy_n(&w.mass(k, 0), model->nv, out + k * model->nv);
   }
 }
 
@@ -192,7 +191,7 @@ void Batch<T>::bias(T* out) {
   for (int e = 0; e < n; ++e, out += model->nv) {
     kinematics(e, w);
     w.residual.setZero();
-    add_inverse_dynamics<false, T>(*model, params_of(e), T(1), w);
+    add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, w);
     std::copy(w.residual.data(), w.residual.data() + model->nv, out);
   }
 }
@@ -225,8 +224,8 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       const StateView<T> next = at(t + 1);
       std::copy(now.q, now.q + m.nq, next.q);
       std::copy(now.v, now.v + m.nv, next.v);
-      std::copy(now.anchors, now.anchors + na, next.anchors);
       std::copy(now.anchored, now.anchored + na, next.anchored);
+      for_each_set(now.anchored, m.na, [&](int i) { next.anchors[i] = now.anchors[i]; });
       std::copy(now.history, now.history + m.nh, next.history);
       if (r.status[e] != 0) continue;
       const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, m.polish, next, memory);

@@ -2,10 +2,14 @@
 //
 // Per pair one wrench W on the first body (−W on the second) and two 6 × 6 blocks, K = ∂W/∂ξ and D = ∂W/∂V, are summed
 // in the shape's frame and carried to the joints once. A point's displacement is ξ_lin + ξ_ang × c with c the point
-// itself, or the sphere's centre for a rolling point.
+// itself, or the sphere's centre for a rolling point. With A = ∂f/∂x where the twist moves along, B = ∂f/∂v:
+//     D = Σ [x]×B | B   times  −[x]× | 1,      K = Σ [x]×A − [f]× | A   times  −[c]× | 1,     [f]×[c]× = c fᵀ − f·c
 #pragma once
 
-#include "pair.hpp"
+#include <algorithm>
+
+#include "pair_columns.hpp"
+#include "touching.hpp"
 
 namespace gelflow {
 
@@ -19,106 +23,215 @@ TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params,
   return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot};
 }
 
-// The wrench of all touching points on the first body, about the shape's origin in its frame, and with derivatives the
-// blocks of K and D (mm, mf, fm, ff of each). Returns whether any point touches.
-template <bool derivatives, class T>
-bool sum_forces(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, V6<T>& wrench,
-                const std::array<M3<T>*, 8>& blocks) {
+// What all points of one pair feel: W about the shape's origin in its frame, and with derivatives K and D. Moments come
+// before forces, turns before shifts.
+template <class T>
+struct PairSums {
+  T wrench[6], k[6][6], d[6][6];
+};
+
+// Packs of points whose forces are known and have yet to be summed.
+template <class T>
+struct Pending {
   using L = Pack<T>;
-  Vec3<L> moment_sum = zero3<L>(), force_sum = zero3<L>();
-  Mat3<L> sums[8];
-  if constexpr (derivatives) std::fill(sums, sums + 8, zero33<L>());
+  static constexpr int most = 8;
+  struct Entry {
+    Vec3<L> x, force;
+    Mat3<L> by_pose, by_v;  // A and B
+  };
+  int count = 0;
+  Entry entry[most];
+};
+
+// Adds what A (or B) is in `matrix` of all entries to a 6 × 6 matrix; c = x + lift ẑ. Each loop runs over all entries and
+// keeps its few sums in registers.
+template <class T>
+GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<T>::Entry::* matrix, const T& lift,
+                               Pack<T>* out) {
+  using L = Pack<T>;
+  const L up(lift);
+  for (int i = 0; i < 3; ++i) {
+    Vec3<L> by_turn = zero3<L>(), by_shift = by_turn;
+    for (int n = 0; n < pending.count; ++n) {
+      const auto& e = pending.entry[n];
+      const Vec3<L>& row = (e.*matrix).row[i];
+      by_shift += row;
+      by_turn += cross(Vec3<L>{e.x.x, e.x.y, e.x.z + up}, row);
+    }
+    for (int j = 0; j < 3; ++j) {
+      out[(3 + i) * 6 + j] += by_turn[j];
+      out[(3 + i) * 6 + 3 + j] += by_shift[j];
+    }
+  }
+  const auto moments = [&](int j, auto&& turned) __attribute__((always_inline)) {
+    Vec3<L> by_turn = zero3<L>(), by_shift = by_turn;
+    for (int n = 0; n < pending.count; ++n) {
+      const auto& e = pending.entry[n];
+      const Mat3<L>& a = e.*matrix;
+      const Vec3<L> c{e.x.x, e.x.y, e.x.z + up};
+      by_shift += cross(e.x, Vec3<L>{a.row[0][j], a.row[1][j], a.row[2][j]});
+      by_turn += cross(e.x, Vec3<L>{turned(c, a.row[0]), turned(c, a.row[1]), turned(c, a.row[2])});
+    }
+    for (int i = 0; i < 3; ++i) {
+      out[i * 6 + j] += by_turn[i];
+      out[i * 6 + 3 + j] += by_shift[i];
+    }
+  };
+  using V = Vec3<L>;
+  moments(0, [](const V& c, const V& r) __attribute__((always_inline)) { return c.y * r.z - c.z * r.y; });
+  moments(1, [](const V& c, const V& r) __attribute__((always_inline)) { return c.z * r.x - c.x * r.z; });
+  moments(2, [](const V& c, const V& r) __attribute__((always_inline)) { return c.x * r.y - c.y * r.x; });
+}
+
+// Sums over the points near the shape. Returns whether any of them touches.
+template <bool derivatives, class T>
+bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, PairSums<T>& sums) {
+  using L = Pack<T>;
+  constexpr int numbers = derivatives ? 84 : 12;  // Σ f, Σ x fᵀ; K and D
+  L all[numbers];
+  std::fill(all, all + numbers, L(0.0));
   bool touching = false;
-  for_touching_points<T>(frame, cloud, rule, [&](const Touching<T>& t) {
+  Pending<T> pending;
+  const auto sum_up = [&]() __attribute__((noinline)) {
+    for (int n = 0; n < pending.count; ++n) {
+      const auto& e = pending.entry[n];
+      for (int j = 0; j < 3; ++j) {
+        all[j] += e.force[j];
+        for (int i = 0; i < 3; ++i) all[3 + 3 * i + j] += e.x[i] * e.force[j];
+      }
+    }
+    if constexpr (derivatives) {
+      add_blocks<T>(pending, &Pending<T>::Entry::by_pose, rule.rolling_radius, all + 12);
+      add_blocks<T>(pending, &Pending<T>::Entry::by_v, T(0), all + 48);
+    }
+    pending.count = 0;
+  };
+  for_touching_points<T>(frame, near, rule, [&](const Touching<T>& t) {
     touching = true;
     PointForce<L> force;
     point_force<derivatives ? 1 : 0>(t.law, t.at, t.v, t.e, t.remembers, force);
-    moment_sum += cross(t.x, force.force);
-    force_sum += force.force;
+    auto& e = pending.entry[pending.count++];
+    e.x = t.x;
+    e.force = force.force;
     if constexpr (derivatives) {
-      const Mat3<L> a = force.by_x + cross_rows(force.by_v, spread<L>(frame.angular));
-      Mat3<L> moment = cross_columns(t.x, a);  // − [f]×
-      moment.row[0] += Vec3<L>{L(0.0), force.force.z, -force.force.y};
-      moment.row[1] += Vec3<L>{-force.force.z, L(0.0), force.force.x};
-      moment.row[2] += Vec3<L>{force.force.y, -force.force.x, L(0.0)};
-      const Mat3<L> moment_v = cross_columns(t.x, force.by_v);
-      sums[0] -= cross_rows(moment, t.center);
-      sums[1] += moment;
-      sums[2] -= cross_rows(a, t.center);
-      sums[3] += a;
-      sums[4] -= cross_rows(moment_v, t.x);
-      sums[5] += moment_v;
-      sums[6] -= cross_rows(force.by_v, t.x);
-      sums[7] += force.by_v;
+      e.by_pose = force.by_x + cross_rows(force.by_v, spread<L>(frame.angular));
+      e.by_v = force.by_v;
     }
+    if (pending.count == Pending<T>::most) sum_up();
   });
   if (!touching) return false;
-  wrench = stack<T>(sum3<T>(moment_sum), sum3<T>(force_sum));
+  if (pending.count > 0) sum_up();
+  T total[numbers];
+  sum_lanes(all, numbers, total);
+  const T* const f = total;
+  const auto x = [&](int i, int j) { return total[3 + 3 * i + j]; };  // Σ x_i f_j
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    sums.wrench[i] = x(j, k) - x(k, j);
+    sums.wrench[3 + i] = f[i];
+  }
   if constexpr (derivatives) {
-    for (int i = 0; i < 8; ++i) *blocks[i] = sum33<T>(sums[i]);
+    for (int i = 0; i < 6; ++i) {
+      for (int j = 0; j < 6; ++j) {
+        sums.k[i][j] = total[12 + 6 * i + j];
+        sums.d[i][j] = total[48 + 6 * i + j];
+      }
+    }
+    const T lift = rule.rolling_radius, work = x(0, 0) + x(1, 1) + x(2, 2) + lift * f[2];  // Σ f·c
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) sums.k[i][j] += x(i, j);
+      sums.k[2][i] += lift * f[i];
+      sums.k[i][i] -= work;
+      const int j = (i + 1) % 3, k = (i + 2) % 3;  // −[f]×
+      sums.k[j][3 + k] += f[i];
+      sums.k[k][3 + j] -= f[i];
+    }
   }
   return true;
 }
 
-// Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `scale`: adds the
-// impulses' size to w.forces.
+// Subtracts h · (what the pair's sums say) from w.by_q and w.by_v.
+template <class T>
+void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) {
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  PairColumns<T>& c = w.columns;
+  for (int i = 0; i < c.n; i += width) {  // what the displacement of these dofs changes
+    L s[6], y[6];
+    for (int a = 0; a < 6; ++a) {
+      s[a] = load<L>(c.s.row(a) + i);
+      y[a] = load<L>(c.y.row(a) + i);
+    }
+    for (int a = 0; a < 6; ++a) {
+      L by_q = L(sums.k[a][0]) * s[0] + L(sums.d[a][0]) * y[0], by_v = L(sums.d[a][0]) * s[0];
+      for (int b = 1; b < 6; ++b) {
+        const L d(sums.d[a][b]);
+        by_q += L(sums.k[a][b]) * s[b] + d * y[b];
+        by_v += d * s[b];
+      }
+      store(by_q, c.force_q.row(a) + i);
+      store(by_v, c.force_v.row(a) + i);
+    }
+    // S_j ×* W: −(S_j ×* W) where j moves the first body, + where it moves the second; s_j S_j carries the sign.
+    const T* const f = sums.wrench;
+    const Vec3<L> turn{s[0], s[1], s[2]}, shift{s[3], s[4], s[5]}, moment{L(f[0]), L(f[1]), L(f[2])},
+        force{L(f[3]), L(f[4]), L(f[5])};
+    const Vec3<L> top = cross(turn, moment) + cross(shift, force), bottom = cross(turn, force);
+    for (int a = 0; a < 3; ++a) {
+      store(top[a], c.turned.row(a) + i);
+      store(bottom[a], c.turned.row(3 + a) + i);
+    }
+  }
+  for (int r = 0; r < c.n; ++r) {
+    const int row = c.dofs->dof[r];
+    if (row < 0) continue;
+    L s[6];
+    for (int a = 0; a < 6; ++a) s[a] = L(T(h * c.s.row(a)[r]));
+    for (int i = 0; i < c.n; i += width) {
+      L by_q(0.0), by_v(0.0), turned(0.0);
+      for (int a = 0; a < 6; ++a) {
+        by_q += s[a] * load<L>(c.force_q.row(a) + i);
+        by_v += s[a] * load<L>(c.force_v.row(a) + i);
+        turned += s[a] * load<L>(c.turned.row(a) + i);
+      }
+      const L counts = load<L>(&c.dofs->turned[static_cast<std::size_t>(r) * c.n + i]);
+      const std::ptrdiff_t at = row * w.by_q.outerStride() + c.dofs->start[i / width];
+      store(load<L>(w.by_q.data() + at) - by_q + counts * turned, w.by_q.data() + at);
+      store(load<L>(w.by_v.data() + at) - by_v, w.by_v.data() + at);
+    }
+  }
+}
+
+// Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `again`: at another trial
+// of the same step. `scale`: adds the impulses' size to w.forces.
 template <bool derivatives, class T>
-void subtract_contact_forces(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                             const std::uint8_t* anchored, double softness, bool scale, Workspace<T>& w) {
+void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, bool again, bool scale,
+                             Workspace<T>& w) {
   using std::abs;
-  PairColumns<T> c;
-  for (const Contact& contact : m.contacts) {
-    const Shape& shape = m.shapes[contact.shape];
-    const Mount& first = m.point_sets[contact.points].mount;
-    const PairFrame<T> frame = pair_frame<T>(params, first, shape, w);
-    V6<T> wrench = V6<T>::Zero();
-    // The blocks of K and D: rows moment, force; columns turn, shift.
-    M3<T> k_mm, k_mf, k_fm, k_ff, d_mm, d_mf, d_fm, d_ff;
-    TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
-    rule.softness = softness;
-    const bool touching = sum_forces<derivatives, T>(frame, m.point_sets[contact.points].cloud, rule, wrench,
-                                                     {&k_mm, &k_mf, &k_fm, &k_ff, &d_mm, &d_mf, &d_fm, &d_ff});
-    if (!touching) {
+  PairSums<T> sums;
+  for (std::size_t n = 0; n < m.contacts.size(); ++n) {
+    const Contact& contact = m.contacts[n];
+    const PointSet& set = m.point_sets[contact.points];
+    const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
+    TouchRule<T> rule = touch_rule<T>(m, contact, params, from.anchors, from.anchored);
+    rule.softness = from.softness;
+    find_near_points<T>(frame, set.cloud, rule, again, w.near[n]);
+    if (!sum_forces<derivatives, T>(frame, w.near[n], rule, sums)) {
       if (!is_finite(frame.check())) w.residual[0] = frame.check();
       continue;
     }
-    pair_columns<derivatives, T>(contact.pair, first.body, frame, w, c);
+    pair_columns<derivatives, T>(contact.pair, set.mount.body, frame, w);
+    const PairColumns<T>& c = w.columns;
     for (int i = 0; i < c.n; ++i) {
-      const T force_i = c.s[i].dot(wrench);
-      w.residual[contact.pair.dof[i]] -= h * force_i;
-      if (scale) w.forces[contact.pair.dof[i]] += h * abs(force_i);
+      const int dof = c.dofs->dof[i];
+      if (dof < 0) continue;
+      T impulse = T(0);
+      for (int a = 0; a < 6; ++a) impulse += c.s.row(a)[i] * sums.wrench[a];
+      impulse *= from.h;
+      w.residual[dof] -= impulse;
+      if (scale) w.forces[dof] += abs(impulse);
     }
-    if constexpr (derivatives) {
-      M6<T> k, d;
-      k.template topLeftCorner<3, 3>() = k_mm;
-      k.template topRightCorner<3, 3>() = k_mf;
-      k.template bottomLeftCorner<3, 3>() = k_fm;
-      k.template bottomRightCorner<3, 3>() = k_ff;
-      d.template topLeftCorner<3, 3>() = d_mm;
-      d.template topRightCorner<3, 3>() = d_mf;
-      d.template bottomLeftCorner<3, 3>() = d_fm;
-      d.template bottomRightCorner<3, 3>() = d_ff;
-      k *= h;
-      d *= h;
-      wrench *= h;
-      V6<T> by_v, by_q, by_q_turned;
-      for (int i = 0; i < c.n; ++i) {  // column: displacement of dof j
-        const int j = contact.pair.dof[i];
-        const bool j_first = contact.pair.first[i];
-        by_v.noalias() = d * c.s[i];
-        by_q.noalias() = k * c.s[i];
-        by_q.noalias() += d * c.y[i];
-        // −(S_j ×* W) where j moves the first body, +(S_j ×* W) where it moves the second: s_j S_j carries the sign.
-        by_q_turned = by_q - cross_force<T>(c.s[i], wrench);
-        for (int r = 0; r < c.n; ++r) {
-          const int row = contact.pair.dof[r];
-          const bool row_first = contact.pair.first[r];
-          const bool turned = j_first ? row_first && m.carries(j, row) : row_first || !m.carries(j, row);
-          w.by_q(row, j) -= dot6<T>(c.s[r], turned ? by_q_turned : by_q);
-          w.by_v(row, j) -= dot6<T>(c.s[r], by_v);
-        }
-      }
-    }
+    if constexpr (derivatives) subtract_derivatives<T>(from.h, sums, w);
   }
 }
 
@@ -126,28 +239,31 @@ void subtract_contact_forces(const Model& m, const T* params, const T& h, const 
 // kinematics of (q, v) in w.
 template <class T>
 void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                      const Workspace<T>& w, T* out) {
+                      Workspace<T>& w, T* out) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    V6<T> wrench = V6<T>::Zero();
-    sum_forces<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), wrench, {});
-    const V3<T> moment = frame.to_world * top(wrench), push = frame.to_world * bottom(wrench);
+    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
+    PairSums<T> sums;
+    find_near_points<T>(frame, set.cloud, rule, false, w.near[n]);
+    if (!sum_forces<false, T>(frame, w.near[n], rule, sums)) std::fill(sums.wrench, sums.wrench + 6, T(0));
+    const V3<T> moment = frame.to_world * vec3(sums.wrench), push = frame.to_world * vec3(sums.wrench + 3);
     const V6<T> in_world = stack<T>(moment + cross<T>(frame.origin, push), push);
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
   }
 }
 
-// Anchors after an accepted step (w holds its kinematics). `next` and `next_set` may be the arrays that are read.
+// Anchors after an accepted step, the last that was evaluated in w. `next` and `next_set` may be the arrays that are read.
 template <class T>
 void advance_contact_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                              Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
-  for (const Contact& contact : m.contacts) {
+  for (std::size_t n = 0; n < m.contacts.size(); ++n) {
+    const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), w.kept,
+    advance_anchors<T>(frame, w.near[n], touch_rule<T>(m, contact, params, anchors, anchored), set.cloud.size(),
                        next + contact.anchor, next_set + contact.anchor);
   }
 }
@@ -157,26 +273,28 @@ void advance_contact_anchors(const Model& m, const T* params, const V3<T>* ancho
 // what the residual says of the anchors before.
 template <bool from_next, class T>
 void contact_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
-                                const std::uint8_t* anchored, const Workspace<T>& w, const V3<T>* by_next,
+                                const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next,
                                 const VX<T>& multipliers, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   using L = Pack<T>;
-  PairColumns<T> c;
-  for (const Contact& contact : m.contacts) {
+  for (std::size_t n = 0; n < m.contacts.size(); ++n) {
+    const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
-    pair_columns<true, T>(contact.pair, first.body, frame, w, c);
+    pair_columns<true, T>(contact.pair, first.body, frame, w);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
     const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     V3<T>* const by_own = by_anchor + contact.anchor;
     if constexpr (from_next) {
-      anchors_transposed<T>(frame, m.point_sets[contact.points].cloud, rule, by_next + contact.anchor, by_pose,
-                            by_twist, by_own);
-      pull_back<T>(contact.pair, c, by_pose, by_twist, by_q, by_v);
+      anchors_transposed<T>(frame, w.near[n], rule, by_next + contact.anchor, by_pose, by_twist, by_own);
+      pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     } else {
       V6<T> virtual_twist = V6<T>::Zero();
-      for (int i = 0; i < c.n; ++i) virtual_twist += c.s[i] * multipliers[contact.pair.dof[i]];
-      for_touching_points<T>(frame, m.point_sets[contact.points].cloud, rule, [&](const Touching<T>& t) {
+      const PairColumns<T>& c = w.columns;
+      for (int i = 0; i < c.n; ++i) {
+        if (c.dofs->dof[i] >= 0) virtual_twist += c.s[i] * multipliers[c.dofs->dof[i]];
+      }
+      for_touching_points<T>(frame, w.near[n], rule, [&](const Touching<T>& t) {
         PointForce<L> force;
         point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
         const Vec3<L> weight =

@@ -10,7 +10,17 @@
 //     ∂F_b/∂v_j = I_b (P_j − S_j × V_after(j)) + B_b S_j
 //     ∂F_b/∂a_j = I_b S_j
 //     B_b X = I_b (X × V_b) + X ×* (I_b V_b) + V_b ×* (I_b X)
-// and I, B and F may be summed over subtrees first.
+// and I, B and F may be summed over subtrees first. With mass m, moment m c, rotational inertia J about the world's
+// origin, V = (ω, v), p = m v + ω × m c and X = (x, y), a translation y changes no B X, and
+//     I X = (J x + m c × y, m y − m c × x),     B X = (B₁ x, −2 p × x),     B₁ = [ω]× (2 J − tr J) + 2 ((m c · v) − v m cᵀ)
+// (Jacobi's identity, and J (a × b) + J a × b + a × J b = tr J a × b). Where nothing before a slide turns, and it is no
+// hinge, P, Q and its share of B vanish: mass is all that counts (`Model::translates`).
+//
+// A free body that carries nothing is shorter in its own frame, with c and J (about the frame's origin) constant there,
+// a the acceleration of the origin less gravity (world), ω and α in the body's frame:
+//     force (world)  m (a + R y),   y = α × c + ω × (ω × c)         moment (body)  J α + ω × J ω + m c × Rᵀ a
+//     by φ           −m R [y]×                                                     m [c]× [Rᵀ a]×
+//     by ω           −m R ([ω × c]× + [ω]× [c]×)                                   [ω]× J − [J ω]×
 #pragma once
 
 #include "kinematics.hpp"
@@ -18,78 +28,169 @@
 namespace gelflow {
 
 template <class T>
-M6<T> body_inertia(const Body& body, const T* params, const M3<T>& r, const V3<T>& p) {
-  const T* n = params + body.mass;
-  const T mass = n[0];
-  const V3<T> c = p + r * vec3(n + 1);
-  M3<T> local;
-  local << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
-  const M3<T> k = skew<T>(c);
-  M6<T> inertia;
-  const M3<T> turned = r.lazyProduct(local);
-  inertia.template topLeftCorner<3, 3>() = turned.lazyProduct(r.transpose());
-  inertia.template topLeftCorner<3, 3>() -= mass * cross_columns<T>(c, k);
-  inertia.template topRightCorner<3, 3>() = mass * k;
-  inertia.template bottomLeftCorner<3, 3>() = -mass * k;
-  inertia.template bottomRightCorner<3, 3>() = mass * M3<T>::Identity();
-  return inertia;
+GELFLOW_INLINE V6<T> times_inertia(const Composite<T>& c, const V6<T>& x) {
+  const V3<T> w = top(x), v = bottom(x);
+  return stack<T>(c.inertia * w + cross<T>(c.moment, v), c.mass * v - cross<T>(c.moment, w));
+}
+template <class T>
+GELFLOW_INLINE V6<T> times_rate(const Composite<T>& c, const V6<T>& x) {
+  const V3<T> w = top(x);
+  return stack<T>(c.rate * w, T(-2) * cross<T>(c.momentum, w));
+}
+// Bᵀ X, of which the linear part is zero.
+template <class T>
+GELFLOW_INLINE V3<T> transposed_rate_times(const Composite<T>& c, const V6<T>& x) {
+  return c.rate.transpose() * top(x) + T(2) * cross<T>(c.momentum, bottom(x));
 }
 
-// Adds h · (inverse dynamics) to w.residual; with derivatives also to w.by_q, w.by_v and w.mass (not times h).
+// The force F_b that moves one body as it does, and its composite, of which `rate` and `momentum` only with derivatives.
 template <bool derivatives, class T>
-void add_inverse_dynamics(const Model& m, const T* params, const T& h, Workspace<T>& w) {
+GELFLOW_INLINE V6<T> body_force(const Body& body, const T* params, const M3<T>& r, const V3<T>& p, const V6<T>& twist,
+                                const V6<T>& acceleration, Composite<T>& c) {
+  const T* n = params + body.mass;
+  c.mass = n[0];
+  if (body.translates) return stack<T>(V3<T>::Zero(), c.mass * bottom(acceleration));
+  const V3<T> w = top(twist), v = bottom(twist), center = p + r * vec3(n + 1);
+  M3<T> local;
+  local << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
+  const M3<T> turned = r.lazyProduct(local);
+  c.moment = c.mass * center;
+  c.inertia = turned.lazyProduct(r.transpose());
+  c.inertia -= c.moment * center.transpose();
+  const T squared = c.moment.dot(center);
+  for (int i = 0; i < 3; ++i) c.inertia(i, i) += squared;
+  const V3<T> momentum = c.mass * v + cross<T>(w, c.moment);
+  const V3<T> angular_momentum = c.inertia * w + cross<T>(c.moment, v);
+  if constexpr (derivatives) {
+    c.momentum = momentum;
+    M3<T> spread = T(2) * c.inertia;
+    const T trace = c.inertia.trace();
+    for (int i = 0; i < 3; ++i) spread(i, i) -= trace;
+    c.rate = cross_columns<T>(w, spread);
+    c.rate -= V3<T>(T(2) * v) * c.moment.transpose();
+    const T along = T(2) * c.moment.dot(v);
+    for (int i = 0; i < 3; ++i) c.rate(i, i) += along;
+  }
+  const V6<T> inertial = times_inertia<T>(c, acceleration);
+  return stack<T>(top(inertial) + cross<T>(w, angular_momentum) + cross<T>(v, momentum),
+                  bottom(inertial) + cross<T>(w, momentum));
+}
+
+// The share of a free body that carries nothing.
+template <bool derivatives, class T>
+void add_floating_body(const Model& m, const Body& body, const T* params, const T& h, const T* v, Workspace<T>& w) {
+  const int k = m.joints[body.joint_begin].v;
+  const T* n = params + body.mass;
+  const T mass = n[0];
+  const M3<T>& r = w.rotation[&body - m.bodies.data()];
+  const V3<T> c = vec3(n + 1), spin = vec3(v + k + 3), spin_rate = vec3(w.update.data() + k + 3);
+  const V3<T> a = vec3(w.update.data() + k) - vec3(params + m.gravity);
+  M3<T> inertia;
+  inertia << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
+  const bool centered = std::is_floating_point_v<T> && c == V3<T>::Zero();
+  if (!centered) {
+    inertia -= mass * c * c.transpose();
+    for (int i = 0; i < 3; ++i) inertia(i, i) += mass * c.squaredNorm();
+  }
+  const V3<T> angular_momentum = inertia * spin;
+  V3<T> force = mass * a, moment = inertia * spin_rate + cross<T>(spin, angular_momentum);
+  if (!centered) {
+    force += mass * (r * (cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c))));
+    moment += mass * cross<T>(c, r.transpose() * a);
+  }
+  for (int i = 0; i < 3; ++i) {
+    w.residual[k + i] += h * force[i];
+    w.residual[k + 3 + i] += h * moment[i];
+  }
+  if constexpr (derivatives) {
+    w.mass.template block<3, 3>(k + 3, k + 3) = inertia;
+    w.by_v.template block<3, 3>(k + 3, k + 3) += h * (cross_columns<T>(spin, inertia) - skew<T>(angular_momentum));
+    for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = mass;
+    if (centered) return;
+    const M3<T> lever = skew<T>(c), turned = mass * r;
+    const V3<T> y = cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c));
+    w.mass.template block<3, 3>(k, k + 3) = -turned * lever;
+    w.mass.template block<3, 3>(k + 3, k) = lever * turned.transpose();
+    w.by_q.template block<3, 3>(k, k + 3) -= h * (turned * skew<T>(y));
+    w.by_q.template block<3, 3>(k + 3, k + 3) += h * mass * (lever * skew<T>(r.transpose() * a));
+    w.by_v.template block<3, 3>(k, k + 3) -=
+        h * (turned * (skew<T>(cross<T>(spin, c)) + cross_columns<T>(spin, lever)));
+  }
+}
+
+// Adds h · (inverse dynamics) to w.residual; with derivatives also to w.by_q and w.by_v, and sets w.mass (not times h).
+template <bool derivatives, class T>
+void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* v, Workspace<T>& w) {
   const int bodies = static_cast<int>(m.bodies.size());
   for (int i = 0; i < bodies; ++i) {
-    const M6<T> inertia = body_inertia<T>(m.bodies[i], params, w.rotation[i], w.position[i]);
-    const V6<T> momentum = inertia * w.twist[i];
-    w.force[i] = inertia * w.acceleration[i] + cross_force<T>(w.twist[i], momentum);
-    if constexpr (derivatives) {
-      const M6<T> x = cross_motion_matrix<T>(w.twist[i]);
-      w.inertia[i] = inertia;
-      M6<T> product;
-      product.noalias() = inertia * x;
-      w.rate[i] = cross_with_force_matrix<T>(momentum) - product - product.transpose();  // I is symmetric
+    if (m.bodies[i].floats) {
+      add_floating_body<derivatives, T>(m, m.bodies[i], params, h, v, w);
+      continue;
     }
+    w.force[i] = body_force<derivatives, T>(m.bodies[i], params, w.rotation[i], w.position[i], w.twist[i],
+                                            w.acceleration[i], w.composite[i]);
   }
   for (int i = bodies - 1; i >= 0; --i) {
     const int parent = m.bodies[i].parent;
     if (parent == world) continue;
     w.force[parent] += w.force[i];
     if constexpr (derivatives) {
-      w.inertia[parent] += w.inertia[i];
-      w.rate[parent] += w.rate[i];
+      Composite<T>& sum = w.composite[parent];
+      const Composite<T>& own = w.composite[i];
+      sum.mass += own.mass;
+      if (m.bodies[parent].translates) continue;
+      sum.moment += own.moment;
+      sum.inertia += own.inertia;
+      sum.rate += own.rate;
+      sum.momentum += own.momentum;
     }
   }
-  for (int k = 0; k < m.nv; ++k) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
-  if constexpr (derivatives) {
-    for (int j = 0; j < m.nv; ++j) {
-      const V6<T>& s = w.axis[j];
-      w.p[j] = cross_motion<T>(w.twist_before[j], s);
-      w.q_missing[j] = -cross_motion<T>(s, w.acceleration_before[j]) - cross_motion<T>(w.p[j], w.twist_before[j]);
-      w.v_missing[j] = w.p[j] - cross_motion<T>(s, w.twist_after[j]);
-    }
-    for (int j = 0; j < m.nv; ++j) {
-      const int body = m.dof_body[j];
-      const V6<T>&s = w.axis[j], &p = w.p[j], &q = w.q_missing[j], &o = w.v_missing[j];
-      const V6<T> force_q = w.inertia[body] * q + w.rate[body] * p;
-      const V6<T> force_v = w.inertia[body] * o + w.rate[body] * s;
-      const V6<T> force_a = w.inertia[body] * s;
-      const V6<T> rate_s = w.rate[body].transpose() * s;
-      const V6<T> carried = cross_force<T>(s, w.force[body]);
-      for (const int k : m.bodies[body].dofs) {  // k before j, or in its group
-        if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
-        const V6<T>& sk = w.axis[k];
-        const bool same = m.group_begin[k] == m.group_begin[j];
-        w.by_q(k, j) += h * (dot6<T>(sk, force_q) + (same ? T(0) : dot6<T>(sk, carried)));
-        w.by_v(k, j) += h * dot6<T>(sk, force_v);
-        w.mass(k, j) = dot6<T>(sk, force_a);
-        if (same) continue;
-        // The transposed entry: dof j's force when the earlier dof k is displaced; the shared subtree is j's.
-        // I is symmetric: Sⱼᵀ I = (I Sⱼ)ᵀ.
-        w.by_q(j, k) += h * (dot6<T>(force_a, w.q_missing[k]) + dot6<T>(rate_s, w.p[k]));
-        w.by_v(j, k) += h * (dot6<T>(force_a, w.v_missing[k]) + dot6<T>(rate_s, sk));
-        w.mass(j, k) = w.mass(k, j);
+  for (const int k : m.tied) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
+  if constexpr (!derivatives) return;
+  for (const int j : m.tied) {
+    const V6<T> s = w.axis[j];
+    const int body = m.dof_body[j];
+    const Composite<T>& composite = w.composite[body];
+    if (m.translates[j]) {
+      const V3<T> momentum = composite.mass * bottom(s);
+      for (const int k : m.bodies[body].dofs) {
+        if (k > j) continue;
+        w.mass(k, j) = w.mass(j, k) = bottom(w.axis[k]).dot(momentum);
       }
+      continue;
+    }
+    const V6<T> before = w.twist_before[j];
+    const V6<T> p = cross_motion<T>(before, s);
+    const V6<T> q = -cross_motion<T>(s, w.acceleration_before[j]) - cross_motion<T>(p, before);
+    const V6<T> o = p - cross_motion<T>(s, w.twist_after[j]);
+    w.p[j] = p;
+    w.q_missing[j] = q;
+    w.v_missing[j] = o;
+  }
+  for (const int j : m.tied) {
+    if (m.translates[j]) continue;
+    const int body = m.dof_body[j];
+    const Composite<T>& composite = w.composite[body];
+    const V6<T> s = w.axis[j];
+    const V6<T> force_q = times_inertia<T>(composite, w.q_missing[j]) + times_rate<T>(composite, w.p[j]);
+    const V6<T> force_v = times_inertia<T>(composite, w.v_missing[j]) + times_rate<T>(composite, s);
+    const V6<T> force_a = times_inertia<T>(composite, s);
+    const V3<T> rate_s = transposed_rate_times<T>(composite, s);
+    const V6<T> carried = force_q + cross_force<T>(s, w.force[body]);
+    for (const int k : m.bodies[body].dofs) {  // k before j, or in its group
+      if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
+      const V6<T> sk = w.axis[k];
+      const bool same = m.group_begin[k] == m.group_begin[j];
+      w.by_q(k, j) += h * dot6<T>(sk, same ? force_q : carried);
+      w.by_v(k, j) += h * dot6<T>(sk, force_v);
+      w.mass(k, j) = dot6<T>(sk, force_a);
+      if (same) continue;
+      w.mass(j, k) = w.mass(k, j);
+      if (m.translates[k]) continue;
+      // The transposed entry: dof j's force when the earlier dof k is displaced; the shared subtree is j's.
+      // I is symmetric: Sⱼᵀ I = (I Sⱼ)ᵀ.
+      w.by_q(j, k) += h * (dot6<T>(force_a, w.q_missing[k]) + rate_s.dot(top(w.p[k])));
+      w.by_v(j, k) += h * (dot6<T>(force_a, w.v_missing[k]) + rate_s.dot(top(sk)));
     }
   }
 }

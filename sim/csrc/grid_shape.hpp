@@ -100,7 +100,7 @@ GELFLOW_INLINE void grid_distance(const DistanceGrid& g, const L& scale, const V
   out.d = select(within, scale * value, one);
   out.n = select3<L>(within, once * slope, {one, zero, zero});
   const L bends = select(within, twice, zero);
-  out.hessian = bends * Mat3<L>{{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}}};
+  out.hessian = bends * Mat3<L>{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}};
   out.bend = Bend::field;
 }
 

@@ -40,9 +40,9 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
         p = vec3(value);
         r = rotation_of<T>(V4<T>(value[3], value[4], value[5], value[6]));
         for (int a = 0; a < 3; ++a) {
-          w.axis[joint.v + a] = stack<T>(V3<T>::Zero(), V3<T>::Unit(a));
+          w.axis.set(joint.v + a, stack<T>(V3<T>::Zero(), V3<T>::Unit(a)));
           const V3<T> turn = r.col(a);
-          w.axis[joint.v + 3 + a] = stack<T>(turn, cross<T>(p, turn));
+          w.axis.set(joint.v + 3 + a, stack<T>(turn, cross<T>(p, turn)));
         }
         continue;
       }
@@ -53,19 +53,19 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
         p = anchor - r * offset;
         for (int a = 0; a < 3; ++a) {
           const V3<T> turn = r.col(a);
-          w.axis[joint.v + a] = stack<T>(turn, cross<T>(anchor, turn));
+          w.axis.set(joint.v + a, stack<T>(turn, cross<T>(anchor, turn)));
         }
         continue;
       }
       const V3<T> local = joint.axis.template cast<T>();
       const V3<T> direction = r * local;
       if (joint.type == JointType::slide) {
-        w.axis[joint.v] = stack<T>(V3<T>::Zero(), direction);
+        w.axis.set(joint.v, stack<T>(V3<T>::Zero(), direction));
         p += direction * (value[0] - T(joint.ref));
       } else {
         const V3<T> offset = joint.pos.template cast<T>();
         const V3<T> anchor = p + r * offset;
-        w.axis[joint.v] = stack<T>(direction, cross<T>(anchor, direction));
+        w.axis.set(joint.v, stack<T>(direction, cross<T>(anchor, direction)));
         r = (r * axis_rotation<T>(local, value[0] - T(joint.ref))).eval();
         p = anchor - r * offset;
       }
@@ -75,7 +75,8 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
   }
 }
 
-// Twists V and accelerations A of every body; gravity enters as an acceleration of the world.
+// Twists V and accelerations A of every body; gravity enters as an acceleration of the world. What is before the slides
+// of a free joint is not written down: only its turning would count, and there is none.
 template <class T>
 void forward_velocities(const Model& m, const T* params, const T* v, const T* a, Workspace<T>& w) {
   const V6<T> base = stack<T>(V3<T>::Zero(), -vec3(params + m.gravity));
@@ -85,15 +86,26 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
     V6<T> acceleration = body.parent == world ? base : w.acceleration[body.parent];
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       const Joint& joint = m.joints[j];
-      for (int k = joint.v; k < joint.v + joint.dofs;) {
+      int k = joint.v;
+      if (joint.type == JointType::free) {  // the slides at once: nothing turns before them
+        for (int axis = 0; axis < 3; ++axis, ++k) {
+          twist[3 + axis] += v[k];
+          acceleration[3 + axis] += a[k];
+        }
+      }
+      for (; k < joint.v + joint.dofs;) {
         const int end = m.group_end[k];
         const V6<T> before = twist, acceleration_before = acceleration;
+        V6<T> own = V6<T>::Zero();
         for (int g = k; g < end; ++g) {
-          twist += w.axis[g] * v[g];
-          acceleration += w.axis[g] * a[g] + cross_motion<T>(before, w.axis[g]) * v[g];
+          const V6<T> axis = w.axis[g];
+          own += axis * v[g];
+          acceleration += axis * a[g];
         }
+        twist += own;
+        acceleration += cross_motion<T>(before, own);
         for (int g = k; g < end; ++g) {
-          w.twist_before[g] = before;
+          w.twist_before.set(g, before);
           w.twist_after[g] = twist;
           w.acceleration_before[g] = acceleration_before;
         }
@@ -121,11 +133,15 @@ void integrate(const Model& m, const T* q0, const VX<T>& increment, T* q1) {
 
 // columns ← columns · ∂q_t/∂increment, where the columns belong to the tangent of q_t: Jr(φ) on turning dofs.
 template <class T>
-void times_position_by_increment(const Model& m, const VX<T>& increment, MX<T>& columns) {
+void times_position_by_increment(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
   for (const Joint& joint : m.joints) {
     if (!joint.turns()) continue;
     const int k = joint.turn_v();
-    columns.middleCols(k, 3) = (columns.middleCols(k, 3) * right_jacobian<T>(vec3(increment.data() + k))).eval();
+    const M3<T> turn = right_jacobian<T>(vec3(increment.data() + k)).transpose();
+    for (Eigen::Index row = 0; row < columns.rows(); ++row) {
+      const V3<T> old = vec3(&columns(row, k)), turned = turn * old;
+      for (int a = 0; a < 3; ++a) columns(row, k + a) = turned[a];
+    }
   }
 }
 

@@ -6,6 +6,10 @@
 // whatever the processor has.
 #pragma once
 
+#ifdef __AVX__
+#include <immintrin.h>
+#endif
+
 #include "spatial.hpp"
 
 namespace gelflow {
@@ -127,15 +131,26 @@ template <class T, int W>
 GELFLOW_INLINE void set_lane(Lanes<T, W>& x, int i, const T& value) {
   x.v[i] = value;
 }
+// One bit per lane, the first one lowest.
+GELFLOW_INLINE unsigned bits(bool x) { return x ? 1U : 0U; }
+template <class M>
+GELFLOW_INLINE auto bits(const M& mask) -> decltype(static_cast<unsigned>(mask.m[0])) {
+  constexpr unsigned lanes = sizeof(mask.m) / sizeof(mask.m[0]);
+#ifdef __AVX__
+  if constexpr (sizeof(mask.m) == 32 && lanes == 4) return _mm256_movemask_pd(reinterpret_cast<__m256d>(mask.m));
+  if constexpr (sizeof(mask.m) == 32 && lanes == 8) return _mm256_movemask_ps(reinterpret_cast<__m256>(mask.m));
+#endif
+  unsigned found = 0;
+  for (unsigned i = 0; i < lanes; ++i) found |= (mask.m[i] != 0 ? 1U : 0U) << i;
+  return found;
+}
 template <class M>
 GELFLOW_INLINE auto is_set(const M& mask, int i) -> decltype(mask.m[i] != 0) {
   return mask.m[i] != 0;
 }
 template <class M>
 GELFLOW_INLINE auto any(const M& mask) -> decltype(mask.m[0] != 0) {
-  auto found = mask.m[0];
-  for (unsigned i = 1; i < sizeof(mask.m) / sizeof(mask.m[0]); ++i) found |= mask.m[i];
-  return found != 0;
+  return bits(mask) != 0;
 }
 template <class T, int W>
 GELFLOW_INLINE Lanes<T, W> sqrt(const Lanes<T, W>& x) {
@@ -147,6 +162,59 @@ GELFLOW_INLINE Lanes<T, W> sqrt(const Lanes<T, W>& x) {
 template <class T, int W>
 GELFLOW_INLINE Lanes<T, W> abs(const Lanes<T, W>& x) {
   return select<T, W>(x < Lanes<T, W>(T(0)), -x, x);
+}
+
+// From and to neighbouring places of an array, which may hold numbers of another precision.
+template <class L, class S>
+GELFLOW_INLINE L load(const S* from) {
+  if constexpr (lane_count<L> == 1) {
+    return L(*from);
+  } else {
+    typedef S Stored __attribute__((vector_size(lane_count<L> * sizeof(S)), aligned(alignof(S)), may_alias));
+    return L(__builtin_convertvector(*reinterpret_cast<const Stored*>(from), typename L::Vector));
+  }
+}
+template <class T>
+GELFLOW_INLINE void store(const T& x, T* to) {
+  *to = x;
+}
+template <class T, int W>
+GELFLOW_INLINE void store(const Lanes<T, W>& x, T* to) {
+  typedef T Stored __attribute__((vector_size(W * sizeof(T)), aligned(alignof(T)), may_alias));
+  *reinterpret_cast<Stored*>(to) = x.v;
+}
+
+// The first `count` lanes.
+template <class L>
+GELFLOW_INLINE Mask<L> first_lanes(int count) {
+  if constexpr (lane_count<L> == 1) {
+    return count > 0;
+  } else {
+    L number;
+    for (int l = 0; l < lane_count<L>; ++l) number.v[l] = LaneScalar<L>(l);
+    return number < L(LaneScalar<L>(count));
+  }
+}
+
+// out[i] = Σ over the lanes of in[i].
+template <class T>
+GELFLOW_INLINE void sum_lanes(const T* in, int n, T* out) {
+  std::copy(in, in + n, out);
+}
+template <class T, int W>
+void sum_lanes(const Lanes<T, W>* in, int n, T* out) {
+  using V = typename Lanes<T, W>::Vector;
+  int i = 0;
+  if constexpr (W == 4) {  // four sums side by side
+    for (; i + 4 <= n; i += 4) {
+      const V &a = in[i].v, &b = in[i + 1].v, &c = in[i + 2].v, &d = in[i + 3].v;
+      const V ab = __builtin_shufflevector(a, b, 0, 4, 2, 6) + __builtin_shufflevector(a, b, 1, 5, 3, 7);
+      const V cd = __builtin_shufflevector(c, d, 0, 4, 2, 6) + __builtin_shufflevector(c, d, 1, 5, 3, 7);
+      const V left = __builtin_shufflevector(ab, cd, 0, 1, 4, 5), right = __builtin_shufflevector(ab, cd, 2, 3, 6, 7);
+      store(Lanes<T, W>(left + right), out + i);
+    }
+  }
+  for (; i < n; ++i) out[i] = sum(in[i]);
 }
 
 // Numbers at one place of as many tables as there are lanes.
@@ -179,6 +247,14 @@ template <class L>
 struct Mat3 {
   Vec3<L> row[3];
 
+  Mat3() = default;
+  GELFLOW_INLINE Mat3(const Vec3<L>& a, const Vec3<L>& b, const Vec3<L>& c) : row{a, b, c} {}
+  // Written out, copies stay in registers; the compiler's own go through memory, in a loop.
+  GELFLOW_INLINE Mat3(const Mat3& o) : row{o.row[0], o.row[1], o.row[2]} {}
+  GELFLOW_INLINE Mat3& operator=(const Mat3& o) {
+    for (int i = 0; i < 3; ++i) row[i] = o.row[i];
+    return *this;
+  }
   GELFLOW_INLINE Mat3& operator+=(const Mat3& o) {
     for (int i = 0; i < 3; ++i) row[i] += o.row[i];
     return *this;
@@ -189,9 +265,7 @@ struct Mat3 {
   }
   friend GELFLOW_INLINE Mat3 operator+(Mat3 a, const Mat3& b) { return a += b; }
   friend GELFLOW_INLINE Mat3 operator-(Mat3 a, const Mat3& b) { return a -= b; }
-  friend GELFLOW_INLINE Mat3 operator*(const L& s, const Mat3& a) {
-    return {{s * a.row[0], s * a.row[1], s * a.row[2]}};
-  }
+  friend GELFLOW_INLINE Mat3 operator*(const L& s, const Mat3& a) { return {s * a.row[0], s * a.row[1], s * a.row[2]}; }
   friend GELFLOW_INLINE Vec3<L> operator*(const Mat3& a, const Vec3<L>& b) {
     return {dot(a.row[0], b), dot(a.row[1], b), dot(a.row[2], b)};
   }
@@ -207,7 +281,7 @@ GELFLOW_INLINE Vec3<L> cross(const Vec3<L>& a, const Vec3<L>& b) {
 }
 template <class L>
 GELFLOW_INLINE Mat3<L> outer(const Vec3<L>& a, const Vec3<L>& b) {  // a bᵀ
-  return {{a.x * b, a.y * b, a.z * b}};
+  return {a.x * b, a.y * b, a.z * b};
 }
 template <class L>
 GELFLOW_INLINE Vec3<L> transposed_times(const Mat3<L>& a, const Vec3<L>& b) {
@@ -216,17 +290,17 @@ GELFLOW_INLINE Vec3<L> transposed_times(const Mat3<L>& a, const Vec3<L>& b) {
 template <class L>
 GELFLOW_INLINE Mat3<L> identity_minus_outer(const Vec3<L>& n) {  // 1 − n nᵀ
   const L one(1.0);
-  return {{Vec3<L>{one - n.x * n.x, -n.x * n.y, -n.x * n.z}, Vec3<L>{-n.y * n.x, one - n.y * n.y, -n.y * n.z},
-           Vec3<L>{-n.z * n.x, -n.z * n.y, one - n.z * n.z}}};
+  return {Vec3<L>{one - n.x * n.x, -n.x * n.y, -n.x * n.z}, Vec3<L>{-n.y * n.x, one - n.y * n.y, -n.y * n.z},
+          Vec3<L>{-n.z * n.x, -n.z * n.y, one - n.z * n.z}};
 }
 // [x]× A and A [x]×.
 template <class L>
 GELFLOW_INLINE Mat3<L> cross_columns(const Vec3<L>& x, const Mat3<L>& a) {
-  return {{x.y * a.row[2] - x.z * a.row[1], x.z * a.row[0] - x.x * a.row[2], x.x * a.row[1] - x.y * a.row[0]}};
+  return {x.y * a.row[2] - x.z * a.row[1], x.z * a.row[0] - x.x * a.row[2], x.x * a.row[1] - x.y * a.row[0]};
 }
 template <class L>
 GELFLOW_INLINE Mat3<L> cross_rows(const Mat3<L>& a, const Vec3<L>& x) {
-  return {{cross(a.row[0], x), cross(a.row[1], x), cross(a.row[2], x)}};
+  return {cross(a.row[0], x), cross(a.row[1], x), cross(a.row[2], x)};
 }
 template <class L>
 GELFLOW_INLINE Vec3<L> select3(const Mask<L>& choice, const Vec3<L>& yes, const Vec3<L>& no) {
@@ -239,7 +313,7 @@ GELFLOW_INLINE Vec3<L> zero3() {
 }
 template <class L>
 GELFLOW_INLINE Mat3<L> zero33() {
-  return {{zero3<L>(), zero3<L>(), zero3<L>()}};
+  return {zero3<L>(), zero3<L>(), zero3<L>()};
 }
 
 // Between packs and the numbers of one body or one point.
@@ -249,8 +323,8 @@ GELFLOW_INLINE Vec3<L> spread(const V3<T>& a) {
 }
 template <class L, class T>
 GELFLOW_INLINE Mat3<L> spread(const M3<T>& a) {
-  return {{Vec3<L>{L(a(0, 0)), L(a(0, 1)), L(a(0, 2))}, Vec3<L>{L(a(1, 0)), L(a(1, 1)), L(a(1, 2))},
-           Vec3<L>{L(a(2, 0)), L(a(2, 1)), L(a(2, 2))}}};
+  return {Vec3<L>{L(a(0, 0)), L(a(0, 1)), L(a(0, 2))}, Vec3<L>{L(a(1, 0)), L(a(1, 1)), L(a(1, 2))},
+          Vec3<L>{L(a(2, 0)), L(a(2, 1)), L(a(2, 2))}};
 }
 template <class T, class L>
 GELFLOW_INLINE V3<T> lane3(const Vec3<L>& a, int i) {

@@ -45,20 +45,45 @@ void check_law(const std::string& owner, const std::array<double, 5>& numbers, F
 
 }  // namespace
 
-PairDofs Model::pair_dofs(int first, int second) const {
-  PairDofs pair;
+PairDofs Model::pair_dofs(int first, int second) {
+  std::vector<int> dofs;
+  std::vector<double> signs(nv, 0.0);
   for (int k = 0; k < nv; ++k) {
     const auto moves = [&](int body) {
       if (body == world) return false;
-      const auto& dofs = bodies[body].dofs;
-      return std::find(dofs.begin(), dofs.end(), k) != dofs.end();
+      const auto& own = bodies[body].dofs;
+      return std::find(own.begin(), own.end(), k) != own.end();
     };
     const bool moves_first = moves(first), moves_second = moves(second);
     if (moves_first == moves_second) continue;
-    pair.dof.push_back(k);
-    pair.first.push_back(moves_first ? 1 : 0);
+    dofs.push_back(k);
+    signs[k] = moves_first ? 1.0 : -1.0;
   }
-  return pair;
+  const auto pack = [&](int width) {
+    PackedDofs packed;
+    for (const int k : dofs) {
+      if (!packed.start.empty() && k < packed.start.back() + width) continue;
+      packed.start.push_back(k);
+    }
+    for (const int start : packed.start) {
+      for (int k = start; k < start + width; ++k) {
+        const double sign = k < nv ? signs[k] : 0.0;
+        packed.sign.push_back(sign);
+        packed.dof.push_back(sign != 0 ? k : -1);
+      }
+    }
+    for (const int row : packed.dof) {
+      for (const int column : packed.dof) {
+        const bool both = row >= 0 && column >= 0;
+        const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && carries(column, row)
+                                                       : signs[row] > 0 || !carries(column, row));
+        packed.turned.push_back(counts ? 1.0 : 0.0);
+      }
+    }
+    columns = std::max(columns, static_cast<int>(packed.dof.size()));
+    return packed;
+  };
+  return {pack(1), pack(4), pack(8)};
 }
 
 int ModelSpec::add_params(const std::string& owner, const std::vector<std::string>& names,
@@ -354,8 +379,6 @@ int ModelSpec::add_actuator(const std::string& name, int joint, const std::strin
 Model ModelSpec::build() const {
   Model model = model_;
   if (model.nv == 0) refuse("the scene has no joint: nothing can move");
-  if (model.nv > 64)
-    refuse("the scene has " + std::to_string(model.nv) + " degrees of freedom; at most 64 are supported");
   model.gravity = next_index(model.param_names);
   for (const char* axis : {"gravity.x", "gravity.y", "gravity.z"}) model.param_names.emplace_back(axis);
   for (int i = 0; i < 3; ++i) model.param_defaults.push_back(gravity[i]);
@@ -376,6 +399,23 @@ Model ModelSpec::build() const {
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       for (int i = 0; i < model.joints[j].dofs; ++i) body.dofs.push_back(model.joints[j].v + i);
     }
+  }
+  model.translates.assign(nv, 0);
+  for (Body& body : model.bodies) {
+    body.translates = true;
+    for (const int k : body.dofs) {  // root first
+      body.translates = body.translates && !model.angular[k];
+      model.translates[k] = body.translates;
+    }
+  }
+  for (std::size_t i = 0; i < model.bodies.size(); ++i) {
+    const auto carried = [&](const Body& other) { return other.parent == static_cast<int>(i); };
+    Body& body = model.bodies[i];
+    body.floats = body.joint_end == body.joint_begin + 1 && model.joints[body.joint_begin].type == JointType::free &&
+                  std::none_of(model.bodies.begin(), model.bodies.end(), carried);
+  }
+  for (int k = 0; k < nv; ++k) {
+    if (!model.bodies[model.dof_body[k]].floats) model.tied.push_back(k);
   }
   model.carries_.assign(static_cast<std::size_t>(nv) * nv, 0);
   for (int k = 0; k < nv; ++k) {

@@ -36,8 +36,10 @@ struct Body {
   int parent;       // moving body, or world
   V4<double> quat;  // of the frame in the parent's frame at q = 0
   int joint_begin, joint_end;
-  int mass, pos;          // offsets in Params: mass, com (3), inertia (6); pos (3)
-  std::vector<int> dofs;  // all dofs that move this body, root first
+  int mass, pos;            // offsets in Params: mass, com (3), inertia (6); pos (3)
+  std::vector<int> dofs;    // all dofs that move this body, root first
+  bool translates = false;  // all of them do (Model::translates)
+  bool floats = false;      // a free joint, and no body on it
 };
 
 struct Joint {
@@ -70,22 +72,33 @@ struct Shape {
 };
 
 // Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
-// a block whose sphere lies outside a shape is skipped whole.
+// a block whose sphere lies outside a shape is skipped whole. Coordinates stand side by side, to be taken a pack at a
+// time, with `padding` numbers behind the last.
 struct PointCloud {
-  struct Block {
-    V3<double> center;
-    double radius;
-    int begin, end;  // points (leaves) or leaves (groups)
+  static constexpr int padding = 8;
+  struct Places {
+    std::vector<double> x, y, z;
+    void add(const V3<double>& p);
+    void pad();
+    V3<double> operator[](int i) const { return {x[i], y[i], z[i]}; }
   };
-  std::vector<V3<double>> points;  // sorted
-  std::vector<double> weights;     // sorted
-  std::vector<V3<double>> areas;   // sorted; of weights that are areas, by the axis across them; empty: they are not
-  std::vector<int> original;       // sorted index → index as given
-  std::vector<Block> leaves, groups;
+  struct Blocks {
+    Places center;
+    std::vector<double> radius;
+    std::vector<int> begin, end;  // points (of leaves) or leaves (of groups)
+    int count() const { return static_cast<int>(begin.size()); }
+  };
+  Places points;                  // sorted
+  std::vector<double> weights;    // sorted
+  std::vector<V3<double>> areas;  // sorted; of weights that are areas, by the axis across them; empty: they are not
+  std::vector<int> original;      // sorted index → index as given
+  Blocks leaves, groups;
+  double extent = 0;   // distance of the farthest point from the origin of the body's frame [m]
+  double spacing = 0;  // between neighbours, about [m]
 
   PointCloud() = default;
   PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& weights);
-  int size() const { return static_cast<int>(points.size()); }
+  int size() const { return static_cast<int>(original.size()); }
 };
 
 // The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and
@@ -105,10 +118,21 @@ struct PointSet {
   PointCloud cloud;
 };
 
-// The dofs that move one body of a pair and not the other; they alone change the relative motion.
+// The dofs that move one body of a pair and not the other; they alone change the relative motion. In packs of
+// neighbouring dofs, for each of the widths that numbers come in (lanes.hpp).
+struct PackedDofs {
+  std::vector<int> start;      // first dof of each pack
+  std::vector<int> dof;        // per column, −1 where the column is none of the pair's
+  std::vector<double> sign;    // +1 where the dof moves the first body, −1 the second, 0 none of the pair's
+  std::vector<double> turned;  // columns × columns: 1 where ∂S_row/∂q_column counts (pair_columns.hpp), else 0
+};
 struct PairDofs {
-  std::vector<int> dof;
-  std::vector<std::int8_t> first;  // 1 where the dof moves the first body, 0 where it moves the second
+  PackedDofs single, four, eight;
+
+  template <int width>
+  const PackedDofs& packed() const {
+    return width == 8 ? eight : width == 4 ? four : single;
+  }
 };
 
 struct Contact {
@@ -157,12 +181,15 @@ struct Model {
 
   int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
   int nh = 0;                               // BDF2's history: 2 nv + 1 numbers, see step.hpp; BDF1 has none
+  int columns = 0;                          // the most that a pair has, see PackedDofs
   std::vector<double> q0;                   // reference positions
 
-  // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, its joint.
+  // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, whether it and all before it
+  // on its chain are slides, its joint.
   std::vector<int> dof_body, dof_joint;
   std::vector<int> group_begin, group_end;
-  std::vector<std::uint8_t> angular;
+  std::vector<int> tied;  // dofs of bodies that do not float
+  std::vector<std::uint8_t> angular, translates;
   // carries(j, k): moving dof j carries dof k's axis along (j is before k on its chain, or in its group).
   std::vector<std::uint8_t> carries_;
   bool carries(int j, int k) const { return carries_[static_cast<std::size_t>(j) * nv + k] != 0; }
@@ -174,7 +201,7 @@ struct Model {
   int max_halvings = 6;
   int polish = 0;  // Newton iterations after it has converged
 
-  PairDofs pair_dofs(int first, int second) const;
+  PairDofs pair_dofs(int first, int second);
 };
 
 // Collects a scene piece by piece, checks each, and hands out the Model.

@@ -36,19 +36,45 @@ void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& orde
   sort_in_space(points, order, middle, end);
 }
 
-PointCloud::Block bounding_block(const std::vector<V3<double>>& points, int begin, int end) {
+struct Sphere {
+  V3<double> center;
+  double radius;
+};
+Sphere bounding_sphere(const PointCloud::Places& points, int begin, int end) {
   V3<double> low = points[begin], high = low;
   for (int i = begin; i < end; ++i) {
     low = low.cwiseMin(points[i]);
     high = high.cwiseMax(points[i]);
   }
-  PointCloud::Block block{0.5 * (low + high), 0, begin, end};
-  for (int i = begin; i < end; ++i) block.radius = std::max(block.radius, (points[i] - block.center).norm());
-  block.radius *= 1 + 1e-6;  // also covers the rounding of single precision
-  return block;
+  Sphere sphere{0.5 * (low + high), 0};
+  for (int i = begin; i < end; ++i) sphere.radius = std::max(sphere.radius, (points[i] - sphere.center).norm());
+  sphere.radius *= 1 + 1e-6;  // also covers the rounding of single precision
+  return sphere;
+}
+
+void add_block(PointCloud::Blocks& blocks, const Sphere& sphere, int begin, int end) {
+  blocks.center.add(sphere.center);
+  blocks.radius.push_back(sphere.radius);
+  blocks.begin.push_back(begin);
+  blocks.end.push_back(end);
+}
+
+void pad_blocks(PointCloud::Blocks& blocks) {
+  blocks.center.pad();
+  blocks.radius.resize(blocks.radius.size() + PointCloud::padding);
 }
 
 }  // namespace
+
+void PointCloud::Places::add(const V3<double>& p) {
+  x.push_back(p[0]);
+  y.push_back(p[1]);
+  z.push_back(p[2]);
+}
+
+void PointCloud::Places::pad() {
+  for (std::vector<double>* axis : {&x, &y, &z}) axis->resize(axis->size() + padding);
+}
 
 PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& given_weights) {
   const int n = static_cast<int>(given.size());
@@ -56,20 +82,24 @@ PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<d
   std::iota(original.begin(), original.end(), 0);
   sort_in_space(given, original, 0, n);
   for (const int i : original) {
-    points.push_back(given[i]);
+    points.add(given[i]);
     weights.push_back(given_weights[i]);
+    extent = std::max(extent, given[i].norm());
   }
   for (int begin = 0; begin < n; begin += leaf_size) {
-    leaves.push_back(bounding_block(points, begin, std::min(begin + leaf_size, n)));
+    const int end = std::min(begin + leaf_size, n);
+    add_block(leaves, bounding_sphere(points, begin, end), begin, end);
   }
-  const int leaf_count = static_cast<int>(leaves.size());
+  const int leaf_count = leaves.count();
+  for (const double radius : leaves.radius) spacing += radius / (2 * leaf_count);  // a leaf is 2 × 4 points, or so
   for (int begin = 0; begin < leaf_count; begin += leaves_per_group) {
     const int end = std::min(begin + leaves_per_group, leaf_count);
-    Block group = bounding_block(points, leaves[begin].begin, leaves[end - 1].end);
-    group.begin = begin;
-    group.end = end;
-    groups.push_back(group);
+    add_block(groups, bounding_sphere(points, leaves.begin[begin], leaves.end[end - 1]), begin, end);
   }
+  points.pad();
+  weights.resize(weights.size() + padding);
+  pad_blocks(leaves);
+  pad_blocks(groups);
 }
 
 }  // namespace gelflow

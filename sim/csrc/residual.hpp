@@ -10,18 +10,6 @@
 
 namespace gelflow {
 
-// What a step's residual needs beside v_t.
-template <class T>
-struct StepStart {
-  T h;  // β h
-  const T *q0, *v_star;
-  const T* shift;  // γ δ, null under BDF1
-  const V3<T>* anchors;
-  const std::uint8_t* anchored;
-  const T* u;
-  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
-};
-
 // Below this speed dry friction in a joint is viscous [m/s or rad/s].
 constexpr double friction_creep = 1e-3;
 
@@ -143,8 +131,10 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
 
 // Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.forces, the impulses at
 // work there, which Newton's tolerance refers to (they take the mass matrix of the last evaluation with derivatives).
+// `again`: w was last used for the same step.
 template <bool derivatives, class T>
-void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, bool scale, Workspace<T>& w) {
+void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, bool again, bool scale,
+              Workspace<T>& w) {
   const T& h = from.h;
   for (int k = 0; k < m.nv; ++k) {
     w.trial[k] = v[k] - from.v_star[k];
@@ -159,15 +149,14 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   if constexpr (derivatives) {
     w.by_q.setZero();
     w.by_v.setZero();
-    w.mass.setZero();
   }
-  add_inverse_dynamics<derivatives, T>(m, params, h, w);
+  add_inverse_dynamics<derivatives, T>(m, params, h, v, w);
   if constexpr (derivatives) w.by_v += w.mass;
   if (scale) {
     for (int k = 0; k < m.nv; ++k) w.forces[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
   subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.softness, scale, w);
-  subtract_contact_forces<derivatives, T>(m, params, h, from.anchors, from.anchored, from.softness, scale, w);
+  subtract_contact_forces<derivatives, T>(m, params, from, again, scale, w);
   if constexpr (derivatives) {
     w.tangent = h * w.by_q;
     times_position_by_increment<T>(m, w.increment, w.tangent);

@@ -145,8 +145,8 @@ __attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L
   for (int a = 0; a < 3; ++a) surface += inverse / square[a] * outer(project.row[a], project.row[a]);
   Mat3<L> moved = out.d * surface;
   for (int a = 0; a < 3; ++a) moved.row[a][a] += one;
-  const Mat3<L> cofactors{
-      {cross(moved.row[1], moved.row[2]), cross(moved.row[2], moved.row[0]), cross(moved.row[0], moved.row[1])}};
+  const Mat3<L> cofactors{cross(moved.row[1], moved.row[2]), cross(moved.row[2], moved.row[0]),
+                          cross(moved.row[0], moved.row[1])};
   const L determinant = dot(moved.row[0], cofactors.row[0]);
   const Mask<L> regular = determinant > L(1e-6);  // not where the curvature's centre is
   const L scale = select(regular, one / select(regular, determinant, one), one);
@@ -243,48 +243,51 @@ GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* 
   }
 }
 
+// One number of the rarer kinds' bounds.
 template <class T>
-GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, const V3<T>& x);
-
-// The place comes by value: its address would keep it out of registers where this is not called.
-template <class T>
-__attribute__((noinline)) T rarer_distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, T x, T y,
-                                                T z) {
-  using std::sqrt;
+__attribute__((noinline)) T rarer_bound(ShapeKind kind, const T* size, const DistanceGrid* grid, T x, T y, T z) {
   if (kind == ShapeKind::grid) return grid_bound<T>(*grid, size[0], {x, y, z});
-  if (kind == ShapeKind::ellipsoid) {
-    const V3<T> scaled(x / size[0], y / size[1], z / size[2]);
-    const T least = std::min({size[0], size[1], size[2]});
-    return (sqrt(scaled.squaredNorm()) - T(1)) * least;
-  }
-  const ShapeKind sharp = kind == ShapeKind::rounded_box ? ShapeKind::box : ShapeKind::cylinder;
-  return distance_only<T>(sharp, size, nullptr, {x, y, z});
+  const V3<T> scaled(x / size[0], y / size[1], z / size[2]);
+  return (std::sqrt(scaled.squaredNorm()) - T(1)) * std::min({size[0], size[1], size[2]});
 }
 
 // A distance that nothing is nearer than, for culling: exact outside but for the ellipsoid, the grid, and rounded
 // edges, which count as sharp; negative inside.
-template <class T>
-GELFLOW_INLINE T distance_only(ShapeKind kind, const T* size, const DistanceGrid* grid, const V3<T>& x) {
-  using std::sqrt;
-  if (kind == ShapeKind::plane) return x[2];
-  if (kind == ShapeKind::sphere) return sqrt(x.squaredNorm()) - size[0];
-  if (kind >= ShapeKind::ellipsoid) [[unlikely]]
-    return rarer_distance_only<T>(kind, size, grid, x[0], x[1], x[2]);
-  if (kind == ShapeKind::cylinder || kind == ShapeKind::capsule) {
-    const T across = sqrt(x[0] * x[0] + x[1] * x[1]), along = (x[2] < T(0) ? -x[2] : x[2]) - size[1];
-    if (kind == ShapeKind::capsule) {
-      return (along > T(0) ? T(sqrt(across * across + along * along)) : across) - size[0];
+template <class L, class T>
+GELFLOW_INLINE L distance_bound(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x) {
+  const L zero(0.0);
+  const auto positive = [&](const L& a) { return select(a > zero, a, zero); };
+  const auto larger = [](const L& a, const L& b) { return select(a > b, a, b); };
+  switch (kind) {
+    case ShapeKind::plane:
+      return x.z;
+    case ShapeKind::sphere:
+      return sqrt(dot(x, x)) - L(size[0]);
+    case ShapeKind::box:
+    case ShapeKind::rounded_box: {
+      const Vec3<L> over{abs(x.x) - L(size[0]), abs(x.y) - L(size[1]), abs(x.z) - L(size[2])};
+      const L inside = larger(over.x, larger(over.y, over.z));
+      const Vec3<L> gap{positive(over.x), positive(over.y), positive(over.z)};
+      return select(inside > zero, sqrt(dot(gap, gap)), inside);
     }
-    const T wall = across - size[0];
-    return wall > T(0) && along > T(0) ? T(sqrt(wall * wall + along * along)) : (wall > along ? wall : along);
+    case ShapeKind::capsule: {
+      const L along = positive(abs(x.z) - L(size[1]));
+      return sqrt(x.x * x.x + x.y * x.y + along * along) - L(size[0]);
+    }
+    case ShapeKind::cylinder:
+    case ShapeKind::rounded_cylinder: {
+      const L wall = sqrt(x.x * x.x + x.y * x.y) - L(size[0]), end = abs(x.z) - L(size[1]);
+      const L inside = larger(wall, end), gap_wall = positive(wall), gap_end = positive(end);
+      return select(inside > zero, sqrt(gap_wall * gap_wall + gap_end * gap_end), inside);
+    }
+    default:
+      break;
   }
-  T inside = T(-1e30), squared = T(0);
-  for (int a = 0; a < 3; ++a) {
-    const T o = (x[a] < T(0) ? -x[a] : x[a]) - size[a];
-    if (o > inside) inside = o;
-    if (o > T(0)) squared += o * o;
+  L bound = zero;
+  for (int i = 0; i < lane_count<L>; ++i) {
+    set_lane(bound, i, rarer_bound<T>(kind, size, grid, lane(x.x, i), lane(x.y, i), lane(x.z, i)));
   }
-  return inside > T(0) ? sqrt(squared) : inside;
+  return bound;
 }
 
 }  // namespace gelflow

@@ -101,26 +101,6 @@ GELFLOW_INLINE V6<T> cross_force(const V6<T>& x, const V6<T>& f) {
   return stack<T>(cross(w, n) + cross(v, l), cross(w, l));
 }
 
-// The 6 × 6 matrices of x ↦ V × x and of x ↦ x ×* f.
-template <class T>
-M6<T> cross_motion_matrix(const V6<T>& velocity) {
-  M6<T> m = M6<T>::Zero();
-  const M3<T> w = skew<T>(top(velocity));
-  m.template topLeftCorner<3, 3>() = w;
-  m.template bottomRightCorner<3, 3>() = w;
-  m.template bottomLeftCorner<3, 3>() = skew<T>(bottom(velocity));
-  return m;
-}
-template <class T>
-M6<T> cross_with_force_matrix(const V6<T>& force) {
-  M6<T> m = M6<T>::Zero();
-  const M3<T> l = skew<T>(bottom(force));
-  m.template topLeftCorner<3, 3>() = -skew<T>(top(force));
-  m.template topRightCorner<3, 3>() = -l;
-  m.template bottomLeftCorner<3, 3>() = -l;
-  return m;
-}
-
 template <class T>
 GELFLOW_INLINE M3<T> rotation_of(const V4<T>& q) {  // unit quaternion w x y z
   const T w = q[0], x = q[1], y = q[2], z = q[3];
@@ -147,10 +127,11 @@ struct RotationSeries {
     using std::sqrt;
     if (real_part(squared) < 1e-4) {  // the next terms are below 1e-19
       const T s = squared;
-      half_sinc = T(0.5) - s / T(48) * (T(1) - s / T(80) * (T(1) - s / T(168)));
-      half_cos = T(1) - s / T(8) * (T(1) - s / T(48) * (T(1) - s / T(120)));
-      one_minus_cos = T(0.5) - s / T(24) * (T(1) - s / T(30) * (T(1) - s / T(56)));
-      theta_minus_sin = T(1.0 / 6) - s / T(120) * (T(1) - s / T(42) * (T(1) - s / T(72)));
+      const auto over = [&](double divisor) { return T(s * T(1 / divisor)); };
+      half_sinc = T(0.5) - over(48) * (T(1) - over(80) * (T(1) - over(168)));
+      half_cos = T(1) - over(8) * (T(1) - over(48) * (T(1) - over(120)));
+      one_minus_cos = T(0.5) - over(24) * (T(1) - over(30) * (T(1) - over(56)));
+      theta_minus_sin = T(1.0 / 6) - over(120) * (T(1) - over(42) * (T(1) - over(72)));
     } else {
       const T theta = sqrt(squared);
       half_sinc = sin(theta * T(0.5)) / theta;

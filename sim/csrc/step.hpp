@@ -28,6 +28,20 @@ struct StateView {
   T* history;
 };
 
+// Calls visit(i) where set[i] is not 0. Most are not: they are looked at eight at a time.
+template <class Visit>
+void for_each_set(const std::uint8_t* set, int n, Visit&& visit) {
+  constexpr int word = sizeof(std::uint64_t);
+  for (int i = 0; i < n; i += word) {
+    const int end = std::min(i + word, n);
+    std::uint64_t any = 1;
+    if (end - i == word) std::memcpy(&any, set + i, word);
+    for (int k = i; any != 0 && k < end; ++k) {
+      if (set[k]) visit(k);
+    }
+  }
+}
+
 struct StepReport {
   Status status = Status::ok;
   int iterations = 0;  // Newton iterations, substeps included
@@ -48,15 +62,7 @@ struct StepMemory {
     v = Eigen::Map<const VX<T>>(s.v, m.nv);
     history = Eigen::Map<const VX<T>>(s.history, m.nh);
     anchors.clear();
-    constexpr int word = sizeof(std::uint64_t);  // most are not set: look at eight at a time
-    for (int i = 0; i < m.na; i += word) {
-      const int end = std::min(i + word, m.na);
-      std::uint64_t any = 1;
-      if (end - i == word) std::memcpy(&any, s.anchored + i, word);
-      for (int k = i; any != 0 && k < end; ++k) {
-        if (s.anchored[k]) anchors.emplace_back(k, s.anchors[k]);
-      }
-    }
+    for_each_set(s.anchored, m.na, [&](int i) { anchors.emplace_back(i, s.anchors[i]); });
   }
   void give_back(const Model& m, const StateView<T>& s) const {
     std::copy(q.data(), q.data() + m.nq, s.q);

@@ -5,7 +5,8 @@
 //     (shear_x, shear_y, normal) = (f·x, f·y, −f·z)
 #pragma once
 
-#include "pair.hpp"
+#include "pair_columns.hpp"
+#include "touching.hpp"
 
 namespace gelflow {
 
@@ -52,8 +53,9 @@ void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchor
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
-      advance_anchors<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), w.kept, next + slot,
-                         next_set + slot);
+      const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
+      find_near_points<T>(frame, pad.cloud, rule, false, w.near_markers);
+      advance_anchors<T>(frame, w.near_markers, rule, pad.cloud.size(), next + slot, next_set + slot);
     }
   }
 }
@@ -62,9 +64,8 @@ void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchor
 // state whose kinematics are in w. by_anchor may be null where there are no anchors.
 template <class T>
 void read_markers_transposed(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                             const Workspace<T>& w, const T* by_reading, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
+                             Workspace<T>& w, const T* by_reading, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   using L = Pack<T>;
-  PairColumns<T> c;
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
@@ -92,8 +93,8 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
             t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
           });
       const V6<T> by_pose = stack<T>(sum3<T>(turn), sum3<T>(shift)), by_twist = stack<T>(sum3<T>(spin), sum3<T>(slide));
-      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w, c);
-      pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
+      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w);
+      pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     }
   }
 }
@@ -101,9 +102,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
 // The same for the anchors' turn: gradients of the anchors after the step to the step's end and the anchors before.
 template <class T>
 void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                               const Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
-                               V3<T>* by_anchor) {
-  PairColumns<T> c;
+                               Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.pushes) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
@@ -112,8 +111,8 @@ void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anc
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
       anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), by_next + slot, by_pose,
                             by_twist, by_anchor + slot);
-      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w, c);
-      pull_back<T>(pad.pairs[s], c, by_pose, by_twist, by_q, by_v);
+      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w);
+      pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     }
   }
 }

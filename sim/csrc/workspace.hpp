@@ -1,7 +1,6 @@
 // Everything one environment's step writes besides its state; allocated once, reused by every step.
 #pragma once
 
-#include <Eigen/LU>
 #include <utility>
 #include <vector>
 
@@ -9,16 +8,80 @@
 
 namespace gelflow {
 
+// Spatial vectors side by side: number a of all of them in row a, with room for a pack behind the last.
+template <class T>
+struct SixRows {
+  explicit SixRows(int n) : stride_(n + PointCloud::padding), numbers_(6 * static_cast<std::size_t>(stride_), T(0)) {}
+  T* row(int a) { return numbers_.data() + static_cast<std::size_t>(a) * stride_; }
+  const T* row(int a) const { return numbers_.data() + static_cast<std::size_t>(a) * stride_; }
+  V6<T> operator[](int i) const {
+    V6<T> x;
+    for (int a = 0; a < 6; ++a) x[a] = row(a)[i];
+    return x;
+  }
+  void set(int i, const V6<T>& x) {
+    for (int a = 0; a < 6; ++a) row(a)[i] = x[a];
+  }
+
+ private:
+  int stride_;
+  std::vector<T> numbers_;
+};
+
+// Bodies that move together, about the world's origin (dynamics.hpp).
+template <class T>
+struct Composite {
+  T mass;
+  V3<T> moment;    // Σ m c
+  M3<T> inertia;   // J
+  M3<T> rate;      // B₁
+  V3<T> momentum;  // linear
+};
+
+// The points of one cloud that may touch one shape, side by side (near_points.hpp).
+template <class T>
+struct NearPoints {
+  int count = 0, capacity = 0;
+  std::vector<int> index;                                  // in the cloud
+  std::vector<T> x, y, z, weight;                          // in the first body's frame
+  std::vector<T> anchor_x, anchor_y, anchor_z, remembers;  // in the shape's frame, 1 where there is one; elastic law
+  double margin;                                           // [m]
+  M3<T> rotation;                                          // where the points were found
+  V3<T> offset;
+};
+
+// The dofs of a pair in the shape's frame (pair_columns.hpp).
+template <class T>
+struct PairColumns {
+  explicit PairColumns(int most) : s(most), y(most), force_q(most), force_v(most), turned(most) {}
+  const PackedDofs* dofs = nullptr;
+  int n = 0;                            // columns, a whole number of packs
+  SixRows<T> s, y;                      // S and Y, signs applied
+  SixRows<T> force_q, force_v, turned;  // what their displacements change (contact.hpp)
+};
+
+// What a step's residual needs beside v_t.
+template <class T>
+struct StepStart {
+  T h;  // β h
+  const T *q0, *v_star;
+  const T* shift;  // γ δ, null under BDF1
+  const V3<T>* anchors;
+  const std::uint8_t* anchored;
+  const T* u;
+  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+};
+
 template <class T>
 struct Workspace {
   explicit Workspace(const Model& m)
-      : rotation(m.bodies.size()),
+      : stride(m.nv + PointCloud::padding),
+        rotation(m.bodies.size()),
         position(m.bodies.size()),
         twist(m.bodies.size()),
         acceleration(m.bodies.size()),
         force(m.bodies.size()),
-        inertia(m.bodies.size()),
-        rate(m.bodies.size()),
+        composite(m.bodies.size()),
         axis(m.nv),
         twist_before(m.nv),
         twist_after(m.nv),
@@ -35,21 +98,31 @@ struct Workspace {
         direction(m.nv),
         start(m.nv),
         best(m.nv),
-        mass(m.nv, m.nv),
-        by_q(m.nv, m.nv),
-        by_v(m.nv, m.nv),
+        mass(m.nv, stride),
+        by_q(m.nv, stride),
+        by_v(m.nv, stride),
         by_u(m.actuators.size()),
-        tangent(m.nv, m.nv),
+        tangent(m.nv, stride),
         q(m.nq),
-        lu(m.nv) {}
+        pivots(m.nv),
+        columns(m.columns),
+        near(m.contacts.size()) {
+    mass.setZero();
+    tangent.setZero();
+  }
+
+  // Rows of matrices are longer than they need to be, so that packs may be added to them anywhere.
+  using Rows = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  int stride;
 
   // Kinematics, world frame; spatial vectors at the world's origin.
   std::vector<M3<T>> rotation;
   std::vector<V3<T>> position;
   std::vector<V6<T>> twist, acceleration, force;
-  std::vector<M6<T>> inertia, rate;  // composite over the subtree: I and B (dynamics.hpp)
-  std::vector<V6<T>> axis;           // S_k per dof
-  std::vector<V6<T>> twist_before, twist_after, acceleration_before;  // around the dof's group
+  std::vector<Composite<T>> composite;  // of the subtree (dynamics.hpp)
+  SixRows<T> axis;                      // S_k per dof
+  SixRows<T> twist_before;              // around the dof's group
+  std::vector<V6<T>> twist_after, acceleration_before;
 
   std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
 
@@ -58,13 +131,15 @@ struct Workspace {
   VX<T> increment;               // q_t = q_{t-1} ⊕ increment
   VX<T> update, trial;           // accelerations; v_t − v*
   VX<T> direction, start, best;  // Newton's
-  MX<T> mass, by_q, by_v;        // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  Rows mass, by_q, by_v;         // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
   VX<T> by_u;                    // ∂g_dof/∂u per actuator
-  MX<T> tangent;                 // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t
+  Rows tangent;                  // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
   VX<T> q;                       // q_t of the trial velocity
-  Eigen::PartialPivLU<MX<T>> lu;
+  std::vector<int> pivots;
 
-  std::vector<std::pair<int, V3<T>>> kept;  // anchors in the making (pair.hpp)
+  PairColumns<T> columns;           // of the pair at work
+  std::vector<NearPoints<T>> near;  // per contact
+  NearPoints<T> near_markers;       // of the pad at work
 };
 
 }  // namespace gelflow

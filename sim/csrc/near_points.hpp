@@ -1,0 +1,156 @@
+// Which points of a cloud may touch a shape.
+#pragma once
+
+#include <bit>
+
+#include "pair_frame.hpp"
+
+namespace gelflow {
+
+// What the points of one cloud need besides their places.
+template <class T>
+struct TouchRule {
+  const T* params;  // kn, kt, mu, kd, ks
+  FrictionLaw law;
+  DampingLaw damping;
+  T rolling_radius;              // 0: the points themselves touch
+  const V3<T>* anchors;          // of this cloud against this shape
+  const std::uint8_t* anchored;  // both unused under the viscous law
+  double softness = 1;           // share of k_t and k_s that is at work
+};
+
+// Calls visit(b) for blocks from … to that may reach into the shape grown by `margin`.
+template <bool scaled, class T, class Visit>
+GELFLOW_INLINE void for_near_blocks(const PairFrame<T>& f, const PointCloud::Blocks& blocks, int from, int to,
+                                    const T& margin, Visit&& visit) {
+  using L = Pack<T>;
+  for (int b = from; b < to; b += pack_width<T>) {
+    const Vec3<L> center{load<L>(&blocks.center.x[b]), load<L>(&blocks.center.y[b]), load<L>(&blocks.center.z[b])};
+    const L radius = load<L>(&blocks.radius[b]);
+    const L reach = (scaled ? L(f.stretch) * radius : radius) + L(margin);
+    unsigned near = bits(f.template may_reach<scaled, L>(center, reach) && first_lanes<L>(to - b));
+    for (; near != 0; near &= near - 1) visit(b + std::countr_zero(near));
+  }
+}
+
+// Calls visit(begin, end) for neighbours in the cloud, some of which may be inside the shape grown by `margin`.
+template <bool scaled, class T, class Visit>
+GELFLOW_INLINE void for_near_leaves(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+  const T around = margin + T(1e-6);  // [m], above the rounding of single precision
+  for_near_blocks<scaled, T>(f, cloud.groups, 0, cloud.groups.count(), around, [&](int g) {
+    for_near_blocks<scaled, T>(f, cloud.leaves, cloud.groups.begin[g], cloud.groups.end[g], around,
+                               [&](int l) { visit(cloud.leaves.begin[l], cloud.leaves.end[l]); });
+  });
+}
+
+// What is near is no matter of derivatives: the frame of a run whose numbers carry some.
+template <class T>
+PairFrame<double> real_frame(const PairFrame<T>& f, double* size) {
+  PairFrame<double> real;
+  for (int i = 0; i < 3; ++i) {
+    size[i] = real_part(f.size[i]);
+    for (int j = 0; j < 3; ++j) real.rotation(i, j) = real_part(f.rotation(i, j));
+    real.offset[i] = real_part(f.offset[i]);
+    real.local[i] = real_part(f.local[i]);
+  }
+  real.size = size;
+  real.kind = f.kind;
+  real.grid = f.grid;
+  real.stretch = f.scaled ? real_part(f.stretch) : 1.0;
+  real.local_level = real_part(f.local_level);
+  return real;
+}
+
+template <class T, class Visit>
+GELFLOW_INLINE void for_near_leaves(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+  if constexpr (std::is_floating_point_v<T>) {
+    if (f.scaled) return for_near_leaves<true, T>(f, cloud, margin, visit);
+    return for_near_leaves<false, T>(f, cloud, margin, visit);
+  } else {
+    double size[3];
+    for_near_leaves<true, double>(real_frame(f, size), cloud, real_part(margin), visit);
+  }
+}
+
+// The same for single points.
+template <class T, class Visit>
+void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+  if constexpr (std::is_floating_point_v<T>) {
+    using L = Pack<T>;
+    const L around = L(margin) + L(T(1e-6));
+    for_near_leaves<T>(f, cloud, margin, [&](int begin, int end) {
+      for (int i = begin; i < end; i += pack_width<T>) {
+        const Vec3<L> point{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};
+        const Mask<L> reaches =
+            f.scaled ? f.template may_reach<true, L>(point, around) : f.template may_reach<false, L>(point, around);
+        unsigned near = bits(reaches && first_lanes<L>(end - i));
+        for (; near != 0; near &= near - 1) visit(i + std::countr_zero(near));
+      }
+    });
+  } else {
+    double size[3];
+    for_near_points<double>(real_frame(f, size), cloud, real_part(margin), visit);
+  }
+}
+
+// The weights of points, scaled with their body: `weight` is that of the scale 1.
+template <class T>
+GELFLOW_INLINE T scaled_weight(const PairFrame<T>& f, const PointCloud& cloud, int i) {
+  const T weight(cloud.weights[i]);
+  return f.scaled && !cloud.areas.empty() ? T(weight + f.enlarged.dot(cloud.areas[i].template cast<T>())) : weight;
+}
+
+// Makes room for more points.
+template <class T>
+void grow(NearPoints<T>& near, bool elastic) {
+  near.capacity = std::max(64, 2 * near.capacity);
+  const std::size_t size = static_cast<std::size_t>(near.capacity) + PointCloud::padding;
+  near.index.resize(size);
+  for (auto* values : {&near.x, &near.y, &near.z, &near.weight}) values->resize(size);
+  if (!elastic) return;
+  for (auto* values : {&near.anchor_x, &near.anchor_y, &near.anchor_z, &near.remembers}) values->resize(size);
+}
+
+// Finds the points that may touch in one step of Newton's method: once, with a margin for what its iterations move, and
+// `again` only where that did not suffice.
+template <class T>
+void find_near_points(const PairFrame<T>& f, const PointCloud& cloud, const TouchRule<T>& rule, bool again,
+                      NearPoints<T>& near) {
+  if (again) {
+    const double turned = real_part((f.rotation - near.rotation).squaredNorm());
+    const double moved = real_part((f.offset - near.offset).squaredNorm());
+    if (std::sqrt(turned) * cloud.extent + std::sqrt(moved) <= near.margin) return;
+    near.margin *= 4;
+  } else {
+    near.margin = cloud.spacing / 16;
+  }
+  near.rotation = f.rotation;
+  near.offset = f.offset;
+  const bool elastic = rule.law == FrictionLaw::elastic;
+  if (near.capacity == 0) grow(near, elastic);
+  int n = 0;
+  for_near_points<T>(f, cloud, rule.rolling_radius + T(near.margin), [&](int i) {
+    if (n == near.capacity) grow(near, elastic);
+    near.index[n] = i;
+    near.x[n] = T(cloud.points.x[i]);
+    near.y[n] = T(cloud.points.y[i]);
+    near.z[n] = T(cloud.points.z[i]);
+    near.weight[n] = scaled_weight(f, cloud, i);
+    if (elastic) {
+      const bool set = rule.anchored[i] != 0;
+      const V3<T> anchor = set ? rule.anchors[i] : V3<T>(V3<T>::Zero());
+      near.anchor_x[n] = anchor[0];
+      near.anchor_y[n] = anchor[1];
+      near.anchor_z[n] = anchor[2];
+      near.remembers[n] = T(set ? 1 : 0);
+    }
+    ++n;
+  });
+  near.count = n;
+  for (int i = n; i % pack_width<T> != 0; ++i) {  // what fills the last pack
+    near.x[i] = near.y[i] = near.z[i] = near.weight[i] = T(0);
+    if (elastic) near.anchor_x[i] = near.anchor_y[i] = near.anchor_z[i] = near.remembers[i] = T(0);
+  }
+}
+
+}  // namespace gelflow

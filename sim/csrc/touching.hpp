@@ -1,0 +1,152 @@
+// Points that touch a shape, a pack at a time; and the memory of the elastic law.
+#pragma once
+
+#include "near_points.hpp"
+
+namespace gelflow {
+
+// Points that are looked at together; `inside` tells which of them touch.
+template <class T>
+struct Touching {
+  using L = Pack<T>;
+  int first = 0;               // index of the first one in the cloud, the others follow;
+  const int* index = nullptr;  // or of all of them
+  Mask<L> inside;
+  PointLaw<L> law;  // of weight 0 where a point does not touch
+  Distance<L> at;
+  Vec3<L> center, x;  // the point itself, or the centre of a rolling sphere; the point that touches
+  Vec3<L> v;          // relative to the shape
+  Vec3<L> anchor, e;
+  Mask<L> remembers;  // has an anchor
+
+  template <class F>
+  GELFLOW_INLINE void for_each_inside(F&& f) const {
+    for (unsigned left = bits(inside); left != 0; left &= left - 1) {
+      const int k = std::countr_zero(left);
+      f(k, index != nullptr ? index[k] : first + k);
+    }
+  }
+};
+
+// Looks at points with these places in the first body's frame, of which t knows the anchors. Whether any is inside.
+template <class T>
+GELFLOW_INLINE bool touches(const PairFrame<T>& frame, const TouchRule<T>& rule, const Vec3<Pack<T>>& local,
+                            const Pack<T>& weight, Touching<T>& t) {
+  using L = Pack<T>;
+  t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
+  if (rule.rolling_radius > T(0)) t.x.z -= L(rule.rolling_radius);  // planes only: n = z
+  distance<L>(frame.kind, frame.size, frame.grid, t.x, t.at);
+  t.inside = t.at.d < L(0.0) && weight > L(0.0);
+  if (!any(t.inside)) return false;
+  const T* p = rule.params;
+  const L felt = select(t.inside, weight, L(0.0)), share = L(T(rule.softness)) * felt;
+  t.law.kn = felt * L(p[0]);
+  t.law.kt = share * L(p[1]);
+  t.law.mu = L(p[2]);
+  t.law.kd = felt * L(p[3]);
+  t.law.damping = rule.damping;
+  t.law.elastic = rule.law == FrictionLaw::elastic;
+  t.v = spread<L>(frame.linear) + cross(spread<L>(frame.angular), t.x);
+  if (t.law.elastic) {
+    t.law.ks = share * L(p[4]);
+    const L size = abs(t.x.x) + abs(t.x.y) + abs(t.x.z);
+    t.law.rounding = L(T(4 * real_part(Eigen::NumTraits<T>::epsilon()))) * size;
+    t.e = select3<L>(t.remembers, t.x - t.anchor, zero3<L>());
+  }
+  return true;
+}
+
+// Calls f(touching) for all points of a cloud that are inside the shape, a pack at a time.
+template <class T, class F>
+void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  const bool elastic = rule.law == FrictionLaw::elastic, weighs = frame.scaled && !cloud.areas.empty();
+  Touching<T> t;
+  t.anchor = zero3<L>();
+  t.remembers = first_lanes<L>(0);
+  for_near_leaves<T>(frame, cloud, rule.rolling_radius, [&](int begin, int end) {
+    for (int i = begin; i < end; i += width) {
+      const int count = std::min(width, end - i);
+      const Vec3<L> local{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};
+      L weight = select(first_lanes<L>(count), load<L>(&cloud.weights[i]), L(0.0));
+      for (int k = 0; weighs && k < count; ++k) set_lane(weight, k, scaled_weight(frame, cloud, i + k));
+      if (elastic) {
+        L remembers(0.0);
+        for (int k = 0; k < count; ++k) {
+          if (!rule.anchored[i + k]) continue;
+          set_lane3<T>(t.anchor, k, rule.anchors[i + k]);
+          set_lane(remembers, k, T(1));
+        }
+        t.remembers = remembers > L(0.0);
+      }
+      t.first = i;
+      if (touches<T>(frame, rule, local, weight, t)) f(static_cast<const Touching<T>&>(t));
+    }
+  });
+}
+
+// The same for points that were found near.
+template <class T, class F>
+GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule,
+                                        F&& f) {
+  using L = Pack<T>;
+  const bool elastic = rule.law == FrictionLaw::elastic;
+  Touching<T> t;
+  t.anchor = zero3<L>();
+  t.remembers = first_lanes<L>(0);
+  for (int i = 0; i < near.count; i += pack_width<T>) {
+    if (elastic) {
+      t.anchor = {load<L>(&near.anchor_x[i]), load<L>(&near.anchor_y[i]), load<L>(&near.anchor_z[i])};
+      t.remembers = load<L>(&near.remembers[i]) > L(0.0);
+    }
+    t.index = &near.index[i];
+    const Vec3<L> local{load<L>(&near.x[i]), load<L>(&near.y[i]), load<L>(&near.z[i])};
+    if (touches<T>(frame, rule, local, load<L>(&near.weight[i]), t)) f(static_cast<const Touching<T>&>(t));
+  }
+}
+
+// The anchors of one cloud after an accepted step, of those points that were found near; `next` and `next_set` may be the
+// arrays that were read for that.
+template <class T>
+void advance_anchors(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, int cloud_size,
+                     V3<T>* next, std::uint8_t* next_set) {
+  std::fill(next_set, next_set + cloud_size, 0);
+  for_touching_points<T>(frame, near, rule, [&](const Touching<T>& t) {
+    PointForce<Pack<T>> force;
+    point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.x, t.anchor, t.remembers);
+    t.for_each_inside([&](int k, int i) {
+      next[i] = lane3<T>(anchor, k);
+      next_set[i] = 1;
+    });
+  });
+}
+
+// The reverse of `advance_anchors`: gradients of the anchors after the step go to the relative pose and twist and to the
+// anchors before.
+template <class T, class Points>
+void anchors_transposed(const PairFrame<T>& frame, const Points& points, const TouchRule<T>& rule, const V3<T>* by_next,
+                        V6<T>& by_pose, V6<T>& by_twist, V3<T>* by_anchor) {
+  using L = Pack<T>;
+  Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
+  for_touching_points<T>(frame, points, rule, [&](const Touching<T>& t) {
+    PointForce<L> force;
+    point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+    Vec3<L> lambda = zero3<L>();
+    t.for_each_inside([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
+    const AnchorGradient<L> g = next_anchor_transposed(t.law, force, t.remembers, lambda);
+    const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
+    turn += cross(t.center, by_point);
+    shift += by_point;
+    spin += cross(t.x, g.v);
+    slide += g.v;
+    t.for_each_inside([&](int k, int i) {
+      if (is_set(t.remembers, k)) by_anchor[i] += lane3<T>(g.anchor, k);
+    });
+  });
+  by_pose += stack<T>(sum3<T>(turn), sum3<T>(shift));
+  by_twist += stack<T>(sum3<T>(spin), sum3<T>(slide));
+}
+
+}  // namespace gelflow
