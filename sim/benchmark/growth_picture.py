@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from gelflow.sim.benchmark.growth import UPPER, Grown
 
@@ -31,7 +30,8 @@ def draw(found: Sequence[Grown], file: Path) -> None:
         axes.set_ylabel("steps per second" + (", of all" if names == ("environments",) else ""))
         axes.set_title(by_name[names[0]].sweep.threads, fontsize="medium")
         axes.grid(True, which="major", alpha=0.3)
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        decades = np.log10(np.concatenate([by_name[name].rates for name in names]))
+        axes.set_ylim(10 ** np.floor(decades.min()), 10 ** np.ceil(decades.max()))
         axes.legend(loc="lower left")
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=90)
