@@ -21,10 +21,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rolling import versions
 
 from gelflow.errors import GelflowError
-from gelflow.sim.benchmark import processor
+from gelflow.sim.benchmark import processor, versions
 from gelflow.sim.energy import EnergyGauge, motor_forces
 from gelflow.sim.motions import motion
 from gelflow.sim.scene import load_scene, scene_names

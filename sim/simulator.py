@@ -94,6 +94,7 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._tactile = np.zeros((num_envs, self.model.markers, 3), self.dtype)
+        self._u = np.zeros((num_envs, self.model.nu), self.dtype)  # one control for all is spread out here
 
     @cached_property
     def param_index(self) -> dict[str, int]:
@@ -140,12 +141,13 @@ class Simulator:
 
     def _controls(self, u: ArrayLike) -> NDArray[Any]:
         array = np.asarray(u, dtype=self.dtype)
-        full = (self.num_envs, self.model.nu)
-        if array.shape != full:
-            if array.shape != full[1:]:
-                raise UsageError(f"u must have shape {full} or ({full[1]},), got {array.shape}")
-            array = np.repeat(array[np.newaxis], self.num_envs, axis=0)
-        return np.ascontiguousarray(array)
+        full = self._u.shape
+        if array.shape == full:
+            return array  # the core copies what is not contiguous
+        if array.shape != full[1:]:
+            raise UsageError(f"u must have shape {full} or ({full[1]},), got {array.shape}")
+        self._u[:] = array
+        return self._u
 
     def check(self) -> None:
         """Raises SimulationError when an environment has failed, naming the first."""
@@ -221,17 +223,23 @@ class Simulator:
             raise UsageError(f"no joint {name!r}; there are {', '.join(names)}")
         return int(indices[names.index(name)])
 
-    def poses(self) -> NDArray[Any]:
-        """Poses of the moving bodies in the world, (N, bodies, 7): position [m], quaternion w x y z."""
-        out = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype)
-        self._batch.poses(out)
-        return out
+    def poses(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Poses of the moving bodies in the world, (N, bodies, 7): position [m], quaternion w x y z.
 
-    def wrenches(self) -> NDArray[Any]:
-        """Per contact, on its first body, about the world's origin, (N, contacts, 6): moment [N m], force [N]."""
-        out = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype)
-        self._batch.wrenches(out)
-        return out
+        A new array each time, or `out`.
+        """
+        target = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype) if out is None else out
+        self._batch.poses(target)
+        return target
+
+    def wrenches(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Per contact, on its first body, about the world's origin, (N, contacts, 6): moment [N m], force [N].
+
+        A new array each time, or `out`.
+        """
+        target = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype) if out is None else out
+        self._batch.wrenches(target)
+        return target
 
     def mass_matrix(self) -> NDArray[Any]:
         """Joint-space mass matrices M(q), (N, nv, nv)."""
@@ -255,31 +263,43 @@ class Simulator:
         anchored: ArrayLike | None = None,
         history: ArrayLike | None = None,
         read_after: Sequence[int] = (),
+        out: Trajectory | None = None,
     ) -> Trajectory:
         """Steps under controls u (steps, N, nu), from the given state or the present one, which is not changed.
 
-        Markers are read after the steps named in `read_after` (0 = the start). Raises UsageError on wrong shapes and
-        on controls that are not finite.
+        Markers are read after the steps named in `read_after` (0 = the start). `out` is an earlier trajectory of as
+        many steps and readings, whose arrays are overwritten: fresh memory for many readings takes longer than they
+        do. Raises UsageError on wrong shapes and on controls that are not finite.
         """
         controls = np.ascontiguousarray(u, dtype=self.dtype)
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
             raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
         steps, n = controls.shape[0], self.num_envs
+        if out is not None and (out.u.shape != controls.shape or len(out.read_after) != len(read_after)):
+            raise UsageError(
+                f"out must be a trajectory of u {controls.shape} and {len(read_after)} readings, "
+                f"got {out.u.shape} and {len(out.read_after)}"
+            )
 
-        def along_time(start: ArrayLike | None, own: NDArray[Any]) -> NDArray[Any]:
-            array = np.zeros((steps + 1, *own.shape), own.dtype)  # of anchors only those that are set are written
+        def along_time(name: str, start: ArrayLike | None) -> NDArray[Any]:
+            own = getattr(self, name)
+            if out is None:  # of anchors only those that are set will be written
+                array: NDArray[Any] = np.zeros((steps + 1, *own.shape), own.dtype)
+            else:
+                array = getattr(out, name)
             array[0] = own if start is None else start
             return array
 
         reads = np.asarray(read_after, dtype=np.int32)
+        readings = (len(reads), n, self.model.markers, 3)
         result = Trajectory(
-            q=along_time(q, self.q),
-            v=along_time(v, self.v),
-            anchors=along_time(anchors, self.anchors),
-            anchored=along_time(anchored, self.anchored),
-            history=along_time(history, self.history),
+            q=along_time("q", q),
+            v=along_time("v", v),
+            anchors=along_time("anchors", anchors),
+            anchored=along_time("anchored", anchored),
+            history=along_time("history", history),
             u=controls,
-            tactile=np.empty((len(reads), n, self.model.markers, 3), self.dtype),
+            tactile=np.empty(readings, self.dtype) if out is None else out.tactile,
             read_after=reads,
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),

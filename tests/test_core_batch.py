@@ -282,3 +282,35 @@ def test_a_build_that_is_not_there_is_told(wanted: str, says: str) -> None:
     run = subprocess.run(command, env={**os.environ, "GELFLOW_CORE": wanted}, capture_output=True, text=True)
     assert (run.returncode == 0) == (not says)
     assert says in run.stderr
+
+
+def test_results_land_in_given_arrays(insertion: Scene) -> None:
+    """A second rollout into the first one's arrays, poses and wrenches into one's own: the same numbers, no copies."""
+    u, sim = controls(insertion), started(insertion, list(range(ENVS)))
+    reads = (0, 5, STEPS)
+    right = sim.rollout(u, read_after=reads)
+    other = sim.rollout(0.9 * u, read_after=(1, 2, 3))
+    again = sim.rollout(u, read_after=reads, out=other)
+    for name in ("q", "v", "anchors", "anchored", "history", "tactile"):
+        assert getattr(again, name) is getattr(other, name)
+    for name in ("q", "v", "anchors", "anchored", "history", "u", "tactile", "read_after", "halvings", "status"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(right, name))
+    for results in (sim.poses, sim.wrenches):
+        own = np.zeros_like(results())
+        assert results(own) is own
+        np.testing.assert_array_equal(own, results())
+    with pytest.raises(UsageError, match=re.escape("out must be a trajectory of u (12, 5, 8) and 1 readings, got")):
+        sim.rollout(u, read_after=(3,), out=other)
+
+
+def test_controls_of_any_layout(insertion: Scene) -> None:
+    u = controls(insertion)[0]
+    one, two, three = (started(insertion, list(range(ENVS))) for _ in range(3))
+    one.step(u, 3)
+    two.step(np.asfortranarray(u), 3)
+    three.step(np.repeat(u, 2, axis=1)[:, ::2].tolist(), 3)
+    np.testing.assert_array_equal(one.q, two.q)
+    np.testing.assert_array_equal(one.q, three.q)
+    one.step(u[0], 3)
+    two.step(np.repeat(u[:1], ENVS, axis=0), 3)
+    np.testing.assert_array_equal(one.q, two.q)

@@ -114,6 +114,9 @@ class InsertionAttempts:
             "anchored": self.sim.anchored.copy(),
             "tactile": np.zeros((num_envs, self.scene.markers, 2)),
         }
+        # What an attempt reads lands here, and stays where a frame is due: after which step, then what was felt.
+        self._felt = np.zeros_like(self._held["tactile"])
+        self._readings = {step: np.zeros_like(self._felt) for step in (self._reference_at, *self._frames)}
 
     def _step_at(self, depth: float) -> int:
         """After which step of an attempt the gripper's target is `depth` below its start."""
@@ -165,13 +168,18 @@ class InsertionAttempts:
         sim, z = self.sim, self._arm_u[2]
         u = self._place(rng)
         start = u[:, z].copy()
-        felt = self._held["tactile"]
-        readings = {0: felt}
+        felt = self._felt
+        felt[:] = self._held["tactile"]
+        readings = self._readings
+        if 0 in readings:
+            readings[0][:] = felt
         stopped = np.zeros(self.num_envs, dtype=bool)
         for step in range(1, self._steps + 1):
             u[:, z] = start - self.task.descent * step / self._steps
             sim.step(u)
-            felt = readings[step] = np.where(stopped[:, None, None], felt, sim.tactile()[..., :2])
+            np.copyto(felt, sim.tactile()[..., :2], where=~stopped[:, None, None])
+            if step in readings:
+                readings[step][:] = felt
             if step > self._reference_at:
                 stopped |= self._mean_shear(felt - readings[self._reference_at]) > self._stop_shear
         noisy = {step: self._with_noise(readings[step], rng) for step in sorted({self._reference_at, *self._frames})}

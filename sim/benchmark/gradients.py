@@ -1,0 +1,142 @@
+"""What gradients cost: a recorded run forwards, and forwards and backwards."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim.benchmark.rolling import rolling_scene
+from gelflow.sim.benchmark.runs import Check, Run, check, motion_run, simulator, twin_of
+from gelflow.sim.benchmark.timing import Effort, Report, Work, busy, interleaved, times_as_fast
+from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
+
+Array = NDArray[np.float64]
+
+START = 30  # steps of the motion before the ones that count: in the middle of contact
+GRADIENT = 1e-4  # how far the gradient may be from its converged twin's, relative
+
+
+@dataclass(frozen=True)
+class Case:
+    """Steps whose end state, or whose readings after every step, are differentiated by the controls and the start."""
+
+    scene: str
+    side: int | None  # of the rolling pad's grid
+    read: bool
+    paper: tuple[float, float] | None = None  # forward and backward by the paper's simulator [µs per step]
+
+    @property
+    def name(self) -> str:
+        return self.scene + (f" {self.side} × {self.side}" if self.side else "")
+
+
+CASES = (
+    Case("rolling", 10, read=False),
+    Case("pushing", None, read=False),
+    Case("insertion", None, read=False),
+    Case("pushing", None, read=True, paper=(556.0, 7.0)),
+    Case("rolling", 200, read=True, paper=(49_200.0, 1268.0)),
+)
+
+
+class _Subject:
+    """A case with a simulator at the start of its steps, and a random weight for each number of its result."""
+
+    def __init__(self, case: Case, steps: int) -> None:
+        self.scene: Scene = rolling_scene(case.side) if case.side else load_scene(case.scene, friction="viscous")
+        self.run: Run = motion_run(self.scene, steps=START + steps)
+        self.sim = simulator(self.scene.describe_to)
+        rows = [u for count, u, _ in self.run.blocks for _ in range(count)]
+        self._before, self._u = rows[:START], np.array(rows[START:])[:, np.newaxis]
+        self._reads = range(1, len(rows) - START + 1) if case.read else ()
+        self.start(self.sim)
+        self.trajectory = self.forward(self.sim)
+        rng = np.random.default_rng(0)
+        self._by: dict[str, Any] = {"q": np.zeros(self.trajectory.q.shape)}
+        if case.read:
+            self._by["tactile"] = rng.normal(size=self.trajectory.tactile.shape)
+        else:
+            self._by["q"][-1] = rng.normal(size=self._by["q"][-1].shape)
+
+    @property
+    def steps(self) -> int:
+        return len(self._u)
+
+    def start(self, sim: Simulator) -> None:
+        self.run.place(sim)
+        for u in self._before:
+            sim.step(u)
+
+    def forward(self, sim: Simulator, out: Trajectory | None = None) -> Trajectory:
+        return sim.rollout(self._u, read_after=self._reads, out=out)
+
+    def backward(self, sim: Simulator, trajectory: Trajectory) -> TrajectoryGradient:
+        return sim.rollout_gradient(trajectory, **self._by)
+
+    def both(self) -> TrajectoryGradient:
+        return self.backward(self.sim, self.forward(self.sim, self.trajectory))
+
+    def works(self) -> list[Work]:
+        """Forwards, and forwards and backwards."""
+        return [Work(partial(self.forward, self.sim, self.trajectory), self.steps), Work(self.both, self.steps)]
+
+    def checks(self) -> tuple[Check, float]:
+        """The run's, and how far the gradient is from the converged twin's, relative."""
+        twin = twin_of(self.sim, self.scene.describe_to)
+        checked = check(self.run, simulator(self.scene.describe_to), self.scene.describe_to)
+        self.start(twin)
+        right = self.backward(twin, self.forward(twin))
+        found = self.both()
+        apart, size = np.linalg.norm(found.u - right.u), np.linalg.norm(right.u)
+        return checked, float(apart / size)
+
+
+def measure_gradients(effort: Effort, *, steps: int | None = None) -> Report:
+    """Time recorded steps in the middle of contact, and those with the reverse pass."""
+    steps = steps or (10 if effort.quick else 50)
+    subjects = [_Subject(case, steps) for case in CASES]
+    checks = [subject.checks() for subject in subjects]
+    effort.watch.begin("gradients", 2 * len(subjects) * (effort.repeats + 1))
+    taken = interleaved([work for subject in subjects for work in subject.works()], effort)
+    rows, results, outside = [], [], []
+    for case, forward, both, (checked, off) in zip(CASES, taken[::2], taken[1::2], checks, strict=True):
+        ratio = times_as_fast(forward, both)
+        what = "each reading" if case.read else "end state"
+        paper = sum(case.paper) if case.paper else None
+        rows.append(
+            (
+                *(case.name, what, f"{forward.median * 1e6:.1f}", f"{both.median * 1e6:.1f}", f"{ratio:.2f}"),
+                *(f"{case.paper[0]:.0f} + {case.paper[1]:.0f}" if case.paper else "",),
+                f"{paper / (both.median * 1e6):.0f}" if paper else "",
+            )
+        )
+        results.append(
+            {
+                "scene": case.scene,
+                "side": case.side,
+                "of": what,
+                "forward": forward.plain(),
+                "forward_and_backward": both.plain(),
+                "ratio": ratio,
+                "paper_us": case.paper,
+                "check": checked.plain(),
+                "gradient_off": off,
+            }
+        )
+        outside += checked.broken(f"gradients, {case.name}")
+        if not off <= GRADIENT:
+            outside.append(f"gradients, {case.name}: {off:.1e} from the converged twin's; allowed is {GRADIENT:g}")
+    return Report(
+        name="gradients",
+        title="Gradients: µs per step of one thread",
+        columns=("scene", "of", "forward", "+ back", "ratio", "paper", "× paper"),
+        rows=rows,
+        note=f"of: what is differentiated, by all controls and the start. {steps} recorded steps in the middle of "
+        "contact, viscous friction. + back: forward and backward; ratio: that to forward. paper: its simulator, "
+        "forward + backward; pushing has 130 markers." + busy(taken),
+        results=results,
+        outside=outside,
+    )

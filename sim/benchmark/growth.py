@@ -1,0 +1,210 @@
+"""How a step's time grows with what there is in a scene: bodies, touching points, markers, environments."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim.benchmark.batch import differ
+from gelflow.sim.benchmark.rolling import rolling_run, rolling_scene
+from gelflow.sim.benchmark.runs import Check, Describe, Run, check, motion_run, simulator
+from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved
+from gelflow.sim.scene import load_scene
+
+Array = NDArray[np.float64]
+
+STEPS = 40
+ONE_THREAD = "one thread"
+UPPER = 0.5  # the exponent is fitted over this share of the sizes, the largest: below, what does not grow counts
+RADIUS = 0.01  # of the balls that are the bodies [m]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One thing that grows."""
+
+    name: str
+    unit: str  # of the horizontal axis
+    sizes: tuple[int, ...]
+    quick: tuple[int, ...]
+    prepare: Callable[[int], tuple[Work, Check]]
+    threads: str = ONE_THREAD
+
+
+@dataclass(frozen=True)
+class Grown:
+    """What a sweep came to."""
+
+    sweep: Sweep
+    sizes: tuple[int, ...]
+    times: list[Times]  # of a step of everything
+    checks: list[Check]
+    exponent: float
+
+    @property
+    def rates(self) -> list[float]:
+        """Steps of everything per second."""
+        return [times.rate for times in self.times]
+
+
+def exponent(sizes: Sequence[int], seconds: Sequence[float]) -> float:
+    """The slope of log time over log size: 1 where time is in proportion to size. Over the largest sizes, at least 2"""
+    count = max(2, round(UPPER * len(sizes)))
+    return float(np.polyfit(np.log(sizes[-count:]), np.log(seconds[-count:]), 1)[0])
+
+
+def balls(count: int) -> Describe:
+    """Balls side by side, each on a slide of its own, at rest on the ground."""
+
+    def describe(spec: Any) -> Any:
+        ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
+        for i in range(count):
+            body = _body(spec, f"ball{i}", -1, (3 * RADIUS * i, 0, RADIUS))
+            spec.add_joint(f"z{i}", body, "slide", (0, 0, 0), (0, 0, 1), damping=0.01)
+            points = spec.add_points(f"lowest{i}", body, np.array([[0, 0, -RADIUS]]), [1.0])
+            spec.add_contact(f"ground{i}", points, ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3)
+        return spec
+
+    return describe
+
+
+def chain(count: int) -> Describe:
+    """A chain of balls that hangs from the ceiling by hinges and swings; its end drags over a wall."""
+
+    def describe(spec: Any) -> Any:
+        wall = spec.add_shape("wall", -1, "plane", (-1e-4, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0), (0, 0, 0))
+        parent = -1
+        for i in range(count):
+            parent = _body(spec, f"link{i}", parent, (0, 0, -2 * RADIUS if i else 0.0))
+            spec.add_joint(f"hinge{i}", parent, "hinge", (0, 0, RADIUS), (0, 1, 0), damping=1e-4)
+        points = spec.add_points("end", parent, np.array([[0, 0, -RADIUS]]), [1.0])
+        spec.add_contact("wall", points, wall, kn=1e2, kt=0.1, mu=0.3, kd=1e2)
+        return spec
+
+    return describe
+
+
+def plate(count: int) -> Describe:
+    """A plate that lies on the ground with so many points, and slides."""
+
+    def describe(spec: Any) -> Any:
+        ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
+        body = _body(spec, "plate", -1, (0, 0, 0))
+        for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
+            joint = spec.add_joint(name, body, "slide", (0, 0, 0), axis, damping=0.01)
+            if name == "x":
+                spec.add_actuator("x", joint, "motor")
+        turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+        spread = 0.05 * np.sqrt((np.arange(count) + 0.5) / count)
+        at = np.stack([spread * np.cos(turn), spread * np.sin(turn), np.full(count, -1e-5)], axis=1)
+        points = spec.add_points("face", body, at, np.full(count, 1.0 / count))
+        spec.add_contact("ground", points, ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3)
+        return spec
+
+    return describe
+
+
+def _body(spec: Any, name: str, parent: int, pos: tuple[float, float, float]) -> int:
+    inertia = 4e-6 * RADIUS  # a ball of 10 g
+    return int(spec.add_body(name, parent, pos, (1, 0, 0, 0), 0.01, (0, 0, 0), (inertia,) * 3 + (0, 0, 0)))
+
+
+def _own(describe: Describe, push: float) -> tuple[Work, Check]:
+    """A model of ours, all of its actuators pushing, so many newtons."""
+    sim = simulator(describe)
+    q0 = sim.q[0].copy()
+    q0[0] += 0.02 if sim.model.joint_names[0] == "hinge0" else 0.0
+    run = Run(q0, ((STEPS, np.full(sim.model.nu, push), False),))
+    return run.work(sim), check(run, sim, describe)
+
+
+def _bodies(count: int) -> tuple[Work, Check]:
+    return _own(balls(count), 0.0)
+
+
+def _links(count: int) -> tuple[Work, Check]:
+    return _own(chain(count), 0.0)
+
+
+def _points(count: int) -> tuple[Work, Check]:
+    return _own(plate(count), 0.02)
+
+
+def _markers(count: int) -> tuple[Work, Check]:
+    """The ball rolling run; markers are read every 5 steps."""
+    scene = rolling_scene(round(count**0.5))
+    run, sim = rolling_run(scene, 5), simulator(scene.describe_to)
+    return run.work(sim), check(run, sim, scene.describe_to)
+
+
+def _environments(count: int) -> tuple[Work, Check]:
+    """The first steps of pushing, on all cores."""
+    scene = load_scene("pushing")
+    run, sim = motion_run(scene, steps=STEPS), simulator(scene.describe_to, num_envs=count, threads=None)
+    differ(sim)
+    return Work(lambda: run.go(sim), run.steps, lambda: run.place(sim)), check(run, sim, scene.describe_to)
+
+
+SWEEPS = (  # the core takes at most 64 velocities
+    Sweep("bodies", "bodies side by side", (1, 2, 4, 8, 16, 32, 64), (1, 4, 16), _bodies),
+    Sweep("chain", "bodies in one chain", (1, 2, 4, 8, 16, 32, 64), (1, 4, 16), _links),
+    Sweep("contacts", "touching points", (1, 10, 100, 1000, 3000, 10_000, 30_000, 100_000), (1, 100, 1000), _points),
+    Sweep("markers", "markers", (100, 1024, 10_000, 30_625, 99_856, 300_304, 1_000_000), (100, 1024, 10_000), _markers),
+    Sweep("environments", "environments", (1, 4, 16, 64, 256, 1024, 4096), (1, 4, 16), _environments, "all cores"),
+)
+
+
+def grow(sweep: Sweep, effort: Effort) -> Grown:
+    """Time one sweep."""
+    sizes = sweep.quick if effort.quick else sweep.sizes
+    effort.watch.begin(f"growth: {sweep.unit}", len(sizes) * (effort.repeats + 2))
+    works, checks = [], []
+    for size in sizes:
+        work, checked = sweep.prepare(size)
+        works.append(work)
+        checks.append(checked)
+        effort.watch.advance()
+    times = interleaved(works, effort)
+    return Grown(sweep, sizes, times, checks, exponent(sizes, [t.median for t in times]))
+
+
+def measure_growth(effort: Effort) -> tuple[Report, list[Grown]]:
+    """Time all sweeps; the report, and what `growth_picture.draw` draws."""
+    found = [grow(sweep, effort) for sweep in SWEEPS]
+    rows, results, outside = [], [], []
+    for grown in found:
+        name, sizes = grown.sweep.name, grown.sizes
+        rows.append(
+            (
+                *(grown.sweep.unit, f"{sizes[0]} - {sizes[-1]}"),
+                *(f"{grown.rates[i]:.0f}" for i in (0, len(sizes) // 2, -1)),
+                f"{grown.exponent:.2f}",
+            )
+        )
+        results.append(
+            {
+                "of": name,
+                "exponent": grown.exponent,
+                "threads": grown.sweep.threads,
+                "sizes": [
+                    {"size": size, **times.plain(), "check": checked.plain()}
+                    for size, times, checked in zip(sizes, grown.times, grown.checks, strict=True)
+                ],
+            }
+        )
+        for size, checked in zip(sizes, grown.checks, strict=True):
+            outside += checked.broken(f"growth, {size} {name}")
+    report = Report(
+        name="growth",
+        title="Growth: steps per second",
+        columns=("number of", "from - to", "at first", "half way", "at last", "time ~ n^"),
+        rows=rows,
+        note="One thread; environments: all cores, and a step is one of all of them. The exponent of time is fitted "
+        "over the larger half of the sizes. For one chain a dense matrix is solved: up to n³."
+        + busy([times for grown in found for times in grown.times if grown.sweep.threads == ONE_THREAD]),
+        results=results,
+        outside=outside,
+    )
+    return report, found

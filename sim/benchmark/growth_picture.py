@@ -1,0 +1,37 @@
+"""The picture of `gelflow bench growth --picture FILE`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gelflow.sim.benchmark.growth import UPPER, Grown
+
+PANELS = (("bodies", "chain"), ("contacts",), ("markers",), ("environments",))
+
+
+def draw(found: Sequence[Grown], file: Path) -> None:
+    """Steps per second over size, one panel for each thing that grows, with the fitted lines."""
+    by_name = {grown.sweep.name: grown for grown in found}
+    figure = Figure(figsize=(10, 7.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    for axes, names in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
+        for k, name in enumerate(names):
+            grown = by_name[name]
+            color = f"C{k}"
+            axes.loglog(grown.sizes, grown.rates, "o", color=color)
+            x = np.array(grown.sizes[-max(2, round(UPPER * len(grown.sizes))) :], float)
+            y = np.array(grown.rates[-len(x) :])
+            level = np.exp(np.mean(np.log(y) + grown.exponent * np.log(x)))
+            axes.loglog(x, level * x**-grown.exponent, color=color, label=f"{name}: time ~ n^{grown.exponent:.2f}")
+        axes.set_xlabel(by_name[names[0]].sweep.unit if len(names) == 1 else "bodies")
+        axes.set_ylabel("steps per second" + (", of all" if names == ("environments",) else ""))
+        axes.set_title(by_name[names[0]].sweep.threads, fontsize="medium")
+        axes.grid(True, which="major", alpha=0.3)
+        decades = np.log10(np.concatenate([by_name[name].rates for name in names]))
+        axes.set_ylim(10 ** np.floor(decades.min()), 10 ** np.ceil(decades.max()))
+        axes.legend(loc="lower left")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=90)

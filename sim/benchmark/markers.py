@@ -1,0 +1,147 @@
+"""What a marker costs: reading a pad of which every marker touches, and the reading's reverse pass."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.benchmark.runs import FORCE
+from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved
+from gelflow.sim.mesh_grid import spline_grid
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+Precision = Literal["double", "single"]
+
+# kind → sizes [m], and what lies above its middle [m]. The pad is pressed into its top.
+SHAPES: dict[str, tuple[tuple[float, float, float], float]] = {
+    "sphere": ((0.02, 0.0, 0.0), 0.02),
+    "plane": ((0.0, 0.0, 0.0), 0.0),
+    "box": ((0.03, 0.02, 0.01), 0.01),
+    "cylinder": ((0.02, 0.03, 0.0), 0.03),
+    "capsule": ((0.015, 0.03, 0.0), 0.045),
+    "ellipsoid": ((0.03, 0.02, 0.012), 0.012),
+    "rounded box": ((0.03, 0.02, 0.01), 0.01),
+    "grid": ((1.0, 1.0, 1.0), 0.02),
+}
+ROUNDING = 2e-3  # [m]
+CELLS = 64  # of the grid along the ball in it
+SIDE, QUICK_SIDE = 200, 50
+PAD, DEPTH = 4e-3, 1e-3  # the pad's side, and how deep its middle is [m]
+PRECISIONS: tuple[Precision, ...] = ("double", "single")
+GRADIENT = 1e-3  # how far single precision's gradient may be from double's, relative
+
+
+def ball_grid(radius: float) -> dict[str, Any]:
+    """The grid of a ball's signed distance, as `add_shape` takes it."""
+    spacing = 2 * radius / CELLS
+    nodes = spacing * np.arange(-CELLS // 2 - 3, CELLS // 2 + 4)
+    distances = np.sqrt(sum(np.meshgrid(nodes**2, nodes**2, nodes**2, indexing="ij"))) - radius
+    grid = spline_grid(distances, np.full(3, nodes[0]), spacing)
+    return {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
+
+
+def pressed_pad(kind: str, side: int) -> _core.Model:
+    """A model: a square pad of side × side markers, on slides along x and z, pressed into the top of a shape."""
+    spec = _core.ModelSpec()
+    size, top = SHAPES[kind]
+    extra: dict[str, Any] = {"rounding": ROUNDING} if kind == "rounded box" else {}
+    extra |= ball_grid(top) if kind == "grid" else {}
+    core_kind = "box" if kind == "rounded box" else kind
+    shape = spec.add_shape("shape", -1, core_kind, (0, 0, 0), (1, 0, 0, 0), size, **extra)
+    body = spec.add_body("pad", -1, (0, 0, top - DEPTH), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
+        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+    at = PAD * ((np.arange(side) + 0.5) / side - 0.5)
+    positions = np.stack([*np.meshgrid(at, at, indexing="ij"), np.zeros((side, side))], axis=-1).reshape(-1, 3)
+    axes = [np.tile(axis, (side**2, 1)) for axis in ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))]
+    numbers = {"kn": 1.0, "kt": 0.01, "mu": 2.0, "kd": 0.003}
+    spec.add_pad("pad", body, positions, *axes, shapes=[shape], law="viscous", **numbers)
+    return _core.Model(spec)
+
+
+@dataclass
+class _Reading:
+    """The pad on one shape in one precision."""
+
+    kind: str
+    precision: Precision
+    sim: Simulator
+
+    def __post_init__(self) -> None:
+        self.sim.v[:] = 0.01  # the markers slide, and go deeper
+        rng = np.random.default_rng(0)
+        self.forces = self.sim.tactile()
+        self._still = self.sim.rollout(np.zeros((0, 1, self.sim.model.nu)), read_after=(0,))
+        self._by = rng.normal(size=self._still.tactile.shape).astype(self.sim.dtype)
+
+    def gradient(self) -> Array:
+        """Of the readings' sum with random weights, by positions and velocities, (4,)."""
+        found = self.sim.rollout_gradient(self._still, tactile=self._by)
+        return np.concatenate([found.q[0], found.v[0]]).astype(float)
+
+    def works(self) -> Iterator[Work]:
+        markers = int(self.sim.model.markers)
+        yield Work(partial(self.sim.tactile, self.forces), markers)
+        yield Work(self.gradient, markers)
+
+
+def measure_markers(effort: Effort, *, side: int | None = None) -> Report:
+    """Time readings with all of side × side markers in the shape, for every shape in both precisions."""
+    side = side or (QUICK_SIDE if effort.quick else SIDE)
+    models = {kind: pressed_pad(kind, side) for kind in SHAPES}
+    readings = [
+        _Reading(kind, precision, Simulator(model, threads=1, precision=precision))
+        for kind, model in models.items()
+        for precision in PRECISIONS
+    ]
+    works = [work for reading in readings for work in reading.works()]
+    effort.watch.begin("markers", len(works) * (effort.repeats + 1))
+    taken = interleaved(works, effort)
+    rows, results, outside = [], [], []
+    for i, kind in enumerate(SHAPES):
+        double, single = readings[2 * i : 2 * i + 2]
+        times = dict(zip(("double", "double_gradient", "single", "single_gradient"), taken[4 * i :], strict=False))
+        result = _compared(double, single) | {name: time.plain() for name, time in times.items()}
+        results.append({"shape": kind, "markers": side**2} | result)
+        rows.append((kind, *_nanoseconds(times), f"{result['touching']:.0%}"))
+        if result["touching"] < 1 or not result["force_off"] <= FORCE or not result["gradient_off"] <= GRADIENT:
+            outside.append(
+                f"markers, {kind}: {result['touching']:.1%} touch, single precision is {result['force_off']:.1e} off "
+                f"double in the forces and {result['gradient_off']:.1e} in the gradient; allowed are 100 %, {FORCE:g} "
+                f"and {GRADIENT:g}"
+            )
+    return Report(
+        name="markers",
+        title=f"Reading {side} × {side} markers, all of them touching: ns per marker",
+        columns=("shape", "double", "+ gradient", "ratio", "single", "+ gradient", "ratio", "touch"),
+        rows=rows,
+        note="One thread, viscous friction. + gradient: the reading and its reverse pass. ratio: of the two."
+        + busy(taken),
+        results=results,
+        outside=outside,
+    )
+
+
+def _nanoseconds(times: dict[str, Times]) -> Iterator[str]:
+    for precision in PRECISIONS:
+        value, gradient = times[precision].median, times[f"{precision}_gradient"].median
+        yield from (f"{value * 1e9:.2f}", f"{(value + gradient) * 1e9:.2f}", f"{(value + gradient) / value:.1f}")
+
+
+def _compared(double: _Reading, single: _Reading) -> dict[str, Any]:
+    """How many markers touch, what they feel in all, and how far single precision is off."""
+    apart = [
+        float(np.linalg.norm(one - other) / np.linalg.norm(other))
+        for one, other in ((single.forces, double.forces), (single.gradient(), double.gradient()))
+    ]
+    return {
+        "touching": float((double.forces[0, :, 2] > 0).mean()),
+        "force_sum": double.forces[0].sum(0).tolist(),
+        "force_off": apart[0],
+        "gradient_off": apart[1],
+    }

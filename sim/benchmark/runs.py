@@ -1,0 +1,147 @@
+"""Runs to time, and how each checks itself: against its fully converged twin, step by step."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.benchmark.timing import Work
+from gelflow.sim.motions import motion
+from gelflow.sim.scene import Scene
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+Describe = Callable[[Any], Any]  # tells a model builder what there is, such as `Scene.describe_to`
+
+CONVERGED = 1e-12  # tolerance of a twin's Newton iterations
+POSITION, TURN, FORCE = 1e-6, 1e-6, 1e-4  # how far from its twin a run may be: [m], [rad], relative
+HOLD = 5  # steps that a motion's controls are held for, and after which markers are read
+
+
+@dataclass(frozen=True)
+class Run:
+    """Steps from a start, in blocks of the same controls."""
+
+    q0: Array  # (nq,)
+    blocks: tuple[tuple[int, Array, bool], ...]  # how many steps, controls (nu,), whether to read the markers then
+
+    @property
+    def steps(self) -> int:
+        return sum(block[0] for block in self.blocks)
+
+    def place(self, sim: Simulator) -> None:
+        """Put all environments at the start."""
+        sim.reset()
+        sim.q[:] = self.q0
+
+    def go(self, sim: Simulator) -> None:
+        """As a user would: readings land in the simulator's own array."""
+        for steps, u, read in self.blocks:
+            sim.step(u, steps)
+            if read:
+                sim.tactile()
+
+    def work(self, sim: Simulator) -> Work:
+        """To time it; a unit is a step of one environment."""
+        return Work(lambda: self.go(sim), self.steps * sim.num_envs, lambda: self.place(sim))
+
+
+def motion_run(scene: Scene, *, steps: int | None = None) -> Run:
+    """The scene's own motion, or its first steps, controls held and markers read every `HOLD` steps."""
+    moves = motion(scene)
+    u = moves.steps(scene.step)[:steps]
+    ends = range(HOLD, len(u) + 1, HOLD)
+    return Run(moves.q0, tuple((HOLD, u[end - 1], True) for end in ends))
+
+
+def simulator(
+    describe: Describe,
+    *,
+    num_envs: int = 1,
+    threads: int | None = 1,
+    tolerance: float | None = None,
+    precision: Literal["double", "single"] = "double",
+) -> Simulator:
+    """A simulator of what `describe` tells, solved to the usual tolerance or to another."""
+    spec = describe(_core.ModelSpec())
+    if tolerance is not None:
+        spec.tolerance = tolerance
+    return Simulator(_core.Model(spec), num_envs=num_envs, threads=threads, precision=precision)
+
+
+def twin_of(sim: Simulator, describe: Describe) -> Simulator:
+    """A fully converged copy, with the same parameters."""
+    twin = simulator(describe, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
+    twin.params[:] = sim.params
+    return twin
+
+
+@dataclass(frozen=True)
+class Check:
+    """What a run came to, and how far it was from its twin."""
+
+    position: float  # largest distance of a body from the twin's, at any reading or change of controls [m]
+    turn: float  # largest angle between the two [rad]
+    force: float  # largest norm of the difference of readings over the largest norm of the twin's reading
+    iterations: float  # of Newton's method, per step
+    halved: int  # steps that were taken as substeps
+    end: tuple[float, ...]  # q of the first environment at the end
+    force_sum: tuple[float, ...]  # of its markers (shear x, shear y, normal), where normal is largest [N]
+
+    @property
+    def holds(self) -> bool:
+        return self.position <= POSITION and self.turn <= TURN and self.force <= FORCE
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"holds": self.holds}
+
+    def broken(self, name: str) -> list[str]:
+        """A line where it does not hold."""
+        if self.holds:
+            return []
+        return [
+            f"{name}: {self.position:.1e} m, {self.turn:.1e} rad, {self.force:.1e} of the marker forces away from "
+            f"its converged twin; allowed are {POSITION:g} m, {TURN:g} rad, {FORCE:g}"
+        ]
+
+
+def check(run: Run, sim: Simulator, describe: Describe) -> Check:
+    """Take the run with its twin beside it. Raises SimulationError where a step can't be taken."""
+    twin = twin_of(sim, describe)
+    position = turn = difference = largest = 0.0
+    force_sum: Array = np.zeros(3)
+    for one in (sim, twin):
+        run.place(one)
+    for steps, u, read in run.blocks:
+        for one in (sim, twin):
+            one.step(u, steps)
+        here, there = sim.poses(), twin.poses()
+        position = max(position, float(np.linalg.norm(here[..., :3] - there[..., :3], axis=-1).max()))
+        turn = max(turn, float(angle(here[..., 3:], there[..., 3:]).max()))
+        if read:
+            felt, right = sim.tactile(), twin.tactile()
+            difference = max(difference, float(np.linalg.norm(felt - right, axis=(1, 2)).max()))
+            largest = max(largest, float(np.linalg.norm(right, axis=(1, 2)).max()))
+            total = felt[0].sum(0)
+            force_sum = max(force_sum, total, key=lambda forces: float(forces[2]))
+    for one in (sim, twin):
+        one.check()
+    return Check(
+        position=position,
+        turn=turn,
+        force=difference / largest if largest > 0 else 0.0,
+        iterations=float(sim.iterations.mean()) / run.steps,
+        halved=int(sim.halved.sum()),
+        end=tuple(sim.q[0].tolist()),
+        force_sum=tuple(force_sum.tolist()),
+    )
+
+
+def angle(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+    """Between rotations, unit quaternions (…, 4), whatever their signs [rad]; exact for small ones too."""
+    apart = np.minimum(np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1))
+    return np.asarray(4 * np.arcsin(np.minimum(apart / 2, 1)))

@@ -1,0 +1,62 @@
+"""The five scenes that come along, each on its own motion, under both friction laws."""
+
+from gelflow.sim.benchmark.rolling import rolling_scene
+from gelflow.sim.benchmark.runs import check, motion_run, simulator
+from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved
+from gelflow.sim.scene import load_scene
+from gelflow.sim.scene_parts import LAWS
+
+SCENES = ("rolling", "pushing", "grasp", "insertion", "dclaw")
+SIDE = 50  # of the rolling pad's grid
+
+# The paper's own simulator, its best build on one core of a recent server [steps/s]; its law is the viscous one.
+PAPER = {"pushing": 5400.0, "grasp": 1000.0, "insertion": 1940.0, "dclaw": 840.0}
+
+
+def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
+    """Time each scene's motion, or its first steps."""
+    cases = [(name, law) for name in SCENES for law in LAWS]
+    works, checks = [], []
+    for name, law in cases:
+        scene = rolling_scene(SIDE, law) if name == "rolling" else load_scene(name, friction=law)
+        run, sim = motion_run(scene, steps=steps), simulator(scene.describe_to)
+        checks.append(check(run, sim, scene.describe_to))
+        works.append(run.work(sim))
+    effort.watch.begin("scenes", len(works) * (effort.repeats + 1))
+    taken = interleaved(works, effort)
+    rows, results, outside = [], [], []
+    for (name, law), times, checked in zip(cases, taken, checks, strict=True):
+        published = PAPER.get(name) if law == "viscous" else None
+        ratio = times.rate / published if published else None
+        rows.append(
+            (
+                *(name, law, f"{times.rate:.0f}", times.spread, f"{times.median * 1e6:.1f}"),
+                *(
+                    f"{checked.iterations:.2f}",
+                    f"{published:.0f}" if published else "",
+                    f"{ratio:.1f}" if ratio else "",
+                ),
+            )
+        )
+        results.append(
+            {
+                "scene": name,
+                "friction": law,
+                "gelflow": times.plain(),
+                "paper": published,
+                "times_the_paper": ratio,
+                "check": checked.plain(),
+            }
+        )
+        outside += checked.broken(f"{name}, {law}")
+    return Report(
+        name="scenes",
+        title="Scenes on their motions: steps per second of one thread",
+        columns=("scene", "friction", "steps/s", "±", "µs", "Newton", "paper", "× paper"),
+        rows=rows,
+        note="Steps of 5 ms; controls change and markers are read every 5. ±: half of what lies between the "
+        "quartiles. µs: per step, readings included. Newton: iterations per step. paper: its simulator's best build "
+        "on a comparable core, whose friction is viscous." + busy(taken),
+        results=results,
+        outside=outside,
+    )

@@ -1,0 +1,153 @@
+"""The one way in which things are timed: in turn, again and again, so that a disturbance of the machine hits all alike.
+
+Figures are medians over the repeats. How many times as fast one thing is as another is the median of the repeats' own
+ratios: the two of a pair ran within moments of each other.
+"""
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from gelflow.errors import UsageError
+
+LEAST = 5e-3  # what takes less [s] is run several times in one repeat: clocks and interrupts are coarse
+QUICK_REPEATS, REPEATS = 5, 15
+FREE = 0.95  # share of a core that a thread gets on a machine that does nothing else, at least
+
+
+class Watch(Protocol):
+    """Is told how far a measurement is."""
+
+    def begin(self, what: str, total: int) -> None:
+        """`what` is being measured; `advance` will be called `total` times."""
+
+    def advance(self) -> None:
+        """One part of it is done."""
+
+
+class Unwatched:
+    """A watch that nobody looks at."""
+
+    def begin(self, what: str, total: int) -> None: ...
+
+    def advance(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long a measurement may take."""
+
+    quick: bool = False  # fewer sizes and shorter runs
+    repeats: int = REPEATS
+    watch: Watch = field(default_factory=Unwatched)
+
+    def __post_init__(self) -> None:
+        if self.repeats < 1:
+            raise UsageError(f"repeats must be at least 1, got {self.repeats}")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A measurement: a table for the terminal, and all of it for a file."""
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+    note: str
+    results: list[dict[str, Any]]  # what JSON can hold
+    outside: list[str]  # runs that were off by more than allowed, a line each
+
+    def plain(self) -> dict[str, Any]:
+        return {"title": self.title, "note": self.note, "outside": self.outside, "results": self.results}
+
+
+@dataclass(frozen=True)
+class Work:
+    """Something to time."""
+
+    run: Callable[[], object]
+    units: int  # steps, markers, … that one run does
+    prepare: Callable[[], object] = lambda: None  # before each run, not timed
+
+
+@dataclass(frozen=True)
+class Times:
+    """What a unit of a work took in each repeat [s]."""
+
+    seconds: tuple[float, ...]  # by the clock on the wall
+    cpu_seconds: tuple[float, ...]  # of all threads: tells a busy machine from a slow one
+
+    @property
+    def median(self) -> float:
+        """Seconds per unit."""
+        return statistics.median(self.seconds)
+
+    @property
+    def rate(self) -> float:
+        """Units per second."""
+        return 1 / self.median
+
+    @property
+    def quartiles(self) -> tuple[float, float]:
+        """Units per second: a quarter of the repeats was slower, a quarter faster."""
+        slow, fast = np.percentile(self.seconds, (75, 25))
+        return float(1 / slow), float(1 / fast)
+
+    @property
+    def spread(self) -> str:
+        """Half of what lies between the quartiles, beside the median."""
+        slow, fast = self.quartiles
+        return f"{(fast - slow) / 2 / self.rate:.0%}"
+
+    @property
+    def cpu_share(self) -> float:
+        """Processor seconds per second."""
+        return statistics.median(cpu / wall for cpu, wall in zip(self.cpu_seconds, self.seconds, strict=True))
+
+    def plain(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "per_second": self.rate,
+            "quartiles": self.quartiles,
+            "cpu_share": self.cpu_share,
+            "repeats": len(self.seconds),
+        }
+
+
+def busy(taken: Sequence[Times]) -> str:
+    """What to add to the note under works of one thread, where others used the machine; usually nothing."""
+    share = statistics.median(times.cpu_share for times in taken)
+    return "" if share > FREE else f" The machine was busy, runs had {share:.0%} of a core: rough figures."
+
+
+def times_as_fast(one: Times, other: Times) -> float:
+    """How many times as fast `one` was as `other`, of the same `interleaved` run."""
+    return statistics.median(b / a for a, b in zip(one.seconds, other.seconds, strict=True))
+
+
+def interleaved(works: Sequence[Work], effort: Effort) -> list[Times]:
+    """Time works in turn, each `effort.repeats` times after once untimed; advances the watch (repeats + 1) × works."""
+    loops = []
+    for work in works:
+        loops.append(math.ceil(LEAST / max(_once(work)[0], 1e-9)))
+        effort.watch.advance()
+    taken: list[list[tuple[float, float]]] = [[] for _ in works]
+    for _ in range(effort.repeats):
+        for work, count, own in zip(works, loops, taken, strict=True):
+            wall, cpu = np.sum([_once(work) for _ in range(count)], axis=0) / (count * work.units)
+            own.append((float(wall), float(cpu)))
+            effort.watch.advance()
+    return [Times(*(tuple(values) for values in zip(*own, strict=True))) for own in taken]
+
+
+def _once(work: Work) -> tuple[float, float]:
+    work.prepare()
+    wall, cpu = time.perf_counter(), time.process_time()
+    work.run()
+    return time.perf_counter() - wall, time.process_time() - cpu
