@@ -39,7 +39,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   int pair = 0;
   const auto visit = [&](const Touching<T>& t) {
     PointForce<Pack<T>> force;
-    point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
     const auto pulls = dot(force.force, t.at.n);
     t.for_each_inside([&](int k, int i) {
       hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
@@ -51,14 +51,14 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     ++pair;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    for_touching_points<T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), visit);
+    for_touching_points<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), visit);
   }
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
-      for_touching_points<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), visit);
+      for_touching_points<false, T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), visit);
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {

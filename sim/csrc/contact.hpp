@@ -106,10 +106,10 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
     }
     pending.count = 0;
   };
-  for_touching_points<T>(frame, near, rule, [&](const Touching<T>& t) {
+  for_touching_points<derivatives, T>(frame, near, rule, [&](const Touching<T>& t) {
     touching = true;
     PointForce<L> force;
-    point_force<derivatives ? 1 : 0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    point_force<derivatives>(t.law, t.at, t.v, t.e, t.remembers, force);
     auto& e = pending.entry[pending.count++];
     e.x = t.x;
     e.force = force.force;
@@ -294,12 +294,11 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
       for (int i = 0; i < c.n; ++i) {
         if (c.dofs->dof[i] >= 0) virtual_twist += c.s[i] * multipliers[c.dofs->dof[i]];
       }
-      for_touching_points<T>(frame, w.near[n], rule, [&](const Touching<T>& t) {
-        PointForce<L> force;
-        point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+      for_touching_points<true, T>(frame, w.near[n], rule, [&](const Touching<T>& t) {
         const Vec3<L> weight =
             L(h) * (spread<L>(V3<T>(bottom(virtual_twist))) + cross(spread<L>(V3<T>(top(virtual_twist))), t.x));
-        const Vec3<L> by = transposed_times(force.by_anchor, weight);
+        const Vec3<L> none = zero3<L>();
+        const Vec3<L> by = point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, none, weight, none).anchor;
         t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
       });
     }

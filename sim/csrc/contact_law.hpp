@@ -31,91 +31,148 @@ struct PointLaw {
 template <class L>
 struct PointForce {
   Vec3<L> force;
-  Mat3<L> by_x, by_v, by_anchor;  // ∂force/∂(x, v, X); the anchor moves the friction alone
+  Mat3<L> by_x, by_v;  // ∂force/∂(x, v)
   Mask<L> slips;
   Vec3<L> friction, slip;  // f_t, v_t
-  Mat3<L> friction_by_x, friction_by_v, slip_by_x, slip_by_v;
 };
 
-// `derivatives`: 0 force only, 1 also by_x and by_v, 2 also by_anchor and the derivatives of friction and slip.
-template <int derivatives, class L>
-GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
-                                const Mask<L>& anchored, PointForce<L>& out) {
+// What the force is made of.
+template <class L>
+struct ForceParts {
+  L rate, normal, by_d, by_rate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
+  L along;                        // n·e
+  Vec3<L> slip, wanted;           // v_t, f*
+  Mask<L> slips;
+  L inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where it slips, else 1
+};
+template <class L>
+GELFLOW_INLINE void force_parts(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
+                                ForceParts<L>& p) {
   using std::sqrt;
   const L zero(0.0), one(1.0);
   const Vec3<L>& n = at.n;
-  const L rate = dot(n, v);
-  L normal, by_d, by_rate;
+  p.rate = dot(n, v);
   if (law.damping == DampingLaw::depth) {
-    const L wanted = law.kn - law.kd * rate;
+    const L wanted = law.kn - law.kd * p.rate;
     const Mask<L> pushes = wanted > zero;
     const L stiffness = select(pushes, wanted, zero);
-    normal = -stiffness * at.d;
-    by_d = -stiffness;
-    by_rate = select(pushes, law.kd * at.d, zero);
+    p.normal = -stiffness * at.d;
+    p.by_d = -stiffness;
+    p.by_rate = select(pushes, law.kd * at.d, zero);
   } else {
     const L ramp(1e-6);  // [m]
     const Mask<L> full = at.d < -ramp;
     const L r = select(full, one, -at.d / ramp);
-    const L push = -law.kn * at.d - r * law.kd * rate;
+    const L push = -law.kn * at.d - r * law.kd * p.rate;
     const Mask<L> pushes = push > zero;
-    normal = select(pushes, push, zero);
-    by_d = select(pushes, select(full, zero, law.kd * rate / ramp) - law.kn, zero);
-    by_rate = select(pushes, -r * law.kd, zero);
+    p.normal = select(pushes, push, zero);
+    p.by_d = select(pushes, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
+    p.by_rate = select(pushes, -r * law.kd, zero);
   }
-  const Vec3<L> slip = v - rate * n;
-  Vec3<L> wanted = -law.kt * slip;
-  L along = zero;
+  p.slip = v - p.rate * n;
+  p.wanted = -law.kt * p.slip;
+  p.along = zero;
   if (law.elastic) {
-    along = dot(n, e);
-    wanted -= law.ks * (e - along * n);  // e is zero where there is no anchor
+    p.along = dot(n, e);
+    p.wanted -= law.ks * (e - p.along * n);  // e is zero where there is no anchor
   }
-  const L bound = law.mu * normal, squared = dot(wanted, wanted);
+  const L bound = law.mu * p.normal, squared = dot(p.wanted, p.wanted);
   // After a slip the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
   // reverse and the readings must not take different sides.
   const L limit = law.elastic ? bound * (one + L(1e-14)) + law.ks * law.rounding : bound;
-  out.slips = squared > limit * limit;
-  const L inverse = one / sqrt(select(out.slips, squared, one));
-  const L ratio = select(out.slips, bound * inverse, one);
-  out.friction = ratio * wanted;
-  out.slip = slip;
-  out.force = normal * n + out.friction;
-  if constexpr (derivatives > 0) {
+  p.slips = squared > limit * limit;
+  p.inverse = p.ratio = one;
+  if (any(p.slips)) {
+    p.inverse = one / sqrt(select(p.slips, squared, one));
+    p.ratio = select(p.slips, bound * p.inverse, one);
+  }
+}
+
+template <bool derivatives, class L>
+GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
+                                const Mask<L>& anchored, PointForce<L>& out) {
+  ForceParts<L> p;
+  force_parts(law, at, v, e, p);
+  const L zero(0.0);
+  const Vec3<L>& n = at.n;
+  out.slips = p.slips;
+  out.slip = p.slip;
+  out.friction = p.ratio * p.wanted;
+  out.force = p.normal * n + out.friction;
+  if constexpr (derivatives) {
     // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature, the second only where there is an anchor, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
     const L memory = law.elastic ? select(anchored, law.ks, zero) : zero;
-    const Vec3<L> direction = select(out.slips, inverse, zero) * wanted;
-    Vec3<L> normal_by_x = by_d * n;
-    const Vec3<L> normal_by_v = by_rate * n;
+    const Vec3<L> direction = select(p.slips, p.inverse, zero) * p.wanted;
+    Vec3<L> normal_by_x = p.by_d * n;
+    const Vec3<L> lever = n + law.mu * direction;  // what a change of N adds
     // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ), where t·n = 0 but for a field, whose ‖n‖ is not quite 1.
-    Mat3<L> project = ratio * (identity_minus_outer(n) - outer(direction, direction));
-    const Vec3<L> lever = law.mu * direction;
-    out.friction_by_v = -law.kt * project + outer(lever, normal_by_v);
-    out.friction_by_x = law.elastic ? -memory * project : zero33<L>();
+    Mat3<L> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
+    if (at.bend == Bend::field) [[unlikely]] {
+      project += p.ratio * dot(direction, n) * outer(direction, n);
+    }
+    out.by_v = -law.kt * project;
+    out.by_v += outer(lever, p.by_rate * n);
+    if (law.elastic) {
+      out.by_x = -memory * project;
+    } else {
+      out.by_x = zero33<L>();
+    }
     if (at.bend != Bend::flat) {
-      if (at.bend == Bend::field) [[unlikely]] {
-        const Mat3<L> lean = ratio * dot(direction, n) * outer(direction, n);
-        project += lean;
-        out.friction_by_v -= law.kt * lean;
-        if (law.elastic) out.friction_by_x -= memory * lean;
-      }
       const Vec3<L> hv = at.hessian * v;
-      normal_by_x += by_rate * hv;
-      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + rate * at.hessian);
-      if (law.elastic) wanted_by_x += memory * (outer(n, at.hessian * e) + along * at.hessian);
-      out.friction_by_x += ratio * (wanted_by_x - outer(direction, transposed_times(wanted_by_x, direction)));
+      normal_by_x += p.by_rate * hv;
+      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + p.rate * at.hessian);
+      if (law.elastic) wanted_by_x += memory * (outer(n, at.hessian * e) + p.along * at.hessian);
+      out.by_x += p.ratio * (wanted_by_x - outer(direction, transposed_times(wanted_by_x, direction)));
+      out.by_x += p.normal * at.hessian;
     }
-    out.friction_by_x += outer(lever, normal_by_x);
-    out.by_x = out.friction_by_x + outer(n, normal_by_x);
-    if (at.bend != Bend::flat) out.by_x += normal * at.hessian;
-    out.by_v = out.friction_by_v + outer(n, normal_by_v);
-    if constexpr (derivatives > 1) {
-      out.by_anchor = memory * project;  // ∂f*/∂X = k_s (1 − n nᵀ)
-      out.slip_by_v = identity_minus_outer(n);
-      out.slip_by_x = zero33<L>();
-      if (at.bend != Bend::flat) out.slip_by_x -= outer(n, at.hessian * v) + rate * at.hessian;
-    }
+    out.by_x += outer(lever, normal_by_x);
   }
+}
+
+// The reverse: gradients with respect to N n, to f_t and to v_t, carried back to (x, v, X). The anchor moves the friction
+// alone.
+template <class L>
+struct PointGradient {
+  Vec3<L> x, v, anchor;
+  Mask<L> slips;
+  Vec3<L> force;  // what `point_force` says
+};
+template <class L>
+GELFLOW_INLINE PointGradient<L> point_force_transposed(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v,
+                                                       const Vec3<L>& e, const Mask<L>& anchored,
+                                                       const Vec3<L>& by_push, const Vec3<L>& by_friction,
+                                                       const Vec3<L>& by_slip) {
+  ForceParts<L> p;
+  force_parts(law, at, v, e, p);
+  const L zero(0.0);
+  const Vec3<L>& n = at.n;
+  const Vec3<L> direction = select(p.slips, p.inverse, zero) * p.wanted;
+  const L drawn = dot(direction, by_friction);
+  const Vec3<L> by_wanted = p.ratio * (by_friction - drawn * direction);
+  const L by_normal = dot(n, by_push) + law.mu * drawn;
+  // slip = v − ḋ n, wanted = −k_t slip − k_s (e − (n·e) n)
+  const Vec3<L> on_slip = by_slip - law.kt * by_wanted;
+  const L by_rate = by_normal * p.by_rate - dot(n, on_slip);
+  PointGradient<L> g;
+  g.slips = p.slips;
+  g.force = p.normal * n + p.ratio * p.wanted;
+  g.v = on_slip + by_rate * n;
+  g.x = by_normal * p.by_d * n;
+  g.anchor = zero3<L>();
+  L by_along = zero;
+  if (law.elastic) {
+    const L memory = select(anchored, law.ks, zero);
+    by_along = memory * dot(n, by_wanted);
+    g.anchor = memory * by_wanted - by_along * n;
+    g.x -= g.anchor;
+  }
+  if (at.bend != Bend::flat) {
+    Vec3<L> by_n = p.normal * by_push + by_rate * v - p.rate * on_slip;
+    if (law.elastic) by_n += by_along * e + select(anchored, law.ks, zero) * p.along * by_wanted;
+    g.x += at.hessian * by_n;
+  }
+  return g;
 }
 
 // The anchor after an accepted step, for a point that is inside (outside, the anchor is cleared).
@@ -127,24 +184,17 @@ GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const PointForce<L>& 
   return select3<L>(f.slips, x - s, select3<L>(anchored, anchor, x));
 }
 
-// Gradient of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
+// Gradient λ of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
 template <class L>
-struct AnchorGradient {
-  Vec3<L> x, v, anchor;
-};
-template <class L>
-GELFLOW_INLINE AnchorGradient<L> next_anchor_transposed(const PointLaw<L>& law, const PointForce<L>& f,
-                                                        const Mask<L>& anchored, const Vec3<L>& lambda) {
+GELFLOW_INLINE PointGradient<L> next_anchor_transposed(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v,
+                                                       const Vec3<L>& e, const Mask<L>& anchored,
+                                                       const Vec3<L>& lambda) {
   const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one);
-  const Vec3<L> none = zero3<L>();
-  const Vec3<L> scaled = one / stiffness * lambda;
-  AnchorGradient<L> g;
-  g.x = transposed_times(f.friction_by_x, scaled) + law.kt * transposed_times(f.slip_by_x, scaled);
-  g.v = transposed_times(f.friction_by_v, scaled) + law.kt * transposed_times(f.slip_by_v, scaled);
-  g.anchor = transposed_times(f.by_anchor, scaled);
-  g.x = select3<L>(f.slips, g.x + lambda, select3<L>(anchored, none, lambda));
-  g.v = select3<L>(f.slips, g.v, none);
-  g.anchor = select3<L>(f.slips, g.anchor, select3<L>(anchored, lambda, none));
+  const Vec3<L> none = zero3<L>(), scaled = one / stiffness * lambda;
+  PointGradient<L> g = point_force_transposed(law, at, v, e, anchored, none, scaled, law.kt * scaled);
+  g.x = select3<L>(g.slips, g.x + lambda, select3<L>(anchored, none, lambda));
+  g.v = select3<L>(g.slips, g.v, none);
+  g.anchor = select3<L>(g.slips, g.anchor, select3<L>(anchored, lambda, none));
   return g;
 }
 

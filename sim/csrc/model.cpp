@@ -321,6 +321,7 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   const M3<double> rotation = rotation_from(owner, quat);
   pad.cloud = PointCloud(positions, weights);
   for (const int i : pad.cloud.original) pad.frames.push_back(frames[i]);
+  pad.flat = std::all_of(frames.begin(), frames.end(), [&](const M3<double>& f) { return f == frames[0]; });
   pad.shapes = shapes;
   pad.law = friction_law(owner, law);
   check_law(owner, law_numbers, pad.law);

@@ -150,6 +150,7 @@ struct Pad {
   Mount mount;
   PointCloud cloud;
   std::vector<M3<double>> frames;  // sorted like the cloud; columns x, y, z
+  bool flat;                       // they are all the same
   std::vector<int> shapes;
   FrictionLaw law;
   int param;                    // kn, kt, mu, kd, ks

@@ -51,7 +51,7 @@ inline py::tuple distance_at(const Model& m, const std::string& name, const Arra
     Vec3<L> at;
     for (int k = 0; k < width; ++k) set_lane3<double>(at, k, x[std::min(begin + k, n - 1)]);
     Distance<L> found_at;
-    distance<L>(found->kind, m.param_defaults.data() + found->size, found->grid.get(), at, found_at);
+    distance<true>(found->kind, m.param_defaults.data() + found->size, found->grid.get(), at, found_at);
     if (found_at.bend == Bend::flat) found_at.hessian = zero33<L>();
     for (int k = 0; k < width && begin + k < n; ++k) {
       const py::ssize_t i = begin + k;

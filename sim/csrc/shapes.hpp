@@ -21,7 +21,7 @@ GELFLOW_INLINE void plane_distance(const Vec3<L>& x, Distance<L>& out) {  // the
   out.bend = Bend::flat;
 }
 
-template <class L>
+template <bool curved, class L>
 GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<L>& out) {
   using std::sqrt;
   const L zero(0.0), one(1.0), squared = dot(x, x);
@@ -29,7 +29,7 @@ GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<
   const L length = sqrt(select(center, one, squared)), inverse = one / length;
   out.d = select(center, -radius, length - radius);
   out.n = select3<L>(center, Vec3<L>{one, zero, zero}, inverse * x);
-  out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
+  if constexpr (curved) out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
   out.bend = Bend::curved;
 }
 
@@ -61,7 +61,7 @@ GELFLOW_INLINE Vec3<L> radial(const Vec3<L>& x, L& length, L& inverse) {
   return select3<L>(axis, {one, zero, zero}, {inverse * x.x, inverse * x.y, zero});
 }
 
-template <class L>
+template <bool curved, class L>
 GELFLOW_INLINE void cylinder_distance(const Vec3<L>& x, const L& radius, const L& half, Distance<L>& out) {
   const L zero(0.0), one(1.0);
   L length, inverse;
@@ -70,19 +70,21 @@ GELFLOW_INLINE void cylinder_distance(const Vec3<L>& x, const L& radius, const L
   const Mask<L> flat = end > wall;
   out.d = select(flat, end, wall);
   out.n = select3<L>(flat, {zero, zero, sign}, outwards);
-  const Vec3<L> around{-outwards.y, outwards.x, zero};
-  out.hessian = select(flat, zero, inverse) * outer(around, around);
+  if constexpr (curved) {
+    const Vec3<L> around{-outwards.y, outwards.x, zero};
+    out.hessian = select(flat, zero, inverse) * outer(around, around);
+  }
   out.bend = Bend::curved;
 }
 
-template <class L>
+template <bool curved, class L>
 GELFLOW_INLINE void capsule_distance(const Vec3<L>& x, const L& radius, const L& half, Distance<L>& out) {
   const L zero(0.0);
   const L nearest = select(x.z > half, half, select(x.z < -half, -half, x.z));
-  const Mask<L> along = !(x.z > half) && !(x.z < -half);
-  sphere_distance<L>({x.x, x.y, x.z - nearest}, radius, out);
+  [[maybe_unused]] const Mask<L> along = !(x.z > half) && !(x.z < -half);
+  sphere_distance<curved, L>({x.x, x.y, x.z - nearest}, radius, out);
   // Beside the segment nothing changes along it: (1 − n nᵀ − z zᵀ)/length.
-  out.hessian.row[2] = select3<L>(along, zero3<L>(), out.hessian.row[2]);
+  if constexpr (curved) out.hessian.row[2] = select3<L>(along, zero3<L>(), out.hessian.row[2]);
 }
 
 // One Newton step for t in Σ (a x/(a² + t))² = 1, on whose left end it starts: it then never steps over the root.
@@ -103,7 +105,7 @@ GELFLOW_INLINE L ellipsoid_step(const Vec3<L>& scaled, const Vec3<L>& square, co
 
 // The nearest point y of the ellipsoid has x − y = t g with g = y/a²: y = a² x/(a² + t), d = t ‖g‖, n = g/‖g‖. In the
 // middle, where all is equally far along the shortest axis, its positive end is taken.
-template <class L>
+template <bool curved, class L>
 __attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L>& axes, Distance<L>& out) {
   using std::sqrt;
   const L zero(0.0), one(1.0);
@@ -139,6 +141,8 @@ __attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L
   const L steepness = sqrt(dot(gradient, gradient)), inverse = one / steepness;
   out.d = t * steepness;
   out.n = inverse * gradient;
+  out.bend = Bend::curved;
+  if constexpr (!curved) return;
   // Curvature of the surface S = P diag(1/a²) P/‖g‖ with P = 1 − n nᵀ, and of the parallel surface (1 + d S)⁻¹ S.
   const Mat3<L> project = identity_minus_outer(out.n);
   Mat3<L> surface = zero33<L>();
@@ -154,7 +158,6 @@ __attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L
     const Vec3<L> row = transposed_times(surface, cofactors.row[a]);
     out.hessian.row[a] = select3<L>(regular, scale * row, surface.row[a]);
   }
-  out.bend = Bend::curved;
 }
 
 // A rounded solid is a smaller one, of sizes less r, grown by r. Beyond the smaller one it is r less than the distance
@@ -222,22 +225,23 @@ __attribute__((noinline)) void rarer_distance(ShapeKind kind, const T* size, con
   grid_distance<L>(*grid, L(size[0]), x, out);
 }
 
-template <class L, class T>
+// `curved`: the Hessian is asked for too.
+template <bool curved, class L, class T>
 GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x,
                              Distance<L>& out) {
   switch (kind) {
     case ShapeKind::plane:
       return plane_distance<L>(x, out);
     case ShapeKind::sphere:
-      return sphere_distance<L>(x, L(size[0]), out);
+      return sphere_distance<curved, L>(x, L(size[0]), out);
     case ShapeKind::box:
       return box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
     case ShapeKind::cylinder:
-      return cylinder_distance<L>(x, L(size[0]), L(size[1]), out);
+      return cylinder_distance<curved, L>(x, L(size[0]), L(size[1]), out);
     case ShapeKind::capsule:
-      return capsule_distance<L>(x, L(size[0]), L(size[1]), out);
+      return capsule_distance<curved, L>(x, L(size[0]), L(size[1]), out);
     case ShapeKind::ellipsoid:
-      return ellipsoid_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
+      return ellipsoid_distance<curved, L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
     [[unlikely]] default:
       return rarer_distance<L, T>(kind, size, grid, x, out);
   }

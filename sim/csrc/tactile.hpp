@@ -22,25 +22,34 @@ TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3
 template <class T>
 void read_markers(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                   const Workspace<T>& w, T* out) {
+  using L = Pack<T>;
   std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
-      for_touching_points<T>(
-          frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), [&](const Touching<T>& t) {
-            PointForce<Pack<T>> force;
-            point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
-            const Vec3<Pack<T>> in_body = transposed_times(spread<Pack<T>>(frame.rotation), force.force);
-            t.for_each_inside([&](int k, int i) {
-              const V3<T> f = lane3<T>(in_body, k);
-              const M3<double>& axes = pad.frames[i];
-              T* reading = out + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
-              for (int a = 0; a < 3; ++a) {
-                const T component = T(axes(0, a)) * f[0] + T(axes(1, a)) * f[1] + T(axes(2, a)) * f[2];
-                reading[a] += a < 2 ? component : T(-component);
-              }
-            });
+      const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
+      T* const readings = out + 3 * static_cast<std::size_t>(pad.first_marker);
+      const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
+      for_touching_points<false, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) {
+        PointForce<L> force;
+        point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
+        if (pad.flat) {
+          const Vec3<L> felt = transposed_times(axes, force.force);
+          T numbers[3][pack_width<T>];
+          for (int a = 0; a < 3; ++a) store(a < 2 ? felt[a] : -felt[a], numbers[a]);
+          t.for_each_inside([&](int k, int i) {
+            T* const reading = readings + 3 * static_cast<std::size_t>(pad.cloud.original[i]);
+            for (int a = 0; a < 3; ++a) reading[a] += numbers[a][k];
           });
+          return;
+        }
+        const Vec3<L> in_body = transposed_times(spread<L>(frame.rotation), force.force);
+        t.for_each_inside([&](int k, int i) {
+          const V3<T> felt = pad.frames[i].transpose().template cast<T>() * lane3<T>(in_body, k);
+          T* const reading = readings + 3 * static_cast<std::size_t>(pad.cloud.original[i]);
+          for (int a = 0; a < 3; ++a) reading[a] += a < 2 ? felt[a] : T(-felt[a]);
+        });
+      });
     }
   }
 }
@@ -71,27 +80,29 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
       V3<T>* const by_own = pad.anchor < 0 ? nullptr : by_anchor + pad.anchor + s * pad.cloud.size();
-      for_touching_points<T>(
-          frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), [&](const Touching<T>& t) {
-            Vec3<L> by_force = zero3<L>();
-            t.for_each_inside([&](int k, int i) {
-              const T* g = by_reading + 3 * static_cast<std::size_t>(pad.first_marker + pad.cloud.original[i]);
-              const V3<T> in_body = pad.frames[i].template cast<T>() * V3<T>(g[0], g[1], -g[2]);
-              set_lane3<T>(by_force, k, V3<T>(frame.rotation * in_body));
-            });
-            PointForce<L> force;
-            point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
-            const Vec3<L> by_velocity = transposed_times(force.by_v, by_force);
-            const Vec3<L> by_point =
-                transposed_times(force.by_x, by_force) - cross(spread<L>(frame.angular), by_velocity);
-            turn += cross(t.x, by_point) + cross(by_force, force.force);  // the axes turn too
-            shift += by_point;
-            spin += cross(t.x, by_velocity);
-            slide += by_velocity;
-            if (by_own == nullptr) return;
-            const Vec3<L> by = transposed_times(force.by_anchor, by_force);
-            t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
-          });
+      const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
+      const T* const by_readings = by_reading + 3 * static_cast<std::size_t>(pad.first_marker);
+      const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
+      for_touching_points<true, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) {
+        T numbers[3][pack_width<T>] = {};
+        t.for_each_inside([&](int k, int i) {
+          const T* const g = by_readings + 3 * static_cast<std::size_t>(pad.cloud.original[i]);
+          V3<T> by(g[0], g[1], -g[2]);
+          if (!pad.flat) by = (frame.rotation * (pad.frames[i].template cast<T>() * by)).eval();
+          for (int a = 0; a < 3; ++a) numbers[a][k] = by[a];
+        });
+        Vec3<L> by_force{load<L>(numbers[0]), load<L>(numbers[1]), load<L>(numbers[2])};
+        if (pad.flat) by_force = axes * by_force;
+        const PointGradient<L> g =
+            point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, by_force, by_force, zero3<L>());
+        const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
+        turn += cross(t.x, by_point) + cross(by_force, g.force);  // the axes turn too
+        shift += by_point;
+        spin += cross(t.x, g.v);
+        slide += g.v;
+        if (by_own == nullptr) return;
+        t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(g.anchor, k); });
+      });
       const V6<T> by_pose = stack<T>(sum3<T>(turn), sum3<T>(shift)), by_twist = stack<T>(sum3<T>(spin), sum3<T>(slide));
       pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w);
       pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);

@@ -29,13 +29,14 @@ struct Touching {
 };
 
 // Looks at points with these places in the first body's frame, of which t knows the anchors. Whether any is inside.
-template <class T>
+// `curved`: Hessians of the distance are asked for.
+template <bool curved, class T>
 GELFLOW_INLINE bool touches(const PairFrame<T>& frame, const TouchRule<T>& rule, const Vec3<Pack<T>>& local,
                             const Pack<T>& weight, Touching<T>& t) {
   using L = Pack<T>;
   t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
   if (rule.rolling_radius > T(0)) t.x.z -= L(rule.rolling_radius);  // planes only: n = z
-  distance<L>(frame.kind, frame.size, frame.grid, t.x, t.at);
+  distance<curved>(frame.kind, frame.size, frame.grid, t.x, t.at);
   t.inside = t.at.d < L(0.0) && weight > L(0.0);
   if (!any(t.inside)) return false;
   const T* p = rule.params;
@@ -57,7 +58,7 @@ GELFLOW_INLINE bool touches(const PairFrame<T>& frame, const TouchRule<T>& rule,
 }
 
 // Calls f(touching) for all points of a cloud that are inside the shape, a pack at a time.
-template <class T, class F>
+template <bool curved, class T, class F>
 void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
   using L = Pack<T>;
   constexpr int width = pack_width<T>;
@@ -81,13 +82,13 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
         t.remembers = remembers > L(0.0);
       }
       t.first = i;
-      if (touches<T>(frame, rule, local, weight, t)) f(static_cast<const Touching<T>&>(t));
+      if (touches<curved, T>(frame, rule, local, weight, t)) f(static_cast<const Touching<T>&>(t));
     }
   });
 }
 
 // The same for points that were found near.
-template <class T, class F>
+template <bool curved, class T, class F>
 GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule,
                                         F&& f) {
   using L = Pack<T>;
@@ -102,7 +103,7 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const NearPoi
     }
     t.index = &near.index[i];
     const Vec3<L> local{load<L>(&near.x[i]), load<L>(&near.y[i]), load<L>(&near.z[i])};
-    if (touches<T>(frame, rule, local, load<L>(&near.weight[i]), t)) f(static_cast<const Touching<T>&>(t));
+    if (touches<curved, T>(frame, rule, local, load<L>(&near.weight[i]), t)) f(static_cast<const Touching<T>&>(t));
   }
 }
 
@@ -112,9 +113,9 @@ template <class T>
 void advance_anchors(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, int cloud_size,
                      V3<T>* next, std::uint8_t* next_set) {
   std::fill(next_set, next_set + cloud_size, 0);
-  for_touching_points<T>(frame, near, rule, [&](const Touching<T>& t) {
+  for_touching_points<false, T>(frame, near, rule, [&](const Touching<T>& t) {
     PointForce<Pack<T>> force;
-    point_force<0>(t.law, t.at, t.v, t.e, t.remembers, force);
+    point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
     const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.x, t.anchor, t.remembers);
     t.for_each_inside([&](int k, int i) {
       next[i] = lane3<T>(anchor, k);
@@ -130,12 +131,10 @@ void anchors_transposed(const PairFrame<T>& frame, const Points& points, const T
                         V6<T>& by_pose, V6<T>& by_twist, V3<T>* by_anchor) {
   using L = Pack<T>;
   Vec3<L> turn = zero3<L>(), shift = turn, spin = turn, slide = turn;
-  for_touching_points<T>(frame, points, rule, [&](const Touching<T>& t) {
-    PointForce<L> force;
-    point_force<2>(t.law, t.at, t.v, t.e, t.remembers, force);
+  for_touching_points<true, T>(frame, points, rule, [&](const Touching<T>& t) {
     Vec3<L> lambda = zero3<L>();
     t.for_each_inside([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
-    const AnchorGradient<L> g = next_anchor_transposed(t.law, force, t.remembers, lambda);
+    const PointGradient<L> g = next_anchor_transposed(t.law, t.at, t.v, t.e, t.remembers, lambda);
     const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
     turn += cross(t.center, by_point);
     shift += by_point;
