@@ -63,7 +63,7 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
       out[(3 + i) * 6 + 3 + j] += by_shift[j];
     }
   }
-  const auto moments = [&](int j, auto&& turned) __attribute__((always_inline)) {
+  const auto moments = [&](int j, auto&& turned) GELFLOW_LOOP_BODY {
     Vec3<L> by_turn = zero3<L>(), by_shift = by_turn;
     for (int n = 0; n < pending.count; ++n) {
       const auto& e = pending.entry[n];
@@ -78,9 +78,9 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
     }
   };
   using V = Vec3<L>;
-  moments(0, [](const V& c, const V& r) __attribute__((always_inline)) { return c.y * r.z - c.z * r.y; });
-  moments(1, [](const V& c, const V& r) __attribute__((always_inline)) { return c.z * r.x - c.x * r.z; });
-  moments(2, [](const V& c, const V& r) __attribute__((always_inline)) { return c.x * r.y - c.y * r.x; });
+  moments(0, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.y * r.z - c.z * r.y; });
+  moments(1, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.z * r.x - c.x * r.z; });
+  moments(2, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.x * r.y - c.y * r.x; });
 }
 
 // Sums over the points near the shape. Returns whether any of them touches.
@@ -106,7 +106,7 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
     }
     pending.count = 0;
   };
-  for_touching_points<derivatives, T>(frame, near, rule, [&](const Touching<T>& t) {
+  for_touching_points<derivatives, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
     touching = true;
     PointForce<L> force;
     point_force<derivatives>(t.law, t.at, t.v, t.e, t.remembers, force);

@@ -128,29 +128,29 @@ void find_near_points(const PairFrame<T>& f, const PointCloud& cloud, const Touc
   near.offset = f.offset;
   const bool elastic = rule.law == FrictionLaw::elastic;
   if (near.capacity == 0) grow(near, elastic);
-  int n = 0;
+  int count = 0;
   for_near_points<T>(f, cloud, rule.rolling_radius + T(near.margin), [&](int i) {
-    if (n == near.capacity) grow(near, elastic);
-    near.index[n] = i;
-    near.x[n] = T(cloud.points.x[i]);
-    near.y[n] = T(cloud.points.y[i]);
-    near.z[n] = T(cloud.points.z[i]);
-    near.weight[n] = scaled_weight(f, cloud, i);
-    if (elastic) {
-      const bool set = rule.anchored[i] != 0;
-      const V3<T> anchor = set ? rule.anchors[i] : V3<T>(V3<T>::Zero());
-      near.anchor_x[n] = anchor[0];
-      near.anchor_y[n] = anchor[1];
-      near.anchor_z[n] = anchor[2];
-      near.remembers[n] = T(set ? 1 : 0);
-    }
-    ++n;
+    if (count == near.capacity) grow(near, elastic);
+    near.index[count++] = i;
   });
-  near.count = n;
-  for (int i = n; i % pack_width<T> != 0; ++i) {  // what fills the last pack
-    near.x[i] = near.y[i] = near.z[i] = near.weight[i] = T(0);
-    if (elastic) near.anchor_x[i] = near.anchor_y[i] = near.anchor_z[i] = near.remembers[i] = T(0);
-  }
+  near.count = count;
+  const int* const index = near.index.data();
+  const auto gather = [&](std::vector<T>& to, auto&& number) {
+    T* out = to.data();
+    for (int n = 0; n < count; ++n) out[n] = number(index[n]);
+    for (int n = count; n % pack_width<T> != 0; ++n) out[n] = T(0);  // what fills the last pack
+  };
+  const PointCloud::Places& points = cloud.points;
+  gather(near.x, [&](int i) { return T(points.x[i]); });
+  gather(near.y, [&](int i) { return T(points.y[i]); });
+  gather(near.z, [&](int i) { return T(points.z[i]); });
+  gather(near.weight, [&](int i) { return scaled_weight(f, cloud, i); });
+  if (!elastic) return;
+  // An anchor that is not set may be anything; nothing looks at it.
+  gather(near.anchor_x, [&](int i) { return rule.anchors[i][0]; });
+  gather(near.anchor_y, [&](int i) { return rule.anchors[i][1]; });
+  gather(near.anchor_z, [&](int i) { return rule.anchors[i][2]; });
+  gather(near.remembers, [&](int i) { return T(rule.anchored[i] != 0 ? 1 : 0); });
 }
 
 }  // namespace gelflow

@@ -106,7 +106,7 @@ GELFLOW_INLINE L ellipsoid_step(const Vec3<L>& scaled, const Vec3<L>& square, co
 // The nearest point y of the ellipsoid has x − y = t g with g = y/a²: y = a² x/(a² + t), d = t ‖g‖, n = g/‖g‖. In the
 // middle, where all is equally far along the shortest axis, its positive end is taken.
 template <bool curved, class L>
-__attribute__((noinline)) void ellipsoid_distance(const Vec3<L>& x, const Vec3<L>& axes, Distance<L>& out) {
+GELFLOW_INLINE void ellipsoid_distance(const Vec3<L>& x, const Vec3<L>& axes, Distance<L>& out) {
   using std::sqrt;
   const L zero(0.0), one(1.0);
   const Vec3<L> square{axes.x * axes.x, axes.y * axes.y, axes.z * axes.z};
@@ -213,9 +213,12 @@ GELFLOW_INLINE void rounded_cylinder_distance(const Vec3<L>& x, const L& radius,
 }
 
 // Kinds that are rarer and longer stay out of the loops of the others.
-template <class L, class T>
+template <bool curved, class L, class T>
 __attribute__((noinline)) void rarer_distance(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x,
                                               Distance<L>& out) {
+  if (kind == ShapeKind::ellipsoid) {
+    return ellipsoid_distance<curved, L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
+  }
   if (kind == ShapeKind::rounded_box) {
     return rounded_box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, L(size[3]), out);
   }
@@ -240,10 +243,11 @@ GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* 
       return cylinder_distance<curved, L>(x, L(size[0]), L(size[1]), out);
     case ShapeKind::capsule:
       return capsule_distance<curved, L>(x, L(size[0]), L(size[1]), out);
-    case ShapeKind::ellipsoid:
-      return ellipsoid_distance<curved, L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
-    [[unlikely]] default:
-      return rarer_distance<L, T>(kind, size, grid, x, out);
+    [[unlikely]] default: {
+      Distance<L> found;  // called, they need a place in memory
+      rarer_distance<curved, L, T>(kind, size, grid, x, found);
+      out = found;
+    }
   }
 }
 

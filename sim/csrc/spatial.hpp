@@ -12,6 +12,7 @@
 
 // The small functions of the inner loops: left alone, the compiler calls them.
 #define GELFLOW_INLINE __attribute__((always_inline)) inline
+#define GELFLOW_LOOP_BODY __attribute__((always_inline))
 
 namespace gelflow {
 

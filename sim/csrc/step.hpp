@@ -134,10 +134,10 @@ template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 Observer&& accepted = {}) {
   StepReport report;
-  memory.keep(m, s);
   const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep
   for (int at = 0, length = whole; at < whole;) {
     const T h = length == whole ? T(m.step) : T(m.step * length / whole);
+    if (at == 0 && length == whole / 2) memory.keep(m, s);  // only a part of a step may have to be taken back
     report.status = substep<T>(m, params, h, length == whole, u, polish, s, memory, report.iterations, accepted);
     if (report.status == Status::ok) {
       at += length;
@@ -146,7 +146,7 @@ StepReport step(const Model& m, const T* params, const T* u, int polish, const S
       length /= 2;
       report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(whole / length)));
     } else {
-      memory.give_back(m, s);
+      if (at > 0) memory.give_back(m, s);
       return report;
     }
   }

@@ -30,7 +30,7 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
       const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
       T* const readings = out + 3 * static_cast<std::size_t>(pad.first_marker);
       const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
-      for_touching_points<false, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) {
+      for_touching_points<false, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
         PointForce<L> force;
         point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
         if (pad.flat) {
@@ -83,7 +83,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
       const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
       const T* const by_readings = by_reading + 3 * static_cast<std::size_t>(pad.first_marker);
       const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
-      for_touching_points<true, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) {
+      for_touching_points<true, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
         T numbers[3][pack_width<T>] = {};
         t.for_each_inside([&](int k, int i) {
           const T* const g = by_readings + 3 * static_cast<std::size_t>(pad.cloud.original[i]);

@@ -113,7 +113,7 @@ template <class T>
 void advance_anchors(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, int cloud_size,
                      V3<T>* next, std::uint8_t* next_set) {
   std::fill(next_set, next_set + cloud_size, 0);
-  for_touching_points<false, T>(frame, near, rule, [&](const Touching<T>& t) {
+  for_touching_points<false, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
     PointForce<Pack<T>> force;
     point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
     const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.x, t.anchor, t.remembers);
