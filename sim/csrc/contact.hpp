@@ -43,9 +43,15 @@ struct Pending {
   Entry entry[most];
 };
 
+// Adds to a sum, or starts it.
+template <bool first, class L>
+GELFLOW_INLINE void put(const L& value, L& sum) {
+  sum = first ? value : sum + value;
+}
+
 // Adds what A (or B) is in `matrix` of all entries to a 6 × 6 matrix; c = x + lift ẑ. Each loop runs over all entries and
 // keeps its few sums in registers.
-template <class T>
+template <bool first, class T>
 GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<T>::Entry::* matrix, const T& lift,
                                Pack<T>* out) {
   using L = Pack<T>;
@@ -59,8 +65,8 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
       by_turn += cross(Vec3<L>{e.x.x, e.x.y, e.x.z + up}, row);
     }
     for (int j = 0; j < 3; ++j) {
-      out[(3 + i) * 6 + j] += by_turn[j];
-      out[(3 + i) * 6 + 3 + j] += by_shift[j];
+      put<first>(by_turn[j], out[(3 + i) * 6 + j]);
+      put<first>(by_shift[j], out[(3 + i) * 6 + 3 + j]);
     }
   }
   const auto moments = [&](int j, auto&& turned) GELFLOW_LOOP_BODY {
@@ -73,8 +79,8 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
       by_turn += cross(e.x, Vec3<L>{turned(c, a.row[0]), turned(c, a.row[1]), turned(c, a.row[2])});
     }
     for (int i = 0; i < 3; ++i) {
-      out[i * 6 + j] += by_turn[i];
-      out[i * 6 + 3 + j] += by_shift[i];
+      put<first>(by_turn[i], out[i * 6 + j]);
+      put<first>(by_shift[i], out[i * 6 + 3 + j]);
     }
   };
   using V = Vec3<L>;
@@ -83,31 +89,45 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
   moments(2, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.x * r.y - c.y * r.x; });
 }
 
+// Adds all entries to the sums, or starts these: Σ f (3), Σ x fᵀ (9), and with derivatives K and D (36 each).
+template <bool first, bool derivatives, class T>
+__attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, Pack<T>* sums) {
+  using L = Pack<T>;
+  Vec3<L> force = zero3<L>();
+  Mat3<L> spread = zero33<L>();
+  for (int n = 0; n < pending.count; ++n) {
+    const auto& e = pending.entry[n];
+    force += e.force;
+    spread += outer(e.x, e.force);
+  }
+  for (int j = 0; j < 3; ++j) {
+    put<first>(force[j], sums[j]);
+    for (int i = 0; i < 3; ++i) put<first>(spread.row[i][j], sums[3 + 3 * i + j]);
+  }
+  if constexpr (derivatives) {
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + 12);
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + 48);
+  }
+  pending.count = 0;
+}
+
 // Sums over the points near the shape. Returns whether any of them touches.
 template <bool derivatives, class T>
 bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, PairSums<T>& sums) {
   using L = Pack<T>;
-  constexpr int numbers = derivatives ? 84 : 12;  // Σ f, Σ x fᵀ; K and D
+  constexpr int numbers = derivatives ? 84 : 12;
   L all[numbers];
-  std::fill(all, all + numbers, L(0.0));
-  bool touching = false;
+  bool started = false;
   Pending<T> pending;
-  const auto sum_up = [&]() __attribute__((noinline)) {
-    for (int n = 0; n < pending.count; ++n) {
-      const auto& e = pending.entry[n];
-      for (int j = 0; j < 3; ++j) {
-        all[j] += e.force[j];
-        for (int i = 0; i < 3; ++i) all[3 + 3 * i + j] += e.x[i] * e.force[j];
-      }
+  const auto add = [&]() GELFLOW_LOOP_BODY {
+    if (started) {
+      add_pending<false, derivatives, T>(pending, rule.rolling_radius, all);
+    } else {
+      add_pending<true, derivatives, T>(pending, rule.rolling_radius, all);
     }
-    if constexpr (derivatives) {
-      add_blocks<T>(pending, &Pending<T>::Entry::by_pose, rule.rolling_radius, all + 12);
-      add_blocks<T>(pending, &Pending<T>::Entry::by_v, T(0), all + 48);
-    }
-    pending.count = 0;
+    started = true;
   };
   for_touching_points<derivatives, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
-    touching = true;
     PointForce<L> force;
     point_force<derivatives>(t.law, t.at, t.v, t.e, t.remembers, force);
     auto& e = pending.entry[pending.count++];
@@ -117,10 +137,10 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
       e.by_pose = force.by_x + cross_rows(force.by_v, spread<L>(frame.angular));
       e.by_v = force.by_v;
     }
-    if (pending.count == Pending<T>::most) sum_up();
+    if (pending.count == Pending<T>::most) add();
   });
-  if (!touching) return false;
-  if (pending.count > 0) sum_up();
+  if (pending.count > 0) add();
+  if (!started) return false;
   T total[numbers];
   sum_lanes(all, numbers, total);
   const T* const f = total;
