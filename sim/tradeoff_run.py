@@ -7,7 +7,7 @@ problem, and one call of the core steps from one reading to the next.
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from gelflow.sim.simulator import Simulator
 Array = NDArray[np.float64]
 
 FRAME = 10e-3  # between two controls, and at least between two readings [s]
+DRAWN = 1.5  # stiffness, friction and masses are drawn up to this many times larger or smaller
 WINDOW = 8  # frames before the look: over which the loss is, and by whose controls it is differentiated
 _FLOOR = 0.1  # of a run's largest shear, see `_flow`
 _STATE = ("q", "v", "anchors", "anchored", "history")
@@ -64,19 +65,16 @@ class Task:
     ----------
     scene: one with a motion; its step must divide 10 ms
     every: markers are read after every so many frames
-    factors: by which parameters of the simulator are multiplied, by name
 
     Raises UsageError when the step does not divide a frame.
     """
 
-    def __init__(self, scene: Scene, *, every: int = 1, factors: Mapping[str, float] | None = None) -> None:
+    def __init__(self, scene: Scene, *, every: int = 1) -> None:
         self.scene, self.every = scene, every
         self.steps = round(FRAME / scene.step)
         if self.steps < 1 or abs(self.steps * scene.step - FRAME) > 1e-9 * FRAME:
             raise UsageError(f"{scene.path}: a step of {scene.step} s must divide {FRAME} s, the time between controls")
         self.sim = Simulator(scene, threads=1)
-        for name, factor in (factors or {}).items():
-            self.sim.param(name)[:] *= factor
         self.motion = motion(scene)
         self.look = round(self.motion.look / FRAME)
         self.controls: NDArray[Any] = self.motion.steps(FRAME).astype(self.sim.dtype)[:, None]
@@ -159,23 +157,55 @@ class Task:
         return np.asarray(np.array(rows)[:, spread > 0] * spread[spread > 0], float)
 
 
+def drawn(scene: Scene, rng: np.random.Generator) -> Scene:
+    """The scene with another physics: stiffness (damping along with it) and friction of each contact and pad, and the
+    mass of each body, times factors between 1/1.5 and 1.5. One state of `rng` gives one physics, whatever the step.
+
+    Bodies with pads keep their mass: motions push them with forces that are meant for it."""
+
+    def factor() -> float:
+        return float(np.exp(rng.uniform(-1, 1) * np.log(DRAWN)))
+
+    def numbers(old: Mapping[str, float], stiffness: float, friction: float) -> dict[str, float]:
+        return {name: value * (friction if name == "mu" else stiffness) for name, value in old.items()}
+
+    groups = {group: (factor(), factor()) for group in dict.fromkeys(c.group for c in scene.contacts)}
+    pads = [(factor(), factor()) for _ in scene.pads]
+    with_pads = {pad.body for pad in scene.pads}
+    masses = [1.0 if i in with_pads else factor() for i in range(len(scene.bodies))]
+    return replace(
+        scene,
+        contacts=tuple(replace(c, numbers=numbers(c.numbers, *groups[c.group])) for c in scene.contacts),
+        pads=tuple(replace(p, numbers=numbers(p.numbers, *two)) for p, two in zip(scene.pads, pads, strict=True)),
+        bodies=tuple(
+            replace(b, mass=b.mass * m, inertia=b.inertia * m)
+            for b, m in zip(scene.bodies, masses, strict=True)
+        ),
+    )
+
+
 def compare(run: Run, truth: Run) -> Errors:
     """How far a run is off the truth, both on the same markers. Gradients that were not asked for count as right."""
     shift = np.linalg.norm(run.poses[..., :3] - truth.poses[..., :3], axis=-1)
     flow = _flow(run, truth) - _flow(truth, truth)
     cosine, gradient = 1.0, 0.0
     if run.gradient is not None and truth.gradient is not None:
-        size, true_size = np.linalg.norm(run.gradient), np.linalg.norm(truth.gradient)
-        cosine = float((run.gradient * truth.gradient).sum() / max(size * true_size, 1e-300))
-        gradient = float(np.linalg.norm(run.gradient - truth.gradient) / true_size)
+        sizes = float(np.linalg.norm(run.gradient) * np.linalg.norm(truth.gradient))
+        cosine = float((run.gradient * truth.gradient).sum()) / sizes if sizes > 0 else 0.0
+        gradient = _relative(run.gradient, truth.gradient)
     return Errors(
         position=float(shift.max()),
         rotation=float(_angle(run.poses[..., 3:], truth.poses[..., 3:]).max()),
-        markers=float(np.linalg.norm(run.field[1:] - truth.field[1:]) / np.linalg.norm(truth.field[1:])),
+        markers=_relative(run.field[1:], truth.field[1:]),
         flow=float(np.linalg.norm(flow, axis=-1).mean()),
         cosine=cosine,
         gradient=gradient,
     )
+
+
+def _relative(found: Array, true: Array) -> float:
+    off, size = float(np.linalg.norm(found - true)), float(np.linalg.norm(true))
+    return off / size if size > 0 else (0.0 if off == 0 else np.inf)
 
 
 def _angle(a: Array, b: Array) -> Array:
