@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import SimulationError
+from gelflow.sim.motions import motion
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.scene_toml import read_toml
 from gelflow.sim.tradeoff_run import FRAME, Errors, Run, Task, compare, drawn
@@ -27,8 +28,10 @@ FINE, COARSE = (9, 6), (7, 4)  # halvings of a frame for the references: of the 
 DENSE = 4  # contact points along a length in the reference of those settings
 EXACT = {"integrator": "bdf2", "tolerance": 1e-10, "precision": "double"}
 _CORNERS = 8  # points that are the corners of a box stay: they are no sample of a surface
-_APART = ("markers", "contacts")  # other readings or another physics: they make no other setting needless
+_APART = ("single", "markers", "contacts")  # other arrays, readings or physics: they make no other setting needless
 _EQUAL, _BETTER = 1.02, 0.9  # figures within 2 % are the same; one by 10 % lower is better
+
+GROUPS = ("own", "step", "tolerance", "combined", "single", "reads", "markers", "contacts", "preset")
 
 Overrides = dict[str, Any]
 
@@ -38,7 +41,7 @@ class Setting:
     """One way to simulate a scene."""
 
     name: str
-    group: str  # what is varied: "step", "tolerance", "combined", "reads", "markers", "contacts", "preset"
+    group: str  # what is varied, one of GROUPS
     overrides: Mapping[str, Any]
     every: int = 1  # frames of 10 ms between two readings
 
@@ -49,7 +52,7 @@ class Price:
 
     setting: Setting
     presets: tuple[str, ...]  # of the scene that are this setting
-    seconds: float  # of computing per simulated second, one environment and one thread; median
+    seconds: float  # of the processor's time per simulated second, one environment and one thread; median
     errors: Errors
     iterations: float  # of Newton's method, per step
     dominated_by: str | None  # a setting that is no worse in anything, and better in something
@@ -96,7 +99,8 @@ def settings(scene: str | Path, *, quick: bool = False) -> list[Setting]:
 
 def _timed(integrator: str, cut: int, more: Overrides) -> Setting:
     values = {"step": FRAME / cut, "integrator": integrator, **more}
-    return Setting(_words(values), "combined" if more else "step", values)
+    group = "single" if more.get("precision") == "single" else "combined" if more else "step"
+    return Setting(_words(values), group, values)
 
 
 def _words(values: Overrides) -> str:
@@ -194,6 +198,7 @@ def measure(
     Raises UsageError for a scene without a motion.
     """
     own = load_scene(scene)
+    motion(own)  # raises where there is none
     plain, dense = COARSE if quick else FINE
     done("reference", 0.0)
     truths, changes = {}, {}
@@ -259,7 +264,7 @@ def dominated(figures: Mapping[str, Sequence[float]], groups: Mapping[str, str])
     """For each setting the one, if any, that is no worse in any figure (2 % apart) and better in some (10 %).
 
     Figures are such that less is better, time first; of several settings the one with the least time is named. Settings
-    with other markers or points are better only than their like.
+    in single precision, with other markers or other points are better only than their like.
     """
     found: dict[str, str | None] = {}
     for name, mine in figures.items():
