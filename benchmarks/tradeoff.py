@@ -27,7 +27,7 @@ from gelflow.sim.tradeoff_run import Errors
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tradeoff.md"
-DRAWS = 24
+DRAWS = 16
 HALVINGS = 8  # of a frame, for the references of the draws
 BEGIN, END = "<!-- written by benchmarks/tradeoff.py -->", "<!-- end -->"
 
@@ -37,7 +37,7 @@ def row(scene: str, name: str, bound: Errors, speed: float) -> str:
     way = load_scene(scene, preset=None if name == OWN else name)
     how = f"{way.integrator.upper()}, {1e3 * way.step:g} ms, {way.tolerance:.0e}".replace("e-0", "e-")
     figures = (1e3 * bound.position, 1e3 * bound.rotation, 100 * bound.markers, bound.flow)
-    cells = [scene, name, how, f"{speed:.0f}", *(f"{x:.3g}" for x in figures), f"{bound.cosine:.5g}"]
+    cells = [scene, name, how, f"{speed:.0f}", *(f"{x:.3g}" for x in figures), f"{bound.cosine:.4f}"]
     return f"| {' | '.join([*cells, f'{100 * bound.gradient:.3g}'])} |"
 
 
@@ -68,6 +68,23 @@ def record(found: Tradeoff, limits: dict[str, Bounds], machine: str) -> dict[str
     }
 
 
+def one(scene: str, draws: int, repeats: int, progress: Progress) -> tuple[Tradeoff, dict[str, Bounds]]:
+    """Everything about one scene."""
+    bar = progress.add_task(scene, total=2.0)
+    worst = preset_errors(
+        scene,
+        range(draws),
+        halvings=HALVINGS,
+        done=lambda share: progress.update(bar, description=f"{scene}: presets", completed=share),
+    )
+    found = measure(
+        scene,
+        repeats=repeats,
+        done=lambda what, share: progress.update(bar, description=f"{scene}: {what}", completed=1 + share),
+    )
+    return found, bounds(worst, draws)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Measure what accuracy costs, and write what docs/tradeoff.md shows.")
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all that come along, when none is named")
@@ -75,24 +92,14 @@ def main() -> int:
     parser.add_argument("--draws", type=int, default=DRAWS, metavar="N", help="of the physics (%(default)s)")
     args = parser.parse_args()
     console, machine = Console(width=80, highlight=False), processor()
-    rows: dict[str, list[str]] = {}
     try:
         for scene in args.scenes or scene_names():
             with Progress(console=Console(stderr=True, width=80), transient=True) as progress:
-                task = progress.add_task(f"{scene}: presets", total=2.0)
-                worst = preset_errors(
-                    scene, range(args.draws), halvings=HALVINGS, done=lambda share: progress.update(task, completed=share)
-                )
-                found = measure(
-                    scene,
-                    repeats=args.repeats,
-                    done=lambda what, share: progress.update(task, description=f"{scene}: {what}", completed=1 + share),
-                )
-            limits, fast = bounds(worst, args.draws), speeds(found)
-            rows[scene] = [row(scene, name, limit.bound, fast[name]) for name, limit in limits.items()]
-            results = ROOT / "benchmarks" / "results" / f"tradeoff_{scene}.json"
+                found, limits = one(scene, args.draws, args.repeats, progress)
+            fast = speeds(found)
+            write_page({scene: [row(scene, name, limit.bound, fast[name]) for name, limit in limits.items()]})
             text = json.dumps(record(found, limits, machine), indent=1, allow_nan=False)
-            results.write_text(text + "\n", encoding="utf-8")
+            (ROOT / "benchmarks" / "results" / f"tradeoff_{scene}.json").write_text(text + "\n", encoding="utf-8")
             draw(found, ROOT / "docs" / "pictures" / f"tradeoff_{scene}.png")
             console.print(table(found, f"{scene}, one thread of {machine}"))
             for name, limit in limits.items():
@@ -100,7 +107,6 @@ def main() -> int:
     except GelflowError as error:
         print(error, file=sys.stderr)
         return 2
-    write_page(rows)
     return 0
 
 

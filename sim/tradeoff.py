@@ -1,7 +1,7 @@
 """What accuracy costs: a scene's motion under many settings, each with its time and its errors.
 
-A setting is what `load_scene` takes as overrides, and how often markers are read. Errors are differences to a reference,
-BDF2 with a step so short that one more halving changes next to nothing; by how much is measured and kept.
+A setting is what `load_scene` takes as overrides, and how often markers are read. Errors are differences to a
+reference, BDF2 with a step so short that one more halving changes next to nothing; by how much is measured and kept.
 """
 
 import math
@@ -122,7 +122,7 @@ def _markers(scene: Scene) -> dict[str, Overrides]:
     if grid is None or any(pad.grid is None for pad in scene.pads):
         return {}
     table = read_toml(scene.path)["pads"][scene.pads[0].name]
-    found = {}
+    found: dict[str, Overrides] = {}
     if "size" in table:
         common = math.gcd(grid.rows, grid.cols)
         for part in (20, 4, 2):
@@ -134,7 +134,8 @@ def _markers(scene: Scene) -> dict[str, Overrides]:
     for part in sorted({1, common - 1, 2 * common} - {0, common}):
         rows, cols = 1 + (grid.rows - 1) * part // common, 1 + (grid.cols - 1) * part // common
         pitch = 1e-3 * grid.pitch * common / part
-        found[f"{rows} × {cols}"] = {"pads.*.rows": rows, "pads.*.cols": cols, "pads.*.pitch": pitch}
+        overrides: Overrides = {"pads.*.rows": rows, "pads.*.cols": cols, "pads.*.pitch": pitch}
+        found[f"{rows} × {cols}"] = overrides
     return found
 
 
@@ -147,7 +148,7 @@ def contact_density(scene: Scene, density: float) -> Overrides:
     data = read_toml(scene.path)
     found: Overrides = {}
     clouds = {p.name: p for p in scene.points if p.radius == 0 and len(p.points) > _CORNERS}
-    for name, points in clouds.items():
+    for name in clouds:
         table, key = data["points"][name], f"points.{name}"
         if "resolution" in table:
             found[f"{key}.resolution"] = [max(2, round((n - 1) * density) + 1) for n in table["resolution"]]
@@ -199,37 +200,24 @@ def measure(
     """
     own = load_scene(scene)
     motion(own)  # raises where there is none
-    plain, dense = COARSE if quick else FINE
-    done("reference", 0.0)
-    truths, changes = {}, {}
-    families = {"scene": (plain, {}, {})}
-    if contact_density(own, 1):
-        families["points"] = dense, contact_density(own, DENSE), contact_density(own, DENSE / 2)
-    for at, (family, (halvings, more, before)) in enumerate(families.items()):
-        truths[family] = reference(scene, halvings, more)
-        changes[family] = compare(reference(scene, halvings - 1, before), truths[family])
-        done("reference", 0.3 * (at + 1) / len(families))
+    halvings = COARSE if quick else FINE
+    truths, changes = _references(own, scene, halvings, lambda share: done("reference", 0.3 * share))
     tried, presets = _with_presets(own, settings(scene, quick=quick))
     tasks: dict[str, Task] = {}
     errors: dict[str, Errors] = {}
     iterations, failed = {}, {}
     for at, setting in enumerate(tried):
-        truth = truths["points" if setting.group == "contacts" else "scene"]
+        task = Task(load_scene(scene, overrides=setting.overrides), every=setting.every)
         try:
-            task = Task(load_scene(scene, overrides=setting.overrides), every=setting.every)
             run = task.run(onto=own)
         except SimulationError as error:
             failed[setting.name] = str(error)
         else:
+            truth = truths["points" if setting.group == "contacts" else "scene"]
             tasks[setting.name], errors[setting.name] = task, compare(run, truth)
             iterations[setting.name] = run.iterations / (task.steps * len(task.controls))
         done("errors", 0.3 + 0.3 * (at + 1) / len(tried))
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    for at in range(repeats):
-        for name, task in tasks.items():
-            times[name].append(task.seconds() / task.motion.duration)
-        done("timing", 0.6 + 0.4 * (at + 1) / repeats)
-    seconds = {name: statistics.median(values) for name, values in times.items()}
+    seconds = _seconds(tasks, repeats, lambda share: done("timing", 0.6 + 0.4 * share))
     groups = {s.name: s.group for s in tried}
     beaten = dominated({name: (seconds[name], *_figures(errors[name])) for name in tasks}, groups)
     prices = tuple(
@@ -237,7 +225,34 @@ def measure(
         for s in tried
         if s.name in tasks
     )
-    return Tradeoff(own.name, prices, failed, FRAME / 2**plain, changes, repeats)
+    return Tradeoff(own.name, prices, failed, FRAME / 2 ** halvings[0], changes, repeats)
+
+
+def _references(
+    own: Scene, scene: str | Path, halvings: tuple[int, int], done: Callable[[float], None]
+) -> tuple[dict[str, Run], dict[str, Errors]]:
+    """What settings are compared with, of the scene and with dense points, and what their last halving changed."""
+    plain, dense = halvings
+    families: dict[str, tuple[int, Overrides, Overrides]] = {"scene": (plain, {}, {})}
+    if contact_density(own, 1):
+        families["points"] = dense, contact_density(own, DENSE), contact_density(own, DENSE / 2)
+    truths, changes = {}, {}
+    done(0.0)
+    for at, (family, (count, more, before)) in enumerate(families.items()):
+        truths[family] = reference(scene, count, more)
+        changes[family] = compare(reference(scene, count - 1, before), truths[family])
+        done((at + 1) / len(families))
+    return truths, changes
+
+
+def _seconds(tasks: Mapping[str, Task], repeats: int, done: Callable[[float], None]) -> dict[str, float]:
+    """Per simulated second; all in turn, so that a disturbance of the machine hits all alike."""
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    for at in range(repeats):
+        for name, task in tasks.items():
+            times[name].append(task.seconds() / task.motion.duration)
+        done((at + 1) / repeats)
+    return {name: statistics.median(values) for name, values in times.items()}
 
 
 def _figures(errors: Errors) -> tuple[float, ...]:

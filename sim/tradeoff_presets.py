@@ -54,11 +54,11 @@ def preset_errors(
 
 
 def bounds(worst: Mapping[str, Errors], draws: int) -> dict[str, Bounds]:
-    """The errors that are promised: the worst ones with a margin."""
+    """The errors that are promised: the worst ones with a margin, in two digits; a cosine in four."""
     found = {}
     for name, errors in worst.items():
         promised = {key: _up(MARGIN * value) for key, value in vars(errors).items() if key != "cosine"}
-        promised["cosine"] = 1 - _up(MARGIN * (1 - errors.cosine))
+        promised["cosine"] = math.floor(1e4 * (1 - MARGIN * (1 - errors.cosine)) + 1e-6) / 1e4
         found[name] = Bounds(errors, Errors(**promised), draws)
     return found
 

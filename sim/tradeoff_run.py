@@ -17,7 +17,8 @@ from scipy.interpolate import RegularGridInterpolator
 from gelflow.errors import UsageError
 from gelflow.observation import DEFAULT_FLOORS, normalize
 from gelflow.sim.motions import motion
-from gelflow.sim.scene import PadDef, Scene
+from gelflow.sim.scene import Scene
+from gelflow.sim.scene_parts import PadDef
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -149,7 +150,8 @@ class Task:
                 values[-1] = later.get(name, 0)
             back = sim.rollout_gradient(
                 trajectory,
-                **at_end,
+                q=at_end["q"],
+                v=at_end["v"],
                 tactile=felt,
                 anchors_end=later.get("anchors"),
                 history_end=later.get("history"),
@@ -181,8 +183,7 @@ def drawn(scene: Scene, rng: np.random.Generator) -> Scene:
         contacts=tuple(replace(c, numbers=numbers(c.numbers, *groups[c.group])) for c in scene.contacts),
         pads=tuple(replace(p, numbers=numbers(p.numbers, *two)) for p, two in zip(scene.pads, pads, strict=True)),
         bodies=tuple(
-            replace(b, mass=b.mass * m, inertia=b.inertia * m)
-            for b, m in zip(scene.bodies, masses, strict=True)
+            replace(b, mass=b.mass * m, inertia=b.inertia * m) for b, m in zip(scene.bodies, masses, strict=True)
         ),
     )
 

@@ -41,9 +41,7 @@ class AttemptResult:
     failed: NDArray[np.bool_]  # the simulator could not take a step
 
 
-def insertion_scene(
-    task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic"
-) -> Scene:
+def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
     """The insertion scene, its pads with the markers that the task's policy sees, whatever the preset."""
     grid = task.grid
     return load_scene(

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 _FIGURES = ("ms/s", "×", "mm", "mrad", "mark%", "flow", "cosine", "grad%")
 _EXPLAINED = (
     "ms/s: processor time per simulated second, one environment, one thread. ×: times faster than real time. mm, mrad: "
-    "largest error of any body's position and turn. mark%: error of the marker field, over the whole motion. flow: mean "
-    "error of a vector of the flow map, whose longest is 1. cosine, grad%: of the gradient of a tactile loss by the "
-    "controls. ●: not dominated."
+    "largest error of any body's position and turn. mark%: error of the marker field, over the whole motion. flow: "
+    "mean error of a vector of the flow map, whose longest is 1. cosine, grad%: of the gradient of a tactile loss by "
+    "the controls. ●: not dominated."
 )
 
 
