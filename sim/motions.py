@@ -139,11 +139,11 @@ def _grasp(scene: Scene) -> Motion:
 
 def _sag(scene: Scene) -> float:
     """How far the bar sinks into its two tables [m]. If it fell there it would rattle for as long as the motion."""
-    points = next(p for p in scene.points if p.name == "bar").points
+    cloud = next(p for p in scene.points if p.name == "bar")
     kn = next(c.numbers["kn"] for c in scene.contacts if c.points == "bar")
-    lower = points[points[:, 2] < 0] + scene.q0[scene.q("bar")][:3]
+    places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
     tables = [s for s in scene.shapes if s.name.startswith("table")]
-    resting = sum(int((np.abs(lower - t.pose.pos) <= t.size)[:, :2].all(1).sum()) for t in tables)
+    resting = sum(weights[(np.abs(places - t.pose.pos) <= t.size)[:, :2].all(1)].sum() for t in tables)
     return float(-scene.gravity[2] * scene.bodies[scene.body("bar")].mass / (kn * resting))
 
 
