@@ -27,7 +27,7 @@ from gelflow.sim.tradeoff_run import Errors
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tradeoff.md"
-DRAWS = 16
+DRAWS = 48
 HALVINGS = 8  # of a frame, for the references of the draws
 BEGIN, END = "<!-- written by benchmarks/tradeoff.py -->", "<!-- end -->"
 

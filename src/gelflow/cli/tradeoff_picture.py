@@ -62,7 +62,7 @@ def _panel(axis: Any, found: "Tradeoff", name: str) -> None:
     named = [(n, point) for price, point in zip(found.prices, points, strict=True) for n in price.presets]
     for at, (preset, point) in enumerate(named):
         axis.plot(*point, "o", mfc="none", mec="tab:red", ms=11, label="preset" if at == 0 else None)
-        axis.annotate(preset, point, xytext=(7, 7), textcoords="offset points", color="tab:red", fontsize=9)
+        axis.annotate(preset, point, xytext=(0, 8), textcoords="offset points", ha="center", color="tab:red")
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
