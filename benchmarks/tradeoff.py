@@ -14,12 +14,11 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
-from rolling import versions
 
 from gelflow.cli.tradeoff import plain, short, table
 from gelflow.cli.tradeoff_picture import draw
 from gelflow.errors import GelflowError
-from gelflow.sim.benchmark import processor
+from gelflow.sim.benchmark import processor, versions
 from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.tradeoff import Tradeoff, measure
 from gelflow.sim.tradeoff_presets import OWN, Bounds, bounds, preset_errors

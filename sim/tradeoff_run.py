@@ -142,7 +142,8 @@ class Task:
         for frame in sorted(starts, reverse=True):
             reads = frame % self.every == 0
             u = np.repeat(self.controls[frame - 1 : frame], self.steps, axis=0)
-            trajectory = sim.rollout(u, **starts[frame], read_after=(self.steps,) if reads else ())
+            start: dict[str, Any] = {**starts[frame]}
+            trajectory = sim.rollout(u, **start, read_after=(self.steps,) if reads else ())
             held = min(self.every, self.look - frame + 1)
             felt = scale * held * fields[frame] / self._weights if reads else None
             at_end = {name: np.zeros(getattr(trajectory, name).shape) for name in ("q", "v")}
