@@ -19,7 +19,7 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, rotate, yaw_quaternion
 from gelflow.hardware_mocks.grip import Grip
 from gelflow.observation import Grid, resampling
-from gelflow.sim.scene import load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.task import INSERTION, InsertionTask
 
@@ -48,6 +48,7 @@ class WorldConfig:
     yaw_stiffness: float = 500.0  # [N m/rad]
     start_width: float = 0.060  # between the fingers [m]
     seed: int = 0  # of the first part; each further part has the next
+    preset: str | None = None  # of the insertion scene, all but its step: see `preset_config`
 
     def __post_init__(self) -> None:
         if not 0 < self.step <= 4e-3 or abs(4e-3 / self.step - round(4e-3 / self.step)) > 1e-9:
@@ -58,6 +59,17 @@ class WorldConfig:
         taught = Pose(np.array([0.0, 0.0, self.load_height + self.grasp_height]), yaw_quaternion(0.0))
         pose = self.hole @ taught @ self.tool.inverse()
         return pose.position, pose.quaternion
+
+
+def preset_config(preset: str | None, *, seed: int) -> WorldConfig:
+    """The cell simulated as a preset of the insertion scene says, in steps that divide 4 ms and are no longer.
+
+    Raises UsageError when there is no such preset.
+    """
+    if preset is None:
+        return WorldConfig(seed=seed)
+    step = load_scene("insertion", preset=preset).step
+    return WorldConfig(seed=seed, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
 
 
 @dataclass
@@ -81,7 +93,7 @@ class World:
     def __init__(self, clock: Clock, config: WorldConfig | None = None, *, task: InsertionTask = INSERTION) -> None:
         self.config = config = config or WorldConfig()
         self._clock, self._task = clock, task
-        scene = load_scene("insertion", friction="elastic", overrides={"step": config.step})
+        scene = self._scene(config.step)
         self._sim = sim = Simulator(scene, threads=1)
         for name in ("arm_x", "arm_y", "arm_z"):
             self._servo(name, config.arm_stiffness, 1000.0)
@@ -203,6 +215,9 @@ class World:
 
     # Inside, with the lock held
 
+    def _scene(self, step: float) -> Scene:
+        return load_scene("insertion", preset=self.config.preset, friction="elastic", overrides={"step": step})
+
     def _servo(self, name: str, stiffness: float, force: float) -> None:
         for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
             self._sim.param(f"{name}.{key}")[:] = value
@@ -220,6 +235,10 @@ class World:
         if self._hand is not None:
             self._sim.q[0, self._part : self._part + 7] = self._hand
             self._sim.v[0, self._part_v : self._part_v + 6] = 0.0
+            # What BDF2 remembers of the part: it did not move, and stood still before.
+            if self._sim.history.size:
+                for first in (0, self._sim.model.nv):
+                    self._sim.history[0, first + self._part_v : first + self._part_v + 6] = 0.0
 
     def _step(self, sim: Simulator, seconds: float) -> None:
         self._time += seconds
@@ -234,8 +253,7 @@ class World:
     def _long_step(self) -> None:
         """One step instead of several, where this computer is too busy for each: less exact, and counted."""
         if self._long is None:
-            scene = load_scene("insertion", friction="elastic", overrides={"step": _LONG * self.config.step})
-            self._long = Simulator(scene, threads=1)
+            self._long = Simulator(self._scene(_LONG * self.config.step), threads=1)
         _copy_state(self._sim, self._long)
         self._long.params[:] = self._sim.params
         self._coarse += _LONG * self.config.step
@@ -307,3 +325,4 @@ def _copy_state(source: Simulator, target: Simulator) -> None:
     """State and contact memory of one simulator into another of the same scene."""
     target.q[:], target.v[:] = source.q, source.v
     target.anchors[:], target.anchored[:] = source.anchors, source.anchored
+    target.history[:] = 0  # it holds for the step of the source: BDF2 begins anew

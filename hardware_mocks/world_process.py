@@ -30,7 +30,7 @@ from gelflow.observation import Grid
 Array = NDArray[np.float64]
 _START_LIMIT = 30.0  # [s, wall]
 _ANSWER_LIMIT = 5.0  # [s, wall]
-_GEL_EVERY = 5  # steps: markers are read this often, several times for every frame of a camera
+_GEL_PERIOD = 0.02  # markers are read this often, several times for every frame of a camera [s]
 
 
 class _Cell:
@@ -222,6 +222,7 @@ class _Service:
         self._commands = shared.command.read()[0]
         self._poses = -1
         self._steps = 0
+        self._gel_every = max(1, round(_GEL_PERIOD / world.config.step))
         self.ending = threading.Event()
 
     def pass_on(self) -> None:
@@ -236,7 +237,7 @@ class _Service:
             self._commands = commands
             world.command_gripper(width=float(width), speed=float(speed), force=float(force))
         shared.fingers.write(world.gripper_state())
-        if self._steps % _GEL_EVERY == 0:
+        if self._steps % self._gel_every == 0:
             shared.gels.write(world.displacements().reshape(-1))
         self._steps += 1
 

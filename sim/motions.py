@@ -23,6 +23,7 @@ class Motion:
 
     q0: Array  # (nq,)
     duration: float  # [s]
+    look: float  # when what is felt is worth a look: touch is made and held [s]
     controls: Callable[[ArrayLike], Array]  # times (K,) [s] → u (K, nu)
 
     def steps(self, step: float) -> Array:
@@ -71,7 +72,7 @@ def _rolling(scene: Scene) -> Motion:
         "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
         "pad_y": [(0.15, 0.0), (0.25, 0.05), (0.35, 0.0)],
     }
-    return Motion(q0, 0.64, _follow(scene, tracks))
+    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
 
 
 def _pushing(scene: Scene) -> Motion:
@@ -81,7 +82,7 @@ def _pushing(scene: Scene) -> Motion:
         "gripper_y": [(0.1, 0.0), (0.2, 0.3), (0.3, 0.0)],
         "gripper_yaw": [(0.12, 0.0), (0.2, 0.1), (0.3, -0.05), (0.4, 0.0)],
     }
-    return Motion(scene.q0.copy(), 0.64, _follow(scene, tracks))
+    return Motion(scene.q0.copy(), 0.64, 0.28, _follow(scene, tracks))
 
 
 def _insertion(scene: Scene) -> Motion:
@@ -115,13 +116,16 @@ def _insertion(scene: Scene) -> Motion:
         "arm_yaw": [(0.3, 0.0), (0.35, 0.01), (0.42, 0.0)],
         "arm_z": [(0.0, top), (0.2, top - 1.6e-3), (0.36, top - 1.6e-3), (0.44, top), (0.48, top), (0.66, top - 3e-3)],
     }
-    return Motion(q0, 0.8, _follow(scene, tracks))
+    return Motion(q0, 0.8, 0.8, _follow(scene, tracks))
 
 
 def _grasp(scene: Scene) -> Motion:
     """The fingers close on the bar off its middle, lift it, set it down, and open."""
     q0 = scene.q0.copy()
     q0[scene.q("arm_y")] = 0.02
+    servo = next(a for a in scene.actuators if a.name == "arm_z")
+    q0[scene.q("arm_z")] += scene.gravity[2] * sum(b.mass for b in scene.bodies if b.name != "bar") / servo.kp
+    q0[scene.q("bar").start + 2] -= _sag(scene)
     q0[[scene.q("finger_left").start, scene.q("finger_right").start]] = -0.0127
     close = [(0.0, 3.0), (0.1, 10.0), (0.52, 10.0), (0.58, -1.0)]
     tracks = {
@@ -130,7 +134,17 @@ def _grasp(scene: Scene) -> Motion:
         "finger_left": close,
         "finger_right": close,
     }
-    return Motion(q0, 0.64, _follow(scene, tracks))
+    return Motion(q0, 0.64, 0.34, _follow(scene, tracks))
+
+
+def _sag(scene: Scene) -> float:
+    """How far the bar sinks into its two tables [m]. If it fell there it would rattle for as long as the motion."""
+    cloud = next(p for p in scene.points if p.name == "bar")
+    kn = next(c.numbers["kn"] for c in scene.contacts if c.points == "bar")
+    places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
+    tables = [s for s in scene.shapes if s.name.startswith("table")]
+    resting = sum(weights[(np.abs(places - t.pose.pos) <= t.size)[:, :2].all(1)].sum() for t in tables)
+    return float(-scene.gravity[2] * scene.bodies[scene.body("bar")].mass / (kn * resting))
 
 
 def _dclaw(scene: Scene) -> Motion:
@@ -145,7 +159,7 @@ def _dclaw(scene: Scene) -> Motion:
             f"bend{finger}": [(0.0, bend), (0.15, bend + 0.12), (0.37, bend + 0.12), (0.43, bend), (0.5, bend + 0.1)],
             f"curl{finger}": [(0.0, start[f"curl{finger}"])],
         }
-    return Motion(q0, 0.64, _follow(scene, tracks))
+    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
 
 
 _MOTIONS: dict[str, Callable[[Scene], Motion]] = {

@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.sim.presets import read_presets, with_preset
 from gelflow.sim.scene_mjcf import ActuatorDef, BodyDef, JointDef, read_mechanics
 from gelflow.sim.scene_parts import (
     LAWS,
@@ -34,9 +35,14 @@ from gelflow.sim.scene_shapes import ShapeDef, used_shapes
 from gelflow.sim.scene_toml import Table, nearest, read_toml, set_path
 
 Array = NDArray[np.float64]
+Precision = Literal["double", "single"]
 
 INTEGRATORS = ("bdf1", "bdf2")
-SECTIONS = ("format", "model", "step", "integrator", "friction", "joints", "shapes", "points", "contacts", "pads")
+PRECISIONS: tuple[Precision, ...] = ("double", "single")
+TOLERANCE = 1e-7  # of Newton's method, where a scene says nothing
+_HOW = ("step", "integrator", "tolerance", "precision")
+_PARTS = ("joints", "shapes", "points", "contacts", "pads")
+SECTIONS = ("format", "model", *_HOW, "friction", *_PARTS, "presets")
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class Scene:
     path: Path
     step: float  # [s]
     integrator: str  # "bdf1" or "bdf2"
+    tolerance: float  # of Newton's method, see docs/physics.md
+    precision: Precision  # in which a `Simulator` steps it unless told otherwise
     friction: str  # the law that contacts and pads follow unless they fix their own
     gravity: Array  # [m/s²]
     bodies: tuple[BodyDef, ...]
@@ -59,6 +67,7 @@ class Scene:
     pads: tuple[PadDef, ...]
     q0: Array  # where the scene starts: the keyframe "start" or "home", or the pose in the model file
     left_out: tuple[str, ...]  # what the files have and the simulation doesn't, and why
+    presets: Mapping[str, Mapping[str, Any]]  # what each preset of the file sets, by dotted key
 
     @property
     def nq(self) -> int:
@@ -126,6 +135,7 @@ class Scene:
         spec.gravity = tuple(self.gravity)
         spec.step = self.step
         spec.integrator = self.integrator
+        spec.tolerance = self.tolerance
         for index, body in enumerate(self.bodies):
             spec.add_body(body.name, body.parent, body.pose.pos, body.pose.quat, body.mass, body.com, body.inertia)
             for joint, limit in zip(self.joints, self.limits, strict=True):
@@ -233,20 +243,30 @@ def scene_names() -> tuple[str, ...]:
     return tuple(sorted(p.name.removesuffix(".toml") for p in _shipped().iterdir() if p.name.endswith(".toml")))
 
 
-def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(
+    scene: str | Path,
+    *,
+    preset: str | None = None,
+    friction: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Scene:
     """Read a scene.
 
     Parameters
     ----------
     scene: name of a scene that comes with gelflow, or path of a TOML file
+    preset: name of one of the file's presets, such as "fast": how exactly it is simulated, and at what cost
     friction: "viscous" or "elastic", instead of the file's own choice
     overrides: values that replace those of the file, by dotted key, such as {"pads.pad.rows": 50}; `*` for every
-        table at its place. Keys are checked like the file's own.
+        table at its place. Keys are checked like the file's own. They count more than the preset's.
 
     Raises UsageError, in one line, on an unknown key or name, a missing file, or what the simulator does not model.
     """
     path = _find(scene)
     data = copy.deepcopy(read_toml(path))
+    presets = read_presets(Table(data, str(path)), free=_HOW, parts=_PARTS)
+    if preset is not None:
+        with_preset(data, presets, preset, str(path))
     for key, value in (overrides or {}).items():
         set_path(data, key, value)
     if friction is not None:
@@ -269,6 +289,8 @@ def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Map
         path=path,
         step=top.number("step", least=1e-6),
         integrator=top.word("integrator", "bdf1", among=INTEGRATORS),
+        tolerance=top.number("tolerance", TOLERANCE, least=1e-15),
+        precision=cast("Precision", top.word("precision", "double", among=PRECISIONS)),
         friction=law,
         gravity=mechanics.gravity,
         bodies=mechanics.bodies,
@@ -281,6 +303,7 @@ def load_scene(scene: str | Path, *, friction: str | None = None, overrides: Map
         pads=pads,
         q0=mechanics.q0,
         left_out=(*mechanics.left_out, *unused, *idle),
+        presets=presets,
     )
 
 

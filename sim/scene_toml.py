@@ -34,17 +34,25 @@ def set_path(tables: dict[str, Any], dotted: str, value: Any) -> None:
     Raises UsageError when a table on the way does not exist. The last key is checked by whoever reads the table.
     """
     *way, last = dotted.split(".")
+    for table in tables_at(tables, way, f"override {dotted!r}"):
+        table[last] = value
+
+
+def tables_at(tables: dict[str, Any], way: Sequence[str], where: str) -> list[dict[str, Any]]:
+    """The nested tables that a way of keys leads to; a `*` stands for every table at its place.
+
+    Raises UsageError, which begins with `where`, when one does not exist.
+    """
     at = [tables]
     for key in way:
         found: list[dict[str, Any]] = []
         for table in at:
             children = {name: child for name, child in table.items() if isinstance(child, dict)}
             if key != "*" and key not in children:
-                raise UsageError(f"override {dotted!r}: no table {key!r}; {nearest(key, children)}")
+                raise UsageError(f"{where}: no table {key!r}; {nearest(key, children)}")
             found += children.values() if key == "*" else [children[key]]
         at = found
-    for table in at:
-        table[last] = value
+    return at
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Simulator:
     scene: a `Scene` (or a core model)
     num_envs: how many copies
     threads: at most this many threads; all cores when None. Results do not depend on it.
-    precision: "double" or "single"
+    precision: "double" or "single"; when None as the scene says, "double" for a core model
 
     `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them. So are
     `anchors` (N, na, 3) and `anchored` (N, na), the memory of the elastic friction law, and `history` (N, nh), that of
@@ -70,10 +70,12 @@ class Simulator:
         *,
         num_envs: int = 1,
         threads: int | None = None,
-        precision: Literal["double", "single"] = "double",
+        precision: Literal["double", "single"] | None = None,
     ) -> None:
         if num_envs < 1:
             raise UsageError(f"num_envs must be at least 1, got {num_envs}")
+        if precision is None:
+            precision = getattr(scene, "precision", "double")
         if precision not in ("double", "single"):
             raise UsageError(f"precision must be 'double' or 'single', got {precision!r}")
         self.scene = scene

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim.scene import Scene
-from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts
+from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import TABLE_7, Randomization
 from gelflow.task import INSERTION, InsertionTask
 
@@ -34,6 +34,15 @@ _MOST_DRAWS = 100  # rounds of drawing until a start does not go in at once; one
 
 def _spaces(task: InsertionTask) -> tuple[Any, Any]:
     return Box(-1, 1, task.observation_shape, np.float32), Box(-1, 1, (3,), np.float32)
+
+
+def _scene(task: InsertionTask, scene: Scene | None, preset: str | None) -> Scene:
+    """The scene that an environment was given, or the task's under a preset."""
+    if scene is None:
+        return insertion_scene(task, preset=preset)
+    if preset is not None:
+        raise UsageError(f"give a scene or a preset of the task's scene, not both; got preset {preset!r} and a scene")
+    return scene
 
 
 def _misalignment(options: dict[str, Any] | None, count: int) -> NDArray[np.float64] | None:
@@ -73,10 +82,12 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         *,
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
+        preset: str | None = None,
         randomization: Randomization = TABLE_7,
         threads: int | None = 1,
     ) -> None:
         self.task = task
+        scene = _scene(task, scene, preset)
         self.observation_space, self.action_space = _spaces(task)
         self._attempts = InsertionAttempts(1, task=task, scene=scene, randomization=randomization, threads=threads)
         self._tries = np.zeros(1, dtype=np.int64)
@@ -126,10 +137,12 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         *,
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
+        preset: str | None = None,
         randomization: Randomization = TABLE_7,
         threads: int | None = None,
     ) -> None:
         self.task = task
+        scene = _scene(task, scene, preset)
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
         self.single_observation_space, self.single_action_space = _spaces(task)

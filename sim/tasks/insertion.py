@@ -22,8 +22,8 @@ from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
 
-STEPS = 45  # of an attempt, as published: 1.1 mm in 225 ms, about ten times as fast as the robot
-SETTLE_STEPS = 24  # until the part hangs still in the closed gripper
+DESCENT_TIME = 0.225  # of an attempt, as published: 45 steps of 5 ms, about ten times as fast as the robot [s]
+SETTLE_TIME = 0.120  # until the part hangs still in the closed gripper [s]
 ARMS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 PADS = ("left", "right")
 _CLEAR = 0.1  # height of the part where the gripper closes on it: touching nothing [m]
@@ -41,11 +41,12 @@ class AttemptResult:
     failed: NDArray[np.bool_]  # the simulator could not take a step
 
 
-def insertion_scene(task: InsertionTask = INSERTION, *, friction: str = "elastic") -> Scene:
-    """The insertion scene, its pads with the markers that the task's policy sees."""
+def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
+    """The insertion scene, its pads with the markers that the task's policy sees, whatever the preset."""
     grid = task.grid
     return load_scene(
         "insertion",
+        preset=preset,
         friction=friction,
         overrides={
             "pads.*.rows": grid.rows,
@@ -66,7 +67,7 @@ class InsertionAttempts:
     scene: `insertion_scene(task)`, or one of the same make
     randomization: from what the physics of a part is drawn
     threads: of the simulator; all cores when None. Results do not depend on it.
-    steps: over which an attempt goes down
+    steps: over which an attempt goes down; when None as many as 225 ms have
 
     `pose` (N, 3) is where each gripper is: x [m], y [m], yaw [rad] in the hole's frame. Write into it between attempts.
     Raises UsageError when task and scene do not fit together.
@@ -80,13 +81,14 @@ class InsertionAttempts:
         scene: Scene | None = None,
         randomization: Randomization = TABLE_7,
         threads: int | None = None,
-        steps: int = STEPS,
+        steps: int | None = None,
     ) -> None:
-        if steps < 1:
+        if steps is not None and steps < 1:
             raise UsageError(f"steps must be at least 1, got {steps}")
         self.task = task
-        self._steps = steps
         self.scene = insertion_scene(task) if scene is None else scene
+        self._steps = max(1, round(DESCENT_TIME / self.scene.step)) if steps is None else steps
+        self._settle_steps = max(1, round(SETTLE_TIME / self.scene.step))
         self.randomization = randomization
         if [p.name for p in self.scene.pads] != list(PADS) or any(g != task.grid for g in self.scene.grids):
             raise UsageError(f"the scene's pads must be {', '.join(PADS)} with the task's markers {task.grid}")
@@ -154,7 +156,7 @@ class InsertionAttempts:
         self._u[:, self._arm_u] = sim.q[:, self._arm_q]
         weight = -scene.gravity[2] * sum(sim.param(f"{body.name}.mass") for body in scene.bodies)
         self._u[:, self._arm_u[2]] += weight / sim.param("arm_z.kp")  # feed-forward: the arm does not sag
-        sim.step(self._u, SETTLE_STEPS)
+        sim.step(self._u, self._settle_steps)
         self._held["q"][:] = sim.q
         self._held["anchors"][:] = sim.anchors
         self._held["anchored"][:] = sim.anchored

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from gelflow.cli.presets import PRESET_HELP
 from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.task import INSERTION
 
@@ -35,6 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--insertions", type=int, default=5, metavar="N", help="how many parts (default 5)")
     parser.add_argument("--factor", type=float, default=5.0, help="robot time over wall time (default 5)")
     parser.add_argument("--seed", type=int, default=1, help="of the first part's misalignment (default 1)")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="the policy; default: gelflow's own")
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="folder (default out/demo)")
     parser.add_argument("--no-real-time", action="store_true", help="leave out the one insertion at factor 1")
@@ -60,13 +62,14 @@ def run(args: argparse.Namespace) -> int:
         count=args.insertions,
         factor=args.factor,
         seed=args.seed,
+        preset=args.preset,
         title=title,
     )
     console.print(table(done, title))
     if not args.no_real_time and done.trouble is None:
         real = demonstrate(
             console, policy, checkpoint, out=args.out, count=1, factor=1.0, seed=args.seed + args.insertions,
-            title="One more in real time (factor 1)", name="session-real-time",
+            preset=args.preset, title="One more in real time (factor 1)", name="session-real-time",
         )  # fmt: skip
         console.print(table(real, "One more in real time (factor 1)"))
         done = replace(done, trouble=real.trouble)
@@ -78,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         f"inserted: {said} of {count} as the robot says, {true} of {count} in truth; {done.wall:.0f} s in all."
     )
     with console.status("the same policy in simulation alone"):
-        console.print(in_simulation(policy), soft_wrap=True)
+        console.print(in_simulation(policy, preset=args.preset), soft_wrap=True)
     console.print(f"pictures of what the policy saw: {args.out}/insertion-*.png", soft_wrap=True)
     console.print(f"the session is {session}; make its decisions again with:", soft_wrap=True)
     console.print(f"  gelflow replay {session}", soft_wrap=True)
@@ -114,6 +117,7 @@ def demonstrate(
     count: int,
     factor: float,
     seed: int,
+    preset: str | None = None,
     title: str,
     name: str = "session",
 ) -> Demonstration:
@@ -125,7 +129,7 @@ def demonstrate(
 
     begun = time.monotonic()
     shown: list[Shown] = []
-    with mock_robot(factor=factor, seed=seed) as (lab_path, truth_url):
+    with mock_robot(factor=factor, seed=seed, preset=preset) as (lab_path, truth_url):
         lab = load_lab(lab_path)
         console.print(f"[bold]{title}[/]\n{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
         console.print(ATTEMPT_HEADER, markup=False)
@@ -194,12 +198,12 @@ def table(done: Demonstration, title: str) -> Table:
     return view
 
 
-def in_simulation(policy: "NetworkPolicy") -> str:
+def in_simulation(policy: "NetworkPolicy", *, preset: str | None = None) -> str:
     """How the policy does without wires and cameras, and what luck would do: the figures that the demo's compare to."""
     from gelflow.policies.attempts import NetworkActor, RandomActor, evaluate
     from gelflow.policies.simulation import simulated
 
-    attempts = simulated(_COMPARED)
+    attempts = simulated(_COMPARED, preset=preset)
     reach = policy.network.architecture.reach
     ways = (NetworkActor(policy.network, _COMPARED), RandomActor(reach, _COMPARED, 0))
     own, random = (evaluate("", way, attempts, episodes=_COMPARED, seed=1) for way in ways)
@@ -210,7 +214,7 @@ def in_simulation(policy: "NetworkPolicy") -> str:
 
 
 @contextlib.contextmanager
-def mock_robot(*, factor: float, seed: int) -> Iterator[tuple[Path, str]]:
+def mock_robot(*, factor: float, seed: int, preset: str | None = None) -> Iterator[tuple[Path, str]]:
     """A mock robot in a process of its own: its lab file, and where it tells the truth.
 
     Raises PeerError with its last words when it does not start.
@@ -223,6 +227,8 @@ def mock_robot(*, factor: float, seed: int) -> Iterator[tuple[Path, str]]:
             "--lab-out": lab, "--factor": factor, "--seed": seed, "--truth-port": truth_port,
             "--egm-port": _free_port(socket.SOCK_DGRAM),
         }  # fmt: skip
+        if preset is not None:
+            options["--preset"] = preset
         words_of = [str(word) for option in options.items() for word in option]
         process = subprocess.Popen(
             [sys.executable, "-c", command, "mock", "--attached", *words_of],

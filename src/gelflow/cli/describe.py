@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.tree import Tree
 
+from gelflow.cli.presets import PRESET_HELP
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("scene", metavar="SCENE", help="name of a scene that comes with gelflow, or a TOML file")
     parser.add_argument("--friction", choices=["viscous", "elastic"], help="law, instead of the scene's own")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
     parser.add_argument("--no-timing", action="store_true", help="leave the measured times out")
     parser.add_argument("--repeats", type=int, default=60, metavar="N", help="timed repeats (%(default)s)")
     parser.add_argument("--json", action="store_true", help="print an object instead of text")
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.sim.describe import describe
     from gelflow.sim.scene import load_scene
 
-    scene = load_scene(args.scene, friction=args.friction)
+    scene = load_scene(args.scene, preset=args.preset, friction=args.friction)
     description = describe(scene)
     if args.json:
         times = None if args.no_timing else dataclasses.asdict(_measured(scene, args.repeats))

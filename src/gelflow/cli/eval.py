@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from gelflow.cli.presets import PRESET_HELP
 from gelflow.errors import UsageError
 from gelflow.task import INSERTION
 
@@ -23,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="parts to insert (default 200)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="simulated robots side by side (default 64)")
     parser.add_argument("--seed", type=int, default=1, help="decides every random number (default 1)")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -39,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
     console = Console()
     count = min(args.envs, args.episodes)
-    plain, noisy = simulated(count), simulated(count, noise=Noise())
+    plain, noisy = (simulated(count, noise=noise, preset=args.preset) for noise in (None, Noise()))
     reach = network.architecture.reach
     ways: list[tuple[str, NetworkActor | RandomActor, Attempts]] = [
         ("policy", NetworkActor(network, count), plain),

@@ -23,6 +23,7 @@ COMMANDS = {
     "recover": "salvage what a killed recorder left behind",
     "mock": "start the mock robot: gripper, arm and two cameras on the wire",
     "bench": "measure speed",
+    "tradeoff": "what accuracy costs on a scene: settings by speed and error, and the presets among them",
     "describe": "what a scene models, what it leaves out and why, its size, and where a step's time goes",
     "demo": "the main job on the mock robot: five insertions, pictures, a session",
 }

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, cast
 from rich.console import Console
 from rich.table import Table
 
+from gelflow.cli.presets import PRESET_HELP
 from gelflow.clock import ScaledClock
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lab-out", type=Path, metavar="FILE", help="write the lab file for this mock robot")
     parser.add_argument("--factor", type=float, default=1.0, help="robot time over wall time (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the first part's misalignment; later ones follow on")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
     parser.add_argument("--egm-port", type=int, default=6510, metavar="PORT", help="UDP port of the client (6510)")
     parser.add_argument("--tcp-port", type=int, default=0, metavar="PORT", help="of the gripper; 0 takes a free one")
     parser.add_argument("--truth-port", type=int, default=0, metavar="PORT", help="of the side channel with the truth")
@@ -34,11 +36,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from gelflow.hardware_mocks.robot import MockRobot, RobotConfig
-    from gelflow.hardware_mocks.world import WorldConfig
+    from gelflow.hardware_mocks.world import preset_config
     from gelflow.real.lab_file import save_lab
 
     config = RobotConfig(
-        world=WorldConfig(seed=args.seed),
+        world=preset_config(args.preset, seed=args.seed),
         egm_port=args.egm_port,
         tcp_port=args.tcp_port,
         truth_port=args.truth_port,

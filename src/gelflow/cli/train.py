@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from gelflow.cli.presets import PRESET_HELP
 from gelflow.errors import UsageError
 
 
@@ -17,6 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="simulated robots side by side (default 64)")
     parser.add_argument("--seed", type=int, default=0, help="decides every random number (default 0)")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
     parser.add_argument("--out", type=Path, default=Path("runs/insertion"), help="folder for what is made")
 
 
@@ -48,8 +50,8 @@ def run(args: argparse.Namespace) -> int:
                 )
 
         made = train(
-            simulated(args.envs, noise=Noise()),
-            simulated(args.envs, noise=Noise()),
+            simulated(args.envs, noise=Noise(), preset=args.preset),
+            simulated(args.envs, noise=Noise(), preset=args.preset),
             out=args.out,
             settings=settings,
             command=_command(args, settings.attempts),
@@ -63,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that makes the same again, whatever the defaults become."""
-    values = {"attempts": attempts, "minutes": args.minutes, "envs": args.envs, "seed": args.seed, "out": args.out}
+    names = ("minutes", "envs", "seed", "preset", "out")
+    values = {"attempts": attempts} | {name: getattr(args, name) for name in names}
     given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
     return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]
