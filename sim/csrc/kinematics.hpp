@@ -27,7 +27,7 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const bool root = body.parent == world;
-    M3<T> r = rotation_of<T>(body.quat.template cast<T>());
+    M3<T> r = body.rotation.template cast<T>();
     V3<T> p = vec3(params + body.pos);
     if (!root) {
       p = (w.position[body.parent] + w.rotation[body.parent] * p).eval();

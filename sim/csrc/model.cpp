@@ -126,6 +126,7 @@ int ModelSpec::add_body(const std::string& name, int parent, const V3<double>& p
   body.name = name;
   body.parent = parent;
   body.quat = quat.normalized();
+  body.rotation = rotation_of<double>(body.quat);
   body.joint_begin = body.joint_end = 0;
   body.mass = add_params(
       name,

@@ -33,8 +33,9 @@ constexpr int world = -1;
 
 struct Body {
   std::string name;
-  int parent;       // moving body, or world
-  V4<double> quat;  // of the frame in the parent's frame at q = 0
+  int parent;           // moving body, or world
+  V4<double> quat;      // of the frame in the parent's frame at q = 0;
+  M3<double> rotation;  // the same
   int joint_begin, joint_end;
   int mass, pos;            // offsets in Params: mass, com (3), inertia (6); pos (3)
   std::vector<int> dofs;    // all dofs that move this body, root first

@@ -158,13 +158,21 @@ M3<T> right_jacobian(const V3<T>& phi) {
   return M3<T>::Identity() - s.one_minus_cos * k + s.theta_minus_sin * (k * k);
 }
 
-// Rotation by `angle` about the unit vector `axis` (Rodrigues).
+// Rotation by `angle` about the unit vector a (Rodrigues): cos + (1 − cos) a aᵀ + sin [a]×.
 template <class T>
 M3<T> axis_rotation(const V3<T>& axis, const T& angle) {
   using std::cos;
   using std::sin;
-  const M3<T> k = skew<T>(axis);
-  return M3<T>::Identity() + sin(angle) * k + (T(1) - cos(angle)) * (k * k);
+  const T c = cos(angle), s = sin(angle);
+  const V3<T> rest = (T(1) - c) * axis;
+  M3<T> r;
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    r(i, i) = c + rest[i] * axis[i];
+    r(i, j) = rest[i] * axis[j] - s * axis[k];
+    r(i, k) = rest[i] * axis[k] + s * axis[j];
+  }
+  return r;
 }
 
 }  // namespace gelflow
