@@ -15,6 +15,8 @@
 
 namespace gelflow {
 
+// Threads that stay. Waking one up takes longer than some steps, so whoever waits looks out for a moment before going to
+// sleep.
 class ThreadPool {
  public:
   explicit ThreadPool(int threads);
@@ -33,9 +35,11 @@ class ThreadPool {
   std::condition_variable start_, done_;
   const std::function<void(int, int)>* work_ = nullptr;
   std::atomic<int> next_{0};
-  int items_ = 0, busy_ = 0;
-  std::uint64_t round_ = 0;
-  bool stop_ = false;
+  int items_ = 0;
+  std::atomic<int> busy_{0};  // threads at work
+  std::atomic<std::uint64_t> round_{0};
+  std::atomic<bool> stop_{false};
+  int asleep_ = 0;  // threads that wait for `start_`
 };
 
 // Trajectories of a rollout: arrays of the caller, time first, then environment.

@@ -2,6 +2,23 @@
 
 namespace gelflow {
 
+namespace {
+
+// Looks out for some 100 µs. Whether it came true.
+template <class Condition>
+bool soon(const Condition& condition) {
+  constexpr int looks = 2500;
+  for (int i = 0; i < looks; ++i) {
+    if (condition()) return true;
+#ifdef __x86_64__
+    __builtin_ia32_pause();
+#endif
+  }
+  return false;
+}
+
+}  // namespace
+
 ThreadPool::ThreadPool(int threads) {
   for (int i = 1; i < threads; ++i) threads_.emplace_back([this, i] { loop(i); });
 }
@@ -21,16 +38,20 @@ void ThreadPool::take(int thread) {
 
 void ThreadPool::loop(int thread) {
   std::uint64_t seen = 0;
+  const auto called = [&] { return stop_ || round_ != seen; };
   for (;;) {
-    {
+    if (!soon(called)) {
       std::unique_lock lock(mutex_);
-      start_.wait(lock, [&] { return stop_ || round_ != seen; });
-      if (stop_) return;
-      seen = round_;
+      ++asleep_;
+      start_.wait(lock, called);
+      --asleep_;
     }
+    if (stop_) return;
+    seen = round_;
     take(thread);
+    if (--busy_ > 0) continue;
     const std::lock_guard lock(mutex_);
-    if (--busy_ == 0) done_.notify_one();
+    done_.notify_one();
   }
 }
 
@@ -39,6 +60,7 @@ void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
     for (int i = 0; i < items; ++i) work(i, 0);
     return;
   }
+  bool wake = false;
   {
     const std::lock_guard lock(mutex_);
     work_ = &work;
@@ -46,11 +68,14 @@ void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
     next_ = 0;
     busy_ = static_cast<int>(threads_.size());
     ++round_;
+    wake = asleep_ > 0;
   }
-  start_.notify_all();
+  if (wake) start_.notify_all();
   take(0);
+  const auto done = [&] { return busy_ == 0; };
+  if (soon(done)) return;
   std::unique_lock lock(mutex_);
-  done_.wait(lock, [&] { return busy_ == 0; });
+  done_.wait(lock, done);
 }
 
 }  // namespace gelflow
