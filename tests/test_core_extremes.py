@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from gelflow.sim import _core
-from gelflow.sim.extremes import SCENES, Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.extremes import Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import INTEGRATORS, load_scene
 from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import STATUS, Simulator
@@ -46,6 +47,21 @@ def test_failures_are_rare_and_iterations_capped() -> None:
         total.add(extremes.run(draw))
     assert total.steps > 28_000 and total.failed <= 0.01 * total.steps
     assert total.most_iterations <= _core.ModelSpec().max_step_iterations
+
+
+def test_a_step_that_must_be_halved_tells_its_error() -> None:
+    """Its parts are compared with shorter ones, which are halved in turn where they must be."""
+    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw("insertion", "elastic", "bdf1", "all"))
+    halved = 0
+    for control in u:
+        before = sim.halved.copy()
+        estimate = sim.error_estimate(control)
+        sim.step(control)
+        sim.check()
+        assert np.isfinite(estimate).all()
+        assert estimate[sim.halved > before].any(axis=1).all()
+        halved += int((sim.halved > before).sum())
+    assert halved > 5
 
 
 @pytest.mark.parametrize("law", LAWS)
