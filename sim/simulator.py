@@ -161,7 +161,8 @@ class Simulator:
         """What one step under u would be off by: its positions less those of two half steps, (N, nv) [m, rad].
 
         Costs three steps and changes nothing. Under BDF1 it is about half of the step's own error; under BDF2, whose
-        half steps are BDF1's, it is an upper estimate. Raises SimulationError where a step can not be taken.
+        half steps are BDF1's, it is an upper estimate. A step that has to be halved is compared with parts half as long
+        as its shortest. Raises SimulationError where a step can not be taken.
         """
         try:
             estimate, status = self._batch.error_estimate(self._controls(u))
@@ -242,6 +243,12 @@ class Simulator:
         target = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype) if out is None else out
         self._batch.wrenches(target)
         return target
+
+    def contact_forces(self) -> NDArray[Any]:
+        """What all contacts together do to the joints now, (N, nv) [N, N m]: Jᵀ times their wrenches, as in a step."""
+        out = np.empty((self.num_envs, self.model.nv), self.dtype)
+        self._batch.contact_forces(out)
+        return out
 
     def mass_matrix(self) -> NDArray[Any]:
         """Joint-space mass matrices M(q), (N, nv, nv)."""

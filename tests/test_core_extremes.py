@@ -48,6 +48,21 @@ def test_failures_are_rare_and_iterations_capped() -> None:
     assert total.most_iterations <= _core.ModelSpec().max_step_iterations
 
 
+def test_a_step_that_must_be_halved_tells_its_error() -> None:
+    """Its parts are compared with shorter ones, which are halved in turn where they must be."""
+    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw("insertion", "elastic", "bdf1", "all"))
+    halved = 0
+    for control in u:
+        before = sim.halved.copy()
+        estimate = sim.error_estimate(control)
+        sim.step(control)
+        sim.check()
+        assert np.isfinite(estimate).all()
+        assert estimate[sim.halved > before].any(axis=1).all()
+        halved += int((sim.halved > before).sum())
+    assert halved > 5
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_what_lies_stays(law: str) -> None:
     """A box at rest on the ground for a million steps, 83 minutes: as it lay, so it lies."""

@@ -83,13 +83,15 @@ class Batch {
   int threads() const { return pool_.size(); }
   void reset(const std::uint8_t* which);  // null: all; parameters stay
   void step(const T* u, int steps);       // u (N, nu), held for all steps
-  // What one step under u differs by from two half steps, per dof (N, nv); status (N) as in `status`. Changes nothing.
+  // What one step under u differs by from two half steps, per dof (N, nv); where it has to be halved, from parts half as
+  // long as its shortest. status (N) as in `status`. Changes nothing.
   void error_estimate(const T* u, T* out, std::int32_t* status);
-  void tactile(T* out);      // (N, markers, 3)
-  void wrenches(T* out);     // (N, contacts, 6)
-  void poses(T* out);        // (N, bodies, 7): position, quaternion
-  void mass_matrix(T* out);  // (N, nv, nv)
-  void bias(T* out);         // (N, nv): Coriolis and gravity forces
+  void tactile(T* out);         // (N, markers, 3)
+  void wrenches(T* out);        // (N, contacts, 6)
+  void contact_forces(T* out);  // (N, nv): what all contacts do to the joints
+  void poses(T* out);           // (N, bodies, 7): position, quaternion
+  void mass_matrix(T* out);     // (N, nv, nv)
+  void bias(T* out);            // (N, nv): Coriolis and gravity forces
   void rollout(const Rollout<T>& r);
   // Signature of the branches that each step took, (steps, N).
   void branches(const Rollout<T>& r, std::uint64_t* out);

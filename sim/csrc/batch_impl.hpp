@@ -101,11 +101,11 @@ void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
     StepMemory<T>& memory = memory_[thread];
     const T* const control = u + static_cast<std::size_t>(e) * nu;
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
-    int iterations = 0;
-    Status status = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory).status;
-    for (int half = 0; half < 2 && status == Status::ok; ++half) {
-      status = substep<T>(m, params_of(e), T(m.step / 2), false, control, m.polish, halves.view(), memory, iterations,
-                          NoObserver{});
+    const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory);
+    Status status = taken.status;
+    const int parts = 2 << taken.halvings;  // each half of the shortest substep
+    for (int i = 0; i < parts && status == Status::ok; ++i) {
+      status = gelflow::step<T>(m, params_of(e), control, m.polish, halves.view(), memory, NoObserver{}, parts).status;
     }
     failures[e] = static_cast<std::int32_t>(status);
     T* const difference = out + static_cast<std::size_t>(e) * m.nv;
@@ -149,6 +149,17 @@ void Batch<T>::wrenches(T* out) {
     kinematics(e, memory_[thread].work);
     contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
                         out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
+  });
+}
+
+template <class T>
+void Batch<T>::contact_forces(T* out) {
+  pool_.run(n, [&](int e, int thread) {
+    Workspace<T>& w = memory_[thread].work;
+    kinematics(e, w);
+    w.residual.setZero();
+    subtract_contact_forces<false, T>(*model, params_of(e), T(1), state(e).anchors, state(e).anchored, 1, false, w);
+    for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }
 

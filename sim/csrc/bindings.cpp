@@ -143,6 +143,7 @@ void bind_batch(py::module_& module, const char* name) {
            [](B& b, py::array out) {
              b.wrenches(writable<T>(out, {b.n, static_cast<py::ssize_t>(b.model->contacts.size()), 6}, "out"));
            })
+      .def("contact_forces", [](B& b, py::array out) { b.contact_forces(writable<T>(out, {b.n, b.model->nv}, "out")); })
       .def("poses",
            [](B& b, py::array out) {
              b.poses(writable<T>(out, {b.n, static_cast<py::ssize_t>(b.model->bodies.size()), 7}, "out"));

@@ -127,18 +127,20 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   return Status::ok;
 }
 
-// One step of length m.step. Where Newton does not converge, a substep of half the length is tried, down to
-// step / 2^max_halvings, and after two that succeed one of twice the length again. Where even the shortest fails, the
-// state is left as it was and the report says why.
+// One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a substep of
+// half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length again.
+// Where even the shortest fails, the state is left as it was and the report says why.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
-                Observer&& accepted = {}) {
+                Observer&& accepted = {}, int parts = 1) {
   StepReport report;
+  const double span = m.step / parts;
   const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep
   for (int at = 0, length = whole; at < whole;) {
-    const T h = length == whole ? T(m.step) : T(m.step * length / whole);
+    const T h = length == whole ? T(span) : T(span * length / whole);
+    const bool itself = length == whole && parts == 1;
     if (at == 0 && length == whole / 2) memory.keep(m, s);  // only a part of a step may have to be taken back
-    report.status = substep<T>(m, params, h, length == whole, u, polish, s, memory, report.iterations, accepted);
+    report.status = substep<T>(m, params, h, itself, u, polish, s, memory, report.iterations, accepted);
     if (report.status == Status::ok) {
       at += length;
       if (at % (2 * length) == 0 && at + 2 * length <= whole) length *= 2;
