@@ -131,6 +131,29 @@ def test_forces_and_torques_of_touching_bodies_cancel(name: str, law: str) -> No
     assert touched > 1e-3
 
 
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("name", scene_names())
+def test_what_contacts_apply_to_the_joints_cancels_to_round_off(name: str, law: str) -> None:
+    """The generalized forces of a step's equation, as forces and moments on the floating bodies."""
+    sim = cut_loose(name, law, 1e-5)
+    touched, worst = 0.0, 0.0
+    for _ in range(10):
+        sim.step(np.zeros(0))
+        on_bodies = in_world(sim, sim.contact_forces()[0])
+        told = sim.wrenches()[0]
+        size = np.repeat(np.abs(told).reshape(-1, 2, 3).max((0, 2)), 3)
+        if size[3] < 1e-6:
+            continue
+        touched = max(touched, float(size[3]))
+        worst = max(worst, float(np.abs(on_bodies.sum(0) / size).max()))
+        if len(told) == 1:
+            np.testing.assert_allclose(np.abs(on_bodies), np.abs(told).repeat(2, 0), atol=1e-13 * size.max())
+    sim.check()
+    print(f"{name}, {law}: pairs cancel to {worst:.0e}")
+    assert touched > 1e-3
+    assert worst < 1e-13
+
+
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
 @pytest.mark.parametrize("name", scene_names())
 def test_linear_momentum_is_kept_to_newton_s_tolerance(name: str, integrator: str) -> None:
