@@ -20,10 +20,10 @@ def draw(found: list[Any], ball: list[Any], scenes: dict[str, list[Any]], path: 
             style = {"bdf1": "o--", "bdf2": "s-"}[r.integrator]
             for quantity, alpha in (("q", 1.0), ("tactile", 0.35)):
                 label = f"{r.integrator.upper()}, {r.law}, {quantity}"
-                axis.loglog(r.steps, r.errors[quantity], style, color=COLORS[r.law], alpha=alpha, ms=3, label=label)
-        steps = found[0].steps
+                axis.loglog(r.steps, r.errors(quantity), style, color=COLORS[r.law], alpha=alpha, ms=3, label=label)
+        steps = max((r.steps for r in found if r.scene == name), key=len)
         axis.loglog(steps, [s / steps[0] for s in steps], "k:", lw=0.8, label="slope 1")
-        axis.set(title=name, xlabel="time step [s]", ylabel="relative error")
+        axis.set(title=name, xlabel="time step [s]", ylabel="mean relative error")
         axis.grid(alpha=0.3)
     axes[0][0].legend(fontsize=6)
     shown = {"ball on a plane": ball} | scenes

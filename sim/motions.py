@@ -33,6 +33,15 @@ class Motion:
             raise UsageError(f"a step of {step} s is longer than the motion, {self.duration} s")
         return self.controls(step * np.arange(1, count + 1))
 
+    def varied(self, size: float, pace: float) -> "Motion":
+        """The same motion, its controls' changes `size` times as large and `pace` times as fast, for as long."""
+        rest = self.controls(0.0)
+
+        def controls(times: ArrayLike) -> Array:
+            return rest + size * (self.controls(pace * np.asarray(times, float)) - rest)
+
+        return Motion(self.q0, self.duration, controls)
+
 
 def motion(scene: Scene) -> Motion:
     """The motion of a scene that comes along. Raises UsageError for another scene."""
