@@ -25,8 +25,9 @@ from rich.table import Table
 from gelflow.errors import GelflowError
 from gelflow.sim.benchmark import processor, versions
 from gelflow.sim.energy import EnergyGauge, motor_forces
-from gelflow.sim.motions import motion
-from gelflow.sim.scene import load_scene, scene_names
+from gelflow.sim.motions import SCENES, motion
+from gelflow.sim.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.throws import Throw, fly
 
@@ -149,13 +150,13 @@ def moved_table(found: list[Moved]) -> Table:
 def measure(progress: Callable[[], None]) -> tuple[list[Thrown], list[Moved]]:
     thrown, moved = [], []
     for body, law, kt in CASES:
-        for integrator in ("bdf1", "bdf2"):
+        for integrator in INTEGRATORS:
             for step in STEPS:
                 thrown.append(throw(body, law, kt, integrator, step))
                 progress()
-    for name in scene_names():
-        for law in ("viscous", "elastic"):
-            for integrator in ("bdf1", "bdf2"):
+    for name in SCENES:
+        for law in LAWS:
+            for integrator in INTEGRATORS:
                 for step in SCENE_STEPS:
                     moved.append(move(name, law, integrator, step))
                     progress()
@@ -167,7 +168,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "energy.json")
     args = parser.parse_args()
     console = Console(width=80)
-    whole = 2 * len(CASES) * len(STEPS) + 4 * len(scene_names()) * len(SCENE_STEPS)
+    whole = 2 * len(CASES) * len(STEPS) + len(LAWS) * len(INTEGRATORS) * len(SCENES) * len(SCENE_STEPS)
     try:
         with Progress(console=Console(stderr=True, width=80)) as progress:
             task = progress.add_task("energy", total=whole)

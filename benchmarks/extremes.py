@@ -16,7 +16,8 @@ from rich.progress import track
 
 from gelflow.sim import _core
 from gelflow.sim.benchmark import processor
-from gelflow.sim.extremes import KINDS, SCENES, Extremes, Tally, draws
+from gelflow.sim.extremes import KINDS, Extremes, Tally, draws
+from gelflow.sim.motions import SCENES
 from gelflow.sim.simulator import STATUS
 
 RESULTS = Path(__file__).parent / "results"

@@ -26,8 +26,9 @@ from rich.table import Table
 from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark import processor
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.gradient_cases import SCENES, SHAPES, exact_simulator, in_contact, pressed
+from gelflow.sim.gradient_cases import SHAPES, exact_simulator, in_contact, pressed
 from gelflow.sim.gradient_check import Case, Output, against_differences, against_dual
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import INTEGRATORS
 from gelflow.sim.scene_parts import LAWS
 

@@ -44,9 +44,8 @@ from schemes import Scheme, ball_errors, extrapolated_scene
 from gelflow.errors import GelflowError
 from gelflow.sim import _core
 from gelflow.sim.benchmark import processor
-from gelflow.sim.gradient_cases import INTEGRATORS
 from gelflow.sim.motions import Motion, motion
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

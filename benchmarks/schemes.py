@@ -10,12 +10,11 @@ the one that a step of the core solves, so that costs compare: one Newton solve 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.sim.gradient_check import retract, turning_joints
+from gelflow.sim.gradient_check import difference, retract
 from gelflow.sim.motions import Motion
 from gelflow.sim.simulator import Simulator
 
@@ -172,20 +171,6 @@ def ball_errors(done: Callable[[float], None]) -> list[Scheme]:
         steps = [LONGEST / 2**k for k in range(BALL_HALVINGS + 1)]
         result.append(Scheme(name, steps, errors, [count for _, count in ends]))
         done(0.5 / len(STEPPERS))
-    return result
-
-
-def difference(model: Any, q1: Array, q0: Array) -> Array:
-    """q1 ⊖ q0, (nv,), of positions that are close to each other."""
-    straight_q, straight_v = np.ones(model.nq, bool), np.ones(model.nv, bool)
-    result = np.zeros(model.nv)
-    for at_q, at_v in turning_joints(model):
-        straight_q[at_q : at_q + 4] = straight_v[at_v : at_v + 3] = False
-        a, b = q0[at_q : at_q + 4], q1[at_q : at_q + 4]
-        vector = a[0] * b[1:] - b[0] * a[1:] - np.cross(a[1:], b[1:])
-        sine = np.linalg.norm(vector)
-        result[at_v : at_v + 3] = vector * (2 * np.arctan2(sine, a @ b) / sine if sine > 0 else 2)
-    result[straight_v] = (q1 - q0)[straight_q]
     return result
 
 

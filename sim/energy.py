@@ -11,14 +11,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gelflow.geometry import rotate
 from gelflow.sim import _core
 from gelflow.sim.gradient_check import turning_joints
 from gelflow.sim.scene import Scene
+from gelflow.sim.scene_parts import NUMBERS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 
-_NUMBERS = ("kn", "kt", "mu", "kd", "ks")
 _UNBOUNDED = 1e18  # a friction coefficient that no strain reaches
 
 
@@ -70,7 +71,7 @@ class EnergyGauge:
 
         Points stand contact by contact, in the order in which they were given.
         """
-        twin, numbers = self._twin, set(_NUMBERS)
+        twin, numbers = self._twin, set(NUMBERS)
         theirs = {name: i for i, name in enumerate(sim.model.param_names)}
         for i, name in enumerate(twin.model.param_names):
             if name in theirs and name.rsplit(".", 1)[-1] not in numbers:
@@ -130,10 +131,8 @@ def _gravity(sim: Simulator) -> Array:
     pull = np.stack([sim.param(f"gravity.{axis}") for axis in "xyz"], axis=1)
     result, poses = np.zeros(sim.num_envs), sim.poses()
     for n, name in enumerate(sim.model.body_names):
-        w, vector = poses[:, n, 3:4], poses[:, n, 4:]
         com = np.stack([sim.param(f"{name}.com.{axis}") for axis in "xyz"], axis=1)
-        across = 2 * np.cross(vector, com)
-        place = poses[:, n, :3] + com + w * across + np.cross(vector, across)
+        place = poses[:, n, :3] + [rotate(turn, c) for turn, c in zip(poses[:, n, 3:], com, strict=True)]
         result -= sim.param(f"{name}.mass") * (place * pull).sum(1)
     return result
 

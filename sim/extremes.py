@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.sim import _core
-from gelflow.sim.motions import motion
+from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
@@ -39,7 +39,6 @@ from gelflow.sim.simulator import Simulator
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
 
-SCENES = ("rolling", "pushing", "insertion", "grasp", "dclaw")
 QUANTITIES = ("stiffness", "damping", "friction", "mass", "speed", "step")
 KINDS = ("normal", *QUANTITIES, "all")
 _FEW_MARKERS = {"rolling": {"pads.pad.rows": 10, "pads.pad.cols": 10}}

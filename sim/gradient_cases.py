@@ -18,7 +18,6 @@ from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 
-SCENES = ("rolling", "insertion", "pushing", "grasp", "dclaw")
 SHAPES = {  # kind: size [m]
     "plane": (0.0, 0.0, 0.0),
     "sphere": (0.02, 0.0, 0.0),

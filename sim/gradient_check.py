@@ -310,7 +310,7 @@ def _slopes(
             read_after=case.reads,
         )
         if case.output == "q":
-            value = np.array([_difference(model, q, middle.q[-1, 0]) for q in run.q[-1]]) @ case.weights
+            value = np.array([difference(model, q, middle.q[-1, 0]) for q in run.q[-1]]) @ case.weights
         elif case.output == "v":
             value = (run.v[-1] - middle.v[-1]) @ case.weights
         else:
@@ -321,8 +321,8 @@ def _slopes(
     return np.asarray((pairs[..., 1] - pairs[..., 0]) / (2 * sizes))
 
 
-def _difference(model: Any, q: NDArray[np.float64], base: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Tangent from `base` to a nearby q."""
+def difference(model: Any, q: NDArray[np.float64], base: NDArray[np.float64]) -> NDArray[np.float64]:
+    """q ⊖ base: the tangent (nv,) from positions `base` (nq,) to positions close to them."""
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nv)
     for at_q, at_v in turning_joints(model):

@@ -178,3 +178,4 @@ _MOTIONS: dict[str, Callable[[Scene], Motion]] = {
     "grasp": _grasp,
     "dclaw": _dclaw,
 }
+SCENES = tuple(_MOTIONS)

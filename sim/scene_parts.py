@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 LAWS = ("viscous", "elastic")
-_NUMBERS = ("kn", "kt", "mu", "kd", "ks")
+NUMBERS = ("kn", "kt", "mu", "kd", "ks")
 _PER_UNIT = ("per point", "per area")
 _GIVEN = ("positions", "normals", "x_axes")
 # Keys of a pad's table that only its shape has.
@@ -163,7 +163,7 @@ def read_contacts(
     geoms = {geom.name: geom for geom in mechanics.geoms}
     contacts = []
     for group, table in tables.items():
-        table.only(("points", "against", "damping", "law", *LAWS, *_NUMBERS))
+        table.only(("points", "against", "damping", "law", *LAWS, *NUMBERS))
         sampled = _named(points, table.word("points"), table, "points")
         law = table.word("law", friction, among=LAWS)
         damping = table.word("damping", "depth", among=("depth", "plain"))
@@ -194,7 +194,7 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
     `folder` is where the files of markers are looked for.
     """
     geoms = {geom.name: geom for geom in mechanics.geoms}
-    common = ("site", "shape", "against", "stiffness", "law", "pushes", "gel", *LAWS, *_NUMBERS)
+    common = ("site", "shape", "against", "stiffness", "law", "pushes", "gel", *LAWS, *NUMBERS)
     pads = []
     for name, table in tables.items():
         shape = table.word("shape", "rectangle", among=tuple(_PAD_KEYS))
@@ -368,9 +368,9 @@ def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -
 def _law_numbers(table: Table, law: str) -> dict[str, float]:
     """The force law's numbers: those of the law's own table before the common ones; no k_s under the viscous law."""
     for name in LAWS:
-        table.table(name).only(_NUMBERS)
+        table.table(name).only(NUMBERS)
     own = Table({**table.data, **table.table(law).data}, table.where)
-    numbers = {key: own.number(key, least=0) for key in _NUMBERS if key != "ks"}
+    numbers = {key: own.number(key, least=0) for key in NUMBERS if key != "ks"}
     return {**numbers, "ks": own.number("ks", None if law == "elastic" else 0.0, least=0)}
 
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from gelflow.geometry import rotate
 from gelflow.sim import _core
 from gelflow.sim.gradient_check import Case, against_dual
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 
 UNIT = 2.0**-10  # [m]
-LAWS = ("viscous", "elastic")
 PRECISIONS = ("double", "single")
 ROUNDING = {"double": 1e-12, "single": 1e-5}
 NUMBERS: dict[str, Any] = {"kn": 1024.0, "kt": 16.0, "mu": 0.5, "kd": 1024.0}  # UNIT deep: 1 N

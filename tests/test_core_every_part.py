@@ -10,10 +10,10 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core, gradient_check
-from gelflow.sim.extremes import SCENES, Draw, Extremes, Precision
+from gelflow.sim.extremes import Draw, Extremes, Precision
 from gelflow.sim.gradient_cases import SHAPES, pressed
 from gelflow.sim.mesh_grid import spline_grid
-from gelflow.sim.motions import motion
+from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import load_scene
 from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from gelflow.sim import _core
-from gelflow.sim.extremes import SCENES, Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.extremes import Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import INTEGRATORS, load_scene
 from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import STATUS, Simulator

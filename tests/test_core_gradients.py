@@ -6,7 +6,8 @@ import pytest
 
 from gelflow.sim import gradient_check
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.gradient_cases import SCENES, SHAPES, exact_simulator, in_contact, pressed
+from gelflow.sim.gradient_cases import SHAPES, exact_simulator, in_contact, pressed
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import INTEGRATORS
 from gelflow.sim.scene_parts import LAWS
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gelflow.sim import _core
 from gelflow.sim.gradient_check import Case, against_dual
 from gelflow.sim.scene import INTEGRATORS
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]
@@ -95,7 +96,7 @@ KINKS: dict[str, Kink] = {
         f"{kind}, {where}, {law}": place(kind, where, law)
         for kind, many in PLACES.items()
         for where in many
-        for law in ("viscous", "elastic")
+        for law in LAWS
     },
     "just touching, at rest": lambda i: probe(i, slides="xyz"),
     "just touching, elastic": lambda i: probe(i, slides="xyz", law="elastic"),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gelflow.sim import _core
-from gelflow.sim.gradient_cases import SCENES
+from gelflow.sim.motions import SCENES
 from gelflow.sim.sampling import box_surface, capsule
 from gelflow.sim.scene import INTEGRATORS, load_scene
 from gelflow.sim.scene_parts import LAWS
