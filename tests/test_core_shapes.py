@@ -58,7 +58,8 @@ def distance(kind: str, x: Array) -> float:
         (ct, cp), (st, sp) = np.cos(angles), np.sin(angles)
         return np.array([radii[0] * ct * cp, radii[1] * st * cp, radii[2] * sp])
 
-    starts = itertools.product(np.linspace(-np.pi, np.pi, 7), np.linspace(-1.2, 1.2, 5))
+    x = np.abs(x)  # the nearest point lies in the same octant
+    starts = itertools.product((0.3, 1.2), repeat=2)
     near = min(np.linalg.norm(surface(minimize(lambda s: ((surface(s) - x) ** 2).sum() * 1e4, s0, tol=1e-14).x) - x)
                for s0 in starts)  # fmt: skip
     return float(near if (x**2 / radii**2).sum() > 1 else -near)
