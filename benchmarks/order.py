@@ -38,12 +38,11 @@ from order_picture import draw
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
-from rolling import versions
 from schemes import Scheme, ball_errors, extrapolated_scene
 
 from gelflow.errors import GelflowError
 from gelflow.sim import _core
-from gelflow.sim.benchmark import processor
+from gelflow.sim.benchmark import processor, versions
 from gelflow.sim.motions import Motion, motion
 from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
