@@ -158,7 +158,8 @@ void Batch<T>::contact_forces(T* out) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();
-    subtract_contact_forces<false, T>(*model, params_of(e), T(1), state(e).anchors, state(e).anchored, 1, false, w);
+    const StepStart<T> from{T(1), nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
+    subtract_contact_forces<false, T>(*model, params_of(e), from, false, false, w);
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }

@@ -127,9 +127,9 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   return Status::ok;
 }
 
-// One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a substep of
-// half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length again.
-// Where even the shortest fails, the state is left as it was and the report says why.
+// One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a
+// substep of half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length
+// again. Where even the shortest fails, the state is left as it was and the report says why.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 Observer&& accepted = {}, int parts = 1) {
