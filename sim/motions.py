@@ -76,6 +76,9 @@ def _rolling(scene: Scene) -> Motion:
     """The pad comes down on the ball, rolls it, lifts off while the ball rolls on, and catches it."""
     q0 = scene.q0.copy()
     q0[scene.q("pad_z")] = -0.0145  # half a millimetre above the ball
+    ball = next(b for b in scene.bodies if b.name == "ball")
+    ground = next(c for c in scene.contacts if c.name == "ball_ground")
+    q0[scene.q("ball").start + 2] += scene.gravity[2] * ball.mass / ground.numbers["kn"]  # it would bounce otherwise
     tracks = {  # the pad weighs 0.245 N
         "pad_z": [(0.0, 0.18), (0.1, 0.16), (0.3, 0.16), (0.34, 0.30), (0.38, 0.30), (0.42, 0.17)],
         "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
