@@ -118,3 +118,46 @@ def test_a_part_in_a_viscous_grasp_creeps_at_m_g_over_n_k_t() -> None:
     creep = weight / (touching * float(sim.param("pad_left.kt")[0])) * 100 * scene.step
     sunk = before - sim.q[0, height] - (at - sim.q[0, scene.q("arm_z").start])
     assert sunk == pytest.approx(creep, rel=1e-3)
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+def test_a_free_joint_is_three_slides_and_a_ball(integrator: str) -> None:
+    """A free body has equations of its own; as a chain of joints it has those of every tree. Its mass is off centre."""
+
+    def thrown(free: bool) -> Simulator:
+        spec = _core.ModelSpec()
+        spec.step, spec.tolerance, spec.integrator = 2e-3, 1e-10, integrator
+        inertia = (2e-4, 3e-4, 4e-4, 2e-5, -1e-5, 3e-5)
+        body = spec.add_body("body", -1, ORIGIN, UPRIGHT, 0.3, (0.02, -0.01, 0.03), inertia)
+        joints = (
+            [("free", (0, 0, 1))]
+            if free
+            else [("slide", (1, 0, 0)), ("slide", (0, 1, 0)), ("slide", (0, 0, 1)), ("ball", (0, 0, 1))]
+        )
+        for i, (kind, axis) in enumerate(joints):
+            spec.add_joint(f"joint{i}", body, kind, ORIGIN, axis, damping=0.01)
+        sim = Simulator(_core.Model(spec))
+        sim.q[0] = [0.1, -0.2, 0.3, *(np.array([1, 2, -1, 0.5]) / 2.5)]
+        sim.v[0] = [0.5, -1.0, 2.0, 7.0, -3.0, 11.0]
+        return sim
+
+    free, chain = thrown(True), thrown(False)
+    for of in (Simulator.mass_matrix, Simulator.bias):
+        np.testing.assert_allclose(of(free), of(chain), rtol=1e-12, atol=1e-15)
+    for sim in (free, chain):
+        sim.step(np.zeros(0), 100)
+        sim.check()
+    np.testing.assert_allclose(free.q, chain.q, atol=1e-10)
+    np.testing.assert_allclose(free.v, chain.v, atol=1e-8)
+    assert free.iterations == chain.iterations  # the derivatives are the same too
+
+
+def test_a_hundred_bodies_fall_alike() -> None:
+    spec = _core.ModelSpec()
+    for i in range(100):
+        body = spec.add_body(f"body{i}", -1, ORIGIN, UPRIGHT, 0.1 + i, ORIGIN, (1, 1, 1, 0, 0, 0))
+        spec.add_joint(f"slide{i}", body, "slide", ORIGIN, (0, 0, 1))
+    sim = Simulator(_core.Model(spec))
+    sim.step(np.zeros(0), 20)
+    sim.check()
+    np.testing.assert_allclose(sim.v[0], -9.8 * 20 * 5e-3, rtol=1e-12)

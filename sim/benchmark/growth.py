@@ -147,9 +147,9 @@ def _environments(count: int) -> tuple[Work, Check]:
     return Work(lambda: run.go(sim), run.steps, lambda: run.place(sim)), check(run, sim, scene.describe_to)
 
 
-SWEEPS = (  # the core takes at most 64 velocities
-    Sweep("bodies", "bodies side by side", (1, 2, 4, 8, 16, 32, 64), (1, 4, 16), _bodies),
-    Sweep("chain", "bodies in one chain", (1, 2, 4, 8, 16, 32, 64), (1, 4, 16), _links),
+SWEEPS = (
+    Sweep("bodies", "bodies side by side", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _bodies),
+    Sweep("chain", "bodies in one chain", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _links),
     Sweep("contacts", "touching points", (1, 10, 100, 1000, 3000, 10_000, 30_000, 100_000), (1, 100, 1000), _points),
     Sweep("markers", "markers", (100, 1024, 10_000, 30_625, 99_856, 300_304, 1_000_000), (100, 1024, 10_000), _markers),
     Sweep("environments", "environments", (1, 4, 16, 64, 256, 1024, 4096), (1, 4, 16), _environments, "all cores"),

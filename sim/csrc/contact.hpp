@@ -89,24 +89,28 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
   moments(2, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.x * r.y - c.y * r.x; });
 }
 
-// Adds all entries to the sums, or starts these: Σ f (3), Σ x fᵀ (9), and with derivatives K and D (36 each).
+// Adds all entries to the sums, or starts these: Σ f (3), Σ x × f (3), and with derivatives Σ x fᵀ (9), K and D (36 each).
 template <bool first, bool derivatives, class T>
 __attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, Pack<T>* sums) {
   using L = Pack<T>;
-  Vec3<L> force = zero3<L>();
-  Mat3<L> spread = zero33<L>();
+  Vec3<L> force = zero3<L>(), moment = force;
   for (int n = 0; n < pending.count; ++n) {
     const auto& e = pending.entry[n];
     force += e.force;
-    spread += outer(e.x, e.force);
+    moment += cross(e.x, e.force);
   }
-  for (int j = 0; j < 3; ++j) {
-    put<first>(force[j], sums[j]);
-    for (int i = 0; i < 3; ++i) put<first>(spread.row[i][j], sums[3 + 3 * i + j]);
+  for (int i = 0; i < 3; ++i) {
+    put<first>(force[i], sums[i]);
+    put<first>(moment[i], sums[3 + i]);
   }
   if constexpr (derivatives) {
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + 12);
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + 48);
+    Mat3<L> spread = zero33<L>();
+    for (int n = 0; n < pending.count; ++n) spread += outer(pending.entry[n].x, pending.entry[n].force);
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) put<first>(spread.row[i][j], sums[6 + 3 * i + j]);
+    }
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + 15);
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + 51);
   }
   pending.count = 0;
 }
@@ -115,7 +119,7 @@ __attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, P
 template <bool derivatives, class T>
 bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, PairSums<T>& sums) {
   using L = Pack<T>;
-  constexpr int numbers = derivatives ? 84 : 12;
+  constexpr int numbers = derivatives ? 87 : 6;
   L all[numbers];
   bool started = false;
   Pending<T> pending;
@@ -143,20 +147,19 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
   if (!started) return false;
   T total[numbers];
   sum_lanes(all, numbers, total);
-  const T* const f = total;
-  const auto x = [&](int i, int j) { return total[3 + 3 * i + j]; };  // Σ x_i f_j
   for (int i = 0; i < 3; ++i) {
-    const int j = (i + 1) % 3, k = (i + 2) % 3;
-    sums.wrench[i] = x(j, k) - x(k, j);
-    sums.wrench[3 + i] = f[i];
+    sums.wrench[i] = total[3 + i];
+    sums.wrench[3 + i] = total[i];
   }
   if constexpr (derivatives) {
     for (int i = 0; i < 6; ++i) {
       for (int j = 0; j < 6; ++j) {
-        sums.k[i][j] = total[12 + 6 * i + j];
-        sums.d[i][j] = total[48 + 6 * i + j];
+        sums.k[i][j] = total[15 + 6 * i + j];
+        sums.d[i][j] = total[51 + 6 * i + j];
       }
     }
+    const T* const f = total;
+    const auto x = [&](int i, int j) { return total[6 + 3 * i + j]; };                     // Σ x_i f_j
     const T lift = rule.rolling_radius, work = x(0, 0) + x(1, 1) + x(2, 2) + lift * f[2];  // Σ f·c
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) sums.k[i][j] += x(i, j);

@@ -30,8 +30,8 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   DirectionalRollout out;
   for (int t = 0; t < start.steps; ++t) {
     for (std::size_t a = 0; a < nu; ++a) u[a] = {start.u[t * nu + a], start.du[t * nu + a]};
-    // Two updates after convergence: the derivative part converges one iteration behind the value.
-    const StepReport report = step<Dual>(m, params.data(), u.data(), 2, state, memory);
+    // Updates after convergence: the derivative part converges one iteration behind the value.
+    const StepReport report = step<Dual>(m, params.data(), u.data(), 3, state, memory);
     out.status = static_cast<std::int32_t>(report.status);
     if (report.status != Status::ok) break;
   }

@@ -103,7 +103,7 @@ struct PointCloud {
 };
 
 // The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and
-// scaled: then the points follow (pair.hpp).
+// scaled: then the points follow (pair_frame.hpp).
 struct Mount {
   int body;
   V3<double> pos;

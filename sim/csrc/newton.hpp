@@ -50,7 +50,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 }
 
 // Solves one substep; on success `v` is v_t, and w holds residual and kinematics at (w.q, v).
-// `polish` more Newton updates follow convergence (dual numbers need two for their derivative part).
+// `polish` more Newton updates follow convergence (dual numbers need three for their derivative part).
 //
 // The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
 // close to piecewise linear, and a full step into the right piece often makes the residual larger before the next one
@@ -58,12 +58,13 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 // starts from the best point seen. Where the search gets stuck at an edge, the derivatives just past it say where to go.
 //
 // An update with derivatives of an earlier one shrinks the residual by some factor and not to its square, and so ends
-// nearer to the tolerance: a margin makes up for it. In single precision there is no room for one.
+// nearer to the tolerance: a margin makes up for it. In single precision there is no room for one, and who asks for the
+// last digits gets them.
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
   constexpr int full_steps = 6, patience = 6;
-  constexpr double quick = 0.03, margin = 0.1;
+  constexpr double quick = 0.03, margin = 0.1, exacting = 1e-9;
   const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
   bool fresh = false;  // w holds the derivatives at v
@@ -92,7 +93,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
     // Where an update made the residual that much smaller, its derivatives do for one more, which costs half as much.
-    old = !fresh && !converged && k <= 3 && std::is_same_v<T, double> && size < quick * before;
+    old = !fresh && !converged && k <= 3 && tolerance > exacting && std::is_same_v<T, double> && size < quick * before;
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
     solve<T>(w.tangent, m.nv, w.pivots, w.residual, w.direction);
