@@ -56,6 +56,7 @@ PairFrame<double> real_frame(const PairFrame<T>& f, double* size) {
   real.size = size;
   real.kind = f.kind;
   real.grid = f.grid;
+  real.scaled = true;
   real.stretch = f.scaled ? real_part(f.stretch) : 1.0;
   real.local_level = real_part(f.local_level);
   return real;
