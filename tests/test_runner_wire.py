@@ -322,6 +322,7 @@ def test_ctrl_c_stops_announces_and_closes_the_recording(robot: MockRobot, tmp_p
 
 _SOURCE = str(Path(__file__).resolve().parents[1] / "src")
 _RUN_UNTIL_INTERRUPTED = """
+import signal
 import sys
 from pathlib import Path
 import numpy as np
@@ -333,6 +334,7 @@ class Still:
     def reset(self): pass
     def act(self, observation): return np.zeros(3)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell runs in the background
 folder = Path(sys.argv[1])
 try:
     run_insertions(RunPlan(load_lab(folder / "lab.toml"), Still(), INSERTION, folder / "session.mcap", insertions=9))
