@@ -30,7 +30,6 @@ STEPS = 100
 GROUPS = {
     "near points": ("find_near_points", "for_near_points", "for_near_leaves", "for_near_blocks"),
     "forces": ("sum_forces", "add_pending", "touches", "distance", "point_force"),
-    "memory": ("advance_contact_anchors", "advance_marker_anchors", "advance_anchors"),
     "to joints": ("subtract_derivatives", "pair_columns", "subtract_contact_forces", "pair_frame", "move_mount"),
     "dynamics": ("inverse_dynamics", "floating_body", "subtract_joint_forces", "actuator_pull"),
     "places": ("forward_", "integrate", "quaternion", "axis_rotation", "right_jacobian", "position_by", "sincos"),
@@ -40,7 +39,7 @@ GROUPS = {
 
 def run(name: str, steps: int) -> float:
     """Some steps from the start of the scene's motion, one call each [s per step]."""
-    scene = load_scene(name)
+    scene = load_scene(name, friction="viscous")
     sim, moves = Simulator(scene, threads=1), motion(scene)
     sim.q[:] = moves.q0
     controls = moves.steps(scene.step)[:steps]
@@ -84,7 +83,7 @@ def main() -> int:
     found = {}
     for name in track(SCENES, "scenes", console=Console(stderr=True)):
         found[name] = {"instructions": count(name), "us": 1e6 * min(run(name, STEPS) for _ in range(50))}
-    table = Table(title="Instructions per step, % by what they are for", title_justify="left")
+    table = Table(title="Instructions per step, % by what they are for (viscous friction)", title_justify="left")
     for heading in ("", *SCENES):
         table.add_column(heading, justify="right" if heading else "left")
     for group in [*GROUPS, "other"]:
