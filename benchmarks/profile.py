@@ -20,11 +20,10 @@ from rich.progress import track
 from rich.table import Table
 
 from gelflow.sim.benchmark import processor, versions
-from gelflow.sim.motions import motion
+from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
-SCENES = ("rolling", "pushing", "grasp", "insertion", "dclaw")
 STEPS = 100
 # Groups by the names of functions, looked for in this order; small ones are inlined into those that call them.
 GROUPS = {

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from gelflow.errors import UsageError
+from gelflow.geometry import angles_between
 from gelflow.observation import DEFAULT_FLOORS, normalize
 from gelflow.sim.motions import motion
 from gelflow.sim.scene import Scene
@@ -200,7 +201,7 @@ def compare(run: Run, truth: Run) -> Errors:
         gradient = _relative(run.gradient, truth.gradient)
     return Errors(
         position=float(shift.max()),
-        rotation=float(_angle(run.poses[..., 3:], truth.poses[..., 3:]).max()),
+        rotation=float(angles_between(run.poses[..., 3:], truth.poses[..., 3:]).max()),
         markers=_relative(run.field[1:], truth.field[1:]),
         flow=float(np.linalg.norm(flow, axis=-1).mean()),
         cosine=cosine,
@@ -211,12 +212,6 @@ def compare(run: Run, truth: Run) -> Errors:
 def _relative(found: Array, true: Array) -> float:
     off, size = float(np.linalg.norm(found - true)), float(np.linalg.norm(true))
     return off / size if size > 0 else (0.0 if off == 0 else np.inf)
-
-
-def _angle(a: Array, b: Array) -> Array:
-    """Between two turns given as unit quaternions [rad], also where it is tiny."""
-    sign = np.where((a * b).sum(-1, keepdims=True) < 0, -1, 1)
-    return np.asarray(4 * np.arcsin(np.clip(np.linalg.norm(a - sign * b, axis=-1) / 2, 0, 1)))
 
 
 def _flow(run: Run, truth: Run) -> Array:

@@ -16,6 +16,7 @@ import pytest
 from gelflow.cli.bench import MEASUREMENTS, conclude
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
+from gelflow.geometry import angles_between
 from gelflow.sim.benchmark.batch import differ, measure_batch
 from gelflow.sim.benchmark.gradients import measure_gradients
 from gelflow.sim.benchmark.growth import SWEEPS, exponent
@@ -23,9 +24,10 @@ from gelflow.sim.benchmark.markers import SHAPES, measure_markers
 from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
 from gelflow.sim.benchmark.paper_build import MODULE, why_not
 from gelflow.sim.benchmark.rolling import ROLLING_STEPS, Cell, measure_rolling, rolling_run, rolling_scene
-from gelflow.sim.benchmark.runs import angle, check, motion_run, simulator
-from gelflow.sim.benchmark.scenes import SCENES, measure_scenes
+from gelflow.sim.benchmark.runs import check, motion_run, simulator
+from gelflow.sim.benchmark.scenes import measure_scenes
 from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import load_scene
 
 ONCE = Effort(quick=True, repeats=1)
@@ -183,8 +185,8 @@ def test_a_run_that_is_off_is_noticed(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_angles_between_quaternions() -> None:
     half = np.array([[1.0, 0, 0, 0], [np.cos(5e-9), np.sin(5e-9), 0, 0], [0, 0, 1, 0]])
-    np.testing.assert_allclose(angle(half[0], half), [0, 1e-8, np.pi], rtol=1e-6)
-    np.testing.assert_allclose(angle(half[0], -half), [0, 1e-8, np.pi], rtol=1e-6)
+    np.testing.assert_allclose(angles_between(half[0], half), [0, 1e-8, np.pi], rtol=1e-6)
+    np.testing.assert_allclose(angles_between(half[0], -half), [0, 1e-8, np.pi], rtol=1e-6)
 
 
 def test_works_are_timed_in_turn() -> None:

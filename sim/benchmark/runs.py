@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.geometry import angles_between
 from gelflow.sim import _core
 from gelflow.sim.benchmark.timing import Work
 from gelflow.sim.motions import motion
@@ -121,7 +122,7 @@ def check(run: Run, sim: Simulator, describe: Describe) -> Check:
             one.step(u, steps)
         here, there = sim.poses(), twin.poses()
         position = max(position, float(np.linalg.norm(here[..., :3] - there[..., :3], axis=-1).max()))
-        turn = max(turn, float(angle(here[..., 3:], there[..., 3:]).max()))
+        turn = max(turn, float(angles_between(here[..., 3:], there[..., 3:]).max()))
         if read:
             felt, right = sim.tactile(), twin.tactile()
             difference = max(difference, float(np.linalg.norm(felt - right, axis=(1, 2)).max()))
@@ -139,9 +140,3 @@ def check(run: Run, sim: Simulator, describe: Describe) -> Check:
         end=tuple(sim.q[0].tolist()),
         force_sum=tuple(force_sum.tolist()),
     )
-
-
-def angle(one: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
-    """Between rotations, unit quaternions (…, 4), whatever their signs [rad]; exact for small ones too."""
-    apart = np.minimum(np.linalg.norm(one - other, axis=-1), np.linalg.norm(one + other, axis=-1))
-    return np.asarray(4 * np.arcsin(np.minimum(apart / 2, 1)))

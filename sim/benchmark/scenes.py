@@ -3,10 +3,10 @@
 from gelflow.sim.benchmark.rolling import rolling_scene
 from gelflow.sim.benchmark.runs import check, motion_run, simulator
 from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved
+from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import load_scene
 from gelflow.sim.scene_parts import LAWS
 
-SCENES = ("rolling", "pushing", "grasp", "insertion", "dclaw")
 SIDE = 50  # of the rolling pad's grid
 
 # The paper's own simulator, its best build on one core of a recent server [steps/s]; its law is the viscous one.

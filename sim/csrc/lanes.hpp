@@ -342,13 +342,5 @@ template <class T, class L>
 GELFLOW_INLINE V3<T> sum3(const Vec3<L>& a) {
   return {sum(a.x), sum(a.y), sum(a.z)};
 }
-template <class T, class L>
-GELFLOW_INLINE M3<T> sum33(const Mat3<L>& a) {
-  M3<T> total;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) total(i, j) = sum(a.row[i][j]);
-  }
-  return total;
-}
 
 }  // namespace gelflow

@@ -7,6 +7,8 @@
 
 namespace gelflow {
 
+constexpr double reach_slack = 1e-6;  // [m], above the rounding of single precision
+
 // What the points of one cloud need besides their places.
 template <class T>
 struct TouchRule {
@@ -36,7 +38,7 @@ GELFLOW_INLINE void for_near_blocks(const PairFrame<T>& f, const PointCloud::Blo
 // Calls visit(begin, end) for neighbours in the cloud, some of which may be inside the shape grown by `margin`.
 template <bool scaled, class T, class Visit>
 GELFLOW_INLINE void for_near_leaves(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
-  const T around = margin + T(1e-6);  // [m], above the rounding of single precision
+  const T around = margin + T(reach_slack);
   for_near_blocks<scaled, T>(f, cloud.groups, 0, cloud.groups.count(), around, [&](int g) {
     for_near_blocks<scaled, T>(f, cloud.leaves, cloud.groups.begin[g], cloud.groups.end[g], around,
                                [&](int l) { visit(cloud.leaves.begin[l], cloud.leaves.end[l]); });
@@ -78,7 +80,7 @@ template <class T, class Visit>
 void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
   if constexpr (std::is_floating_point_v<T>) {
     using L = Pack<T>;
-    const L around = L(margin) + L(T(1e-6));
+    const L around = L(margin + T(reach_slack));
     for_near_leaves<T>(f, cloud, margin, [&](int begin, int end) {
       for (int i = begin; i < end; i += pack_width<T>) {
         const Vec3<L> point{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};

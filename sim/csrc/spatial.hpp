@@ -44,7 +44,7 @@ GELFLOW_INLINE M3<T> skew(const V3<T>& a) {
   return m;
 }
 
-// [x]× A and A [x]×, without the zeros.
+// [x]× A, without the zeros.
 template <class T>
 GELFLOW_INLINE M3<T> cross_columns(const V3<T>& x, const M3<T>& a) {
   M3<T> r;
@@ -52,16 +52,6 @@ GELFLOW_INLINE M3<T> cross_columns(const V3<T>& x, const M3<T>& a) {
     r(0, j) = x[1] * a(2, j) - x[2] * a(1, j);
     r(1, j) = x[2] * a(0, j) - x[0] * a(2, j);
     r(2, j) = x[0] * a(1, j) - x[1] * a(0, j);
-  }
-  return r;
-}
-template <class T>
-GELFLOW_INLINE M3<T> cross_rows(const M3<T>& a, const V3<T>& x) {
-  M3<T> r;
-  for (int i = 0; i < 3; ++i) {
-    r(i, 0) = a(i, 1) * x[2] - a(i, 2) * x[1];
-    r(i, 1) = a(i, 2) * x[0] - a(i, 0) * x[2];
-    r(i, 2) = a(i, 0) * x[1] - a(i, 1) * x[0];
   }
   return r;
 }

@@ -51,6 +51,12 @@ def angle_between(a: Array, b: Array) -> float:
     return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 
+def angles_between(a: Array, b: Array) -> Array:
+    """The same for arrays of unit quaternions (…, 4), whatever their signs; exact for tiny angles too."""
+    apart = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    return np.asarray(4 * np.arcsin(np.minimum(apart / 2, 1)))
+
+
 @dataclass(frozen=True)
 class Pose:
     """A frame in another frame."""
