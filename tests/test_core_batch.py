@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
+from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import STATUS, Simulator
 
@@ -70,6 +71,28 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch(insertion: Scene)
     order = [3, 0, 4]
     others = trace(started(insertion, order, threads=2), u[:, order])
     assert [row.tobytes() for row in others] == [reference[env].tobytes() for env in order]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_neighbour_with_other_parameters_leaves_no_trace(name: str) -> None:
+    """Both run on one thread, in its memory: what the first one needs of that and the second does not, such as a centre
+    of mass that is off the frame's origin."""
+    scene = load_scene(name)
+    moves = motion(scene)
+    u = moves.steps(scene.step)[:3, None]
+    runs = []
+    for envs in (1, 2):
+        sim = Simulator(scene, num_envs=envs, threads=1)
+        params = sim.params[0]
+        scale = np.where(np.isfinite(params), np.where(params == 0, 1.0, params), 0.0)
+        sim.params[: envs - 1] += 1e-3 * scale * np.random.default_rng(1).normal(size=params.shape)
+        sim.q[:] = moves.q0
+        run = sim.rollout(np.repeat(u, envs, axis=1), read_after=(1, 3))
+        back = sim.rollout_gradient(run, q=np.ones(()), tactile=np.ones(()), params=True)
+        runs.append((run.q, run.v, run.tactile, back.u, back.v, back.params))
+    for alone, beside in zip(*runs, strict=True):
+        axis = 0 if alone.ndim < 3 else 1
+        np.testing.assert_array_equal(alone.take(-1, axis), beside.take(-1, axis))
 
 
 def test_a_rollout_is_the_same_steps(insertion: Scene) -> None:
@@ -249,6 +272,7 @@ BUILDS = """
 import sys
 import numpy as np
 from gelflow.sim import _core
+from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 

@@ -106,7 +106,11 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
     w.mass.template block<3, 3>(k + 3, k + 3) = inertia;
     w.by_v.template block<3, 3>(k + 3, k + 3) += h * (cross_columns<T>(spin, inertia) - skew<T>(angular_momentum));
     for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = mass;
-    if (centered) return;
+    if (centered) {  // not so for another environment, perhaps
+      w.mass.template block<3, 3>(k, k + 3).setZero();
+      w.mass.template block<3, 3>(k + 3, k).setZero();
+      return;
+    }
     const M3<T> lever = skew<T>(c), turned = mass * r;
     const V3<T> y = cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c));
     w.mass.template block<3, 3>(k, k + 3) = -turned * lever;
