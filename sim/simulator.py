@@ -95,7 +95,7 @@ class Simulator:
         self.status: NDArray[np.int32] = self._batch.status
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
-        self._tactile = np.zeros((num_envs, self.model.markers, 3), self.dtype)
+        self._readings: NDArray[Any] | None = None  # there from the first reading on
         self._u = np.zeros((num_envs, self.model.nu), self.dtype)  # one control for all is spread out here
 
     @cached_property
@@ -175,11 +175,16 @@ class Simulator:
     def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Marker readings now, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
 
-        Without `out` the array is the simulator's own and is overwritten by the next call.
+        Without `out` the array is the simulator's own: read-only, and overwritten by the next call. That is faster where
+        few markers touch, since only those are written that change.
         """
-        target = self._tactile if out is None else out
-        self._batch.tactile(target)
-        return target
+        if out is not None:
+            self._batch.tactile(out)
+            return out
+        self._batch.tactile()
+        if self._readings is None:
+            self._readings = self._batch.readings
+        return self._readings
 
     def displacement(self, forces: Any = None) -> Any:
         """How far the markers go in their gels, (…, markers, 3): along x, along y, into the pad [m].

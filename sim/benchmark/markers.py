@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -86,7 +85,7 @@ class _Reading:
 
     def works(self) -> Iterator[Work]:
         markers = int(self.sim.model.markers)
-        yield Work(partial(self.sim.tactile, self.forces), markers)
+        yield Work(self.sim.tactile, markers)
         yield Work(self.gradient, markers)
 
 

@@ -67,7 +67,7 @@ template <class T, class Multipliers>
 void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
                         StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.start(u), r.v1.data(), false, false, w);
+  evaluate<true, T>(m, params, r.start(u), r.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,
@@ -84,7 +84,7 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> c(m.nv);
-  solve<T>(w.tangent, m.nv, w.pivots, b, c);
+  solve<T>(w.tangent, m.nv, w.pivots, b.data(), c);
   multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
   const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c, by_v_star = w.mass.leftCols(m.nv).transpose() * c;
@@ -109,7 +109,7 @@ void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, 
                         StateGradient<T>& g, Workspace<T>& w) {
   w.update.setZero();
   forward_positions<T>(m, params, s.q, w);
-  forward_velocities<T>(m, params, s.v, w.update.data(), w);
+  forward_velocities<true, T>(m, params, s.v, w.update.data(), w);
   read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
 }
 

@@ -77,6 +77,7 @@ class Batch {
   std::vector<V3<T>> anchors;   // (N, na)
   std::vector<std::uint8_t> anchored;
   std::vector<T> history;                        // (N, nh)
+  std::vector<T> readings;                       // (N, markers, 3) once they were asked for; for nobody else to write
   std::vector<std::int32_t> status;              // (N)
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
@@ -87,6 +88,7 @@ class Batch {
   // long as its shortest. status (N) as in `status`. Changes nothing.
   void error_estimate(const T* u, T* out, std::int32_t* status);
   void tactile(T* out);         // (N, markers, 3)
+  void tactile();               // the same into `readings`
   void wrenches(T* out);        // (N, contacts, 6)
   void contact_forces(T* out);  // (N, nv): what all contacts do to the joints
   void poses(T* out);           // (N, bodies, 7): position, quaternion
@@ -103,10 +105,12 @@ class Batch {
     return params.data() + static_cast<std::size_t>(env) * model->param_names.size();
   }
   void kinematics(int env, Workspace<T>& w);
+  void read(T* out, Written* written);
   void check_state() const;
   void check_controls(const T* u, int rows) const;
   void transpose_one(int env, const Rollout<T>& r, const RolloutGradient<T>& g, StepMemory<T>& memory);
   std::vector<StepMemory<T>> memory_;  // one per thread
+  std::vector<Written> written_;       // per environment, of `readings`
   ThreadPool pool_;
 };
 

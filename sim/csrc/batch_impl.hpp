@@ -83,7 +83,7 @@ void Batch<T>::step(const T* u, int steps) {
   pool_.run(n, [&](int e, int thread) {
     for (int i = 0; i < steps && status[e] == 0; ++i) {
       const StepReport report = gelflow::step<T>(*model, params_of(e), u + static_cast<std::size_t>(e) * nu,
-                                                 model->polish, state(e), memory_[thread]);
+                                                 model->polish, state(e), memory_[thread], i > 0);
       status[e] = static_cast<std::int32_t>(report.status);
       iterations[e] += report.iterations;
       halved[e] += report.halvings > 0 ? 1 : 0;
@@ -101,11 +101,12 @@ void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
     StepMemory<T>& memory = memory_[thread];
     const T* const control = u + static_cast<std::size_t>(e) * nu;
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
-    const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory);
+    const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory, false);
     Status status = taken.status;
     const int parts = 2 << taken.halvings;  // each half of the shortest substep
     for (int i = 0; i < parts && status == Status::ok; ++i) {
-      status = gelflow::step<T>(m, params_of(e), control, m.polish, halves.view(), memory, NoObserver{}, parts).status;
+      status = gelflow::step<T>(m, params_of(e), control, m.polish, halves.view(), memory, i > 0, NoObserver{}, parts)
+                   .status;
     }
     failures[e] = static_cast<std::int32_t>(status);
     T* const difference = out + static_cast<std::size_t>(e) * m.nv;
@@ -131,15 +132,33 @@ void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
   w.update.setZero();
   forward_positions<T>(*model, params_of(env), s.q, w);
-  forward_velocities<T>(*model, params_of(env), s.v, w.update.data(), w);
+  forward_velocities<true, T>(*model, params_of(env), s.v, w.update.data(), w);
 }
 
 template <class T>
 void Batch<T>::tactile(T* out) {
+  read(out, nullptr);
+}
+
+template <class T>
+void Batch<T>::tactile() {
+  if (written_.empty()) {
+    readings.resize(static_cast<std::size_t>(n) * model->markers * 3);
+    written_.resize(n);
+  }
+  read(readings.data(), written_.data());
+}
+
+template <class T>
+void Batch<T>::read(T* out, Written* written) {
   pool_.run(n, [&](int e, int thread) {
-    kinematics(e, memory_[thread].work);
-    read_markers<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
-                    out + static_cast<std::size_t>(e) * model->markers * 3);
+    const StateView<T> s = state(e);
+    Workspace<T>& w = memory_[thread].work;
+    w.update.setZero();
+    forward_positions<T>(*model, params_of(e), s.q, w);
+    forward_velocities<false, T>(*model, params_of(e), s.v, w.update.data(), w);
+    read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
+                    out + static_cast<std::size_t>(e) * model->markers * 3, written == nullptr ? nullptr : written + e);
   });
 }
 
@@ -159,7 +178,7 @@ void Batch<T>::contact_forces(T* out) {
     kinematics(e, w);
     w.residual.setZero();
     const StepStart<T> from{T(1), nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
-    subtract_contact_forces<false, T>(*model, params_of(e), from, false, false, w);
+    subtract_contact_forces<false, T>(*model, params_of(e), from, Found::elsewhere, false, w);
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }
@@ -204,7 +223,7 @@ void Batch<T>::bias(T* out) {
     kinematics(e, w);
     w.residual.setZero();
     add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, w);
-    std::copy(w.residual.data(), w.residual.data() + model->nv, out);
+    std::copy_n(w.residual.data(), model->nv, out);
   }
 }
 
@@ -228,9 +247,9 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       for (; read < r.reads && r.read_after[read] == t; ++read) {
         memory.work.update.setZero();
         forward_positions<T>(m, params_of(env), now.q, memory.work);
-        forward_velocities<T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
+        forward_velocities<false, T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
         read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
-                        r.tactile + (read * N + e) * m.markers * 3);
+                        r.tactile + (read * N + e) * m.markers * 3, nullptr);
       }
       if (t == r.steps) break;
       const StateView<T> next = at(t + 1);
@@ -240,7 +259,8 @@ void Batch<T>::rollout(const Rollout<T>& r) {
       for_each_set(now.anchored, m.na, [&](int i) { next.anchors[i] = now.anchors[i]; });
       std::copy(now.history, now.history + m.nh, next.history);
       if (r.status[e] != 0) continue;
-      const StepReport report = gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, m.polish, next, memory);
+      const StepReport report =
+          gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, m.polish, next, memory, t > 0);
       r.status[e] = static_cast<std::int32_t>(report.status);
       r.halvings[t * N + e] = static_cast<std::int8_t>(report.halvings);
     }
@@ -356,7 +376,7 @@ void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient
       records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
     } else {
       StateCopy<T> scratch(m, old);
-      gelflow::step<T>(m, params, u, m.polish, scratch.view(), memory,
+      gelflow::step<T>(m, params, u, m.polish, scratch.view(), memory, false,
                        [&](const StepStart<T>& from, const StepMemory<T>& taken) {
                          records.emplace_back(m, from, taken.v_new, false);
                        });

@@ -139,6 +139,15 @@ void bind_batch(py::module_& module, const char* name) {
              const py::gil_scoped_release release;
              b.tactile(data);
            })
+      .def(
+          "tactile", [](B& b) { b.tactile(); }, py::call_guard<py::gil_scoped_release>())
+      .def_property_readonly("readings",  // what `tactile()` wrote
+                             [](py::object self) {
+                               B& b = self.cast<B&>();
+                               py::array own = view(b.readings.data(), {b.n, b.model->markers, 3}, self);
+                               own.attr("flags").attr("writeable") = false;
+                               return own;
+                             })
       .def("wrenches",
            [](B& b, py::array out) {
              b.wrenches(writable<T>(out, {b.n, static_cast<py::ssize_t>(b.model->contacts.size()), 6}, "out"));

@@ -35,7 +35,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
   Signature hash;
   w.update.setZero();
   forward_positions<T>(m, params, q, w);
-  forward_velocities<T>(m, params, v, w.update.data(), w);
+  forward_velocities<true, T>(m, params, v, w.update.data(), w);
   int pair = 0;
   const auto visit = [&](const Touching<T>& t) {
     PointForce<Pack<T>> force;

@@ -225,12 +225,40 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
   }
 }
 
-// Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `again`: at another trial
-// of the same step. `scale`: adds the impulses' size to w.forces.
-template <bool derivatives, class T>
-void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, bool again, bool scale,
-                             Workspace<T>& w) {
+// A wrench about the shape's origin in its frame as one about the world's origin.
+template <class T>
+V6<T> wrench_in_world(const PairFrame<T>& frame, const T* wrench) {
+  const V3<T> moment = frame.to_world * vec3(wrench), push = frame.to_world * vec3(wrench + 3);
+  return stack<T>(moment + cross<T>(frame.origin, push), push);
+}
+
+// Subtracts the impulses h · (the pair's wrench) from w.residual. `scale`: adds their size to w.forces.
+template <class T>
+void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bool scale, Workspace<T>& w) {
   using std::abs;
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  const PackedDofs& dofs = pair.packed<width>();
+  for (std::size_t n = 0; n < dofs.start.size(); ++n) {
+    const int at = dofs.start[n];
+    L sum = L(wrench[0]) * load<L>(w.axis.row(0) + at);
+    for (int a = 1; a < 6; ++a) sum += L(wrench[a]) * load<L>(w.axis.row(a) + at);
+    T impulse[width];
+    store(L(h) * load<L>(&dofs.sign[n * width]) * sum, impulse);
+    for (int k = 0; k < width; ++k) {
+      const int dof = dofs.dof[n * width + k];
+      if (dof < 0) continue;
+      w.residual[dof] -= impulse[k];
+      if (scale) w.forces[dof] += abs(impulse[k]);
+    }
+  }
+}
+
+// Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `found`: what the
+// workspace was last used for. `scale`: adds the impulses' size to w.forces.
+template <bool derivatives, class T>
+void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, Found found, bool scale,
+                             Workspace<T>& w) {
   PairSums<T> sums;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
@@ -238,23 +266,16 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
     TouchRule<T> rule = touch_rule<T>(m, contact, params, from.anchors, from.anchored);
     rule.softness = from.softness;
-    find_near_points<T>(frame, set.cloud, rule, again, w.near[n]);
+    find_near_points<T>(frame, set.cloud, rule, found, w.near[n]);
     if (!sum_forces<derivatives, T>(frame, w.near[n], rule, sums)) {
       if (!is_finite(frame.check())) w.residual[0] = frame.check();
       continue;
     }
-    pair_columns<derivatives, T>(contact.pair, set.mount.body, frame, w);
-    const PairColumns<T>& c = w.columns;
-    for (int i = 0; i < c.n; ++i) {
-      const int dof = c.dofs->dof[i];
-      if (dof < 0) continue;
-      T impulse = T(0);
-      for (int a = 0; a < 6; ++a) impulse += c.s.row(a)[i] * sums.wrench[a];
-      impulse *= from.h;
-      w.residual[dof] -= impulse;
-      if (scale) w.forces[dof] += abs(impulse);
+    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench), scale, w);
+    if constexpr (derivatives) {
+      pair_columns<T>(contact.pair, set.mount.body, frame, w);
+      subtract_derivatives<T>(from.h, sums, w);
     }
-    if constexpr (derivatives) subtract_derivatives<T>(from.h, sums, w);
   }
 }
 
@@ -269,10 +290,9 @@ void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, con
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
     const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     PairSums<T> sums;
-    find_near_points<T>(frame, set.cloud, rule, false, w.near[n]);
+    find_near_points<T>(frame, set.cloud, rule, Found::elsewhere, w.near[n]);
     if (!sum_forces<false, T>(frame, w.near[n], rule, sums)) std::fill(sums.wrench, sums.wrench + 6, T(0));
-    const V3<T> moment = frame.to_world * vec3(sums.wrench), push = frame.to_world * vec3(sums.wrench + 3);
-    const V6<T> in_world = stack<T>(moment + cross<T>(frame.origin, push), push);
+    const V6<T> in_world = wrench_in_world<T>(frame, sums.wrench);
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
   }
 }
@@ -304,7 +324,7 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
     if (contact.anchor < 0) continue;
     const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
-    pair_columns<true, T>(contact.pair, first.body, frame, w);
+    pair_columns<T>(contact.pair, first.body, frame, w);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
     const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     V3<T>* const by_own = by_anchor + contact.anchor;

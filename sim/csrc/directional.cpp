@@ -31,15 +31,15 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   for (int t = 0; t < start.steps; ++t) {
     for (std::size_t a = 0; a < nu; ++a) u[a] = {start.u[t * nu + a], start.du[t * nu + a]};
     // Updates after convergence: the derivative part converges one iteration behind the value.
-    const StepReport report = step<Dual>(m, params.data(), u.data(), 3, state, memory);
+    const StepReport report = step<Dual>(m, params.data(), u.data(), 3, state, memory, false);
     out.status = static_cast<std::int32_t>(report.status);
     if (report.status != Status::ok) break;
   }
   std::vector<Dual> tactile(static_cast<std::size_t>(m.markers) * 3);
   memory.work.update.setZero();
   forward_positions<Dual>(m, params.data(), q.data(), memory.work);
-  forward_velocities<Dual>(m, params.data(), v.data(), memory.work.update.data(), memory.work);
-  read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data());
+  forward_velocities<true, Dual>(m, params.data(), v.data(), memory.work.update.data(), memory.work);
+  read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data(), nullptr);
 
   for (const Dual& x : q) out.q.push_back(x.a);
   out.dq.resize(m.nv);

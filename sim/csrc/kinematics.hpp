@@ -75,40 +75,54 @@ void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>
   }
 }
 
-// Twists V and accelerations A of every body; gravity enters as an acceleration of the world. What is before the slides
-// of a free joint is not written down: only its turning would count, and there is none.
-template <class T>
+// Twists V and accelerations A of every body; gravity enters as an acceleration of the world. `around`: also what is
+// before and after each dof, which derivatives need. What is before slides that nothing turns is not written down: only
+// its turning would count, and there is none. Bodies that float have no accelerations here (dynamics.hpp).
+template <bool around, class T>
 void forward_velocities(const Model& m, const T* params, const T* v, const T* a, Workspace<T>& w) {
   const V6<T> base = stack<T>(V3<T>::Zero(), -vec3(params + m.gravity));
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
+    if (body.floats) {
+      const int k = m.joints[body.joint_begin].v;
+      const V3<T> slide = vec3(v + k), turn = w.rotation[i] * vec3(v + k + 3);
+      w.twist[i] = stack<T>(turn, slide + cross<T>(w.position[i], turn));
+      if constexpr (around) {
+        const V6<T> before = stack<T>(V3<T>::Zero(), slide);
+        for (int g = k + 3; g < k + 6; ++g) w.twist_before.set(g, before);
+      }
+      continue;
+    }
     V6<T> twist = body.parent == world ? V6<T>(V6<T>::Zero()) : w.twist[body.parent];
     V6<T> acceleration = body.parent == world ? base : w.acceleration[body.parent];
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       const Joint& joint = m.joints[j];
-      int k = joint.v;
-      if (joint.type == JointType::free) {  // the slides at once: nothing turns before them
-        for (int axis = 0; axis < 3; ++axis, ++k) {
-          twist[3 + axis] += v[k];
-          acceleration[3 + axis] += a[k];
+      for (int k = joint.v; k < joint.v + joint.dofs;) {
+        if (m.translates[k]) {
+          for (int axis = 3; axis < 6; ++axis) {
+            twist[axis] += w.axis.row(axis)[k] * v[k];
+            acceleration[axis] += w.axis.row(axis)[k] * a[k];
+          }
+          ++k;
+          continue;
         }
-      }
-      for (; k < joint.v + joint.dofs;) {
         const int end = m.group_end[k];
-        const V6<T> before = twist, acceleration_before = acceleration;
-        V6<T> own = V6<T>::Zero();
+        const V6<T> before = twist;
+        V6<T> own = V6<T>::Zero(), own_rate = own;
         for (int g = k; g < end; ++g) {
           const V6<T> axis = w.axis[g];
           own += axis * v[g];
-          acceleration += axis * a[g];
+          own_rate += axis * a[g];
         }
         twist += own;
-        acceleration += cross_motion<T>(before, own);
-        for (int g = k; g < end; ++g) {
-          w.twist_before.set(g, before);
-          w.twist_after[g] = twist;
-          w.acceleration_before[g] = acceleration_before;
+        if constexpr (around) {
+          for (int g = k; g < end; ++g) {
+            w.twist_before.set(g, before);
+            w.twist_after[g] = twist;
+            w.acceleration_before[g] = acceleration;
+          }
         }
+        acceleration += own_rate + cross_motion<T>(before, own);
         k = end;
       }
     }

@@ -1,4 +1,6 @@
-// A few dense linear equations: Gauss's elimination with row pivots, a pack of columns at a time.
+// A few dense linear equations. Up to `small` of them: the inverse, by Gauss and Jordan, since one matrix serves several
+// right-hand sides, each of which is then a product without a chain of divisions. More: Gauss's elimination. Both with
+// row pivots, a pack of columns at a time.
 #pragma once
 
 #include <utility>
@@ -8,22 +10,60 @@
 
 namespace gelflow {
 
-// Replaces the first n columns of `a` by the factors of P A = L U; on the diagonal stands 1/U. Rows of `a` are longer
-// than n by a pack or more. Where A is singular, what `solve` finds is not finite.
+constexpr int small = 16;
+
+template <class T, class Rows>
+int pivot(const Rows& a, int n, int k) {
+  using std::abs;
+  int largest = k;
+  for (int i = k + 1; i < n; ++i) {
+    if (abs(a(i, k)) > abs(a(largest, k))) largest = i;
+  }
+  return largest;
+}
+
+// Replaces the first n columns of `a` by those of its inverse.
+template <class T, class Rows>
+void invert(Rows& a, int n, std::vector<int>& pivots) {
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  const std::ptrdiff_t stride = a.outerStride();
+  T* const start = a.data();
+  for (int k = 0; k < n; ++k) {
+    T* const own = start + k * stride;
+    pivots[k] = pivot<T>(a, n, k);
+    if (pivots[k] != k) std::swap_ranges(own, own + n, start + pivots[k] * stride);
+    // Column k is set last: a pack that is loaded right after one of its numbers was stored would have to wait.
+    const T inverse = T(1) / own[k];
+    for (int j = 0; j < n; j += width) store(L(inverse) * load<L>(own + j), own + j);
+    for (int i = 0; i < n; ++i) {
+      if (i == k) continue;
+      T* const row = start + i * stride;
+      const T factor = row[k];
+      for (int j = 0; j < n; j += width) store(load<L>(row + j) - L(factor) * load<L>(own + j), row + j);
+      row[k] = -factor * inverse;
+    }
+    own[k] = inverse;
+  }
+  for (int k = n - 1; k >= 0; --k) {
+    if (pivots[k] == k) continue;
+    for (int i = 0; i < n; ++i) std::swap(a(i, k), a(i, pivots[k]));
+  }
+}
+
+// Makes `a`, whose rows are longer than n by a pack or more, ready for `solve`. Where it is singular, what that finds is
+// not finite.
 template <class T, class Rows>
 void factorize(Rows& a, int n, std::vector<int>& pivots) {
+  if (n <= small) return invert<T>(a, n, pivots);
+  // P A = L U; on the diagonal stands 1/U.
   using L = Pack<T>;
-  using std::abs;
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
   for (int k = 0; k < n; ++k) {
     T* const pivot_row = start + k * stride;
-    int largest = k;
-    for (int i = k + 1; i < n; ++i) {
-      if (abs(start[i * stride + k]) > abs(start[largest * stride + k])) largest = i;
-    }
-    pivots[k] = largest;
-    if (largest != k) std::swap_ranges(pivot_row, pivot_row + n, start + largest * stride);
+    pivots[k] = pivot<T>(a, n, k);
+    if (pivots[k] != k) std::swap_ranges(pivot_row, pivot_row + n, start + pivots[k] * stride);
     pivot_row[k] = T(1) / pivot_row[k];
     for (int i = k + 1; i < n; ++i) {
       T* const row = start + i * stride;
@@ -38,10 +78,30 @@ void factorize(Rows& a, int n, std::vector<int>& pivots) {
 
 // x = A⁻¹ b, from what `factorize` left.
 template <class T, class Rows>
-void solve(const Rows& a, int n, const std::vector<int>& pivots, const VX<T>& b, VX<T>& x) {
+void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<T>& x) {
   const std::ptrdiff_t stride = a.outerStride();
   const T* const start = a.data();
-  x = b;
+  if (n <= small) {
+    using L = Pack<T>;
+    constexpr int width = pack_width<T>;
+    T right[small + LaneTypes<float>::width];
+    std::copy(b, b + n, right);
+    std::fill(right + n, right + n + width, T(0));
+    for (int i = 0; i < n; i += width) {
+      L sums[width];
+      for (int k = 0; k < width; ++k) {
+        const T* const row = start + std::min(i + k, n - 1) * stride;
+        L sum = load<L>(row) * load<L>(right);
+        for (int j = width; j < n; j += width) sum += load<L>(row + j) * load<L>(right + j);
+        sums[k] = sum;
+      }
+      T found[width];
+      sum_lanes(sums, width, found);
+      std::copy(found, found + std::min(width, n - i), x.data() + i);
+    }
+    return;
+  }
+  std::copy(b, b + n, x.data());
   for (int k = 0; k < n; ++k) std::swap(x[k], x[pivots[k]]);
   for (int j = 0; j < n; ++j) {
     for (int i = j + 1; i < n; ++i) x[i] -= start[i * stride + j] * x[j];

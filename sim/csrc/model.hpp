@@ -76,7 +76,7 @@ struct Shape {
 // a block whose sphere lies outside a shape is skipped whole. Coordinates stand side by side, to be taken a pack at a
 // time, with `padding` numbers behind the last.
 struct PointCloud {
-  static constexpr int padding = 8;
+  static constexpr int padding = 8, few = 8;
   struct Places {
     std::vector<double> x, y, z;
     void add(const V3<double>& p);

@@ -75,24 +75,32 @@ GELFLOW_INLINE void for_near_leaves(const PairFrame<T>& f, const PointCloud& clo
   }
 }
 
-// The same for single points.
+// Calls visit(i) for those of the points begin … end that may be nearer to the shape than `reach`.
 template <class T, class Visit>
-void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
+GELFLOW_INLINE void for_reaching(const PairFrame<T>& f, const double* x, const double* y, const double* z, int begin,
+                                 int end, const T& reach, Visit&& visit) {
+  using L = Pack<T>;
+  const L around = L(reach + T(reach_slack));
+  for (int i = begin; i < end; i += pack_width<T>) {
+    const Vec3<L> point{load<L>(x + i), load<L>(y + i), load<L>(z + i)};
+    const Mask<L> reaches =
+        f.scaled ? f.template may_reach<true, L>(point, around) : f.template may_reach<false, L>(point, around);
+    unsigned near = bits(reaches && first_lanes<L>(end - i));
+    for (; near != 0; near &= near - 1) visit(i + std::countr_zero(near));
+  }
+}
+
+// The same for all points of a cloud.
+template <class T, class Visit>
+void for_near_points(const PairFrame<T>& f, const PointCloud& cloud, const T& reach, Visit&& visit) {
   if constexpr (std::is_floating_point_v<T>) {
-    using L = Pack<T>;
-    const L around = L(margin + T(reach_slack));
-    for_near_leaves<T>(f, cloud, margin, [&](int begin, int end) {
-      for (int i = begin; i < end; i += pack_width<T>) {
-        const Vec3<L> point{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};
-        const Mask<L> reaches =
-            f.scaled ? f.template may_reach<true, L>(point, around) : f.template may_reach<false, L>(point, around);
-        unsigned near = bits(reaches && first_lanes<L>(end - i));
-        for (; near != 0; near &= near - 1) visit(i + std::countr_zero(near));
-      }
+    const PointCloud::Places& p = cloud.points;
+    for_near_leaves<T>(f, cloud, reach, [&](int begin, int end) {
+      for_reaching<T>(f, p.x.data(), p.y.data(), p.z.data(), begin, end, reach, visit);
     });
   } else {
     double size[3];
-    for_near_points<double>(real_frame(f, size), cloud, real_part(margin), visit);
+    for_near_points<double>(real_frame(f, size), cloud, real_part(reach), visit);
   }
 }
 
@@ -114,39 +122,79 @@ void grow(NearPoints<T>& near, bool elastic) {
   for (auto* values : {&near.anchor_x, &near.anchor_y, &near.anchor_z, &near.remembers}) values->resize(size);
 }
 
-// Finds the points that may touch in one step of Newton's method: once, with a margin for what its iterations move, and
-// `again` only where that did not suffice.
+// Whether a point that is now nearer to the shape than `margin` was found by that search.
 template <class T>
-void find_near_points(const PairFrame<T>& f, const PointCloud& cloud, const TouchRule<T>& rule, bool again,
-                      NearPoints<T>& near) {
-  if (again) {
-    const double turned = real_part((f.rotation - near.rotation).squaredNorm());
-    const double moved = real_part((f.offset - near.offset).squaredNorm());
-    if (std::sqrt(turned) * cloud.extent + std::sqrt(moved) <= near.margin) return;
-    near.margin *= 4;
-  } else {
-    near.margin = cloud.spacing / 16;
+bool covers(const Search<T>& search, const PairFrame<T>& f, const PointCloud& cloud, double margin) {
+  const double turned = real_part((f.rotation - search.rotation).squaredNorm());
+  const double moved = real_part((f.offset - search.offset).squaredNorm());
+  return std::sqrt(turned) * cloud.extent + std::sqrt(moved) + margin <= search.margin;
+}
+
+// Finds the points that next steps look among, and this one, which needs those within `margin`.
+template <class T>
+void find_around(const PairFrame<T>& f, const PointCloud& cloud, const T& reach, double margin, NearPoints<T>& near) {
+  near.wide = {f.rotation, f.offset, std::max(cloud.spacing, margin)};
+  near.around.clear();
+  for_near_points<T>(f, cloud, reach + T(near.wide.margin), [&](int i) { near.around.push_back(i); });
+  const std::size_t size = near.around.size() + PointCloud::padding;
+  for (auto* values : {&near.around_x, &near.around_y, &near.around_z}) values->resize(size);
+  for (std::size_t n = 0; n < near.around.size(); ++n) {
+    const int i = near.around[n];
+    near.around_x[n] = cloud.points.x[i];
+    near.around_y[n] = cloud.points.y[i];
+    near.around_z[n] = cloud.points.z[i];
   }
-  near.rotation = f.rotation;
-  near.offset = f.offset;
+}
+
+// Finds the points that may touch in one step of Newton's method: once, with a margin for what its iterations move, and
+// another time only where that did not suffice. It looks among those that were within a wider margin at an earlier step,
+// as long as nothing has moved farther since: what it finds does not depend on that.
+template <class T>
+void find_near_points(const PairFrame<T>& f, const PointCloud& cloud, const TouchRule<T>& rule, Found found,
+                      NearPoints<T>& near) {
+  const bool few = cloud.size() <= PointCloud::few;  // not worth a search: all of them
+  double margin = cloud.spacing / 16;
+  if (found == Found::now) {
+    if (few || covers(near.search, f, cloud, 0)) return;
+    margin = 4 * near.search.margin;
+  }
+  near.search = {f.rotation, f.offset, margin};
   const bool elastic = rule.law == FrictionLaw::elastic;
   if (near.capacity == 0) grow(near, elastic);
+  const T reach = rule.rolling_radius + T(margin);
   int count = 0;
-  for_near_points<T>(f, cloud, rule.rolling_radius + T(near.margin), [&](int i) {
+  const auto add = [&](int i, const T& x, const T& y, const T& z) {
     if (count == near.capacity) grow(near, elastic);
-    near.index[count++] = i;
-  });
+    near.index[count] = i;
+    near.x[count] = x;
+    near.y[count] = y;
+    near.z[count] = z;
+    ++count;
+  };
+  const PointCloud::Places& points = cloud.points;
+  const auto add_own = [&](int i) { add(i, T(points.x[i]), T(points.y[i]), T(points.z[i])); };
+  if (few) {
+    for (int i = 0; i < cloud.size(); ++i) add_own(i);
+  } else if constexpr (std::is_floating_point_v<T>) {
+    if (found == Found::elsewhere || !covers(near.wide, f, cloud, margin)) {
+      find_around<T>(f, cloud, rule.rolling_radius, margin, near);
+    }
+    const int among = static_cast<int>(near.around.size());
+    for_reaching<T>(f, near.around_x.data(), near.around_y.data(), near.around_z.data(), 0, among, reach,
+                    [&](int n) { add(near.around[n], T(near.around_x[n]), T(near.around_y[n]), T(near.around_z[n])); });
+  } else {
+    for_near_points<T>(f, cloud, reach, add_own);
+  }
   near.count = count;
+  for (; count % pack_width<T> != 0; ++count) {  // what fills the last pack
+    near.x[count] = near.y[count] = near.z[count] = T(0);
+  }
   const int* const index = near.index.data();
   const auto gather = [&](std::vector<T>& to, auto&& number) {
     T* out = to.data();
-    for (int n = 0; n < count; ++n) out[n] = number(index[n]);
-    for (int n = count; n % pack_width<T> != 0; ++n) out[n] = T(0);  // what fills the last pack
+    for (int n = 0; n < near.count; ++n) out[n] = number(index[n]);
+    for (int n = near.count; n < count; ++n) out[n] = T(0);
   };
-  const PointCloud::Places& points = cloud.points;
-  gather(near.x, [&](int i) { return T(points.x[i]); });
-  gather(near.y, [&](int i) { return T(points.y[i]); });
-  gather(near.z, [&](int i) { return T(points.z[i]); });
   gather(near.weight, [&](int i) { return scaled_weight(f, cloud, i); });
   if (!elastic) return;
   // An anchor that is not set may be anything; nothing looks at it.

@@ -13,14 +13,24 @@ enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
 
 // Size of the residual relative to impulses.
 template <class T>
-double relative(const VX<T>& residual, const VX<T>& impulses) {
-  double sum = 0;
-  for (Eigen::Index k = 0; k < residual.size(); ++k) {
-    const double value = real_part(residual[k]) / std::max<double>(real_part(impulses[k]), 1e-30);
-    if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
-    sum += value * value;
+double relative(const VX<T>& residual, const VX<T>& impulses, int n) {
+  double total = 0;
+  if constexpr (std::is_floating_point_v<T>) {
+    using L = Pack<double>;
+    const L least(1e-30);
+    L squares(0.0);
+    for (int k = 0; k < n; k += pack_width<double>) {  // behind the last stand zeros
+      const L impulse = load<L>(&impulses[k]), value = load<L>(&residual[k]) / select(impulse > least, impulse, least);
+      squares += value * value;
+    }
+    total = sum(squares);
+  } else {
+    for (int k = 0; k < n; ++k) {
+      const double value = real_part(residual[k]) / std::max<double>(real_part(impulses[k]), 1e-30);
+      total += value * value;
+    }
   }
-  return std::sqrt(sum);
+  return std::isfinite(total) ? std::sqrt(total) : std::numeric_limits<double>::infinity();
 }
 
 // Whether the residual may be rounding errors alone: those of the impulses, of the momenta before the step (whose moments
@@ -68,35 +78,35 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
   const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
   bool fresh = false;  // w holds the derivatives at v
-  const auto look = [&](bool derivatives, bool again) {
+  const auto look = [&](bool derivatives, Found found) {
     if (derivatives) {
-      evaluate<true, T>(m, params, from, v.data(), again, true, w);
+      evaluate<true, T>(m, params, from, v.data(), found, true, w);
     } else {
-      evaluate<false, T>(m, params, from, v.data(), again, true, w);
+      evaluate<false, T>(m, params, from, v.data(), found, true, w);
     }
     fresh = derivatives;
   };
   const auto measure = [&](bool derivatives) {
-    look(derivatives, true);
-    return relative(w.residual, w.scale);
+    look(derivatives, Found::now);
+    return relative(w.residual, w.scale, m.nv);
   };
-  look(true, false);
+  look(true, from.follows ? Found::earlier : Found::elsewhere);
   w.scale = w.forces;  // what residuals are compared by
-  double size = relative(w.residual, w.scale), best = size, before = size, mark = size;
+  double size = relative(w.residual, w.scale, m.nv), best = size, before = size, mark = size;
   if (!std::isfinite(size)) return Status::not_finite;
   w.best = v;
   bool settled = false;  // no better residual can be had
   bool past = false;     // v lies just past an edge; the search goes on from w.start before it
   bool old = false;      // the last update was made with the derivatives of an earlier one
   for (int k = 0; k <= m.max_iterations; ++k) {
-    const bool converged = settled || relative(w.residual, w.forces) <= (old ? margin : 1.0) * tolerance;
+    const bool converged = settled || relative(w.residual, w.forces, m.nv) <= (old ? margin : 1.0) * tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
     // Where an update made the residual that much smaller, its derivatives do for one more, which costs half as much.
     old = !fresh && !converged && k <= 3 && tolerance > exacting && std::is_same_v<T, double> && size < quick * before;
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
-    solve<T>(w.tangent, m.nv, w.pivots, w.residual, w.direction);
+    solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);
     if (past) {
       w.direction += w.start - v;
     } else {

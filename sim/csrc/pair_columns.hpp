@@ -28,7 +28,7 @@ GELFLOW_INLINE PackedMotion<T> packed_motion(const PairFrame<T>& f, const SixRow
   return {transposed_times(turn, w), transposed_times(turn, v + cross(w, spread<L>(f.origin)))};
 }
 
-template <bool derivatives, class T>
+template <class T>
 void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Workspace<T>& w) {
   using L = Pack<T>;
   PairColumns<T>& c = w.columns;
@@ -45,15 +45,13 @@ void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Worksp
       store(s.angular[a], c.s.row(a) + i);
       store(s.linear[a], c.s.row(3 + a) + i);
     }
-    if constexpr (derivatives) {
-      const PackedMotion<T> before = packed_motion<T>(f, w.twist_before, at);
-      const Vec3<L> angular = spread<L>(V3<T>(top(twist))) - before.angular;
-      const Vec3<L> linear = spread<L>(V3<T>(bottom(twist))) - before.linear;
-      const Vec3<L> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
-      for (int a = 0; a < 3; ++a) {
-        store(turn[a], c.y.row(a) + i);
-        store(shift[a], c.y.row(3 + a) + i);
-      }
+    const PackedMotion<T> before = packed_motion<T>(f, w.twist_before, at);
+    const Vec3<L> angular = spread<L>(V3<T>(top(twist))) - before.angular;
+    const Vec3<L> linear = spread<L>(V3<T>(bottom(twist))) - before.linear;
+    const Vec3<L> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
+    for (int a = 0; a < 3; ++a) {
+      store(turn[a], c.y.row(a) + i);
+      store(shift[a], c.y.row(3 + a) + i);
     }
   }
 }

@@ -47,7 +47,7 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   const StepStart<Taped> from{
       h,          t.q0.data(), t.v0.data(), t.shift.empty() ? nullptr : t.shift.data(), t.anchors.data(),
       s.anchored, t.u.data()};
-  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), false, false, w);
+  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {
@@ -68,9 +68,9 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
   Workspace<Taped> w(m);
   w.update.setZero();
   forward_positions<Taped>(m, t.params.data(), t.q0.data(), w);
-  forward_velocities<Taped>(m, t.params.data(), t.v0.data(), w.update.data(), w);
+  forward_velocities<true, Taped>(m, t.params.data(), t.v0.data(), w.update.data(), w);
   std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
-  read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data());
+  read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (std::size_t i = 0; i < readings.size(); ++i) weigh(weights, readings[i], by_reading[i]);
   t.add_to(by_params, weights);

@@ -131,9 +131,9 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
 
 // Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.forces, the impulses at
 // work there, which Newton's tolerance refers to (they take the mass matrix of the last evaluation with derivatives).
-// `again`: w was last used for the same step.
+// `found`: what w was last used for.
 template <bool derivatives, class T>
-void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, bool again, bool scale,
+void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, Found found, bool scale,
               Workspace<T>& w) {
   const T& h = from.h;
   for (int k = 0; k < m.nv; ++k) {
@@ -144,7 +144,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   integrate<T>(m, from.q0, w.increment, w.q.data());
   w.update = w.trial / h;  // accelerations
   forward_positions<T>(m, params, w.q.data(), w);
-  forward_velocities<T>(m, params, v, w.update.data(), w);
+  forward_velocities<derivatives, T>(m, params, v, w.update.data(), w);
   w.residual.setZero();
   if constexpr (derivatives) {
     w.by_q.setZero();
@@ -156,7 +156,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
     for (int k = 0; k < m.nv; ++k) w.forces[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
   subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.softness, scale, w);
-  subtract_contact_forces<derivatives, T>(m, params, from, again, scale, w);
+  subtract_contact_forces<derivatives, T>(m, params, from, found, scale, w);
   if constexpr (derivatives) {
     w.tangent = h * w.by_q;
     times_position_by_increment<T>(m, w.increment, w.tangent);

@@ -244,8 +244,9 @@ GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* 
     case ShapeKind::capsule:
       return capsule_distance<curved, L>(x, L(size[0]), L(size[1]), out);
     [[unlikely]] default: {
-      Distance<L> found;  // called, they need a place in memory
-      rarer_distance<curved, L, T>(kind, size, grid, x, found);
+      const Vec3<L> at = x;  // called, they need places in memory
+      Distance<L> found;
+      rarer_distance<curved, L, T>(kind, size, grid, at, found);
       out = found;
     }
   }

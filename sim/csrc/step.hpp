@@ -56,6 +56,7 @@ struct StepMemory {
   Workspace<T> work;
   VX<T> q, v, v_new, v_star, shift, history;
   std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
+  bool follows = false;                        // work was last used for this environment
 
   void keep(const Model& m, const StateView<T>& s) {
     q = Eigen::Map<const VX<T>>(s.q, m.nq);
@@ -81,7 +82,8 @@ template <class T>
 StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
                       StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
-  StepStart<T> from{h, s.q, memory.v_star.data(), nullptr, s.anchors, s.anchored, u};
+  StepStart<T> from{h, s.q, memory.v_star.data(), nullptr, s.anchors, s.anchored, u, memory.follows};
+  memory.follows = true;
   if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
   for (int k = 0; k < m.nv; ++k) {
     memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
@@ -130,9 +132,11 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
 // One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a
 // substep of half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length
 // again. Where even the shortest fails, the state is left as it was and the report says why.
+// `follows`: memory was last used for a step of the same environment.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
-                Observer&& accepted = {}, int parts = 1) {
+                bool follows, Observer&& accepted = {}, int parts = 1) {
+  memory.follows = follows;
   StepReport report;
   const double span = m.step / parts;
   const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep

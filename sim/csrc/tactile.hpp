@@ -18,12 +18,35 @@ TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3
   return {params + pad.param, pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot};
 }
 
-// Readings of all markers, shape (markers, 3); needs the kinematics of (q, v) in w.
+// Which readings in an array may be other than zero: all, or those of these markers. Mostly few markers touch, and to
+// clear them all costs more than to read those.
+struct Written {
+  bool all = true;
+  std::vector<int> markers;
+};
+
+// Readings of all markers, shape (markers, 3); needs the kinematics of (q, v) in w. `written`: what is not zero in `out`
+// now, and then; null where nobody keeps account.
 template <class T>
 void read_markers(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                  const Workspace<T>& w, T* out) {
+                  const Workspace<T>& w, T* out, Written* written) {
   using L = Pack<T>;
-  std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
+  if (written == nullptr || written->all) {
+    std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
+  } else {
+    for (const int marker : written->markers) std::fill_n(out + 3 * static_cast<std::size_t>(marker), 3, T(0));
+  }
+  const std::size_t few = static_cast<std::size_t>(m.markers) / 8;
+  if (written != nullptr) {
+    written->all = false;
+    written->markers.clear();
+    written->markers.reserve(few + pack_width<T>);
+  }
+  const auto write_down = [&](const Pad& pad, const Touching<T>& t) GELFLOW_LOOP_BODY {
+    if (written == nullptr || written->all) return;
+    t.for_each_inside([&](int, int i) { written->markers.push_back(pad.first_marker + pad.cloud.original[i]); });
+    written->all = written->markers.size() > few;
+  };
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
@@ -33,14 +56,21 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
       for_touching_points<false, T>(frame, pad.cloud, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
         PointForce<L> force;
         point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
+        write_down(pad, t);
         if (pad.flat) {
           const Vec3<L> felt = transposed_times(axes, force.force);
           T numbers[3][pack_width<T>];
           for (int a = 0; a < 3; ++a) store(a < 2 ? felt[a] : -felt[a], numbers[a]);
-          t.for_each_inside([&](int k, int i) {
-            T* const reading = readings + 3 * static_cast<std::size_t>(pad.cloud.original[i]);
-            for (int a = 0; a < 3; ++a) reading[a] += numbers[a][k];
-          });
+          const int* const original = pad.cloud.original.data() + t.first;
+          const auto write = [&](int k) GELFLOW_LOOP_BODY {
+            T* const reading = readings + 3 * static_cast<std::size_t>(original[k]);
+            for (int a = 0; a < 3; ++a) reading[a] = s == 0 ? numbers[a][k] : T(reading[a] + numbers[a][k]);
+          };
+          if (bits(t.inside) == (1U << pack_width<T>)-1) {
+            for (int k = 0; k < pack_width<T>; ++k) write(k);
+          } else {
+            t.for_each_inside([&](int k, int) GELFLOW_LOOP_BODY { write(k); });
+          }
           return;
         }
         const Vec3<L> in_body = transposed_times(spread<L>(frame.rotation), force.force);
@@ -63,7 +93,7 @@ void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchor
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
-      find_near_points<T>(frame, pad.cloud, rule, false, w.near_markers);
+      find_near_points<T>(frame, pad.cloud, rule, Found::elsewhere, w.near_markers);
       advance_anchors<T>(frame, w.near_markers, rule, pad.cloud.size(), next + slot, next_set + slot);
     }
   }
@@ -104,7 +134,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
         t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(g.anchor, k); });
       });
       const V6<T> by_pose = stack<T>(sum3<T>(turn), sum3<T>(shift)), by_twist = stack<T>(sum3<T>(spin), sum3<T>(slide));
-      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w);
+      pair_columns<T>(pad.pairs[s], pad.mount.body, frame, w);
       pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     }
   }
@@ -122,7 +152,7 @@ void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anc
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
       anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), by_next + slot, by_pose,
                             by_twist, by_anchor + slot);
-      pair_columns<true, T>(pad.pairs[s], pad.mount.body, frame, w);
+      pair_columns<T>(pad.pairs[s], pad.mount.body, frame, w);
       pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     }
   }

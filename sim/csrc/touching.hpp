@@ -63,28 +63,42 @@ void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, con
   using L = Pack<T>;
   constexpr int width = pack_width<T>;
   const bool elastic = rule.law == FrictionLaw::elastic, weighs = frame.scaled && !cloud.areas.empty();
-  Touching<T> t;
-  t.anchor = zero3<L>();
-  t.remembers = first_lanes<L>(0);
-  for_near_leaves<T>(frame, cloud, rule.rolling_radius, [&](int begin, int end) {
+  int begin = 0, end = 0;  // a run of neighbouring leaves
+  const auto look = [&] {
     for (int i = begin; i < end; i += width) {
+      Touching<T> t;
       const int count = std::min(width, end - i);
       const Vec3<L> local{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};
       L weight = select(first_lanes<L>(count), load<L>(&cloud.weights[i]), L(0.0));
-      for (int k = 0; weighs && k < count; ++k) set_lane(weight, k, scaled_weight(frame, cloud, i + k));
+      if (weighs) {
+        T weights[width] = {};
+        for (int k = 0; k < count; ++k) weights[k] = scaled_weight(frame, cloud, i + k);
+        weight = load<L>(weights);
+      }
+      t.anchor = zero3<L>();
+      t.remembers = first_lanes<L>(0);
       if (elastic) {
-        L remembers(0.0);
+        T anchors[3][width] = {}, remembers[width] = {};
         for (int k = 0; k < count; ++k) {
           if (!rule.anchored[i + k]) continue;
-          set_lane3<T>(t.anchor, k, rule.anchors[i + k]);
-          set_lane(remembers, k, T(1));
+          for (int a = 0; a < 3; ++a) anchors[a][k] = rule.anchors[i + k][a];
+          remembers[k] = T(1);
         }
-        t.remembers = remembers > L(0.0);
+        t.anchor = {load<L>(anchors[0]), load<L>(anchors[1]), load<L>(anchors[2])};
+        t.remembers = load<L>(remembers) > L(0.0);
       }
       t.first = i;
       if (touches<curved, T>(frame, rule, local, weight, t)) f(static_cast<const Touching<T>&>(t));
     }
+  };
+  for_near_leaves<T>(frame, cloud, rule.rolling_radius, [&](int from, int to) {
+    if (from != end) {
+      look();
+      begin = from;
+    }
+    end = to;
   });
+  look();
 }
 
 // The same for points that were found near.
@@ -93,10 +107,10 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const NearPoi
                                         F&& f) {
   using L = Pack<T>;
   const bool elastic = rule.law == FrictionLaw::elastic;
-  Touching<T> t;
-  t.anchor = zero3<L>();
-  t.remembers = first_lanes<L>(0);
   for (int i = 0; i < near.count; i += pack_width<T>) {
+    Touching<T> t;
+    t.anchor = zero3<L>();
+    t.remembers = first_lanes<L>(0);
     if (elastic) {
       t.anchor = {load<L>(&near.anchor_x[i]), load<L>(&near.anchor_y[i]), load<L>(&near.anchor_z[i])};
       t.remembers = load<L>(&near.remembers[i]) > L(0.0);

@@ -38,6 +38,18 @@ struct Composite {
   V3<T> momentum;  // linear
 };
 
+// What the near points of a step were found for before: another environment perhaps; an earlier step of the same one; the
+// same step.
+enum class Found : std::uint8_t { elsewhere, earlier, now };
+
+// Where a search for near points was made, and how far around the shape.
+template <class T>
+struct Search {
+  M3<T> rotation;  // first body → shape
+  V3<T> offset;
+  double margin;  // [m]
+};
+
 // The points of one cloud that may touch one shape, side by side (near_points.hpp).
 template <class T>
 struct NearPoints {
@@ -45,9 +57,11 @@ struct NearPoints {
   std::vector<int> index;                                  // in the cloud
   std::vector<T> x, y, z, weight;                          // in the first body's frame
   std::vector<T> anchor_x, anchor_y, anchor_z, remembers;  // in the shape's frame, 1 where there is one; elastic law
-  double margin;                                           // [m]
-  M3<T> rotation;                                          // where the points were found
-  V3<T> offset;
+  Search<T> search;
+  // Those among which the next steps look.
+  std::vector<int> around;
+  std::vector<double> around_x, around_y, around_z;
+  Search<T> wide;
 };
 
 // The dofs of a pair in the shape's frame (pair_columns.hpp).
@@ -69,7 +83,8 @@ struct StepStart {
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
-  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+  bool follows = false;  // the workspace was last used for an earlier step of this environment
+  double softness = 1;   // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
 };
 
 template <class T>
@@ -89,9 +104,9 @@ struct Workspace {
         p(m.nv),
         q_missing(m.nv),
         v_missing(m.nv),
-        residual(m.nv),
-        forces(m.nv),
-        scale(m.nv),
+        residual(stride),
+        forces(stride),
+        scale(stride),
         increment(m.nv),
         update(m.nv),
         trial(m.nv),
@@ -107,6 +122,7 @@ struct Workspace {
         pivots(m.nv),
         columns(m.columns),
         near(m.contacts.size()) {
+    forces.setZero();
     mass.setZero();
     tangent.setZero();
   }
@@ -127,14 +143,14 @@ struct Workspace {
   std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
 
   // The step's residual g and its derivatives.
-  VX<T> residual, forces, scale;
-  VX<T> increment;               // q_t = q_{t-1} ⊕ increment
-  VX<T> update, trial;           // accelerations; v_t − v*
-  VX<T> direction, start, best;  // Newton's
-  Rows mass, by_q, by_v;         // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
-  VX<T> by_u;                    // ∂g_dof/∂u per actuator
-  Rows tangent;                  // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
-  VX<T> q;                       // q_t of the trial velocity
+  VX<T> residual, forces, scale;  // behind the last number as many zeros as rows have (newton.hpp)
+  VX<T> increment;                // q_t = q_{t-1} ⊕ increment
+  VX<T> update, trial;            // accelerations; v_t − v*
+  VX<T> direction, start, best;   // Newton's
+  Rows mass, by_q, by_v;          // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  VX<T> by_u;                     // ∂g_dof/∂u per actuator
+  Rows tangent;                   // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
+  VX<T> q;                        // q_t of the trial velocity
   std::vector<int> pivots;
 
   PairColumns<T> columns;           // of the pair at work
