@@ -96,7 +96,8 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._readings: NDArray[Any] | None = None  # there from the first reading on
-        self._u = np.zeros((num_envs, self.model.nu), self.dtype)  # one control for all is spread out here
+        self._all = (num_envs, self.model.nu)  # controls of all environments
+        self._u = np.zeros(self._all, self.dtype)  # one control for all is spread out here
 
     @cached_property
     def param_index(self) -> dict[str, int]:
@@ -143,11 +144,13 @@ class Simulator:
 
     def _controls(self, u: ArrayLike) -> NDArray[Any]:
         array = np.asarray(u, dtype=self.dtype)
-        full = self._u.shape
-        if array.shape == full:
+        shape = array.shape
+        if shape == self._all:
             return array  # the core copies what is not contiguous
-        if array.shape != full[1:]:
-            raise UsageError(f"u must have shape {full} or ({full[1]},), got {array.shape}")
+        if shape != self._all[1:]:
+            raise UsageError(f"u must have shape {self._all} or ({self._all[1]},), got {shape}")
+        if self.num_envs == 1:
+            return array.reshape(self._all)
         self._u[:] = array
         return self._u
 

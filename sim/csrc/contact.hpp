@@ -27,7 +27,13 @@ TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params,
 // before forces, turns before shifts.
 template <class T>
 struct PairSums {
-  T wrench[6], k[6][6], d[6][6];
+  static constexpr int spread_at = 6, k_at = 15, d_at = 51;
+  T numbers[88];  // W (6), Σ x fᵀ (9), K and D (36 each), and one to make it whole packs
+  const T* wrench() const { return numbers; }
+  T spread(int i, int j) const { return numbers[spread_at + 3 * i + j]; }
+  T& k(int i, int j) { return numbers[k_at + 6 * i + j]; }
+  T k(int i, int j) const { return numbers[k_at + 6 * i + j]; }
+  T d(int i, int j) const { return numbers[d_at + 6 * i + j]; }
 };
 
 // Packs of points whose forces are known and have yet to be summed.
@@ -89,7 +95,7 @@ GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<
   moments(2, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.x * r.y - c.y * r.x; });
 }
 
-// Adds all entries to the sums, or starts these: Σ f (3), Σ x × f (3), and with derivatives Σ x fᵀ (9), K and D (36 each).
+// Adds all entries to the sums, or starts these, which lie as in PairSums; K without what the forces themselves add.
 template <bool first, bool derivatives, class T>
 __attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, Pack<T>* sums) {
   using L = Pack<T>;
@@ -100,17 +106,17 @@ __attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, P
     moment += cross(e.x, e.force);
   }
   for (int i = 0; i < 3; ++i) {
-    put<first>(force[i], sums[i]);
-    put<first>(moment[i], sums[3 + i]);
+    put<first>(moment[i], sums[i]);
+    put<first>(force[i], sums[3 + i]);
   }
   if constexpr (derivatives) {
     Mat3<L> spread = zero33<L>();
     for (int n = 0; n < pending.count; ++n) spread += outer(pending.entry[n].x, pending.entry[n].force);
     for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) put<first>(spread.row[i][j], sums[6 + 3 * i + j]);
+      for (int j = 0; j < 3; ++j) put<first>(spread.row[i][j], sums[PairSums<T>::spread_at + 3 * i + j]);
     }
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + 15);
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + 51);
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + PairSums<T>::k_at);
+    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + PairSums<T>::d_at);
   }
   pending.count = 0;
 }
@@ -119,8 +125,9 @@ __attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, P
 template <bool derivatives, class T>
 bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, PairSums<T>& sums) {
   using L = Pack<T>;
-  constexpr int numbers = derivatives ? 87 : 6;
-  L all[numbers];
+  constexpr int numbers = derivatives ? 87 : 6, packed = derivatives ? 88 : 8;
+  L all[packed];
+  for (int i = numbers; i < packed; ++i) all[i] = L(0.0);
   bool started = false;
   Pending<T> pending;
   const auto add = [&]() GELFLOW_LOOP_BODY {
@@ -145,29 +152,18 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
   });
   if (pending.count > 0) add();
   if (!started) return false;
-  T total[numbers];
-  sum_lanes(all, numbers, total);
-  for (int i = 0; i < 3; ++i) {
-    sums.wrench[i] = total[3 + i];
-    sums.wrench[3 + i] = total[i];
-  }
+  sum_lanes(all, packed, sums.numbers);
   if constexpr (derivatives) {
-    for (int i = 0; i < 6; ++i) {
-      for (int j = 0; j < 6; ++j) {
-        sums.k[i][j] = total[15 + 6 * i + j];
-        sums.d[i][j] = total[51 + 6 * i + j];
-      }
-    }
-    const T* const f = total;
-    const auto x = [&](int i, int j) { return total[6 + 3 * i + j]; };                     // Σ x_i f_j
-    const T lift = rule.rolling_radius, work = x(0, 0) + x(1, 1) + x(2, 2) + lift * f[2];  // Σ f·c
+    const T* const f = sums.wrench() + 3;
+    const T lift = rule.rolling_radius;
+    const T work = sums.spread(0, 0) + sums.spread(1, 1) + sums.spread(2, 2) + lift * f[2];  // Σ f·c
     for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) sums.k[i][j] += x(i, j);
-      sums.k[2][i] += lift * f[i];
-      sums.k[i][i] -= work;
+      for (int j = 0; j < 3; ++j) sums.k(i, j) += sums.spread(i, j);
+      sums.k(2, i) += lift * f[i];
+      sums.k(i, i) -= work;
       const int j = (i + 1) % 3, k = (i + 2) % 3;  // −[f]×
-      sums.k[j][3 + k] += f[i];
-      sums.k[k][3 + j] -= f[i];
+      sums.k(j, 3 + k) += f[i];
+      sums.k(k, 3 + j) -= f[i];
     }
   }
   return true;
@@ -186,17 +182,17 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
       y[a] = load<L>(c.y.row(a) + i);
     }
     for (int a = 0; a < 6; ++a) {
-      L by_q = L(sums.k[a][0]) * s[0] + L(sums.d[a][0]) * y[0], by_v = L(sums.d[a][0]) * s[0];
+      L by_q = L(sums.k(a, 0)) * s[0] + L(sums.d(a, 0)) * y[0], by_v = L(sums.d(a, 0)) * s[0];
       for (int b = 1; b < 6; ++b) {
-        const L d(sums.d[a][b]);
-        by_q += L(sums.k[a][b]) * s[b] + d * y[b];
+        const L d(sums.d(a, b));
+        by_q += L(sums.k(a, b)) * s[b] + d * y[b];
         by_v += d * s[b];
       }
       store(by_q, c.force_q.row(a) + i);
       store(by_v, c.force_v.row(a) + i);
     }
     // S_j ×* W: −(S_j ×* W) where j moves the first body, + where it moves the second; s_j S_j carries the sign.
-    const T* const f = sums.wrench;
+    const T* const f = sums.wrench();
     const Vec3<L> turn{s[0], s[1], s[2]}, shift{s[3], s[4], s[5]}, moment{L(f[0]), L(f[1]), L(f[2])},
         force{L(f[3]), L(f[4]), L(f[5])};
     const Vec3<L> top = cross(turn, moment) + cross(shift, force), bottom = cross(turn, force);
@@ -271,7 +267,7 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
       if (!is_finite(frame.check())) w.residual[0] = frame.check();
       continue;
     }
-    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench), scale, w);
+    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench()), scale, w);
     if constexpr (derivatives) {
       pair_columns<T>(contact.pair, set.mount.body, frame, w);
       subtract_derivatives<T>(from.h, sums, w);
@@ -291,8 +287,8 @@ void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, con
     const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
     PairSums<T> sums;
     find_near_points<T>(frame, set.cloud, rule, Found::elsewhere, w.near[n]);
-    if (!sum_forces<false, T>(frame, w.near[n], rule, sums)) std::fill(sums.wrench, sums.wrench + 6, T(0));
-    const V6<T> in_world = wrench_in_world<T>(frame, sums.wrench);
+    if (!sum_forces<false, T>(frame, w.near[n], rule, sums)) std::fill_n(sums.numbers, 6, T(0));
+    const V6<T> in_world = wrench_in_world<T>(frame, sums.wrench());
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
   }
 }

@@ -133,7 +133,7 @@ bool covers(const Search<T>& search, const PairFrame<T>& f, const PointCloud& cl
 // Finds the points that next steps look among, and this one, which needs those within `margin`.
 template <class T>
 void find_around(const PairFrame<T>& f, const PointCloud& cloud, const T& reach, double margin, NearPoints<T>& near) {
-  near.wide = {f.rotation, f.offset, std::max(cloud.spacing, margin)};
+  near.wide = {f.rotation, f.offset, std::max(cloud.spacing / 2, margin)};
   near.around.clear();
   for_near_points<T>(f, cloud, reach + T(near.wide.margin), [&](int i) { near.around.push_back(i); });
   const std::size_t size = near.around.size() + PointCloud::padding;

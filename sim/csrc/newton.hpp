@@ -39,8 +39,13 @@ template <class T>
 bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
                        const Workspace<T>& w) {
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
-  double reach = 0, mass = 0, speed = 0, spin = 0;
-  for (int k = 0; k < m.nq; ++k) reach = std::max(reach, std::abs(real_part(from.q0[k])));
+  double reach = 0, turn = 1, mass = 0, speed = 0, spin = 0;  // turn: of the largest angle, or of a quaternion
+  for (const V3<T>& position : w.position) {
+    for (int a = 0; a < 3; ++a) reach = std::max(reach, std::abs(real_part(position[a])));
+  }
+  for (const Joint& joint : m.joints) {
+    if (joint.type == JointType::hinge) turn = std::max(turn, std::abs(real_part(from.q0[joint.q])));
+  }
   for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
   for (int k = 0; k < m.nv; ++k) {
     double& fastest = m.angular[k] ? spin : speed;
@@ -50,10 +55,10 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
   for (int i = 0; i < m.nv; ++i) {
     double own = m.angular[i] ? reach * momentum : momentum, stiffness = 0;
     for (int j = 0; j < m.nv; ++j) {
-      stiffness += std::abs(real_part(w.by_q(i, j)));
+      stiffness += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? turn : reach);
       own += std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
     }
-    const double bound = unit * (stiffness * reach + own + real_part(w.forces[i]));
+    const double bound = unit * (stiffness + own + real_part(w.forces[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
   }
   return true;
