@@ -62,6 +62,9 @@ class Simulator:
     `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them. So are
     `anchors` (N, na, 3) and `anchored` (N, na), the memory of the elastic friction law, and `history` (N, nh), that of
     BDF2: last step's displacement (nv), the velocity before it (nv), and 1 where there was one; BDF1 has none, nh = 0.
+
+    In single precision the core keeps what `q` rounds away, so that small steps add up, and sees bodies from each other
+    in double; gradients are computed in double, at the states of the trajectory.
     """
 
     def __init__(
@@ -178,8 +181,8 @@ class Simulator:
     def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Marker readings now, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
 
-        Without `out` the array is the simulator's own: read-only, and overwritten by the next call. That is faster where
-        few markers touch, since only those are written that change.
+        Without `out` the array is the simulator's own: read-only, and overwritten by the next call. Only what changes
+        is written there, which is faster where few markers touch.
         """
         if out is not None:
             self._batch.tactile(out)

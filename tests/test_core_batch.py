@@ -268,6 +268,45 @@ def test_single_precision_follows_double_in_a_grasp(insertion: Scene) -> None:
     np.testing.assert_allclose(single.tactile(), reading, atol=5e-3 * np.abs(reading).max())
 
 
+def test_small_steps_add_up_in_single_precision() -> None:
+    """A step moves the body by 1e-9 m, a sixtieth of what single precision resolves at half a metre."""
+    spec = _core.ModelSpec()
+    spec.gravity, spec.step = (0.0, 0.0, 0.0), 1e-6
+    body = spec.add_body("body", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+    spec.add_joint("body", body, "free", (0, 0, 0), (0, 0, 1))
+    model = _core.Model(spec)
+    stepped, rolled = Simulator(model, precision="single"), Simulator(model, precision="single")
+    for sim in (stepped, rolled):
+        sim.q[0, 0], sim.v[0, 0], sim.v[0, 5] = 0.5, 1e-3, 1e-3
+    none = np.zeros((1000, 1, 0))
+    stepped.step(none[0], 1000)
+    end = rolled.rollout(none).q[-1, 0]
+    for q in (stepped.q[0], end):
+        assert q[0] - np.float32(0.5) == pytest.approx(1e-6, rel=0.1)
+        assert q[6] == pytest.approx(0.5e-6, rel=1e-3)
+    stepped.q[0, 0] = 1e-7  # what half a metre lacked is none of its
+    stepped.step(none[0])
+    assert stepped.q[0, 0] == pytest.approx(1.01e-7, rel=1e-5)
+
+
+@pytest.mark.parametrize("friction", ["viscous", "elastic"])
+@pytest.mark.parametrize("name", SCENES)
+def test_gradients_of_single_precision_are_those_of_double(name: str, friction: str) -> None:
+    scene = load_scene(name, friction=friction)
+    moves = motion(scene)
+    u = moves.steps(scene.step)[:40, None]
+    found = []
+    for precision in ("double", "single"):
+        sim = Simulator(scene, precision=precision)
+        sim.q[:] = moves.q0
+        run = sim.rollout(u, read_after=(20, 40))
+        weights = np.random.default_rng(0).normal(size=run.tactile.shape)
+        back = sim.rollout_gradient(run, v=np.ones(()), tactile=weights, params=True)
+        found.append((back.u, back.q, back.v, back.params))
+    for exact, single in zip(*found, strict=True):
+        assert np.linalg.norm(single - exact) <= 1e-3 * np.linalg.norm(exact)
+
+
 BUILDS = """
 import sys
 import numpy as np
@@ -334,7 +373,7 @@ def test_own_readings_are_those_of_a_fresh_array(side: int) -> None:
     moves = motion(scene)
     sim = Simulator(scene, num_envs=2, threads=1)
     sim.q[:] = moves.q0
-    counts = set()
+    counts: set[int] = set()
     for block in np.array_split(moves.steps(scene.step), 40):
         for u in block:
             sim.step(u)

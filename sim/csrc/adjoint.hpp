@@ -36,7 +36,7 @@ struct Record {
     if (second) shift = Eigen::Map<const VX<T>>(from.shift, m.nv);
   }
   StepStart<T> start(const T* u) const {
-    return {h, q0.data(), v_star.data(), second ? shift.data() : nullptr, anchors.data(), anchored.data(), u};
+    return {h, q0.data(), v_star.data(), nullptr, second ? shift.data() : nullptr, anchors.data(), anchored.data(), u};
   }
   T h;
   bool second;  // a step of BDF2
@@ -108,7 +108,7 @@ template <class T>
 void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, const T* by_reading,
                         StateGradient<T>& g, Workspace<T>& w) {
   w.update.setZero();
-  forward_positions<T>(m, params, s.q, w);
+  place_bodies<T>(m, params, s.q, s.low, w);
   forward_velocities<true, T>(m, params, s.v, w.update.data(), w);
   read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
 }

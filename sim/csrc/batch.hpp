@@ -10,8 +10,7 @@
 #include <mutex>
 #include <thread>
 
-#include "adjoint.hpp"
-#include "param_gradient.hpp"
+#include "rollout.hpp"
 
 namespace gelflow {
 
@@ -40,30 +39,6 @@ class ThreadPool {
   std::atomic<std::uint64_t> round_{0};
   std::atomic<bool> stop_{false};
   int asleep_ = 0;  // threads that wait for `start_`
-};
-
-// Trajectories of a rollout: arrays of the caller, time first, then environment.
-template <class T>
-struct Rollout {
-  int steps, reads;
-  const T* u;              // (steps, N, nu)
-  T *q, *v, *anchors;      // (steps + 1, N, ·); the first entry is the start
-  T* history;              // (steps + 1, N, nh)
-  std::uint8_t* anchored;  // (steps + 1, N, na)
-  std::int8_t* halvings;   // (steps, N)
-  std::int32_t* status;    // (N): 0, or why the environment stopped
-  const int* read_after;   // (reads): markers are read after that many steps, increasing
-  T* tactile;              // (reads, N, markers, 3)
-};
-template <class T>
-struct RolloutGradient {
-  const T *q, *v;             // in: of the trajectory, shaped as there
-  const T* anchors_end;       // in: (N, na, 3), of the anchors at the end
-  const T* history_end;       // in: (N, nh)
-  const T* tactile;           // in: (reads, N, markers, 3)
-  T *u, *q0, *v0, *anchors0;  // out
-  T* history0;                // out, (N, nh)
-  double* params;             // out, (N, params); null: not asked for
 };
 
 template <class T>
@@ -108,9 +83,10 @@ class Batch {
   void read(T* out, Written* written);
   void check_state() const;
   void check_controls(const T* u, int rows) const;
-  void transpose_one(int env, const Rollout<T>& r, const RolloutGradient<T>& g, StepMemory<T>& memory);
-  std::vector<StepMemory<T>> memory_;  // one per thread
-  std::vector<Written> written_;       // per environment, of `readings`
+  std::vector<StepMemory<T>> memory_;     // one per thread
+  std::vector<T> low_;                    // (N, nq) in single precision: what q lacks (StateView)
+  std::unique_ptr<Batch<double>> exact_;  // in single precision: for gradients
+  std::vector<Written> written_;          // per environment, of `readings`
   ThreadPool pool_;
 };
 

@@ -22,6 +22,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
       iterations(n),
       halved(n),
       pool_(threads) {
+  if (!std::is_same_v<T, Place<T>>) low_.resize(q.size());
   for (int i = 0; i < pool_.size(); ++i) memory_.emplace_back(*model);
   for (int e = 0; e < n; ++e) {
     std::copy(model->param_defaults.begin(), model->param_defaults.end(),
@@ -33,8 +34,9 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
 template <class T>
 StateView<T> Batch<T>::state(int env) {
   const auto e = static_cast<std::size_t>(env);
-  return {q.data() + e * model->nq, v.data() + e * model->nv, anchors.data() + e * model->na,
-          anchored.data() + e * model->na, history.data() + e * model->nh};
+  return {q.data() + e * model->nq,       v.data() + e * model->nv,
+          anchors.data() + e * model->na, anchored.data() + e * model->na,
+          history.data() + e * model->nh, low_.empty() ? nullptr : low_.data() + e * model->nq};
 }
 
 template <class T>
@@ -43,6 +45,7 @@ void Batch<T>::reset(const std::uint8_t* which) {
     if (which && !which[e]) continue;
     const StateView<T> s = state(e);
     std::copy(model->q0.begin(), model->q0.end(), s.q);
+    if (s.low != nullptr) std::fill_n(s.low, model->nq, T(0));
     std::fill(s.v, s.v + model->nv, T(0));
     std::fill(s.anchored, s.anchored + model->na, 0);
     std::fill(s.anchors, s.anchors + model->na, V3<T>::Zero());
@@ -131,7 +134,7 @@ template <class T>
 void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
   w.update.setZero();
-  forward_positions<T>(*model, params_of(env), s.q, w);
+  place_bodies<T>(*model, params_of(env), s.q, s.low, w);
   forward_velocities<true, T>(*model, params_of(env), s.v, w.update.data(), w);
 }
 
@@ -155,7 +158,7 @@ void Batch<T>::read(T* out, Written* written) {
     const StateView<T> s = state(e);
     Workspace<T>& w = memory_[thread].work;
     w.update.setZero();
-    forward_positions<T>(*model, params_of(e), s.q, w);
+    place_bodies<T>(*model, params_of(e), s.q, s.low, w);
     forward_velocities<false, T>(*model, params_of(e), s.v, w.update.data(), w);
     read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
                     out + static_cast<std::size_t>(e) * model->markers * 3, written == nullptr ? nullptr : written + e);
@@ -177,7 +180,7 @@ void Batch<T>::contact_forces(T* out) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();
-    const StepStart<T> from{T(1), nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
+    const StepStart<T> from{T(1), nullptr, nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
     subtract_contact_forces<false, T>(*model, params_of(e), from, Found::elsewhere, false, w);
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
@@ -189,12 +192,12 @@ void Batch<T>::poses(T* out) {
   for (int e = 0; e < n; ++e) {
     kinematics(e, w);
     for (std::size_t b = 0; b < model->bodies.size(); ++b, out += 7) {
-      const Eigen::Quaternion<T> turn(w.rotation[b]);
-      for (int i = 0; i < 3; ++i) out[i] = w.position[b][i];
-      out[3] = turn.w();
-      out[4] = turn.x();
-      out[5] = turn.y();
-      out[6] = turn.z();
+      const Eigen::Quaternion<Place<T>> turn(w.rotation[b]);
+      for (int i = 0; i < 3; ++i) out[i] = T(w.position[b][i]);
+      out[3] = T(turn.w());
+      out[4] = T(turn.x());
+      out[5] = T(turn.y());
+      out[6] = T(turn.z());
     }
   }
 }
@@ -237,16 +240,17 @@ void Batch<T>::rollout(const Rollout<T>& r) {
     StepMemory<T>& memory = memory_[thread];
     r.status[e] = 0;
     int read = 0;
+    VX<T> low = VX<T>::Zero(std::is_same_v<T, Place<T>> ? 0 : m.nq);  // goes along with the last state
     const auto at = [&](int t) {
       const std::size_t row = t * N + e;
-      return StateView<T>{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-                          r.anchored + row * na, r.history + row * m.nh};
+      return StateView<T>{r.q + row * m.nq,      r.v + row * m.nv,       reinterpret_cast<V3<T>*>(r.anchors) + row * na,
+                          r.anchored + row * na, r.history + row * m.nh, low.size() == 0 ? nullptr : low.data()};
     };
     for (int t = 0;; ++t) {
       const StateView<T> now = at(t);
       for (; read < r.reads && r.read_after[read] == t; ++read) {
         memory.work.update.setZero();
-        forward_positions<T>(m, params_of(env), now.q, memory.work);
+        place_bodies<T>(m, params_of(env), now.q, now.low, memory.work);
         forward_velocities<false, T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
         read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
                         r.tactile + (read * N + e) * m.markers * 3, nullptr);
@@ -287,127 +291,45 @@ void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
   });
 }
 
-// What the gradients by parameters are asked with: everything in double precision.
-template <class From>
-std::vector<double> in_double(const From* values, std::size_t count) {
-  return {values, values + count};
-}
-template <class T>
-std::vector<V3<double>> in_double(const V3<T>* values, std::size_t count) {
-  std::vector<V3<double>> result;
-  for (std::size_t i = 0; i < count; ++i) result.push_back(values[i].template cast<double>());
-  return result;
-}
-template <class T>
-struct StepInDouble {
-  StepInDouble(const Model& m, const T* numbers, const T* control, const Record<T>& r, const VX<T>& multipliers,
-               const StateGradient<T>& g)
-      : params(in_double(numbers, m.param_names.size())),
-        u(in_double(control, m.actuators.size())),
-        q0(in_double(r.q0.data(), m.nq)),
-        v0(in_double(r.v_star.data(), m.nv)),
-        shift(in_double(r.shift.data(), r.shift.size())),
-        v1(in_double(r.v1.data(), m.nv)),
-        c(in_double(multipliers.data(), m.nv)),
-        anchors(in_double(r.anchors.data(), m.na)),
-        by_next(in_double(g.anchors.data(), m.na)),
-        h(real_part(r.h)),
-        anchored(r.anchored.data()) {}
-  ParamState state() const {
-    return {h,         q0.data(), v0.data(),      shift.empty() ? nullptr : shift.data(),
-            v1.data(), u.data(),  anchors.data(), anchored};
-  }
-  std::vector<double> params, u, q0, v0, shift, v1, c;
-  std::vector<V3<double>> anchors, by_next;
-  double h;
-  const std::uint8_t* anchored;
-};
-template <class T>
-struct ReadingInDouble {
-  ReadingInDouble(const Model& m, const T* numbers, const StateView<T>& s, const T* by_reading)
-      : params(in_double(numbers, m.param_names.size())),
-        q(in_double(s.q, m.nq)),
-        v(in_double(s.v, m.nv)),
-        by(in_double(by_reading, static_cast<std::size_t>(m.markers) * 3)),
-        anchors(in_double(s.anchors, m.na)),
-        anchored(s.anchored) {}
-  ParamState state(const Model& m) const {
-    return {m.step, q.data(), v.data(), nullptr, nullptr, nullptr, anchors.data(), anchored};
-  }
-  std::vector<double> params, q, v, by;
-  std::vector<V3<double>> anchors;
-  const std::uint8_t* anchored;
-};
-
-template <class T>
-void Batch<T>::transpose_one(int env, const Rollout<T>& r, const RolloutGradient<T>& g, StepMemory<T>& memory) {
-  const Model& m = *model;
-  const std::size_t nu = m.actuators.size(), na = m.na, N = n, e = env;
-  const T* params = params_of(env);
-  StateGradient<T> gradient(m);
-  std::copy_n(reinterpret_cast<const V3<T>*>(g.anchors_end) + e * na, na, gradient.anchors.begin());
-  std::copy_n(g.history_end + e * m.nh, m.nh, gradient.history.data());
-  std::vector<Record<T>> records;
-  int read = r.reads - 1;
-  for (int t = r.steps; t >= 0; --t) {
-    const std::size_t row = t * N + e;
-    const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-                           r.anchored + row * na, r.history + row * m.nh};
-    gradient.q += to_tangent<T>(m, now.q, g.q + row * m.nq);
-    gradient.v += Eigen::Map<const VX<T>>(g.v + row * m.nv, m.nv);
-    for (; read >= 0 && r.read_after[read] == t; --read) {
-      const T* by_reading = g.tactile + (read * N + e) * m.markers * 3;
-      tactile_transposed<T>(m, params, now, by_reading, gradient, memory.work);
-      if (g.params) {
-        const ReadingInDouble<T> exact(m, params, now, by_reading);
-        add_reading_param_gradient(m, exact.params.data(), exact.state(m), exact.by.data(),
-                                   g.params + e * m.param_names.size());
-      }
-    }
-    if (t == 0) break;
-    // The step is taken again from where it started, so that each substep's start and anchors are at hand.
-    const std::size_t before = (t - 1) * N + e;
-    const StateView<T> old{r.q + before * m.nq, r.v + before * m.nv, reinterpret_cast<V3<T>*>(r.anchors) + before * na,
-                           r.anchored + before * na, r.history + before * m.nh};
-    const T* u = r.u + before * nu;
-    records.clear();
-    if (r.halvings[before] == 0) {
-      const StepStart<T> from = start_of<T>(m, T(m.step), true, old, u, memory);
-      records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
-    } else {
-      StateCopy<T> scratch(m, old);
-      gelflow::step<T>(m, params, u, m.polish, scratch.view(), memory, false,
-                       [&](const StepStart<T>& from, const StepMemory<T>& taken) {
-                         records.emplace_back(m, from, taken.v_new, false);
-                       });
-    }
-    for (auto it = records.rbegin(); it != records.rend(); ++it) {
-      substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {
-        if (!g.params) return;
-        const StepInDouble<T> exact(m, params, u, *it, c, gradient);
-        add_step_param_gradient(m, exact.params.data(), exact.state(), exact.c.data(), exact.by_next.data(),
-                                g.params + e * m.param_names.size());
-      });
-    }
-  }
-  add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, g.q0 + e * m.nq);
-  std::copy_n(gradient.v.data(), m.nv, g.v0 + e * m.nv);
-  std::copy_n(gradient.anchors.data(), na, reinterpret_cast<V3<T>*>(g.anchors0) + e * na);
-  std::copy_n(gradient.history.data(), m.nh, g.history0 + e * m.nh);
-}
-
 template <class T>
 void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g) {
   const std::size_t N = n;
-  std::fill_n(g.u, static_cast<std::size_t>(r.steps) * N * model->actuators.size(), T(0));
-  std::fill_n(g.q0, N * model->nq, T(0));
-  std::fill_n(g.v0, N * model->nv, T(0));
-  std::fill_n(g.anchors0, N * model->na * 3, T(0));
-  std::fill_n(g.history0, N * model->nh, T(0));
-  if (g.params) std::fill_n(g.params, N * model->param_names.size(), 0.0);
-  pool_.run(n, [&](int e, int thread) {
-    if (r.status[e] == 0) transpose_one(e, r, g, memory_[thread]);  // a failed environment has gradient zero
-  });
+  if constexpr (std::is_same_v<T, double>) {
+    std::fill_n(g.u, static_cast<std::size_t>(r.steps) * N * model->actuators.size(), 0.0);
+    std::fill_n(g.q0, N * model->nq, 0.0);
+    std::fill_n(g.v0, N * model->nv, 0.0);
+    std::fill_n(g.anchors0, N * model->na * 3, 0.0);
+    std::fill_n(g.history0, N * model->nh, 0.0);
+    if (g.params) std::fill_n(g.params, N * model->param_names.size(), 0.0);
+    pool_.run(n, [&](int e, int thread) {  // a failed environment has gradient zero
+      if (r.status[e] == 0) transpose_one<T>(*model, params_of(e), e, N, r, g, memory_[thread]);
+    });
+  } else {
+    // In double precision, at the states that were reached in single: rounding errors would add up on the way back.
+    if (!exact_) exact_ = std::make_unique<Batch<double>>(model, n, threads());
+    std::copy(params.begin(), params.end(), exact_->params.begin());
+    const std::size_t rows = static_cast<std::size_t>(r.steps + 1) * N, nu = model->actuators.size();
+    const std::size_t numbers = static_cast<std::size_t>(r.reads) * N * model->markers * 3;
+    const auto exact = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
+    const auto u = exact(r.u, (rows - N) * nu);
+    auto q = exact(r.q, rows * model->nq), v = exact(r.v, rows * model->nv);
+    auto anchors = exact(r.anchors, rows * model->na * 3), history = exact(r.history, rows * model->nh);
+    const auto by_q = exact(g.q, rows * model->nq), by_v = exact(g.v, rows * model->nv);
+    const auto by_anchors = exact(g.anchors_end, N * model->na * 3);
+    const auto by_history = exact(g.history_end, N * model->nh), by_tactile = exact(g.tactile, numbers);
+    std::vector<double> by_u(u.size()), by_q0(N * model->nq), by_v0(N * model->nv), by_anchors0(by_anchors.size());
+    std::vector<double> by_history0(by_history.size());
+    exact_->rollout_transposed(
+        {r.steps, r.reads, u.data(), q.data(), v.data(), anchors.data(), history.data(), r.anchored, r.halvings,
+         r.status, r.read_after, nullptr},
+        {by_q.data(), by_v.data(), by_anchors.data(), by_history.data(), by_tactile.data(), by_u.data(), by_q0.data(),
+         by_v0.data(), by_anchors0.data(), by_history0.data(), g.params});
+    std::copy(by_u.begin(), by_u.end(), g.u);
+    std::copy(by_q0.begin(), by_q0.end(), g.q0);
+    std::copy(by_v0.begin(), by_v0.end(), g.v0);
+    std::copy(by_anchors0.begin(), by_anchors0.end(), g.anchors0);
+    std::copy(by_history0.begin(), by_history0.end(), g.history0);
+  }
 }
 
 }  // namespace gelflow

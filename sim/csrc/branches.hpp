@@ -34,7 +34,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
                                const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
   Signature hash;
   w.update.setZero();
-  forward_positions<T>(m, params, q, w);
+  place_bodies<T>(m, params, q, nullptr, w);
   forward_velocities<true, T>(m, params, v, w.update.data(), w);
   int pair = 0;
   const auto visit = [&](const Touching<T>& t) {

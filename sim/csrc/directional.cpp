@@ -37,7 +37,7 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   }
   std::vector<Dual> tactile(static_cast<std::size_t>(m.markers) * 3);
   memory.work.update.setZero();
-  forward_positions<Dual>(m, params.data(), q.data(), memory.work);
+  place_bodies<Dual>(m, params.data(), q.data(), nullptr, memory.work);
   forward_velocities<true, Dual>(m, params.data(), v.data(), memory.work.update.data(), memory.work);
   read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data(), nullptr);
 

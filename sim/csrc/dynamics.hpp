@@ -82,7 +82,7 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
   const int k = m.joints[body.joint_begin].v;
   const T* n = params + body.mass;
   const T mass = n[0];
-  const M3<T>& r = w.rotation[&body - m.bodies.data()];
+  const M3<T>& r = as<T>(w.rotation[&body - m.bodies.data()]);
   const V3<T> c = vec3(n + 1), spin = vec3(v + k + 3), spin_rate = vec3(w.update.data() + k + 3);
   const V3<T> a = vec3(w.update.data() + k) - vec3(params + m.gravity);
   M3<T> inertia;
@@ -131,7 +131,7 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
       add_floating_body<derivatives, T>(m, m.bodies[i], params, h, v, w);
       continue;
     }
-    w.force[i] = body_force<derivatives, T>(m.bodies[i], params, w.rotation[i], w.position[i], w.twist[i],
+    w.force[i] = body_force<derivatives, T>(m.bodies[i], params, as<T>(w.rotation[i]), as<T>(w.position[i]), w.twist[i],
                                             w.acceleration[i], w.composite[i]);
   }
   for (int i = bodies - 1; i >= 0; --i) {

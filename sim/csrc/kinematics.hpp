@@ -22,57 +22,77 @@ V4<T> vec4(const T* p) {
   return {p[0], p[1], p[2], p[3]};
 }
 
+// A position and what it lacks. That is ignored where it is no rounding error of this position: another was written
+// since.
 template <class T>
-void forward_positions(const Model& m, const T* params, const T* q, Workspace<T>& w) {
+Place<T> whole(const T* q, const T* low, int i) {
+  if (low == nullptr) return Place<T>(q[i]);
+  const Place<T> sum = Place<T>(q[i]) + Place<T>(low[i]);
+  return T(sum) == q[i] ? sum : Place<T>(q[i]);
+}
+
+template <class T>
+void forward_positions(const Model& m, const T* params, const Place<T>* q, Workspace<T>& w) {
+  using P = Place<T>;
+  const auto set_axis = [&](int k, const V3<P>& moment, const V3<P>& direction) {
+    w.axis.set(k, as<T>(stack<P>(moment, direction)));
+  };
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const bool root = body.parent == world;
-    M3<T> r = body.rotation.template cast<T>();
-    V3<T> p = vec3(params + body.pos);
+    M3<P> r = body.rotation.template cast<P>();
+    V3<P> p = as<P>(vec3(params + body.pos));
     if (!root) {
       p = (w.position[body.parent] + w.rotation[body.parent] * p).eval();
       r = (w.rotation[body.parent] * r).eval();
     }
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       const Joint& joint = m.joints[j];
-      const T* value = q + joint.q;
+      const P* value = q + joint.q;
       if (joint.type == JointType::free) {
         p = vec3(value);
-        r = rotation_of<T>(V4<T>(value[3], value[4], value[5], value[6]));
+        r = rotation_of<P>(V4<P>(value[3], value[4], value[5], value[6]));
         for (int a = 0; a < 3; ++a) {
-          w.axis.set(joint.v + a, stack<T>(V3<T>::Zero(), V3<T>::Unit(a)));
-          const V3<T> turn = r.col(a);
-          w.axis.set(joint.v + 3 + a, stack<T>(turn, cross<T>(p, turn)));
+          set_axis(joint.v + a, V3<P>::Zero(), V3<P>::Unit(a));
+          const V3<P> turn = r.col(a);
+          set_axis(joint.v + 3 + a, turn, cross<P>(p, turn));
         }
         continue;
       }
       if (joint.type == JointType::ball) {
-        const V3<T> offset = joint.pos.template cast<T>();
-        const V3<T> anchor = p + r * offset;
-        r = (r * rotation_of<T>(V4<T>(value[0], value[1], value[2], value[3]))).eval();
+        const V3<P> offset = joint.pos.template cast<P>();
+        const V3<P> anchor = p + r * offset;
+        r = (r * rotation_of<P>(V4<P>(value[0], value[1], value[2], value[3]))).eval();
         p = anchor - r * offset;
         for (int a = 0; a < 3; ++a) {
-          const V3<T> turn = r.col(a);
-          w.axis.set(joint.v + a, stack<T>(turn, cross<T>(anchor, turn)));
+          const V3<P> turn = r.col(a);
+          set_axis(joint.v + a, turn, cross<P>(anchor, turn));
         }
         continue;
       }
-      const V3<T> local = joint.axis.template cast<T>();
-      const V3<T> direction = r * local;
+      const V3<P> local = joint.axis.template cast<P>();
+      const V3<P> direction = r * local;
       if (joint.type == JointType::slide) {
-        w.axis.set(joint.v, stack<T>(V3<T>::Zero(), direction));
-        p += direction * (value[0] - T(joint.ref));
+        set_axis(joint.v, V3<P>::Zero(), direction);
+        p += direction * (value[0] - P(joint.ref));
       } else {
-        const V3<T> offset = joint.pos.template cast<T>();
-        const V3<T> anchor = p + r * offset;
-        w.axis.set(joint.v, stack<T>(direction, cross<T>(anchor, direction)));
-        r = (r * axis_rotation<T>(local, value[0] - T(joint.ref))).eval();
+        const V3<P> offset = joint.pos.template cast<P>();
+        const V3<P> anchor = p + r * offset;
+        set_axis(joint.v, direction, cross<P>(anchor, direction));
+        r = (r * axis_rotation<P>(local, value[0] - P(joint.ref))).eval();
         p = anchor - r * offset;
       }
     }
     w.rotation[i] = r;
     w.position[i] = p;
   }
+}
+
+// The bodies where the positions q place them; `low`: what they lack, or null.
+template <class T>
+void place_bodies(const Model& m, const T* params, const T* q, const T* low, Workspace<T>& w) {
+  for (int i = 0; i < m.nq; ++i) w.q[i] = whole(q, low, i);
+  forward_positions<T>(m, params, w.q.data(), w);
 }
 
 // Twists V and accelerations A of every body; gravity enters as an acceleration of the world. `around`: also what is
@@ -85,8 +105,8 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
     const Body& body = m.bodies[i];
     if (body.floats) {
       const int k = m.joints[body.joint_begin].v;
-      const V3<T> slide = vec3(v + k), turn = w.rotation[i] * vec3(v + k + 3);
-      w.twist[i] = stack<T>(turn, slide + cross<T>(w.position[i], turn));
+      const V3<T> slide = vec3(v + k), turn = as<T>(w.rotation[i]) * vec3(v + k + 3);
+      w.twist[i] = stack<T>(turn, slide + cross<T>(as<T>(w.position[i]), turn));
       if constexpr (around) {
         const V6<T> before = stack<T>(V3<T>::Zero(), slide);
         for (int g = k + 3; g < k + 6; ++g) w.twist_before.set(g, before);
@@ -131,17 +151,20 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
   }
 }
 
-// q_t = q_{t-1} ⊕ increment.
+// q_t = q_{t-1} ⊕ increment; `low`: what q_{t-1} lacks, or null.
 template <class T>
-void integrate(const Model& m, const T* q0, const VX<T>& increment, T* q1) {
+void integrate(const Model& m, const T* q0, const T* low, const VX<T>& increment, Place<T>* q1) {
+  using P = Place<T>;
   for (const Joint& joint : m.joints) {
-    for (int a = 0; a < joint.plain(); ++a) q1[joint.q + a] = q0[joint.q + a] + increment[joint.v + a];
+    for (int i = joint.q, k = joint.v; i < joint.turn_q(); ++i, ++k) q1[i] = whole(q0, low, i) + P(increment[k]);
     if (!joint.turns()) continue;
-    V4<T> turned =
-        quaternion_product<T>(vec4(q0 + joint.turn_q()), quaternion_exp<T>(vec3(increment.data() + joint.turn_v())));
+    const int i = joint.turn_q();
+    const V4<P> before(whole(q0, low, i), whole(q0, low, i + 1), whole(q0, low, i + 2), whole(q0, low, i + 3));
+    const V3<T> turn = vec3(increment.data() + joint.turn_v());
+    V4<P> turned = quaternion_product<P>(before, quaternion_exp<P>(as<P>(turn)));
     using std::sqrt;
     turned /= sqrt(turned.squaredNorm());
-    for (int a = 0; a < 4; ++a) q1[joint.turn_q() + a] = turned[a];
+    for (int a = 0; a < 4; ++a) q1[i + a] = turned[a];
   }
 }
 

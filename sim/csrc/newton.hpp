@@ -40,7 +40,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
                        const Workspace<T>& w) {
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
   double reach = 0, turn = 1, mass = 0, speed = 0, spin = 0;  // turn: of the largest angle, or of a quaternion
-  for (const V3<T>& position : w.position) {
+  for (const V3<Place<T>>& position : w.position) {
     for (int a = 0; a < 3; ++a) reach = std::max(reach, std::abs(real_part(position[a])));
   }
   for (const Joint& joint : m.joints) {
@@ -80,7 +80,8 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
               Workspace<T>& w) {
   constexpr int full_steps = 6, patience = 6;
   constexpr double quick = 0.03, margin = 0.1, exacting = 1e-9;
-  const double own = std::max(m.tolerance, 1000 * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+  constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
+  const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
   bool fresh = false;  // w holds the derivatives at v
   const auto look = [&](bool derivatives, Found found) {

@@ -67,52 +67,58 @@ M3<T> turn_of(const T* turn) {
 //     x' = p' + R exp(φ) S Rᵀ (x − p) = A x + b,    A − 1 = R (exp(φ) S − 1) Rᵀ,    b = (p' − p) − (A − 1) p
 // (written so that nothing is rounded where nothing moves): the body's pose ∘ (A, b) takes the body's place.
 template <class T>
-__attribute__((noinline)) void move_mount(const T* place, const Mount& mount, M3<T>& rotation, V3<T>& position,
-                                          PairFrame<T>& f) {
-  const M3<T> r = mount.rotation.template cast<T>();
-  const V3<T> p = mount.pos.template cast<T>();
-  M3<T> change = turn_of<T>(place + 3);
+__attribute__((noinline)) void move_mount(const T* place, const Mount& mount, M3<Place<T>>& rotation,
+                                          V3<Place<T>>& position, PairFrame<T>& f) {
+  using P = Place<T>;
+  const M3<P> r = mount.rotation.template cast<P>();
+  const V3<P> p = mount.pos.template cast<P>();
+  M3<P> change = as<P>(turn_of<T>(place + 3));
   if (mount.scales) {
     const T* s = place + 6;
-    for (int a = 0; a < 3; ++a) change.col(a) *= s[a];
+    for (int a = 0; a < 3; ++a) change.col(a) *= P(s[a]);
     f.scaled = !std::is_floating_point_v<T> || differs<T>(s, V3<double>::Ones());
     f.stretch = std::max({s[0], s[1], s[2]});
     f.enlarged = V3<T>(s[1] * s[2] - T(1), s[2] * s[0] - T(1), s[0] * s[1] - T(1));
   }
-  change -= M3<T>::Identity();
+  change -= M3<P>::Identity();
   change = (r * change * r.transpose()).eval();
-  position += rotation * V3<T>(vec3(place) - p - change * p);
+  position += rotation * V3<P>(as<P>(vec3(place)) - p - change * p);
   rotation += (rotation * change).eval();
 }
 
 template <class T>
 PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape, const Workspace<T>& w) {
+  using P = Place<T>;
   PairFrame<T> f;
   const int first = mount.body;
   f.kind = shape.kind;
   f.size = params + shape.size;
   f.grid = shape.grid.get();
-  f.to_world = shape.rotation.template cast<T>();
+  M3<P> to_world = shape.rotation.template cast<P>();
   if (differs<T>(params + shape.place + 3, V3<double>::Zero())) {
-    f.to_world = (f.to_world * turn_of<T>(params + shape.place + 3)).eval();
+    to_world = (to_world * as<P>(turn_of<T>(params + shape.place + 3))).eval();
   }
-  f.origin = vec3(params + shape.place);
+  V3<P> origin = as<P>(vec3(params + shape.place));
   V6<T> twist = first == world ? V6<T>(V6<T>::Zero()) : w.twist[first];
   if (shape.body != world) {
-    f.origin = (w.position[shape.body] + w.rotation[shape.body] * f.origin).eval();
-    f.to_world = (w.rotation[shape.body] * f.to_world).eval();
+    origin = (w.position[shape.body] + w.rotation[shape.body] * origin).eval();
+    to_world = (w.rotation[shape.body] * to_world).eval();
     twist -= w.twist[shape.body];
   }
-  M3<T> first_rotation = first == world ? M3<T>(M3<T>::Identity()) : w.rotation[first];
-  V3<T> first_position = first == world ? V3<T>(V3<T>::Zero()) : w.position[first];
+  M3<P> first_rotation = first == world ? M3<P>(M3<P>::Identity()) : w.rotation[first];
+  V3<P> first_position = first == world ? V3<P>(V3<P>::Zero()) : w.position[first];
   f.scaled = false;
   const T* place = params + mount.place;
   if (differs<T>(place, mount.pos) || differs<T>(place + 3, V3<double>::Zero()) ||
       (mount.scales && differs<T>(place + 6, V3<double>::Ones()))) {
     move_mount<T>(place, mount, first_rotation, first_position, f);
   }
-  f.rotation = f.to_world.transpose() * first_rotation;
-  f.offset = f.to_world.transpose() * (first_position - f.origin);
+  const M3<P> rotation = to_world.transpose() * first_rotation;
+  const V3<P> offset = to_world.transpose() * (first_position - origin);
+  f.to_world = as<T>(to_world);
+  f.origin = as<T>(origin);
+  f.rotation = as<T>(rotation);
+  f.offset = as<T>(offset);
   f.local =
       shape.kind == ShapeKind::plane ? V3<T>(f.rotation.transpose().col(2)) : V3<T>(f.rotation.transpose() * -f.offset);
   f.local_level = f.offset[2];

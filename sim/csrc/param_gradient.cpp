@@ -45,7 +45,7 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   Workspace<Taped> w(m);
   const Taped h(s.h);
   const StepStart<Taped> from{
-      h,          t.q0.data(), t.v0.data(), t.shift.empty() ? nullptr : t.shift.data(), t.anchors.data(),
+      h,          t.q0.data(), t.v0.data(), nullptr, t.shift.empty() ? nullptr : t.shift.data(), t.anchors.data(),
       s.anchored, t.u.data()};
   evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<Taped>> next = t.anchors;
@@ -67,7 +67,7 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
   w.update.setZero();
-  forward_positions<Taped>(m, t.params.data(), t.q0.data(), w);
+  place_bodies<Taped>(m, t.params.data(), t.q0.data(), nullptr, w);
   forward_velocities<true, Taped>(m, t.params.data(), t.v0.data(), w.update.data(), w);
   std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
   read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);

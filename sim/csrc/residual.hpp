@@ -33,8 +33,8 @@ struct ActuatorPull {
   T force, by_u, by_length, by_speed;
   int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
 };
-template <class T>
-ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const T* q, const T* v,
+template <class T, class Q>
+ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const Q* q, const T* v,
                               double softness = 1) {
   const T gear = p[0], kp = p[1], kd = p[2];
   ActuatorPull<T> pull{T(0), T(1), T(0), T(0), 0};
@@ -61,7 +61,7 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
     pull.by_u = T(0);
   }
   pull.force =
-      gain * control + bias + pull.by_length * (gear * q[actuator.q]) + pull.by_speed * (gear * v[actuator.dof]);
+      gain * control + bias + pull.by_length * (gear * T(q[actuator.q])) + pull.by_speed * (gear * v[actuator.dof]);
   if (softness < 1) {
     pull.force *= T(softness);
     pull.by_length *= T(softness);
@@ -76,7 +76,7 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
 
 // Joint-space forces: damping, friction, springs, limits, actuators. Adds −h f and its derivatives to the residual.
 template <bool derivatives, class T>
-void subtract_joint_forces(const Model& m, const T* params, const T& h, const T* q, const T* v, const T* u,
+void subtract_joint_forces(const Model& m, const T* params, const T& h, const Place<T>* q, const T* v, const T* u,
                            double softness, bool scale, Workspace<T>& w) {
   using std::abs;
   const T creep(friction_creep / softness);
@@ -103,7 +103,7 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const T*
     }
     if (joint.turns()) continue;
     const int k = joint.v;
-    const T value = q[joint.q];
+    const T value(q[joint.q]);
     w.residual[k] += h * stiffness * (value - rest);
     if constexpr (derivatives) w.by_q(k, k) += h * stiffness;
     const LimitPush<T> push = limit_push<T>(p, value, v[k]);
@@ -141,7 +141,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
     w.increment[k] = h * v[k];
     if (from.shift) w.increment[k] += from.shift[k];
   }
-  integrate<T>(m, from.q0, w.increment, w.q.data());
+  integrate<T>(m, from.q0, from.low, w.increment, w.q.data());
   w.update = w.trial / h;  // accelerations
   forward_positions<T>(m, params, w.q.data(), w);
   forward_velocities<derivatives, T>(m, params, v, w.update.data(), w);

@@ -31,6 +31,28 @@ using VX = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 template <class T>
 using MX = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 
+// What places in the world are written in: in single precision their differences would be lost (`Batch<float>`).
+template <class T>
+struct PlaceOf {
+  using type = T;
+};
+template <>
+struct PlaceOf<float> {
+  using type = double;
+};
+template <class T>
+using Place = typename PlaceOf<T>::type;
+
+// The same numbers as those of type T.
+template <class T, class Matrix>
+GELFLOW_INLINE decltype(auto) as(const Matrix& x) {
+  if constexpr (std::is_same_v<T, typename Matrix::Scalar>) {
+    return (x);
+  } else {
+    return Eigen::Matrix<T, Matrix::RowsAtCompileTime, Matrix::ColsAtCompileTime>(x.template cast<T>());
+  }
+}
+
 template <class T>
 GELFLOW_INLINE V3<T> cross(const V3<T>& a, const V3<T>& b) {
   return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};

@@ -26,6 +26,7 @@ struct StateView {
   V3<T>* anchors;
   std::uint8_t* anchored;
   T* history;
+  T* low = nullptr;  // what q lacks in single precision, half a rounding unit at most: so small steps add up
 };
 
 // Calls visit(i) where set[i] is not 0. Most are not: they are looked at eight at a time.
@@ -52,14 +53,15 @@ struct StepReport {
 template <class T>
 struct StepMemory {
   explicit StepMemory(const Model& m)
-      : work(m), q(m.nq), v(m.nv), v_new(m.nv), v_star(m.nv), shift(m.nv), history(m.nh) {}
+      : work(m), q(m.nq), low(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), shift(m.nv), history(m.nh) {}
   Workspace<T> work;
-  VX<T> q, v, v_new, v_star, shift, history;
+  VX<T> q, low, v, v_new, v_star, shift, history;
   std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
   bool follows = false;                        // work was last used for this environment
 
   void keep(const Model& m, const StateView<T>& s) {
     q = Eigen::Map<const VX<T>>(s.q, m.nq);
+    if (s.low != nullptr) low = Eigen::Map<const VX<T>>(s.low, m.nq);
     v = Eigen::Map<const VX<T>>(s.v, m.nv);
     history = Eigen::Map<const VX<T>>(s.history, m.nh);
     anchors.clear();
@@ -67,6 +69,7 @@ struct StepMemory {
   }
   void give_back(const Model& m, const StateView<T>& s) const {
     std::copy(q.data(), q.data() + m.nq, s.q);
+    if (s.low != nullptr) std::copy(low.data(), low.data() + m.nq, s.low);
     std::copy(v.data(), v.data() + m.nv, s.v);
     std::copy(history.data(), history.data() + m.nh, s.history);
     std::fill(s.anchored, s.anchored + m.na, 0);
@@ -82,7 +85,7 @@ template <class T>
 StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
                       StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
-  StepStart<T> from{h, s.q, memory.v_star.data(), nullptr, s.anchors, s.anchored, u, memory.follows};
+  StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.follows};
   memory.follows = true;
   if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
   for (int k = 0; k < m.nv; ++k) {
@@ -124,7 +127,10 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
       s.history[2 * m.nv] = T(1);
     }
   }
-  std::copy(memory.work.q.data(), memory.work.q.data() + m.nq, s.q);
+  for (int i = 0; i < m.nq; ++i) {
+    s.q[i] = T(memory.work.q[i]);
+    if (s.low != nullptr) s.low[i] = T(memory.work.q[i] - Place<T>(s.q[i]));
+  }
   std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
   return Status::ok;
 }

@@ -79,6 +79,7 @@ template <class T>
 struct StepStart {
   T h;  // β h
   const T *q0, *v_star;
+  const T* low;    // what q0 lacks, or null (StateView)
   const T* shift;  // γ δ, null under BDF1
   const V3<T>* anchors;
   const std::uint8_t* anchored;
@@ -132,8 +133,8 @@ struct Workspace {
   int stride;
 
   // Kinematics, world frame; spatial vectors at the world's origin.
-  std::vector<M3<T>> rotation;
-  std::vector<V3<T>> position;
+  std::vector<M3<Place<T>>> rotation;
+  std::vector<V3<Place<T>>> position;
   std::vector<V6<T>> twist, acceleration, force;
   std::vector<Composite<T>> composite;  // of the subtree (dynamics.hpp)
   SixRows<T> axis;                      // S_k per dof
@@ -150,7 +151,7 @@ struct Workspace {
   Rows mass, by_q, by_v;          // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
   VX<T> by_u;                     // ∂g_dof/∂u per actuator
   Rows tangent;                   // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
-  VX<T> q;                        // q_t of the trial velocity
+  VX<Place<T>> q;                 // q_t of the trial velocity
   std::vector<int> pivots;
 
   PairColumns<T> columns;           // of the pair at work
