@@ -1,7 +1,7 @@
 """The five scenes that come along, each on its own motion, under both friction laws."""
 
 from gelflow.sim.benchmark.rolling import rolling_scene
-from gelflow.sim.benchmark.runs import check, motion_run, simulator
+from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
 from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved
 from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import load_scene
@@ -19,7 +19,7 @@ def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
     works, checks = [], []
     for name, law in cases:
         scene = rolling_scene(SIDE, law) if name == "rolling" else load_scene(name, friction=law)
-        run, sim = motion_run(scene, steps=steps), simulator(scene.describe_to)
+        run, sim = motion_run(scene, steps=steps), simulator(scene.describe_to, tolerance=TIMED)
         checks.append(check(run, sim, scene.describe_to))
         works.append(run.work(sim))
     effort.watch.begin("scenes", len(works) * (effort.repeats + 1))
@@ -55,8 +55,8 @@ def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
         columns=("scene", "friction", "steps/s", "±", "µs", "Newton", "paper", "× paper"),
         rows=rows,
         note="Steps of 5 ms; controls change and markers are read every 5. ±: half of what lies between the "
-        "quartiles. µs: per step, readings included. Newton: iterations per step. paper: its simulator's best build "
-        "on a comparable core, whose friction is viscous." + busy(taken),
+        f"quartiles. µs: per step, readings included. Newton: iterations per step, to {TIMED:g} of the forces. paper: "
+        "its simulator's best build on a comparable core, whose friction is viscous." + busy(taken),
         results=results,
         outside=outside,
     )
