@@ -24,7 +24,7 @@ from gelflow.sim.benchmark.markers import SHAPES, measure_markers
 from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
 from gelflow.sim.benchmark.paper_build import MODULE, why_not
 from gelflow.sim.benchmark.rolling import ROLLING_STEPS, Cell, measure_rolling, rolling_run, rolling_scene
-from gelflow.sim.benchmark.runs import check, motion_run, simulator
+from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
 from gelflow.sim.benchmark.scenes import measure_scenes
 from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
 from gelflow.sim.motions import SCENES
@@ -68,7 +68,7 @@ def test_every_timed_run_carries_its_check(everything: tuple[Path, str]) -> None
 def test_rolling_is_the_run_of_the_paper() -> None:
     """Ends where a plain loop of single steps under the five forces ends, at every interval of reading."""
     report = measure_rolling(ONCE, cells=[Cell(5, every) for every in (1, 7, 20, 350, 0)])
-    sim = simulator((scene := rolling_scene(5)).describe_to)
+    sim = simulator((scene := rolling_scene(5)).describe_to, tolerance=TIMED)
     sim.q[:] = scene.q0
     largest = np.zeros(3)
     for step in range(350):
@@ -155,6 +155,14 @@ def test_all_markers_touch_on_every_shape() -> None:
         assert 0 < result["force_off"] < 1e-4 and 0 < result["gradient_off"] < 1e-3
     ball, grid = (next(r for r in report.results if r["shape"] == kind) for kind in ("sphere", "grid"))
     np.testing.assert_allclose(grid["force_sum"], ball["force_sum"], rtol=0.02, atol=1e-9)  # the grid is of that ball
+
+
+def test_single_precision_is_close_and_is_not_double(everything: tuple[Path, str]) -> None:
+    results = json.loads((everything[0] / "speed.json").read_text("utf-8"))["precision"]["results"]
+    assert len(results) == 2 * len(SCENES)
+    for result in results:
+        assert 0 < result["position"] < 1e-6 and 0 < result["turn"] < 1e-5
+        assert 0 < result["readings"] < 1e-3 and 0 < result["gradient"] < 5e-3
 
 
 @pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.name)

@@ -22,6 +22,7 @@ MEASUREMENTS = {
     "gradients": "forwards, and forwards and backwards",
     "batch": "many environments on one core and on all",
     "markers": "a marker's reading and its gradient, for each shape",
+    "precision": "single precision beside double, errors and speed",
     "growth": "time against bodies, touching points, markers, environments",
 }
 
@@ -106,6 +107,10 @@ def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "Report":
         from gelflow.sim.benchmark.markers import measure_markers
 
         return measure_markers(effort)
+    if name == "precision":
+        from gelflow.sim.benchmark.precision import measure_precision
+
+        return measure_precision(effort)
     from gelflow.sim.benchmark.growth import measure_growth
 
     report, found = measure_growth(effort)

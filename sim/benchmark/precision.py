@@ -1,0 +1,86 @@
+"""Single precision beside double: how far off whole motions, readings and gradients are, and what it saves."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.geometry import angles_between
+from gelflow.sim.benchmark.runs import HOLD, motion_run, simulator
+from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved, times_as_fast
+from gelflow.sim.motions import SCENES, motion
+from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene_parts import LAWS
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+READ_EVERY = 4 * HOLD  # steps
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A motion as one precision runs it."""
+
+    poses: Array  # (readings, bodies, 7)
+    tactile: Array  # (readings, markers, 3)
+    gradient: Array  # of all readings with random weights, by the controls (steps, nu)
+
+
+def measure_precision(effort: Effort) -> Report:
+    """The five scenes under both laws, forward and backward."""
+    cases = [(name, law) for name in SCENES for law in LAWS]
+    steps = 4 * READ_EVERY if effort.quick else None
+    works, found = [], []
+    for name, law in cases:
+        scene = load_scene(name, friction=law)
+        run = motion_run(scene, steps=steps)
+        double, single = (_course(scene, precision, steps) for precision in ("double", "single"))
+        found.append(_apart(single, double))
+        for precision in ("double", "single"):
+            works.append(run.work(simulator(scene.describe_to, precision=precision)))
+    effort.watch.begin("precision", len(works) * (effort.repeats + 1))
+    taken = interleaved(works, effort)
+    rows, results = [], []
+    for (name, law), apart, double_times, single_times in zip(cases, found, taken[::2], taken[1::2], strict=True):
+        ratio = times_as_fast(single_times, double_times)
+        errors = (f"{value:.0e}" for value in apart.values())
+        rows.append((name, law, *errors, f"{single_times.rate:.0f}", f"{ratio:.2f}"))
+        results.append({"scene": name, "friction": law, **apart, "single": single_times.plain(), "times_double": ratio})
+    return Report(
+        name="precision",
+        title="Single precision beside double: a whole motion",
+        columns=("scene", "friction", "m", "rad", "readings", "gradient", "steps/s", "× double"),
+        rows=rows,
+        note="m, rad: largest difference of a body's place and turn. readings: largest norm of a difference over the "
+        f"largest norm. gradient: of readings every {READ_EVERY} steps with random weights, by all controls, relative. "
+        "Gradients are computed in double, at the states of single precision." + busy(taken),
+        results=results,
+        outside=[],
+    )
+
+
+def _course(scene: Scene, precision: Any, steps: int | None) -> _Course:
+    moves, sim = motion(scene), Simulator(scene, threads=1, precision=precision)
+    u = moves.steps(scene.step)[:steps]
+    sim.q[:] = moves.q0
+    run = sim.rollout(u[:, None], read_after=tuple(range(READ_EVERY, len(u) + 1, READ_EVERY)))
+    weights = np.random.default_rng(0).normal(size=run.tactile.shape)
+    gradient = sim.rollout_gradient(run, tactile=weights).u[:, 0]
+    poses = []
+    for at in run.read_after:
+        sim.q[:] = run.q[at]
+        poses.append(sim.poses()[0].astype(float))
+    return _Course(np.array(poses), run.tactile[:, 0].astype(float), gradient.astype(float))
+
+
+def _apart(single: _Course, double: _Course) -> dict[str, float]:
+    """Largest differences: places [m], turns [rad], and, relative, readings and the gradient."""
+    norms = np.linalg.norm(double.tactile, axis=(1, 2))
+    return {
+        "position": float(np.linalg.norm(single.poses[..., :3] - double.poses[..., :3], axis=-1).max()),
+        "turn": float(angles_between(single.poses[..., 3:], double.poses[..., 3:]).max()),
+        "readings": float(np.linalg.norm(single.tactile - double.tactile, axis=(1, 2)).max() / norms.max()),
+        "gradient": float(np.linalg.norm(single.gradient - double.gradient) / np.linalg.norm(double.gradient)),
+    }
