@@ -20,6 +20,7 @@ from rich.progress import track
 from rich.table import Table
 
 from gelflow.sim.benchmark import processor, versions
+from gelflow.sim.benchmark.runs import HOLD
 from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -27,24 +28,34 @@ from gelflow.sim.simulator import Simulator
 STEPS = 100
 # Groups by the names of functions, looked for in this order; small ones are inlined into those that call them.
 GROUPS = {
-    "near points": ("find_near_points", "for_near_points", "for_near_leaves", "for_near_blocks"),
+    "near points": (
+        "find_near_points",
+        "find_around",
+        "covers",
+        "for_near_points",
+        "for_near_leaves",
+        "for_near_blocks",
+    ),
     "forces": ("sum_forces", "add_pending", "touches", "distance", "point_force"),
-    "to joints": ("subtract_derivatives", "pair_columns", "subtract_contact_forces", "pair_frame", "move_mount"),
+    "to joints": (
+        *("subtract_derivatives", "pair_columns", "subtract_impulses", "wrench_in_world", "subtract_contact_forces"),
+        *("pair_frame", "move_mount"),
+    ),
     "dynamics": ("inverse_dynamics", "floating_body", "subtract_joint_forces", "actuator_pull"),
     "places": ("forward_", "integrate", "quaternion", "axis_rotation", "right_jacobian", "position_by", "sincos"),
-    "solver": ("factorize", "solve", "newton", "evaluate", "relative"),
+    "solver": ("factorize", "invert", "solve", "newton", "evaluate", "relative"),
 }
 
 
 def run(name: str, steps: int) -> float:
-    """Some steps from the start of the scene's motion, one call each [s per step]."""
+    """Some steps from the start of the scene's motion, `HOLD` a call [s per step]."""
     scene = load_scene(name, friction="viscous")
     sim, moves = Simulator(scene, threads=1), motion(scene)
     sim.q[:] = moves.q0
     controls = moves.steps(scene.step)[:steps]
     start = time.process_time()
-    for u in controls:
-        sim.step(u)
+    for u in controls[HOLD - 1 :: HOLD]:
+        sim.step(u, HOLD)
     sim.check()
     return (time.process_time() - start) / len(controls)
 
