@@ -105,11 +105,13 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
   bool past = false;     // v lies just past an edge; the search goes on from w.start before it
   bool old = false;      // the last update was made with the derivatives of an earlier one
   for (int k = 0; k <= m.max_iterations; ++k) {
-    const bool converged = settled || relative(w.residual, w.forces, m.nv) <= (old && std::is_same_v<T, Place<T>> ? margin : 1.0) * tolerance;
+    const bool converged = settled || relative(w.residual, w.forces, m.nv) <=
+                                          (old && std::is_same_v<T, Place<T>> ? margin : 1.0) * tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
     // Where an update made the residual that much smaller, its derivatives do for one more, which costs half as much.
-    old = !fresh && !converged && k <= 3 && tolerance > exacting && std::is_floating_point_v<T> && size < quick * before;
+    old =
+        !fresh && !converged && k <= 3 && tolerance > exacting && std::is_floating_point_v<T> && size < quick * before;
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
     solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);
