@@ -311,7 +311,6 @@ BUILDS = """
 import sys
 import numpy as np
 from gelflow.sim import _core
-from gelflow.sim.motions import SCENES, motion
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 

@@ -107,9 +107,7 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
 template <class T>
 void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, const T* by_reading,
                         StateGradient<T>& g, Workspace<T>& w) {
-  w.update.setZero();
-  place_bodies<T>(m, params, s.q, s.low, w);
-  forward_velocities<true, T>(m, params, s.v, w.update.data(), w);
+  forward_state<true, T>(m, params, s.q, s.low, s.v, w);
   read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
 }
 

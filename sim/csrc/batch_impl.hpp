@@ -133,9 +133,7 @@ void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
 template <class T>
 void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
-  w.update.setZero();
-  place_bodies<T>(*model, params_of(env), s.q, s.low, w);
-  forward_velocities<true, T>(*model, params_of(env), s.v, w.update.data(), w);
+  forward_state<true, T>(*model, params_of(env), s.q, s.low, s.v, w);
 }
 
 template <class T>
@@ -157,9 +155,7 @@ void Batch<T>::read(T* out, Written* written) {
   pool_.run(n, [&](int e, int thread) {
     const StateView<T> s = state(e);
     Workspace<T>& w = memory_[thread].work;
-    w.update.setZero();
-    place_bodies<T>(*model, params_of(e), s.q, s.low, w);
-    forward_velocities<false, T>(*model, params_of(e), s.v, w.update.data(), w);
+    forward_state<false, T>(*model, params_of(e), s.q, s.low, s.v, w);
     read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
                     out + static_cast<std::size_t>(e) * model->markers * 3, written == nullptr ? nullptr : written + e);
   });
@@ -249,9 +245,7 @@ void Batch<T>::rollout(const Rollout<T>& r) {
     for (int t = 0;; ++t) {
       const StateView<T> now = at(t);
       for (; read < r.reads && r.read_after[read] == t; ++read) {
-        memory.work.update.setZero();
-        place_bodies<T>(m, params_of(env), now.q, now.low, memory.work);
-        forward_velocities<false, T>(m, params_of(env), now.v, memory.work.update.data(), memory.work);
+        forward_state<false, T>(m, params_of(env), now.q, now.low, now.v, memory.work);
         read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
                         r.tactile + (read * N + e) * m.markers * 3, nullptr);
       }

@@ -33,9 +33,7 @@ template <class T>
 std::uint64_t branch_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
                                const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
   Signature hash;
-  w.update.setZero();
-  place_bodies<T>(m, params, q, nullptr, w);
-  forward_velocities<true, T>(m, params, v, w.update.data(), w);
+  forward_state<true, T>(m, params, q, nullptr, v, w);
   int pair = 0;
   const auto visit = [&](const Touching<T>& t) {
     PointForce<Pack<T>> force;

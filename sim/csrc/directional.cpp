@@ -36,9 +36,7 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
     if (report.status != Status::ok) break;
   }
   std::vector<Dual> tactile(static_cast<std::size_t>(m.markers) * 3);
-  memory.work.update.setZero();
-  place_bodies<Dual>(m, params.data(), q.data(), nullptr, memory.work);
-  forward_velocities<true, Dual>(m, params.data(), v.data(), memory.work.update.data(), memory.work);
+  forward_state<false, Dual>(m, params.data(), q.data(), nullptr, v.data(), memory.work);
   read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data(), nullptr);
 
   for (const Dual& x : q) out.q.push_back(x.a);

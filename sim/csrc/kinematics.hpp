@@ -88,13 +88,6 @@ void forward_positions(const Model& m, const T* params, const Place<T>* q, Works
   }
 }
 
-// The bodies where the positions q place them; `low`: what they lack, or null.
-template <class T>
-void place_bodies(const Model& m, const T* params, const T* q, const T* low, Workspace<T>& w) {
-  for (int i = 0; i < m.nq; ++i) w.q[i] = whole(q, low, i);
-  forward_positions<T>(m, params, w.q.data(), w);
-}
-
 // Twists V and accelerations A of every body; gravity enters as an acceleration of the world. `around`: also what is
 // before and after each dof, which derivatives need. What is before slides that nothing turns is not written down: only
 // its turning would count, and there is none. Bodies that float have no accelerations here (dynamics.hpp).
@@ -149,6 +142,15 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
     w.twist[i] = twist;
     w.acceleration[i] = acceleration;
   }
+}
+
+// Both of a state (q, v) with accelerations zero; `low`: what q lacks, or null.
+template <bool around, class T>
+void forward_state(const Model& m, const T* params, const T* q, const T* low, const T* v, Workspace<T>& w) {
+  w.update.setZero();
+  for (int i = 0; i < m.nq; ++i) w.q[i] = whole(q, low, i);
+  forward_positions<T>(m, params, w.q.data(), w);
+  forward_velocities<around, T>(m, params, v, w.update.data(), w);
 }
 
 // q_t = q_{t-1} ⊕ increment; `low`: what q_{t-1} lacks, or null.

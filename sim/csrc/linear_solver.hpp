@@ -12,14 +12,18 @@ namespace gelflow {
 
 constexpr int small = 16;
 
+// Brings the row with the largest number in column k, of those not yet used, to place k.
 template <class T, class Rows>
-int pivot(const Rows& a, int n, int k) {
+T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
   using std::abs;
   int largest = k;
   for (int i = k + 1; i < n; ++i) {
     if (abs(a(i, k)) > abs(a(largest, k))) largest = i;
   }
-  return largest;
+  T* const row = a.data() + k * a.outerStride();
+  pivots[k] = largest;
+  if (largest != k) std::swap_ranges(row, row + n, a.data() + largest * a.outerStride());
+  return row;
 }
 
 // Replaces the first n columns of `a` by those of its inverse.
@@ -30,9 +34,7 @@ void invert(Rows& a, int n, std::vector<int>& pivots) {
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
   for (int k = 0; k < n; ++k) {
-    T* const own = start + k * stride;
-    pivots[k] = pivot<T>(a, n, k);
-    if (pivots[k] != k) std::swap_ranges(own, own + n, start + pivots[k] * stride);
+    T* const own = pivot_row<T>(a, n, k, pivots);
     // Column k is set last: a pack that is loaded right after one of its numbers was stored would have to wait.
     const T inverse = T(1) / own[k];
     for (int j = 0; j < n; j += width) store(L(inverse) * load<L>(own + j), own + j);
@@ -61,16 +63,14 @@ void factorize(Rows& a, int n, std::vector<int>& pivots) {
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
   for (int k = 0; k < n; ++k) {
-    T* const pivot_row = start + k * stride;
-    pivots[k] = pivot<T>(a, n, k);
-    if (pivots[k] != k) std::swap_ranges(pivot_row, pivot_row + n, start + pivots[k] * stride);
-    pivot_row[k] = T(1) / pivot_row[k];
+    T* const own = pivot_row<T>(a, n, k, pivots);
+    own[k] = T(1) / own[k];
     for (int i = k + 1; i < n; ++i) {
       T* const row = start + i * stride;
-      row[k] *= pivot_row[k];
+      row[k] *= own[k];
       const L factor(row[k]);
       for (int j = k + 1; j < n; j += pack_width<T>) {
-        store(load<L>(row + j) - factor * load<L>(pivot_row + j), row + j);
+        store(load<L>(row + j) - factor * load<L>(own + j), row + j);
       }
     }
   }

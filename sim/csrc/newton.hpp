@@ -79,7 +79,7 @@ template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
   constexpr int full_steps = 6, patience = 6;
-  constexpr double quick = 0.03, margin = 0.1, exacting = 1e-9;
+  constexpr double quick = 0.03, margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, exacting = 1e-9;
   constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
   const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
@@ -96,7 +96,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     look(derivatives, Found::now);
     return relative(w.residual, w.scale, m.nv);
   };
-  look(true, from.follows ? Found::earlier : Found::elsewhere);
+  look(true, from.found);
   w.scale = w.forces;  // what residuals are compared by
   double size = relative(w.residual, w.scale, m.nv), best = size, before = size, mark = size;
   if (!std::isfinite(size)) return Status::not_finite;
@@ -105,8 +105,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
   bool past = false;     // v lies just past an edge; the search goes on from w.start before it
   bool old = false;      // the last update was made with the derivatives of an earlier one
   for (int k = 0; k <= m.max_iterations; ++k) {
-    const bool converged = settled || relative(w.residual, w.forces, m.nv) <=
-                                          (old && std::is_same_v<T, Place<T>> ? margin : 1.0) * tolerance;
+    const bool converged = settled || relative(w.residual, w.forces, m.nv) <= (old ? margin : 1.0) * tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
     // Where an update made the residual that much smaller, its derivatives do for one more, which costs half as much.

@@ -66,9 +66,7 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
                                 double* by_params) {
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
-  w.update.setZero();
-  place_bodies<Taped>(m, t.params.data(), t.q0.data(), nullptr, w);
-  forward_velocities<true, Taped>(m, t.params.data(), t.v0.data(), w.update.data(), w);
+  forward_state<false, Taped>(m, t.params.data(), t.q0.data(), nullptr, t.v0.data(), w);
   std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
   read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
   std::vector<double> weights(Tape::current().size(), 0.0);

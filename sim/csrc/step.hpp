@@ -57,7 +57,7 @@ struct StepMemory {
   Workspace<T> work;
   VX<T> q, low, v, v_new, v_star, shift, history;
   std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
-  bool follows = false;                        // work was last used for this environment
+  Found found = Found::elsewhere;              // what work was last used for
 
   void keep(const Model& m, const StateView<T>& s) {
     q = Eigen::Map<const VX<T>>(s.q, m.nq);
@@ -85,8 +85,7 @@ template <class T>
 StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
                       StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
-  StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.follows};
-  memory.follows = true;
+  StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.found};
   if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
   for (int k = 0; k < m.nv; ++k) {
     memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
@@ -111,6 +110,7 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   const StepStart<T> from = start_of<T>(m, h, whole, s, u, memory);
   memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
   Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+  memory.found = Found::earlier;
   if (status != Status::ok) {
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
     status = newton_from_softer<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
@@ -142,7 +142,7 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 bool follows, Observer&& accepted = {}, int parts = 1) {
-  memory.follows = follows;
+  memory.found = follows ? Found::earlier : Found::elsewhere;
   StepReport report;
   const double span = m.step / parts;
   const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep

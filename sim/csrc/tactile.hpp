@@ -31,6 +31,7 @@ template <class T>
 void read_markers(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
                   const Workspace<T>& w, T* out, Written* written) {
   using L = Pack<T>;
+  constexpr unsigned whole_pack = (1U << pack_width<T>)-1;
   if (written == nullptr || written->all) {
     std::fill(out, out + 3 * static_cast<std::size_t>(m.markers), T(0));
   } else {
@@ -66,7 +67,7 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
             T* const reading = readings + 3 * static_cast<std::size_t>(original[k]);
             for (int a = 0; a < 3; ++a) reading[a] = s == 0 ? numbers[a][k] : T(reading[a] + numbers[a][k]);
           };
-          if (bits(t.inside) == (1U << pack_width<T>)-1) {
+          if (bits(t.inside) == whole_pack) {
             for (int k = 0; k < pack_width<T>; ++k) write(k);
           } else {
             t.for_each_inside([&](int k, int) GELFLOW_LOOP_BODY { write(k); });

@@ -84,8 +84,8 @@ struct StepStart {
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
-  bool follows = false;  // the workspace was last used for an earlier step of this environment
-  double softness = 1;   // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+  Found found = Found::elsewhere;  // what the workspace was last used for
+  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
 };
 
 template <class T>
