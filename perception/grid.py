@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import PeerError, UsageError
+from gelflow.errors import UsageError
 from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots
 from gelflow.perception.lattice import Lattice, fill, grow
+from gelflow.perception.refusal import StartRefused, draw_seen
 
 Polarity = Literal["auto", "dark", "bright"]
 
@@ -53,7 +54,8 @@ def find_grid(
 
     With `rows` and `cols` the grid has that many lines and columns (with `either_way`, or the other way round);
     lines beyond, which the image's border cuts, are left out. Without, every line that is mostly there counts.
-    Raises PeerError when there is no grid, UsageError when it has other rows and columns than asked for.
+    Raises StartRefused when there is no grid, or one of other rows and columns than asked for; UsageError when no
+    grid can have these.
     """
     looks = {"dark": DARK, "bright": BRIGHT, "auto": DARK + BRIGHT}[polarity]
     shrink = max(1, round(max(image.shape[:2]) / _SEARCH))
@@ -64,15 +66,18 @@ def find_grid(
     wanted = _wanted(rows, cols, either_way)
     best = _search(small, looks)
     if best is None:
-        raise PeerError(f"no grid of markers found in the image{_hint(polarity)}")
+        raise StartRefused(f"no grid of markers found in the image{_hint(polarity)}", image.copy())
     look, radius, spacing = best[0], best[1] * shrink, best[2] * shrink
     # Once more at full size, now that radius and spacing are known: what tracking will do in every image.
     dots = _likely(find_dots(contrast(image, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
     lattice = grow(dots.centers)
     if lattice is None or lattice.unevenness > _UNEVEN:
-        raise PeerError(f"no regular grid of markers found in the image{_hint(polarity)}")
-    lattice = _window(lattice, dots, rows, cols, wanted)
-    return _found(look, lattice, dots)
+        picture = draw_seen(image, dots.centers, radius, None)
+        raise StartRefused(f"no regular grid of markers found in the image{_hint(polarity)}", picture)
+    refusal, part = _window(lattice, dots, rows, cols, wanted)
+    if part is None:
+        raise StartRefused(refusal, draw_seen(image, dots.centers, radius, lattice.dots))
+    return _found(look, part, dots)
 
 
 def _hint(polarity: Polarity) -> str:
@@ -169,23 +174,25 @@ def _best(full: NDArray[np.float64], rows: int, cols: int) -> tuple[float, int, 
     return float(sums.max()), int(top), int(left), float(others.max()) if len(others) else 0.0
 
 
-def _window(lattice: Lattice, dots: Dots, rows: int | None, cols: int | None, wanted: list[tuple[int, int]]) -> Lattice:
-    """The part of `lattice` that is the printed grid."""
+def _window(
+    lattice: Lattice, dots: Dots, rows: int | None, cols: int | None, wanted: list[tuple[int, int]]
+) -> tuple[str, Lattice | None]:
+    """The part of `lattice` that is the printed grid; none, and why, when that is not clear."""
     full = _full(lattice, dots)
     top, bottom, left, right = _trim(full)
     if not wanted:
         if bottom - top < 3 or right - left < 3:
-            raise PeerError("the grid of markers in the image has fewer than 3 × 3 whole dots")
-        return Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.unevenness)
+            return "the grid of markers in the image has fewer than 3 × 3 whole dots", None
+        return "", Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.unevenness)
     size, window = max(((size, _best(full, *size)) for size in wanted), key=lambda choice: choice[1][0])
     count, top_best, left_best, second = window
     seen = f"the image shows {bottom - top} lines of {right - left} whole markers, not the {rows} × {cols} asked for"
     if count < 0.7 * size[0] * size[1]:
-        raise UsageError(f"{seen}: correct rows and columns, or leave them out to have them found")
+        return f"{seen}: correct rows and columns, or leave them out to have them found", None
     if count - second < 0.25 * min(size):
-        raise UsageError(f"{seen}, and which lines to leave out is not clear: correct rows and columns")
+        return f"{seen}, and which lines to leave out is not clear: correct rows and columns", None
     part = lattice.dots[top_best : top_best + size[0], left_best : left_best + size[1]]
-    return Lattice(part, lattice.spacing, lattice.unevenness)
+    return "", Lattice(part, lattice.spacing, lattice.unevenness)
 
 
 def _found(look: Look, lattice: Lattice, dots: Dots) -> Found:

@@ -25,7 +25,7 @@ def draw_overlay(
     picture = np.asarray(larger, dtype=np.uint8)
     shape = (tracked.rows, tracked.cols)
     # The centre of a pixel of the small image lies in the middle of the scale × scale block that it became.
-    places = np.asarray((tracked.positions + 0.5) * scale - 0.5).reshape(*shape, 2)
+    places = np.asarray((tracked.position + 0.5) * scale - 0.5).reshape(*shape, 2)
     valid = tracked.valid.reshape(shape)
     _draw_grid(picture, places, valid, _colours(shape[0]), _colours(shape[1]))
     tips = places + magnify * scale * np.nan_to_num(tracked.displacement).reshape(*shape, 2)

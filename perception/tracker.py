@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, UsageError
 from gelflow.perception.detect import Dots, contrast, find_dots
 from gelflow.perception.grid import Found, Polarity, find_grid, surroundings
 from gelflow.perception.lattice import fill, grow, neighbours
+from gelflow.perception.refusal import StartRefused
+
+__all__ = ["MarkerTracker", "StartRefused", "Tracked", "TrackerConfig"]
 
 # All as shares of the markers' spacing.
 _SURE = 0.25  # a dot this close to where a marker was is that marker's
@@ -43,9 +46,11 @@ class TrackerConfig:
 class Tracked:
     """The markers in one image, line by line from the top, each line from the left."""
 
-    positions: NDArray[np.float64]  # (right, down) [px], shape (markers, 2); where not valid, where it is expected
-    displacement: NDArray[np.float64]  # from the first image [px], shape (markers, 2); NaN where not valid
-    valid: NDArray[np.bool_]  # seen in this and in the first image, shape (markers,)
+    position: NDArray[np.float64]  # (right, down) [px], shape (markers, 2); where not valid, where it is expected
+    displacement: NDArray[np.float64]  # from rest [px], shape (markers, 2); NaN where neither valid nor inferred
+    valid: NDArray[np.bool_]  # measured in this image, shape (markers,)
+    inferred: NDArray[np.bool_]  # not measured, guessed from its neighbours, shape (markers,)
+    quality: NDArray[np.float64]  # 0 to 1: how far the measurement can be believed; 0 where not valid, (markers,)
     rows: int  # lines in the image
     cols: int  # markers in a line
     spacing: float  # of the markers in the first image [px]
@@ -62,17 +67,25 @@ class MarkerTracker:
         self._seen_before = 0
         self._images_lost = 0
 
-    def reset(self) -> None:
-        """Forgets everything: the next image is a first image."""
-        self._found = None
+    @property
+    def rest(self) -> NDArray[np.float64]:
+        """Where the markers are at rest (right, down) [px], shape (markers, 2), line by line.
 
-    def start(self, image: NDArray[np.uint8]) -> Tracked:
+        Raises UsageError before `start`.
+        """
+        if self._found is None:
+            raise UsageError("the tracker has no rest positions yet: start it with an image at rest")
+        return self._found.positions.reshape(-1, 2)
+
+    def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> Tracked:
         """Finds the grid in `image` (B G R) and takes it as the reference; displacements in it are zero.
 
-        Raises PeerError when the image shows no grid, UsageError when its rows and columns are not the configured.
+        `rows` and `cols` are lines and markers in a line; left out, the configuration's, and if it has none, found.
+        Raises StartRefused when the image shows no such grid, or not clearly.
         """
         c = self.config
-        found = find_grid(image, rows=c.rows, cols=c.cols, either_way=c.either_way, polarity=c.polarity)
+        rows, cols = (c.rows, c.cols) if rows is None and cols is None else (rows, cols)
+        found = find_grid(image, rows=rows, cols=cols, either_way=c.either_way, polarity=c.polarity)
         self._found, self._size = found, (image.shape[0], image.shape[1])
         self._last = found.positions.copy()
         self._seen_before, self._images_lost = int(found.seen.sum()), 0
@@ -88,7 +101,9 @@ class MarkerTracker:
             return self.start(image)
         if image.shape[:2] != self._size:
             got, expected = (f"{width} × {height} px" for height, width in (image.shape[:2], self._size))
-            raise PeerError(f"the image's size changed from {expected} to {got}: reset the tracker for another camera")
+            raise PeerError(
+                f"the image's size changed from {expected} to {got}: start the tracker anew for another camera"
+            )
         response = contrast(image, found.look, surroundings(found.spacing))
         least = _FAINT * found.peak
         dots = find_dots(response, radius=found.radius, apart=_APART * found.spacing, least=least)
@@ -112,9 +127,11 @@ class MarkerTracker:
         return len(dots) - have >= 0.5 * line and (suddenly or self._images_lost % 10 == 1)
 
     def _tracked(self, found: Found, displacement: NDArray[np.float64], valid: NDArray[np.bool_]) -> Tracked:
-        shown = np.where(valid[..., None], displacement, np.nan).reshape(-1, 2)
-        rows, cols = found.shape
-        return Tracked(self._last.reshape(-1, 2).copy(), shown, valid.reshape(-1), rows, cols, found.spacing)
+        inferred = ~valid & valid.any()
+        shown = np.where((valid | inferred)[..., None], displacement, np.nan).reshape(-1, 2)
+        position, rows, cols = self._last.reshape(-1, 2).copy(), *found.shape
+        flat = valid.reshape(-1)
+        return Tracked(position, shown, flat, inferred.reshape(-1), flat.astype(np.float64), rows, cols, found.spacing)
 
 
 def _follow(centers: NDArray[np.float64], last: NDArray[np.float64], spacing: float) -> NDArray[np.intp]:

@@ -34,7 +34,7 @@ def tracked(rows: int = 18, cols: int = 14) -> Tracked:
     valid[5] = False
     displacement = np.tile([1.0, 2.0], (n, 1))
     displacement[5] = np.nan
-    return Tracked(np.zeros((n, 2)), displacement, valid, rows, cols, 22.0)
+    return Tracked(np.zeros((n, 2)), displacement, valid, ~valid, valid.astype(float), rows, cols, 22.0)
 
 
 def test_without_a_scale_the_frame_is_in_pixels() -> None:

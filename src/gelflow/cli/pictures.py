@@ -55,7 +55,7 @@ def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
     image = decode(made.deepest.images[sensor].data)
     tracked = tracker.track(image)
     axis.imshow(image[:, :, ::-1])
-    (x, y), (right, down) = tracked.positions[tracked.valid].T, tracked.displacement[tracked.valid].T
+    (x, y), (right, down) = tracked.position[tracked.valid].T, tracked.displacement[tracked.valid].T
     start = x - right, y - down
     axis.quiver(
         *start, _MAGNIFY * right, _MAGNIFY * down, color="w", angles="xy", scale_units="xy", scale=1, width=0.006

@@ -68,7 +68,7 @@ class _Run:
             rows=first.rows,
             cols=first.cols,
             spacing_px=first.spacing,
-            positions_px=np.array([t.positions for t in self.tracked], dtype=np.float32),
+            positions_px=np.array([t.position for t in self.tracked], dtype=np.float32),
             displacement_px=np.array([t.displacement for t in self.tracked], dtype=np.float32),
             valid=np.array([t.valid for t in self.tracked]),
         )

@@ -1,0 +1,42 @@
+"""Why a first image is no reference, with a picture of what was seen in it."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError
+
+_DOT = (0, 255, 255)
+_LINE = (255, 180, 0)
+_SHIFT = 4  # OpenCV takes coordinates in 1/16 px
+
+
+class StartRefused(PeerError):
+    """The image shows no grid of markers that can be trusted. The message says why.
+
+    `picture` (B G R, uint8) is the image with what was seen drawn over it: yellow rings are dots, blue lines join
+    neighbours of the grid.
+    """
+
+    def __init__(self, reason: str, picture: NDArray[np.uint8]) -> None:
+        super().__init__(reason)
+        self.picture = picture
+
+
+def draw_seen(
+    image: NDArray[np.uint8], centers: NDArray[np.float64], radius: float, grid: NDArray[np.intp] | None
+) -> NDArray[np.uint8]:
+    """`image` (B G R) with rings of `radius` [px] around `centers` (right, down) [px], shape (n, 2).
+
+    `grid`, shape (lines, columns), has the number of the dot at each node, −1 where there is none.
+    """
+    picture = image.copy()
+    fixed = np.round(centers * 2**_SHIFT).astype(np.int32)
+    if grid is not None:
+        for one, two in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
+            both = (one >= 0) & (two >= 0)
+            lines = np.stack([fixed[one[both]], fixed[two[both]]], axis=1)
+            cv2.polylines(picture, list(lines), False, _LINE, 1, cv2.LINE_AA, _SHIFT)
+    for right, down in fixed.tolist():
+        cv2.circle(picture, (right, down), round((radius + 1) * 2**_SHIFT), _DOT, 1, cv2.LINE_AA, _SHIFT)
+    return picture
