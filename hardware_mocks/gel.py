@@ -85,7 +85,7 @@ class GelRenderer:
     def __init__(self, look: GelLook | None = None) -> None:
         self.look = look = GelLook() if look is None else look
         rng = np.random.default_rng(look.seed)
-        light = _illumination(look, rng)
+        light = illumination(look, rng)
         markers = look.grid.rows * look.grid.cols
         printed = np.ones(markers, dtype=bool)
         printed[rng.permutation(markers)[: round(look.missing * markers)]] = False
@@ -165,7 +165,7 @@ def _sprites(look: GelLook) -> tuple[NDArray[np.float32], int]:
     return sprites.reshape(_PHASES**2, steps.size**2), reach
 
 
-def _illumination(look: GelLook, rng: np.random.Generator) -> NDArray[np.float32]:
+def illumination(look: GelLook, rng: np.random.Generator) -> NDArray[np.float32]:
     """The gel without markers: a coloured light from each side, a vignette and soft unevenness."""
     down, right = np.meshgrid(np.linspace(-1, 1, look.height), np.linspace(-1, 1, look.width), indexing="ij")
     angle = rng.uniform(0, 2 * np.pi)
