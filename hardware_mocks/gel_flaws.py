@@ -93,12 +93,12 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "hard": {
         **{"blur": 1.4, "noise": 2.5, "shot": 0.02, "quality": 75, "gradient": 0.45, "colour": 0.8},
-        **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.37, "missing": 0.03},
+        **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.6, "missing": 0.03},
         **{"damaged": 0.06, "bridges": 2, "occluders": 1, "motion_blur": 0.5},
     },
 }
 
-# One factor at a time, on the typical class. A contrast of 0.3 is that share of the usual one, as 0.6 is in "hard".
+# One factor at a time, on the typical class.
 FACTORS: dict[str, dict[str, Any]] = {
     "noise 6": {"noise": 6.0},
     "blur 2.5 px": {"blur": 2.5},
@@ -107,7 +107,7 @@ FACTORS: dict[str, dict[str, Any]] = {
     "15 % damaged": {"damaged": 0.15},
     "four bridges": {"bridges": 4},
     "two occluders": {"occluders": 2},
-    "contrast 0.3": {"contrast": 0.19},
+    "contrast 0.3": {"contrast": 0.3},
     "keystone 15 %": {"keystone": 0.15},
     "oval 1.8:1": {"oval": 1.8},
     "bright dots": {"bright": True},

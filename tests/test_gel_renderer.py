@@ -121,7 +121,7 @@ def test_wrong_looks_and_sequences_are_refused() -> None:
         ({"blur": 0.2}, "blur of a flawed look must be within 0.5"),
     ):
         with pytest.raises(UsageError, match=message):
-            look_of(**wrong)  # type: ignore[arg-type]
+            look_of(**wrong)
     with pytest.raises(UsageError, match="expected a field out of press, shear, twist, slip"):
         GelSequence(look_of(), "pull")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="at least 1 frame"):
