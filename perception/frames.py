@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import Grid, TactileFrame
+from gelflow.perception.calibration import Calibration
 from gelflow.perception.tracker import Tracked, TrackerConfig
 
 Image = NDArray[np.uint8]
@@ -19,6 +20,7 @@ Image = NDArray[np.uint8]
 class CameraMount:
     """How a camera looks at its pad, and the grid of markers that is printed there.
 
+    Millimetres come from its `calibration`, or from one scale where perspective and lens don't matter.
     At rotation 0 the finger's tip is at the image's bottom; the rotation is that of the image against this,
     clockwise. Seen from behind (`mirrored`) the pad's y then points to the left, otherwise to the right.
     """
@@ -29,14 +31,27 @@ class CameraMount:
     center: tuple[float, float] = (2.0, 0.0)  # (x, y) of the grid's centre on the pad [mm]
     rotation: Literal[0, 90, 180, 270] = 0  # of the image, clockwise [deg]
     mirrored: bool = True  # the camera sees the gel from behind
-    pixels_per_mm: float | None = None  # None: not known, frames are in px
+    pixels_per_mm: float | None = None  # the same everywhere in the image
+    calibration: Calibration | None = None  # exact everywhere; with neither, frames are in px
 
     def __post_init__(self) -> None:
         if self.rotation not in (0, 90, 180, 270):
             raise UsageError(f"a camera's rotation must be 0, 90, 180 or 270 degrees, got {self.rotation}")
         if self.pixels_per_mm is not None and not 0 < self.pixels_per_mm < float("inf"):
             raise UsageError(f"pixels_per_mm must be positive, got {self.pixels_per_mm}")
+        if self.pixels_per_mm is not None and self.calibration is not None:
+            raise UsageError("a camera has a calibration or pixels_per_mm, not both")
+        self._check_calibration()
         _ = self.grid  # refuses impossible numbers of rows and columns, and pitches
+
+    def _check_calibration(self) -> None:
+        c = self.calibration
+        if c is not None and (c.rows, c.cols, c.spacing_mm) != (*self.image_grid, self.pitch):
+            lines, across = self.image_grid
+            raise UsageError(
+                f"the calibration is of {c.rows} lines of {c.cols} markers, {c.spacing_mm:g} mm apart; the mount says "
+                f"{lines} lines of {across}, {self.pitch:g} mm apart"
+            )
 
     @property
     def grid(self) -> Grid:
@@ -59,6 +74,19 @@ class CameraMount:
         numbers = np.arange(lines * across).reshape(lines, across)
         turned = np.rot90(numbers, k=self.rotation // 90)  # against the clock: back to the tip at the bottom
         return np.ascontiguousarray(turned[:, ::-1] if self.mirrored else turned).reshape(-1)
+
+    @property
+    def unit(self) -> Literal["mm", "px"]:
+        """What displacements are known in."""
+        return "px" if self.calibration is None and self.pixels_per_mm is None else "mm"
+
+    def displacement_mm(self, tracked: Tracked) -> NDArray[np.float64]:
+        """Displacements in the image's axes (right, down) [mm], shape (markers, 2). Raises UsageError in "px"."""
+        if self.calibration is not None:
+            return self.calibration.displacement_mm(tracked.position, tracked.displacement)
+        if self.pixels_per_mm is None:
+            raise UsageError("this camera's millimetres are not known: give the mount a calibration or pixels_per_mm")
+        return tracked.displacement / self.pixels_per_mm
 
     def to_pad(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vectors in the image (right, down), shape (n, 2), as (x, y) on the pad, in the same unit."""
@@ -83,14 +111,14 @@ def decode(data: bytes) -> Image:
 def tactile_frame(trackeds: Sequence[Tracked], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
     """What all sensors felt: one tracked image and one mount per sensor, sensor 0 (the left finger) first.
 
-    The unit is "mm" when every mount knows its scale, otherwise "px". Raises UsageError when the numbers of images
+    The unit is "mm" when every mount knows it, otherwise "px". Raises UsageError when the numbers of images
     and mounts differ, the pads have different grids, or a tracked grid is not the mount's.
     """
     if not trackeds or len(trackeds) != len(mounts):
         raise UsageError(f"expected one tracked image per mount, got {len(trackeds)} images and {len(mounts)} mounts")
     if any(mount.grid != mounts[0].grid for mount in mounts):
         raise UsageError("the sensors of one frame must have the same grid of markers")
-    unit: Literal["mm", "px"] = "px" if any(mount.pixels_per_mm is None for mount in mounts) else "mm"
+    unit: Literal["mm", "px"] = "px" if any(mount.unit == "px" for mount in mounts) else "mm"
     grid = mounts[0].grid
     shear = np.zeros((len(mounts), grid.rows * grid.cols, 2), dtype=np.float32)
     valid = np.zeros(shear.shape[:2], dtype=bool)
@@ -102,8 +130,8 @@ def tactile_frame(trackeds: Sequence[Tracked], mounts: Sequence[CameraMount], st
                 f"({mount.rows} × {mount.cols}, turned {mount.rotation}°) expects {lines} lines of {across}"
             )
         order = mount.order()
-        scale = mount.pixels_per_mm if unit == "mm" and mount.pixels_per_mm is not None else 1.0
         valid[sensor] = tracked.valid[order]
-        vectors = mount.to_pad(tracked.displacement[order]) / scale
+        displacement = mount.displacement_mm(tracked) if unit == "mm" else tracked.displacement
+        vectors = mount.to_pad(displacement[order])
         shear[sensor] = np.where(valid[sensor, :, None], vectors, np.nan)
     return TactileFrame(shear, valid, grid.positions().astype(np.float32), stamp, unit, grid=grid)

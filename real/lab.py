@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.perception.calibration import load_calibration
 from gelflow.perception.frames import CameraMount
 
 FORMAT = 1
@@ -75,7 +76,8 @@ class CameraLab:
     rows: int  # markers from the finger's base to its tip
     cols: int  # markers across the finger
     pitch_mm: float  # distance between neighbouring markers on the gel [mm]
-    pixels_per_mm: float  # scale of the image on the gel [px/mm]
+    calibration: str = ""  # file of gelflow calibrate-camera for this camera, beside the lab file or by its full path
+    pixels_per_mm: float = 0.0  # without a calibration: one scale of the image on the gel [px/mm]
     center_mm: tuple[float, float] = (0.0, 0.0)  # the marker grid's centre on the pad, x to the tip [mm]
     rotation_deg: int = 0  # of the image, clockwise; at 0 the finger's tip is at the bottom [°]: 0, 90, 180 or 270
     mirrored: bool = True  # the camera sees the gel from behind
@@ -88,10 +90,13 @@ class CameraLab:
         turned = self.rotation_deg in (0, 90, 180, 270)
         _require(turned, f"rotation_deg must be 0, 90, 180 or 270, got {self.rotation_deg}")
         _require(self.rows >= 3 and self.cols >= 3, f"rows and cols must be at least 3, got {self.rows}, {self.cols}")
-        _positive(self, "pitch_mm", "pixels_per_mm")
+        _positive(self, "pitch_mm")
+        one = bool(self.calibration) != bool(self.pixels_per_mm) and self.pixels_per_mm >= 0
+        _require(one, "give either calibration, a file of gelflow calibrate-camera, or pixels_per_mm, above 0")
 
     @property
     def mount(self) -> CameraMount:
+        """How the camera looks at its pad. Raises UsageError when the calibration can't be read or does not fit."""
         rotation = cast(Literal[0, 90, 180, 270], self.rotation_deg)
         return CameraMount(
             rows=self.rows,
@@ -100,7 +105,8 @@ class CameraLab:
             center=self.center_mm,
             rotation=rotation,
             mirrored=self.mirrored,
-            pixels_per_mm=self.pixels_per_mm,
+            pixels_per_mm=self.pixels_per_mm or None,
+            calibration=load_calibration(self.calibration) if self.calibration else None,
         )
 
 

@@ -28,7 +28,22 @@ def load_lab(path: str | Path) -> Lab:
         raise UsageError(f"{path}: lab file format {found}; this gelflow reads format {FORMAT}")
     lab = _table(Lab, data, str(path), "")
     assert isinstance(lab, Lab)
-    return lab
+    return _with_calibrations(lab, path)
+
+
+def _with_calibrations(lab: Lab, path: Path) -> Lab:
+    """`lab` with full paths of its cameras' calibrations, each of which is read once: an error shows at once."""
+    cameras = {}
+    for name in ("left", "right"):
+        camera = getattr(lab.cameras, name)
+        if camera.calibration:
+            camera = dataclasses.replace(camera, calibration=str((path.parent / camera.calibration).resolve()))
+        try:
+            _ = camera.mount
+        except UsageError as error:
+            raise UsageError(f"{path}: [cameras.{name}] {error}") from None
+        cameras[name] = camera
+    return dataclasses.replace(lab, cameras=dataclasses.replace(lab.cameras, **cameras))
 
 
 def save_lab(lab: Lab, path: str | Path, *, title: str) -> None:

@@ -53,7 +53,10 @@ def _look(name: str, check: Callable[[], str]) -> Item:
 
 def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     image = cell.cameras[sensor].latest()
-    tracked = MarkerTracker(mount.tracker_config()).start(decode(image.data))
+    picture = decode(image.data)
+    if mount.calibration is not None:
+        mount.calibration.check_size(picture)
+    tracked = MarkerTracker(mount.tracker_config()).start(picture)
     seen, total = int(tracked.valid.sum()), mount.rows * mount.cols
     if seen < _FEWEST * total:
         raise PeerError(f"{seen} of {total} markers are seen; look at the gel, its light and the camera")

@@ -9,6 +9,7 @@ import pytest
 import gelflow.real
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.perception.calibration import Calibration, save_calibration
 from gelflow.real.lab import Lab
 from gelflow.real.lab_file import load_lab, save_lab
 
@@ -72,6 +73,8 @@ def test_what_is_saved_is_read_back_equal(tmp_path: Path) -> None:
         ("# rotation_deg = 0 ", "rotation_deg = 45 #", "rotation_deg must be 0, 90, 180 or 270, got 45"),
         ('# presentation = "prompt"', 'presentation = "hope"', 'presentation must be "prompt" or "wait"'),
         ("# stop_shear_mm = 0.12", "stop_shear_mm = 0.01", "stop_shear_mm must be above contact_shear_mm"),
+        ("pixels_per_mm = 15.7", "pixels_per_mm = 0.0", "[cameras.left] give either calibration"),
+        ("pixels_per_mm = 15.7", 'calibration = "none.json"', "[cameras.left] cannot read"),
         ("# stale_pose = 0.020", "stale_pose = 0", "stale_pose must be above 0"),
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
     ],
@@ -79,6 +82,20 @@ def test_what_is_saved_is_read_back_equal(tmp_path: Path) -> None:
 def test_what_is_wrong_is_named(tmp_path: Path, example: str, old: str, new: str, expected: str) -> None:
     assert old in example
     assert expected in refused(tmp_path, example.replace(old, new, 1))
+
+
+def test_a_calibration_is_named_from_where_the_lab_file_is(tmp_path: Path, example: str) -> None:
+    matrix = ((13.0, 0.0, 0.0), (0.0, 13.0, 0.0), (0.0, 0.0, 1.0))
+    calibration = Calibration(320, 427, 18, 14, 1.4, matrix, (-0.1,), (159.5, 213.0), 0.1, 0.2)
+    save_calibration(calibration, tmp_path / "left.json")
+    path = tmp_path / "lab.toml"
+    path.write_text(example.replace("pixels_per_mm = 15.7", 'calibration = "left.json"', 1), encoding="utf-8")
+    lab = load_lab(path)
+    assert lab.cameras.left.mount.calibration == calibration and lab.cameras.right.mount.pixels_per_mm == 15.7
+    save_lab(lab, tmp_path / "elsewhere" / "lab.toml", title="the same calibration")
+    assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
+    path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
+    assert "[cameras.left] the calibration is of 18 lines of 14" in refused(tmp_path, path.read_text())
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

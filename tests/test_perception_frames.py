@@ -1,12 +1,16 @@
 """The camera's edge of the observation format: bytes to images, image axes to the pad's."""
 
+import json
+
 import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.hardware_mocks.gel import GelLook, GelRenderer
+from gelflow.perception.calibration import Calibration
 from gelflow.perception.frames import CameraMount, decode, tactile_frame
 from gelflow.perception.tracker import MarkerTracker, Tracked
+from gelflow.session.records import restore, to_json
 
 SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
 
@@ -42,6 +46,25 @@ def test_without_a_scale_the_frame_is_in_pixels() -> None:
     frame = tactile_frame([tracked(), tracked()], mounts, stamp=0.0)
     assert frame.unit == "px"
     assert np.allclose(frame.shear[:, 0], [2.0, 1.0])  # both in px, though one camera's scale is known
+
+
+def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() -> None:
+    # A camera that looks askew: its scale grows from 12 to 18 px/mm over the image. The finger's tip is at the right.
+    matrix = ((13.5, 0.0, 0.0), (0.0, 13.5, 0.0), (0.2, 0.0, 1.0))
+    calibration = Calibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
+    mount = CameraMount(rotation=270, mirrored=True, calibration=calibration)
+    rest_mm = calibration.nodes_mm()
+    moved = np.tile([0.3, -0.2], (len(rest_mm), 1))
+    rest, position = calibration.to_pixels(rest_mm), calibration.to_pixels(rest_mm + moved)
+    all_of_them = np.ones(len(rest), dtype=bool)
+    seen = Tracked(position, position - rest, all_of_them, ~all_of_them, all_of_them.astype(float), 14, 18, 22.0)
+    frame = tactile_frame([seen], [mount], stamp=0.0)
+    assert frame.unit == "mm" and np.allclose(frame.shear, [0.3, -0.2], atol=1e-6)
+    assert restore(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
+    with pytest.raises(UsageError, match="not both"):
+        CameraMount(rotation=270, calibration=calibration, pixels_per_mm=15.7)
+    with pytest.raises(UsageError, match="calibration is of 14 lines of 18 markers"):
+        CameraMount(rotation=0, calibration=calibration)
 
 
 def test_a_marker_not_seen_is_invalid_and_never_zero() -> None:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import platform
+import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -57,7 +58,7 @@ def to_json(value: Any) -> bytes:
 
 
 def restore(kind: type[Record], data: Any, *, what: str) -> Record:
-    """A dataclass from its `plain` form; lists become tuples.
+    """A dataclass from its `plain` form; lists become tuples, and tables dataclasses where a field holds one.
 
     Raises UsageError when `data` does not fit: it was then written by another version.
     """
@@ -66,10 +67,18 @@ def restore(kind: type[Record], data: Any, *, what: str) -> Record:
         extra = f"unknown keys {sorted(set(data) - names)}" if isinstance(data, Mapping) else f"{data!r}"
         known = ", ".join(sorted(names))
         raise UsageError(f"{what}: expected the keys {known}, got {extra}; is it of another version?")
+    fields = typing.get_type_hints(kind)
     try:
-        return kind(**{key: _tuples(value) for key, value in data.items()})
+        return kind(**{key: _field(fields[key], value, f"{what}, {key}") for key, value in data.items()})
     except (TypeError, ValueError) as error:
         raise UsageError(f"{what}: {error}") from error
+
+
+def _field(wanted: Any, value: Any, what: str) -> Any:
+    for kind in (wanted, *typing.get_args(wanted)):
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
+            return restore(kind, value, what=what)
+    return _tuples(value)
 
 
 def _tuples(value: Any) -> Any:
