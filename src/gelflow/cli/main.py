@@ -22,6 +22,7 @@ COMMANDS = {
     "replay": "run a recorded session through tracker and policy again and compare the decisions",
     "recover": "salvage what a killed recorder left behind",
     "mock": "start the mock robot: gripper, arm and two cameras on the wire",
+    "render": "draw images of a gel with known truth: what tracking is tried on",
     "bench": "measure speed",
     "tradeoff": "what accuracy costs on a scene: settings by speed and error, and the presets among them",
     "describe": "what a scene models, what it leaves out and why, its size, and where a step's time goes",
