@@ -16,6 +16,8 @@ from gelflow.hardware_mocks.gel_flaws import FlawedLook
 
 SHARP = 0.5  # standard deviation of an edge before the optical blur: the pixel's own width and no aliasing [px]
 
+_WRINKLE = 0.4  # from one wrinkle to the next, in spacings
+
 Layer = NDArray[np.float32]  # shape (height, width), or (height, width, 3) where it has colour
 
 
@@ -43,35 +45,38 @@ def light(look: FlawedLook, rng: np.random.Generator) -> Layer:
 
 
 def shading(look: FlawedLook, contact: Contact, angle: float) -> Layer:
-    """By how much the dome's slopes lighten and darken each channel; lights 120° apart, the first at `angle`."""
+    """By how much the slopes of dome and wrinkles lighten and darken each channel.
+
+    The three lights stand 120° apart, the first at `angle`.
+    """
     right, down = places(look)
     x, y = (right - contact.center[0]) / contact.radius, (down - contact.center[1]) / contact.radius
     dome = contact.depth * np.exp(-(x * x + y * y) / 2)
+    across = math.cos(angle) * y - math.sin(angle) * x
+    along = math.cos(angle) * x + math.sin(angle) * y + 0.1 * np.sin(4 * across)
+    wrinkles = contact.depth * look.ridges * ndtr(8 * (0.9 - np.hypot(x, y)))
+    turns = 2 * math.pi * contact.radius / (_WRINKLE * look.spacing)
     channels = []
-    for k, tint in enumerate((0.1, -0.1, 0.3)):  # pressed gel is nearer to the lights: a little redder, less green
+    for k, tint in enumerate((0.1, -0.1, 0.3)):  # pressed gel is nearer to the lights, and redder
         turn = angle + k * 2 * math.pi / 3
-        channels.append(1 + look.shading * dome * (0.9 * (x * math.cos(turn) + y * math.sin(turn)) + tint))
-    return np.stack(channels, axis=-1)
+        slope = 0.9 * (x * math.cos(turn) + y * math.sin(turn))
+        fine = 0.22 * np.sin(turns * along + 0.8 * k) if look.ridges else 0.0
+        channels.append(1 + look.shading * dome * (slope + tint) + wrinkles * fine)
+    return np.asarray(np.stack(channels, axis=-1), dtype=np.float32)
 
 
 def shine(look: FlawedLook, contact: Contact, spots: NDArray[np.float64], angle: float) -> Layer:
-    """How far pixels are saturated by wrinkles, the contact's rim and highlights, 0 to 1.
+    """How far pixels are saturated by light that the contact's rim and highlights throw back, 0 to 1.
 
     `spots`, shape (highlights, 2), lie around the contact's centre in units of its radius.
     """
     right, down = places(look)
     x, y = right - contact.center[0], down - contact.center[1]
-    far = np.hypot(x, y) / contact.radius
     total = np.zeros_like(right)
     if look.ridges:
-        period = 0.4 * look.spacing
-        along = math.cos(angle) * x + math.sin(angle) * y
-        across = math.cos(angle) * y - math.sin(angle) * x
-        wave = np.sin(2 * np.pi * along / period + 1.5 * np.sin(across / look.spacing))
-        wrinkles = 0.35 * np.square(np.square(np.maximum(wave, 0))) * ndtr(6 * (0.9 - far))
-        lit = np.square(np.maximum(along / (far * contact.radius + 1), 0))
-        rim = 0.9 * lit * np.exp(-np.square((far - 1) * (contact.radius / (0.12 * look.spacing))))
-        total = look.ridges * np.maximum(wrinkles, rim)
+        far = np.hypot(x, y)
+        lit = np.square(np.maximum((math.cos(angle) * x + math.sin(angle) * y) / (far + 1), 0))
+        total = 0.9 * look.ridges * lit * np.exp(-np.square((far - contact.radius) / (0.12 * look.spacing)))
     for spot in spots:
         reach = np.hypot(x - float(spot[0]) * contact.radius, 1.6 * (y - float(spot[1]) * contact.radius))
         total = np.maximum(total, ndtr((0.35 * look.spacing - reach) / 1.5))

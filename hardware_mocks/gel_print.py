@@ -1,5 +1,6 @@
 """The print on a gel: which dots it lacks, which are damaged or run together, and the ink of all in an image."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from gelflow.hardware_mocks.gel_layers import SHARP, Layer, places
 Array = NDArray[np.float64]
 Patches = NDArray[np.float32]  # shape (dots, side, side)
 
+_LITTLE = 6  # holes of a worn dot
 _DENSE = 0.96  # usual density of the ink; the look's contrast is that of a density of 1
 
 
@@ -20,24 +22,32 @@ _DENSE = 0.96  # usual density of the ink; the look's contrast is that of a dens
 class Damage:
     """Ink that is gone from one dot. Places in units of the dot's radius, in the dot's own, unstretched frame."""
 
-    kind: str  # "cut", "scratch" or "hole"
+    kind: str  # "cut", "scratch", "hole" or "worn": many little holes
     angle: float
     offset: float
     size: float
 
     def left(self, x: Patches, y: Patches, edge: float) -> Patches:
         """Share of the ink that is left at places (x, y); edges are as soft as `edge`."""
-        right, down = np.cos(self.angle), np.sin(self.angle)
+        right, down = math.cos(self.angle), math.sin(self.angle)
+        if self.kind in ("cut", "scratch"):
+            beyond = x * right + y * down - self.offset
+            return np.asarray(ndtr((np.abs(beyond) - self.size if self.kind == "scratch" else -beyond) / edge))
         if self.kind == "hole":
             far = np.hypot(x - self.offset * right, y - self.offset * down)
             return np.asarray(ndtr((far - self.size) / edge))
-        beyond = x * right + y * down - self.offset
-        return np.asarray(ndtr((np.abs(beyond) - self.size if self.kind == "scratch" else -beyond) / edge))
+        ink = np.ones_like(x)
+        for k in range(_LITTLE):
+            turn, out = self.angle + 2.4 * k, math.sqrt((k + 0.5) / _LITTLE)  # 2.4: the golden angle
+            far = np.hypot(x - out * math.cos(turn), y - out * math.sin(turn))
+            ink = ink * ndtr((far - 0.5 * self.size) / edge)
+        return np.asarray(ink)
 
 
 def _drawn_damage(rng: np.random.Generator) -> Damage:
-    kind = ("cut", "scratch", "hole")[rng.integers(3)]
-    low, high = {"cut": (0.1, 0.6), "scratch": (-0.4, 0.4), "hole": (0.2, 0.8)}[kind]
+    offsets = {"cut": (0.1, 0.6), "scratch": (-0.4, 0.4), "hole": (0.2, 0.8), "worn": (0.0, 0.0)}
+    kind = tuple(offsets)[rng.integers(len(offsets))]
+    low, high = offsets[kind]
     return Damage(kind, rng.uniform(0, 2 * np.pi), rng.uniform(low, high), rng.uniform(0.12, 0.45))
 
 

@@ -24,6 +24,7 @@ from gelflow.hardware_mocks.gel_print import Print
 Points = NDArray[np.float64]
 
 _HIDDEN = 0.25  # share of a dot that may be covered before it counts as not visible
+_BLACK, _YELLOW = (-1.0, -1.0, -1.0), (-0.3, 1.1, 1.0)  # what paint of full contrast adds to blue, green and red
 _SHINE = 280.0  # what shines is beyond the sensor's range [grey levels]
 _OCCLUDER = (0.55, 0.5, 0.6)  # B G R, as a share of the gel's mean light
 
@@ -107,8 +108,8 @@ class TruthRenderer:
         motion = np.zeros_like(centers) if smear is None else np.asarray(smear, dtype=float)
         clear, dots = self._print.draw(centers, shapes, motion)
         picture = self._light * layers.shading(look, contact, self._angle) if contact else self._light.copy()
-        strength = look.contrast if look.bright else -look.contrast
-        picture *= (self._dust * (1 + strength * (1 - clear)))[..., None]
+        paint = look.contrast * np.array(_YELLOW if look.bright else _BLACK, dtype=np.float32)
+        picture *= self._dust[..., None] * (1 + paint * (1 - clear)[..., None])
         hidden = np.zeros_like(clear)
         if contact is not None and (look.ridges or look.highlights):
             hidden = layers.shine(look, contact, self._spots, self._angle)
