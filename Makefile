@@ -2,7 +2,7 @@
 #   make demo    the main job on the mock robot
 #   make test    all tests
 #   make check   lint, format, types, import rules
-#   make core    rebuild the C++ core after a change
+#   make core    rebuild the C++ parts after a change
 #   make sanitize   the core's tests on a core that AddressSanitizer and UBSan watch (GCC, Linux)
 #   make clean   remove what was built (the environment .venv stays; delete it by hand to start afresh)
 # Variables: PYTHON=python3.12 names another Python for the environment; TORCH_INDEX=URL adds an index for torch
@@ -16,7 +16,7 @@ INSTALL := .venv/bin/python -m pip --disable-pip-version-check install -q --no-c
 BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
-CXX_FILES = $(wildcard sim/csrc/*.cpp sim/csrc/*.hpp)
+CXX_FILES = $(foreach folder,sim/csrc perception/csrc,$(wildcard $(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
 SANITIZE_BUILD := build/sanitize
@@ -54,7 +54,7 @@ sanitize: core
 setup: $(SETUP)
 
 # Build isolation is off so that the build tools too have pinned versions, and a rebuild finds them again.
-$(SETUP): pyproject.toml constraints.txt sim/csrc/CMakeLists.txt
+$(SETUP): pyproject.toml constraints.txt CMakeLists.txt sim/csrc/CMakeLists.txt perception/csrc/CMakeLists.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "expected Python 3.11 or newer, got $$($(PYTHON) --version); try make PYTHON=python3.12" >&2; exit 1; }
 	@echo "setting up .venv (once): build tools, torch, the other dependencies, the C++ core"
@@ -65,5 +65,5 @@ $(SETUP): pyproject.toml constraints.txt sim/csrc/CMakeLists.txt
 	@touch $@
 
 clean:
-	rm -rf build dist sim/_core*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP)
+	rm -rf build dist sim/_core*.so perception/_tracker*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP)
 	find sim perception policies real hardware_mocks src tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

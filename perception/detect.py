@@ -6,7 +6,7 @@ Everything is integer or element-wise arithmetic in a fixed order: the same imag
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 
+PlaneName = Literal["grey", "value", "blue", "green", "red", "chroma"]
+PLANES: tuple[PlaneName, ...] = get_args(PlaneName)  # in the order of csrc/image.hpp
+
+
 @dataclass(frozen=True)
 class Look:
     """What makes a dot stand out: the plane of the image that shows it, and whether it is dark or bright there."""
 
-    plane: Literal["value", "grey", "red", "green", "blue", "chroma"]
+    plane: PlaneName
     bright: bool
 
 
@@ -51,7 +55,7 @@ def contrast(image: NDArray[np.uint8], look: Look, window: int) -> Floats:
 
     `window` [px]: side of the box that counts as surroundings.
     """
-    plane = _plane(image, look.plane)
+    plane = plane_of(image, look.plane)
     mean = cv2.boxFilter(plane, cv2.CV_32F, (window | 1, window | 1), borderType=cv2.BORDER_REFLECT_101)
     # The 8 keeps the sensor noise of black corners from becoming contrast.
     share = (plane - mean) / (mean + np.float32(8)) if look.bright else (mean - plane) / (mean + np.float32(8))
@@ -114,7 +118,8 @@ def _refine(
     return Dots(centers, area, peaks, border > 0.9 * np.minimum(own, 1.3 * radius))
 
 
-def _plane(image: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+def plane_of(image: NDArray[np.uint8], name: PlaneName) -> NDArray[np.uint8]:
+    """One plane of an image (B G R), shape (height, width)."""
     if name == "grey":
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     blue, green, red = cv2.split(image)

@@ -1,6 +1,6 @@
 """The grid of markers in a first image, with nothing known but, perhaps, how many lines and columns it has."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -35,6 +35,11 @@ class Found:
     @property
     def shape(self) -> tuple[int, int]:
         return self.seen.shape[0], self.seen.shape[1]
+
+    def smaller(self, shrink: int) -> "Found":
+        """The same grid in an image made smaller by `shrink`."""
+        places = (self.positions + 0.5) / shrink - 0.5
+        return replace(self, radius=self.radius / shrink, spacing=self.spacing / shrink, positions=places)
 
 
 def surroundings(spacing: float) -> int:

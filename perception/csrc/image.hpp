@@ -1,0 +1,73 @@
+// The one plane of a camera image in which dots stand out, with a margin around it.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+// A function compiled twice, for any processor and for those with AVX2, of which the loader takes the better one. Only
+// plain loops over plain arrays: what they call must be inlined. The sanitizers' build has one.
+#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(GELFLOW_SANITIZE)
+#define GELFLOW_CLONES __attribute__((target_clones("default", "arch=x86-64-v3")))
+#else
+#define GELFLOW_CLONES
+#endif
+#define GELFLOW_INLINE inline __attribute__((always_inline))
+
+namespace gelflow::perception {
+
+struct Point {
+  double x = 0, y = 0;  // right, down [px]
+};
+GELFLOW_INLINE Point operator+(Point a, Point b) { return {a.x + b.x, a.y + b.y}; }
+GELFLOW_INLINE Point operator-(Point a, Point b) { return {a.x - b.x, a.y - b.y}; }
+GELFLOW_INLINE Point operator*(double s, Point a) { return {s * a.x, s * a.y}; }
+GELFLOW_INLINE double squared(Point a) { return a.x * a.x + a.y * a.y; }
+
+// What of the three colours is looked at; in the order of detect.py's PLANES.
+enum class Channel { grey, value, blue, green, red, chroma };
+
+struct Plane {
+  // Reading up to `margin` pixels beyond any side is allowed; what stands there means nothing.
+  static constexpr int margin = 96;
+  int width, height, stride;
+  std::vector<std::uint8_t> data;
+
+  Plane(int width, int height)
+      : width(width), height(height), stride(width + 2 * margin), data(std::size_t(stride) * (height + 2 * margin)) {}
+  const std::uint8_t* row(int y) const { return data.data() + std::size_t(y + margin) * stride + margin; }
+  std::uint8_t* row(int y) { return data.data() + std::size_t(y + margin) * stride + margin; }
+};
+
+// One line of B G R pixels. The weights of grey are those of JPEG's luminance, in 1/256.
+GELFLOW_CLONES inline void take_line(const std::uint8_t* __restrict bgr, std::uint8_t* __restrict out, int width,
+                                     Channel channel) {
+  switch (channel) {
+    case Channel::grey:
+      for (int x = 0; x < width; ++x)
+        out[x] = std::uint8_t((29 * bgr[3 * x] + 150 * bgr[3 * x + 1] + 77 * bgr[3 * x + 2] + 128) >> 8);
+      break;
+    case Channel::blue:
+    case Channel::green:
+    case Channel::red:
+      bgr += int(channel) - int(Channel::blue);
+      for (int x = 0; x < width; ++x) out[x] = bgr[3 * x];
+      break;
+    case Channel::value:
+    case Channel::chroma:
+      for (int x = 0; x < width; ++x) {
+        const std::uint8_t b = bgr[3 * x], g = bgr[3 * x + 1], r = bgr[3 * x + 2];
+        const std::uint8_t high = std::max(std::max(b, g), r), low = std::min(std::min(b, g), r);
+        out[x] = channel == Channel::value ? high : std::uint8_t(high - low);
+      }
+      break;
+  }
+}
+
+inline void take_plane(const std::uint8_t* bgr, Plane& plane, Channel channel) {
+  for (int y = 0; y < plane.height; ++y)
+    take_line(bgr + std::size_t(3) * plane.width * y, plane.row(y), plane.width, channel);
+}
+
+}  // namespace gelflow::perception
