@@ -8,6 +8,7 @@ from gelflow.perception.tracker import Tracked
 
 _SHIFT = 4  # OpenCV takes coordinates in 1/16 px
 _ARROW = (255, 255, 255)
+_GUESSED = (0, 165, 255)
 _LOST = (60, 60, 255)
 _EDGE = (0, 0, 0)
 
@@ -18,7 +19,8 @@ def draw_overlay(
     """`image` (B G R) with the tracked markers drawn over it, enlarged to at least `smallest` px on its longer side.
 
     Lines between neighbours go from blue (top line, left column) to yellow; the arrow at each valid marker shows its
-    displacement `magnify` times; a marker that is not valid gets a red cross where it is expected.
+    displacement `magnify` times. A marker whose place was inferred gets an orange ring there instead, one of which
+    nothing is known a red cross where it was last.
     """
     scale = max(1, int(np.ceil(smallest / max(image.shape[:2]))))
     larger = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
@@ -30,9 +32,14 @@ def draw_overlay(
     _draw_grid(picture, places, valid, _colours(shape[0]), _colours(shape[1]))
     tips = places + magnify * scale * np.nan_to_num(tracked.displacement).reshape(*shape, 2)
     reach = max(2.0, 0.16 * tracked.spacing * scale)
-    for place, tip, good in zip(places.reshape(-1, 2), tips.reshape(-1, 2), valid.reshape(-1), strict=True):
-        if not good:
+    for place, tip, good, guessed in zip(
+        places.reshape(-1, 2), tips.reshape(-1, 2), tracked.valid, tracked.inferred, strict=True
+    ):
+        if guessed:
+            cv2.circle(picture, _fixed(place), round(reach * 2**_SHIFT), _GUESSED, 2, cv2.LINE_AA, _SHIFT)
+        elif not good:
             _cross(picture, place, reach)
+        if not good:
             continue
         cv2.circle(picture, _fixed(place), round(0.3 * reach * 2**_SHIFT), _ARROW, 1, cv2.LINE_AA, _SHIFT)
         length = float(np.linalg.norm(tip - place))
@@ -63,7 +70,8 @@ def _draw_grid(
 def _caption(picture: NDArray[np.uint8], tracked: Tracked, magnify: float) -> None:
     lengths = np.linalg.norm(tracked.displacement[tracked.valid], axis=1)
     largest = f"{lengths.max():.1f} px" if len(lengths) else "none"
-    text = f"{tracked.valid.sum()}/{tracked.valid.size} valid, largest {largest}, arrows x{magnify:g}"
+    seen = f"{tracked.valid.sum()}/{tracked.valid.size} valid, {tracked.inferred.sum()} inferred"
+    text = f"{seen}, largest {largest}, arrows x{magnify:g}"
     for colour, thickness in ((_EDGE, 3), (_ARROW, 1)):
         cv2.putText(picture, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, thickness, cv2.LINE_AA)
 

@@ -1,15 +1,14 @@
-"""Where images come from: a folder, one image file, a video file, a stream's URL, a camera's number.
+"""Where images come from: a folder, an image file, a video file, a recorded session, a stream's URL, a camera's number.
 
-A source has a name, a length where that is known, and is iterated once; it yields (name of the image, image). Nothing
-is opened before iteration starts. For the robot's cameras there are drivers that keep the received bytes; these
-sources are for looking at what one has.
+A source has a length where that is known, and is iterated once. Nothing is opened before iteration starts. For the
+robot's cameras there are drivers; these sources are for looking at what one has.
 """
 
 import os
 import re
 import socket
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -17,15 +16,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
 from gelflow.perception.frames import decode
+from gelflow.session.reader import SessionReader
+from gelflow.session.records import SENSORS
 
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
+_KEPT = (b"\xff\xd8\xff", b"\x89PNG")  # how the bytes of JPEG and PNG start
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # of the protocols that run over TCP
 # FFmpeg writes to the terminal by itself; OpenCV reads this when it uses FFmpeg for the first time.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a source."""
+
+    name: str  # of its file, or its number
+    image: Image  # B G R, shape (height, width, 3)
+    stamp: float  # when it was taken [s]: from the start of a video or folder, otherwise robot time
+    data: bytes | None = None  # JPEG or PNG that `image` was decoded from, where there is one
 
 
 @dataclass(frozen=True)
@@ -33,17 +46,22 @@ class Source:
     """A finite or endless sequence of images."""
 
     text: str  # as the user wrote it
-    kind: str  # "folder", "image", "video", "stream" or "camera"
+    kind: str  # "folder", "image", "video", "session", "stream" or "camera"
     files: tuple[Path, ...] = ()  # of a folder or an image
+    sensor: str = "left"  # whose images of a session
+    rate: float = 25.0  # of a folder's images, and of a video that does not say [Hz]
     timeout: float = 5.0  # of a stream, for opening and for each image [s]
+    clock: Clock = field(default_factory=ScaledClock)  # stamps what is live
 
     @property
     def live(self) -> bool:
         """Whether it goes on until it is told to stop."""
         return self.kind in ("stream", "camera")
 
-    def __iter__(self) -> Iterator[tuple[str, Image]]:
-        """(name, image as B G R) one after the other. Raises PeerError when one can not be had."""
+    def __iter__(self) -> Iterator[Frame]:
+        """One image after the other. Raises PeerError when one can not be had."""
+        if self.kind == "session":
+            return self._from_session()
         return self._from_files() if self.files else self._from_capture()
 
     def count(self) -> int | None:
@@ -52,22 +70,42 @@ class Source:
             return len(self.files)
         if self.live:
             return None
+        if self.kind == "session":
+            with SessionReader(self.text) as session:
+                return session.counts().get(f"/{self.sensor}/image", 0)
         capture = self._open()
         number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
         return number if number > 0 else None
 
-    def _from_files(self) -> Iterator[tuple[str, Image]]:
-        for file in self.files:
+    def _from_files(self) -> Iterator[Frame]:
+        for number, file in enumerate(self.files):
             try:
-                yield file.name, decode(file.read_bytes())
+                data = file.read_bytes()
+                kept = data if data.startswith(_KEPT) else None
+                yield Frame(file.name, decode(data), number / self.rate, kept)
             except PeerError as error:
                 raise PeerError(f"{file}: {error}") from None
             except OSError as error:
                 raise PeerError(f"{file} can not be read: {error.strerror}") from None
 
-    def _from_capture(self) -> Iterator[tuple[str, Image]]:
+    def _from_session(self) -> Iterator[Frame]:
+        empty = True
+        with SessionReader(self.text) as session:
+            for record in session.records([f"/{self.sensor}/image"]):
+                empty = False
+                name = f"{record.value.sequence:06d}"
+                try:
+                    yield Frame(name, decode(record.value.data), record.stamp, record.value.data)
+                except PeerError as error:
+                    raise PeerError(f"{self.text}, image {name} of the {self.sensor} sensor: {error}") from None
+        if empty:
+            raise PeerError(f"session {self.text} has no image of the {self.sensor} sensor")
+
+    def _from_capture(self) -> Iterator[Frame]:
         capture = self._open()
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        rate = rate if 0.1 <= rate <= 1000 else self.rate
         number = 0
         try:
             while True:
@@ -76,7 +114,8 @@ class Source:
                     break
                 if image.ndim == 2:
                     image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-                yield f"{number:06d}", np.asarray(image, dtype=np.uint8)
+                stamp = self.clock.now() if self.live else number / rate
+                yield Frame(f"{number:06d}", np.asarray(image, dtype=np.uint8), stamp)
                 number += 1
         finally:
             capture.release()
@@ -133,26 +172,33 @@ class Source:
             raise PeerError(f"{self.text} is a text file, not an image or a video")
 
 
-def find_source(text: str, *, timeout: float = 5.0) -> Source:
-    """What `text` means: a number is a camera, scheme://... a stream, otherwise a folder or a file.
+def find_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Source:
+    """What `text` means: a number is a camera, scheme://... a stream, .mcap a session, otherwise a folder or a file.
 
-    Raises UsageError when there is no such file or folder, or a folder without images.
+    `sensor` chooses the images of a session; `rate` [Hz] gives those of a folder their stamps. Raises UsageError when
+    there is no such file or folder, or a folder without images.
     """
     if not text:
         raise UsageError("expected a folder, a file, a URL or a camera's number, got nothing")
+    if sensor not in SENSORS:
+        raise UsageError(f"sensor must be {' or '.join(SENSORS)}, got {sensor!r}")
+    if not 0.01 <= rate <= 10000:
+        raise UsageError(f"rate must be within 0.01 to 10000 Hz, got {rate}")
     if text.isascii() and text.isdigit():
-        return Source(text, "camera", timeout=timeout)
+        return Source(text, "camera", rate=rate)
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
-        return Source(text, "stream", timeout=timeout)
+        return Source(text, "stream", rate=rate)
     path = Path(text)
+    if path.suffix.lower() == ".mcap":
+        return Source(text, "session", sensor=sensor)
     if path.is_dir():
         files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural))
         if not files:
             raise UsageError(f"folder {text} has no images (known are {', '.join(sorted(IMAGE_SUFFIXES))})")
-        return Source(text, "folder", files)
+        return Source(text, "folder", files, rate=rate)
     if not path.exists():
         raise UsageError(f"expected a folder, a file, a URL or a camera's number, got {text}, which does not exist")
-    return Source(text, "image", (path,)) if _is_image(path) else Source(text, "video")
+    return Source(text, "image", (path,)) if _is_image(path) else Source(text, "video", rate=rate)
 
 
 def natural(path: Path) -> tuple[tuple[int, int, str], ...]:

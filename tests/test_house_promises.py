@@ -24,7 +24,7 @@ def test_a_document_names_what_exists(document: str) -> None:
     text = (ROOT / document).read_text()
     links = re.findall(r"\]\((?!https?:)([^)#]+)", text)
     assert [link for link in links if not ((ROOT / document).parent / link).exists()] == []
-    used = set(re.findall(r"`(?:\.venv/bin/)?gelflow ([a-z]+)", text))
+    used = set(re.findall(r"`(?:\.venv/bin/)?gelflow ([a-z-]+)", text))
     assert used - set(COMMANDS) == set()
     targets = set(re.findall(r"\bmake ([a-z]+)\b(?=`|    |,| TORCH| PYTHON)", text))
     rules = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))

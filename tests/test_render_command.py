@@ -27,7 +27,7 @@ def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
         assert (truth.rows, truth.cols) == (7, 9) and truth.made_from["look"]["bridges"] == 3
     assert b"".join(file.read_bytes() for file in sorted(folder.glob("*.jpg"))) == video.read_bytes()
     for source in (folder, video):
-        images = [image for _, image in find_source(str(source))]
+        images = [frame.image for frame in find_source(str(source))]
         assert len(images) == 6
         for image, frame in zip(images, drawn, strict=True):  # decoders differ a little where colours change
             assert np.abs(image.astype(int) - frame.image).mean() < 1.0

@@ -50,11 +50,25 @@ def a_decision(insertion: int = 0, attempt: int = 0) -> Decision:
     )
 
 
+MARKERS = {
+    "rows": 1,
+    "cols": 2,
+    "spacing_px": 22.0,
+    "position_px": np.array([[1.0, 2.0], [23.0, 2.5]]),
+    "displacement_px": np.array([[0.5, 0.0], [np.nan, np.nan]]),
+    "valid": np.array([True, False]),
+    "inferred": np.array([False, False]),
+    "quality": np.array([0.9, 0.0]),
+}
+
+
 def record_everything(recorder: SessionRecorder) -> None:
     recorder.metadata(describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab={"arm": {"port": 6510}}))
     recorder.image(0, CameraImage(b"\xff\xd8left\xff\xd9", 10.25, 3))
     recorder.image(1, CameraImage(b"png", 10.5, 2, "png"))
     joints = np.arange(6) / 7
+    for sensor in (0, 1):
+        recorder.markers(sensor, 10.75, MARKERS)
     recorder.arm_state(ArmState(np.array([0.3, 0.1, 0.2]), TURN, joints, 11.0, True, True, "auto", ""))
     recorder.arm_command(11.5, [0.3, 0.1, 0.199], TURN, kind="command")
     recorder.arm_command(11.6, [0.3, 0.1, 0.1995], TURN, kind="applied")
@@ -89,6 +103,7 @@ def test_everything_comes_back(session: Path) -> None:
         pose = by_topic[topic].value
         assert isinstance(pose, Pose)
         assert pose.position.tolist() == [0.3, 0.1, z] and pose.quaternion.tolist() == TURN.tolist()
+    assert by_topic["/right/markers"].value["displacement_px"] == [[0.5, 0.0], ["NaN", "NaN"]]
     assert by_topic["/arm/joints"].value == {f"joint_{i + 1}": i / 7 for i in range(6)}
     assert by_topic["/arm/status"].value["operating_mode"] == "auto"
     assert by_topic["/gripper/state"].value["force"] == "NaN"

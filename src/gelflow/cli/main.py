@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from gelflow import __version__
 from gelflow.errors import GelflowError
 
-# command → (what it does in one line). The module is gelflow.cli.<command>.
+# command → (what it does in one line). The module is gelflow.cli.<command>, with _ for -.
 COMMANDS = {
     "train": "train a policy in simulation",
     "eval": "success of a policy in simulation, beside random actions",
     "track": "track markers on tactile images: a folder, a video, a stream or a camera",
+    "calibrate-camera": "millimetres in a camera's images, from one image of the gel at rest",
     "run": "run the insertion policy on the robot, or on the mock robot",
     "replay": "run a recorded session through tracker and policy again and compare the decisions",
     "recover": "salvage what a killed recorder left behind",
@@ -41,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == chosen:
-            module = importlib.import_module(f"gelflow.cli.{name}")
+            module = importlib.import_module(f"gelflow.cli.{name.replace('-', '_')}")
             module.configure(sub)
     args = parser.parse_args(arguments)
     assert module is not None

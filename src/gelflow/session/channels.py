@@ -22,6 +22,8 @@ TEXT = {"type": "string"}
 FLAG = {"type": "boolean"}
 NUMBERS = {"type": "array", "items": NUMBER}
 INTEGERS = {"type": "array", "items": INTEGER}
+PAIRS = {"type": "array", "items": NUMBERS}
+FLAGS = {"type": "array", "items": FLAG}
 TABLE = {"type": "object"}
 
 BASE_FRAME = "base"
@@ -59,6 +61,25 @@ PROTOBUF: dict[str, Any] = {
 
 JSON: dict[str, JsonChannel] = {
     "/session": JsonChannel("gelflow.Session", {"format": INTEGER, "task": TABLE, "versions": TABLE}, ("format",)),
+    **{
+        f"/{sensor}/markers": JsonChannel(
+            "gelflow.Markers",
+            {
+                "stamp": NUMBER,
+                "rows": INTEGER,
+                "cols": INTEGER,
+                "spacing_px": NUMBER,
+                "position_px": PAIRS,
+                "displacement_px": PAIRS,
+                "displacement_mm": PAIRS,
+                "valid": FLAGS,
+                "inferred": FLAGS,
+                "quality": NUMBERS,
+            },
+            ("stamp", "rows", "cols", "spacing_px", "position_px", "displacement_px", "valid", "inferred", "quality"),
+        )
+        for sensor in SENSORS
+    },
     "/arm/status": JsonChannel(
         "gelflow.ArmStatus",
         {"stamp": NUMBER, "motors_on": FLAG, "running": FLAG, "operating_mode": TEXT, "fault": TEXT},

@@ -82,12 +82,14 @@ class SessionRecorder:
 
     def image(self, sensor: int, image: CameraImage) -> None:
         """One camera frame as received. `sensor` 0 is the left finger."""
-        if not 0 <= sensor < len(SENSORS):
-            raise UsageError(f"sensor must be 0 (left) or 1 (right), got {sensor}")
-        name = SENSORS[sensor]
+        name = _name(sensor)
         message = CompressedImage(frame_id=f"{name}_gel", data=image.data, format=image.encoding)
         message.timestamp.FromNanoseconds(nanoseconds(image.stamp))
         self._put(f"/{name}/image", message.SerializeToString(), stamp=image.stamp, sequence=image.sequence)
+
+    def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
+        """Where the markers were in the image of that stamp: the properties of `gelflow.Markers`, but the stamp."""
+        self._json(f"/{_name(sensor)}/markers", {"stamp": stamp, **values}, stamp=stamp)
 
     def arm_state(self, state: ArmState) -> None:
         """Measured pose, joints and status of the arm."""
@@ -303,6 +305,12 @@ class _Syncer:
             for done in waiting:
                 if done is not None:
                     done.set()
+
+
+def _name(sensor: int) -> str:
+    if not 0 <= sensor < len(SENSORS):
+        raise UsageError(f"sensor must be 0 (left) or 1 (right), got {sensor}")
+    return SENSORS[sensor]
 
 
 def _fill(message: Any, names: str, values: ArrayLike) -> None:

@@ -1,0 +1,183 @@
+"""What `gelflow track` writes while it runs: CSV, MCAP, overlay video. No command.
+
+Nothing waits for the end: what a killed run leaves behind can be read (an .mcap after `gelflow recover`; of the
+overlays .mkv and .avi, an .mp4 needs its end).
+"""
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.perception.overlay import draw_overlay
+from gelflow.perception.sources import Frame
+from gelflow.perception.tracker import Tracked
+from gelflow.protocols import CameraImage
+from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import SENSORS
+
+CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}  # of an overlay by its file's suffix
+PICTURES = (".png", ".jpg")
+
+_INTERVALS = 10  # between images, whose median is the overlay's
+_SAFE = 50  # images after which the recording waits until all is on the disk
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One image, tracked."""
+
+    number: int  # from 0
+    frame: Frame
+    tracked: Tracked
+    position_mm: Floats | None = None  # on the gel, shape (markers, 2); None without a calibration
+    displacement_mm: Floats | None = None
+
+
+class Output(Protocol):
+    """A file that is written image by image."""
+
+    def add(self, step: Step) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class CsvOutput:
+    """One row per image and marker. What is not known is left empty; what was guessed has inferred = 1."""
+
+    def __init__(self, path: Path, *, millimetres: bool) -> None:
+        columns = ["frame", "image", "stamp", "marker", "row", "col", "x_px", "y_px", "dx_px", "dy_px"]
+        columns += ["x_mm", "y_mm", "dx_mm", "dy_mm"] if millimetres else []
+        try:
+            self._file = path.open("x", encoding="utf-8", newline="")
+        except OSError as error:
+            raise UsageError(f"cannot create {path}: {error.strerror}") from None
+        self._writer = csv.writer(self._file)
+        self._writer.writerow([*columns, "valid", "inferred", "quality"])
+
+    def add(self, step: Step) -> None:
+        tracked = step.tracked
+        numbers = [tracked.position, tracked.displacement]
+        if step.position_mm is not None and step.displacement_mm is not None:
+            numbers += [step.position_mm, step.displacement_mm]
+        first = (step.number, step.frame.name, f"{step.frame.stamp:.6f}")
+        flags = zip(tracked.valid.tolist(), tracked.inferred.tolist(), tracked.quality.tolist(), strict=True)
+        for marker, (row, (valid, inferred, quality)) in enumerate(
+            zip(np.column_stack(numbers).tolist(), flags, strict=True)
+        ):
+            cells = ["" if value != value else f"{value:.5f}" for value in row]
+            place = divmod(marker, tracked.cols)
+            self._writer.writerow([*first, marker, *place, *cells, int(valid), int(inferred), f"{quality:.3f}"])
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class McapOutput:
+    """A session with the images and their markers. `description` is what it says about itself."""
+
+    def __init__(self, path: Path, sensor: str, description: Mapping[str, Any]) -> None:
+        self._clock = _StampClock()
+        self._sensor = SENSORS.index(sensor)
+        self._recorder = SessionRecorder(path, self._clock).open()
+        self._recorder.metadata(description)
+
+    def add(self, step: Step) -> None:
+        stamp, tracked = step.frame.stamp, step.tracked
+        self._clock.stamp = stamp
+        data = step.frame.data if step.frame.data is not None else _png(step.frame.image)
+        encoding = "png" if data.startswith(b"\x89PNG") else "jpeg"
+        self._recorder.image(self._sensor, CameraImage(data, stamp, step.number, encoding))
+        values = {
+            "rows": tracked.rows,
+            "cols": tracked.cols,
+            "spacing_px": tracked.spacing,
+            "position_px": tracked.position,
+            "displacement_px": tracked.displacement,
+            "valid": tracked.valid,
+            "inferred": tracked.inferred,
+            "quality": tracked.quality,
+        }
+        if step.displacement_mm is not None:
+            values["displacement_mm"] = step.displacement_mm
+        self._recorder.markers(self._sensor, stamp, values)
+        if step.number % _SAFE == _SAFE - 1:
+            self._recorder.attempt_end()
+
+    def close(self) -> None:
+        self._recorder.close()
+
+
+class _StampClock:
+    """The time of a recording made from images: the newest one's."""
+
+    stamp = 0.0
+
+    def now(self) -> float:
+        return self.stamp
+
+    def sleep(self, seconds: float) -> None:
+        """Nothing here waits."""
+
+    def wall(self, seconds: float) -> float:
+        return seconds
+
+
+class OverlayOutput:
+    """A video of the overlays, or with the suffix of a picture the last one. It plays as fast as the images came."""
+
+    def __init__(self, path: Path, *, magnify: float) -> None:
+        self._path, self._magnify = path, magnify
+        self._waiting: list[Step] = []  # until it is known how fast the images come
+        self._last: Step | None = None
+        self._video: cv2.VideoWriter | None = None
+
+    def add(self, step: Step) -> None:
+        if self._path.suffix.lower() in PICTURES:
+            self._last = step
+        elif self._video is not None:
+            self._video.write(self._draw(step))
+        else:
+            self._waiting.append(step)
+            if len(self._waiting) > _INTERVALS:
+                self._begin()
+
+    def close(self) -> None:
+        if self._last is not None and not cv2.imwrite(str(self._path), self._draw(self._last)):
+            raise UsageError(f"cannot write {self._path}")
+        if self._waiting:
+            self._begin()
+        if self._video is not None:
+            self._video.release()
+
+    def _begin(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        intervals = np.diff([step.frame.stamp for step in waiting])
+        interval = float(np.median(intervals)) if len(intervals) else 0.0
+        rate = min(1 / interval, 240.0) if interval > 0 else 25.0
+        pictures = [self._draw(step) for step in waiting]
+        size = (pictures[0].shape[1], pictures[0].shape[0])
+        code = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.lower()])
+        self._video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
+        if not self._video.isOpened():
+            raise UsageError(f"cannot write the video {self._path}; is its folder writable?")
+        for picture in pictures:
+            self._video.write(picture)
+
+    def _draw(self, step: Step) -> NDArray[np.uint8]:
+        return draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
+
+
+def _png(image: NDArray[np.uint8]) -> bytes:
+    """Without loss: tracking the recording gives the same numbers. Level 1 is fast and nearly as small as 9."""
+    _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return data.tobytes()
