@@ -128,6 +128,7 @@ def test_the_format_s_own_reader_and_foxglove_s_schemas_agree(session: Path) -> 
             messages[channel.topic] = (schema, decoder(message.data) if decoder else json.loads(message.data))
     expected = {
         "/left/image": "foxglove.CompressedImage",
+        "/left/annotations": "foxglove.ImageAnnotations",
         "/arm/pose": "foxglove.PoseInFrame",
         "/arm/joints": "foxglove.JointStates",
         "/tf": "foxglove.FrameTransform",
@@ -136,6 +137,8 @@ def test_the_format_s_own_reader_and_foxglove_s_schemas_agree(session: Path) -> 
     assert {topic: messages[topic][0].name for topic in expected} == expected
     image = messages["/left/image"][1]
     assert (image.format, image.frame_id, image.timestamp.seconds) == ("jpeg", "left_gel", 10)
+    motion, measured, inferred = ([(p.x, p.y) for p in part.points] for part in messages["/left/annotations"][1].points)
+    assert (motion, measured, inferred) == ([(1.0, 2.5), (1.5, 2.5)], [(1.5, 2.5)], [])
     transform = messages["/tf"][1]
     assert (transform.rotation.w, transform.rotation.z, transform.translation.x) == (0.5, 0.5, 0.3)
     picture = messages["/flow_map"][1]

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,8 +109,8 @@ def _table(fit: Calibration, rest: Floats, seen: NDArray[np.bool_], *, written: 
     table.add_row(
         "markers", f"{fit.rows} lines of {fit.cols}, {seen.sum()} seen, {left_out} left out as measured wrongly"
     )
-    table.add_row("scale", f"{along:.2f} px/mm along lines, {down:.2f} along columns, at the centre")
-    table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid: what one scale would get wrong")
+    table.add_row("scale", f"{along:.2f} px/mm along lines, {down:.2f} along columns (centre)")
+    table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid")
     table.add_row("lens", lens)
     shares = (fit.residual_px, 1e3 * fit.residual_px / along, fit.largest_px)
     table.add_row("residual", "{:.3f} px = {:.1f} µm root mean square, {:.2f} px at most".format(*shares))
@@ -119,7 +118,7 @@ def _table(fit: Calibration, rest: Floats, seen: NDArray[np.bool_], *, written: 
     return table
 
 
-def _scale(fit: Calibration, node: Any) -> float:
+def _scale(fit: Calibration, node: Floats) -> float:
     """Mean scale at a node [px/mm]."""
     corners = fit.to_pixels(node + np.array([[0, 0], [0.1, 0], [0, 0.1]]))
     (right, down) = corners[1:] - corners[0]

@@ -25,7 +25,7 @@ from gelflow.session.records import SENSORS
 CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}  # of an overlay by its file's suffix
 PICTURES = (".png", ".jpg")
 
-_INTERVALS = 10  # between images, whose median is the overlay's
+_INTERVALS = 25  # between images, whose median is the overlay's: the first of a stream may come at once
 _SAFE = 50  # images after which the recording waits until all is on the disk
 
 Floats = NDArray[np.float64]

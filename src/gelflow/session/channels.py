@@ -10,6 +10,7 @@ from typing import Any
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -51,6 +52,7 @@ class JsonChannel:
 
 PROTOBUF: dict[str, Any] = {
     **{f"/{sensor}/image": CompressedImage for sensor in SENSORS},
+    **{f"/{sensor}/annotations": ImageAnnotations for sensor in SENSORS},
     "/arm/pose": PoseInFrame,
     "/arm/joints": JointStates,
     "/arm/command": PoseInFrame,

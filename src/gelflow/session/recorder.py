@@ -24,6 +24,7 @@ from gelflow import __version__
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import ArmState, CameraImage, GripperState
+from gelflow.session.annotations import annotate
 from gelflow.session.channels import BASE_FRAME, JSON, PROTOBUF, TOOL_FRAME
 from gelflow.session.records import FORMAT, SENSORS, Decision, plain, to_json
 
@@ -89,7 +90,10 @@ class SessionRecorder:
 
     def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
         """Where the markers were in the image of that stamp: the properties of `gelflow.Markers`, but the stamp."""
-        self._json(f"/{_name(sensor)}/markers", {"stamp": stamp, **values}, stamp=stamp)
+        name = _name(sensor)
+        self._json(f"/{name}/markers", {"stamp": stamp, **values}, stamp=stamp)
+        drawn = annotate(values, nanoseconds(stamp))  # for people: over the image
+        self._put(f"/{name}/annotations", drawn.SerializeToString(), stamp=stamp)
 
     def arm_state(self, state: ArmState) -> None:
         """Measured pose, joints and status of the arm."""
