@@ -15,6 +15,8 @@ from gelflow.perception.tracker import Tracked, TrackerConfig
 
 Image = NDArray[np.uint8]
 
+ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # how the bytes of JPEG and PNG start
+
 
 @dataclass(frozen=True)
 class CameraMount:
@@ -103,8 +105,10 @@ def decode(data: bytes) -> Image:
     """
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
-        start = data[:8].hex(" ") or "nothing"
-        raise PeerError(f"expected a JPEG or PNG image, got {len(data)} bytes that are none (they start with {start})")
+        start = f"are none (they start with {data[:8].hex(' ') or 'nothing'})"
+        if data.startswith(ENCODED):
+            start = "start like one and can not be decoded: cut off, or damaged"
+        raise PeerError(f"expected a JPEG or PNG image, got {len(data)} bytes that {start}")
     return np.asarray(image, dtype=np.uint8)
 
 

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
-from gelflow.perception.frames import decode
+from gelflow.perception.frames import ENCODED, decode
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS
 
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
-_KEPT = (b"\xff\xd8\xff", b"\x89PNG")  # how the bytes of JPEG and PNG start
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # of the protocols that run over TCP
 # FFmpeg writes to the terminal by itself; OpenCV reads this when it uses FFmpeg for the first time.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -82,7 +81,7 @@ class Source:
         for number, file in enumerate(self.files):
             try:
                 data = file.read_bytes()
-                kept = data if data.startswith(_KEPT) else None
+                kept = data if data.startswith(ENCODED) else None
                 yield Frame(file.name, decode(data), number / self.rate, kept)
             except PeerError as error:
                 raise PeerError(f"{file}: {error}") from None

@@ -94,6 +94,13 @@ def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
         decode(data)
 
 
+def test_an_image_that_is_cut_off_is_told_so() -> None:
+    renderer = GelRenderer()
+    data = renderer.encode(renderer.render(np.zeros((252, 2))))
+    with pytest.raises(PeerError, match="cut off, or damaged"):
+        decode(data[: len(data) // 2])
+
+
 def test_decoding_is_repeatable() -> None:
     renderer = GelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
