@@ -26,7 +26,7 @@ from rich.table import Table
 from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark import processor
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.gradient_cases import SHAPES, exact_simulator, in_contact, pressed
+from gelflow.sim.gradient_cases import FREE, SHAPES, exact_simulator, in_contact, on_shape
 from gelflow.sim.gradient_check import Case, Output, against_differences, against_dual
 from gelflow.sim.motions import SCENES
 from gelflow.sim.scene import INTEGRATORS
@@ -62,7 +62,7 @@ class Row:
 def check(row: Row, seed: int) -> None:
     """One more state of a combination."""
     rng = np.random.default_rng(seed)
-    sim, u = (in_contact if row.name in SCENES else pressed)(row.name, row.law, row.integrator, rng)
+    sim, u = (in_contact if row.name in SCENES else on_shape)(row.name, row.law, row.integrator, rng)
     case = Case.random(sim, u, OUTPUTS[seed % len(OUTPUTS)], rng)
     exact, right = against_dual(case, rng, directions=2), against_differences(case)
     if exact.error >= row.dual:
@@ -107,7 +107,7 @@ def main() -> int:
     parser.add_argument("--states", type=int, default=12, metavar="N", help="states per combination (%(default)s)")
     parser.add_argument("--out", type=Path, default=FILE, help="file to write (%(default)s)")
     args = parser.parse_args()
-    rows = [Row(*names) for names in itertools.product((*SCENES, *SHAPES), LAWS, INTEGRATORS)]
+    rows = [Row(*names) for names in itertools.product((*SCENES, *SHAPES, FREE), LAWS, INTEGRATORS)]
     runs = [Row(ROLLING_RUN, *names) for names in itertools.product(LAWS, INTEGRATORS)]
     console, begin = Console(width=80), time.perf_counter()
     work = [*((row, seed) for row in rows for seed in range(args.states)), *((row, -1) for row in runs)]

@@ -59,10 +59,10 @@ class EnergyGauge:
         scene.describe_to(self._parts)
         self._twin = Simulator(_core.Model(self._parts.spec), num_envs=num_envs)
 
-    def read(self, sim: Simulator, points: tuple[Array, Array] | None = None) -> Energy:
-        """Energy of the present state, whose `points` need not be found again where they are given."""
+    def read(self, sim: Simulator) -> Energy:
+        """Energy of the present state."""
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
-        contact, friction = self._stored(sim, *(points or self.points(sim)))
+        contact, friction = self._stored(sim, *self.points(sim))
         springs, limits = _joints(sim)
         return Energy(kinetic, _gravity(sim), contact, friction, springs, limits)
 

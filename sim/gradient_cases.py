@@ -36,6 +36,7 @@ _TOPS = {
     "ellipsoid": 0.012,
     "mesh": 0.01,
 }
+FREE = "free body"  # on a plane
 POLISH = 2  # iterations after convergence, as the runs with dual numbers have them
 STEPS = 3  # that are checked
 
@@ -143,6 +144,11 @@ def bracket_grid() -> DistanceGrid:
 _BEGIN = {"rolling": _rolling, "insertion": _insertion, "pushing": _pushing, "grasp": _grasp, "dclaw": _dclaw}
 
 
+def on_shape(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+    """Points pressed onto one of SHAPES, or those of a FREE body; and controls to go on with, drawn at random."""
+    return tumbling(law, integrator, rng) if kind == FREE else pressed(kind, law, integrator, rng)
+
+
 def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
     """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge.
 
@@ -184,3 +190,37 @@ def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> t
     sim.step(hold + rng.normal(size=3) * spread, 12)
     sim.check()
     return sim, hold + rng.normal(size=(STEPS, 3)) * spread
+
+
+def tumbling(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+    """A free cloud of points, its centre of mass off its frame, that spins on the ground and against a pusher.
+
+    And controls (steps, 1) to go on with, drawn at random.
+    """
+    spec = _core.ModelSpec()
+    spec.polish, spec.integrator, spec.gravity = POLISH, integrator, (0.0, 0.0, -60.0)  # or it would bounce off
+    upright = (1.0, 0.0, 0.0, 0.0)
+    body = spec.add_body(
+        "body", -1, (0, 0, 0), upright, 0.05, (2e-3, -1e-3, 3e-3), (3e-6, 4e-6, 5e-6, 2e-7, -3e-7, 4e-7)
+    )
+    spec.add_joint("free", body, "free", (0, 0, 0), (0, 0, 1))
+    pusher = spec.add_body("pusher", -1, (-0.03, 0, 0.01), upright, 0.02, (0, 0, 0), (1e-6, 1e-6, 1e-6, 0, 0, 0))
+    slide = spec.add_joint("x", pusher, "slide", (0, 0, 0), (1, 0, 0), damping=0.5)
+    ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (0.98, 0.14, 0.14, 0.02), (0, 0, 0))
+    ball = spec.add_shape("ball", pusher, "sphere", (0, 0, 0), upright, (0.02, 0, 0))
+    cloud = rng.normal(size=(60, 3))
+    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
+    points = spec.add_points("cloud", body, cloud, np.ones(60))
+    numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
+    numbers["ks"] = 100.0 if law == "elastic" else 0.0
+    spec.add_contact("on ground", points, ground, **numbers)
+    spec.add_contact("on pusher", points, ball, **numbers)
+    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
+    spec.add_pad("skin", body, cloud * 1.01, *axes, shapes=[ground, ball], **{**numbers, "kn": 50.0})
+    spec.add_actuator("push", slide, "motor")
+    sim = Simulator(_core.Model(spec))
+    sim.q[0, :3] = 0, 0, 0.011
+    sim.v[0, 3:6] = rng.normal(size=3) * 60  # some 0.3 rad in a step
+    sim.step([0.3], 4)
+    sim.check()
+    return sim, 0.3 + rng.normal(size=(STEPS, 1)) * 0.1

@@ -1,22 +1,8 @@
-"""Free bodies thrown on planes, and what each step does to their energy, for measurements.
-
-What BDF1 can add. A step moves the velocities v_t at its end by the forces at its end, which act on the bodies with the
-power Σ f_i · v_i. So masses, gravity, damping and friction never give energy; masses lose ½ |change|². But in turning a
-point moves along an arc, and not by h v_i. With ω the body's angular velocity and r_i the point from its centre,
-
-    h v_i − (x_i − x_i before) = (h ω̂ − 1 + exp(−h ω̂)) r_i,     at most ½ |h ω|² |r_i|,
-
-and the springs, of depth d_i and of strain s_i, feel the arc: a step of BDF1 adds at most
-
-    ½ |h ω|² R Σ (k_n |d_i| + k_s |s_i|),      R the farthest point, d and s at the end.         (arc)
-
-Nothing for a sphere's moving point, whose place is that of its centre. Nothing is said of steps that had to be halved,
-nor of what the elastic law stores where a point slips with k_t |v_t| > µ N: its anchor then moves to the far side.
-"""
+"""Free bodies thrown on planes, and what each step does to their energy, for measurements."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +14,7 @@ from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 Kind = Literal["sphere", "box", "cylinder"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 GRAVITY = 9.8  # [m/s²]
 MASS = 0.3  # [kg]
@@ -59,6 +46,7 @@ class Throw:
     numbers: Mapping[str, float]  # kn, kt, mu, kd, ks per point
     integrator: str = "bdf1"
     turns: bool = True  # else it is carried by three slides
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in the body's frame [m]
     tolerance: float = 1e-9  # of Newton's method
 
     @property
@@ -73,7 +61,7 @@ class Throw:
         spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), self.step, self.tolerance
         spec.integrator = self.integrator
         still, upright = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        body = spec.add_body("body", -1, still, upright, MASS, still, (*(MASS * moments), 0.0, 0.0, 0.0))
+        body = spec.add_body("body", -1, still, upright, MASS, self.center, (*(MASS * moments), 0.0, 0.0, 0.0))
         if self.turns:
             spec.add_joint("free", body, "free", still, (0.0, 0.0, 1.0))
         else:
@@ -92,10 +80,7 @@ class Throw:
 class Growth:
     """What each step did; arrays (steps, N) [J] but for `halved`, of all steps but those that failed."""
 
-    change: Array  # of the whole energy
-    mechanical: Array  # of the energy without what friction stores
-    stored: Array  # by friction, before the step
-    arc: Array  # what turning can add, see above
+    change: Array  # of the energy
     scale: Array  # energy at work before the step: kinetic, stored, and the body's weight lifted by its reach
     halved: NDArray[np.bool_]
     total: Array  # (steps + 1, N): the energy itself
@@ -122,17 +107,11 @@ def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> G
     for _ in range(steps):
         halvings = sim.halved.copy()
         sim.step(np.zeros(0))
-        depth, strain = gauge.points(sim)
-        after = gauge.read(sim, (depth, strain))
-        springs = throw.numbers["kn"] * depth.sum(1) + throw.numbers["ks"] * np.linalg.norm(strain, axis=2).sum(1)
-        turned = throw.step * np.linalg.norm(sim.v[:, 3:], axis=1) if throw.turns else np.zeros(bodies)
-        arc = (throw.kind != "sphere") * 0.5 * turned**2 * throw.reach * springs
-        change = after.total - before.total
+        after = gauge.read(sim)
         at_work = before.kinetic + before.contact + before.friction + MASS * GRAVITY * throw.reach
-        mechanical = change - (after.friction - before.friction)
-        rows.append((change, mechanical, before.friction, arc, at_work, sim.halved > halvings))
+        rows.append((after.total - before.total, at_work, sim.halved > halvings))
         total.append(after.total)
         before = after
     sim.check()
-    change, mechanical, stored, arc, scale, halved = (np.array(column) for column in zip(*rows, strict=True))
-    return Growth(change, mechanical, stored, arc, scale, halved, np.array(total))
+    change, scale, halved = (np.array(column) for column in zip(*rows, strict=True))
+    return Growth(change, scale, halved, np.array(total))

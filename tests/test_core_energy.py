@@ -1,10 +1,9 @@
-"""Energy: BDF1 never adds any beyond the arc that turning points take (`gelflow.sim.throws` has the bound).
+"""Energy: BDF1 never adds any to free bodies on planes; of scenes it is told how much a step may gain.
 
-Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction and step. The tolerance is ten
-times Newton's, relative to the energy at work.
+Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction, step and centre of mass. The
+tolerance is ten times Newton's, relative to the energy at work.
 """
 
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +14,9 @@ from gelflow.sim import _core
 from gelflow.sim.energy import EnergyGauge, motor_forces
 from gelflow.sim.motions import motion
 from gelflow.sim.scene import load_scene, scene_names
+from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.throws import GRAVITY, MASS, SIZE, Throw, fly
+from gelflow.sim.throws import GRAVITY, KINDS, MASS, SIZE, Kind, Throw, fly
 
 TOLERANCE = 1e-8
 
@@ -25,40 +25,42 @@ def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
     return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
 
 
-def throws(kind: Any, law: str, *, turns: bool = True, kt: bool = True) -> st.SearchStrategy[Throw]:
-    """Every material, with and without damping, at steps of 0.1 to 20 ms."""
+def throws(kind: Kind, law: str) -> st.SearchStrategy[Throw]:
+    """Every material, with and without damping, at steps of 0.1 to 20 ms, of bodies that turn and that do not."""
     damped = st.one_of(st.just(0.0), logarithmic(0.03, 30))
     numbers = st.fixed_dictionaries(
         {
             "kn": logarithmic(1e2, 1e5),
-            "kt": st.one_of(st.just(0.0), logarithmic(0.1, 50)) if kt else st.just(0.0),
+            "kt": st.one_of(st.just(0.0), logarithmic(0.1, 50)),
             "mu": st.sampled_from([0.0, 0.3, 0.8, 2.0]),
             "ks": logarithmic(1e2, 1e4) if law == "elastic" else st.just(0.0),
         }
     )
+    centers = st.one_of(st.just((0.0, 0.0, 0.0)), st.tuples(*[st.floats(-0.5 * SIZE, 0.5 * SIZE)] * 3))
 
-    def build(damping: str, kd: float, step: float, numbers: dict[str, float]) -> Throw:
+    def build(
+        damping: str, kd: float, step: float, numbers: dict[str, float], turns: bool, center: tuple[float, float, float]
+    ) -> Throw:
         scaled = kd * (1e3 if damping == "depth" else 1)
-        return Throw(kind, law, damping, step, {**numbers, "kd": scaled}, turns=turns)
+        return Throw(kind, law, damping, step, {**numbers, "kd": scaled}, turns=turns, center=center)
 
-    return st.builds(build, st.sampled_from(["depth", "plain"]), damped, logarithmic(1e-4, 2e-2), numbers)
+    turning = st.sampled_from([True, True, True, False])
+    return st.builds(
+        build, st.sampled_from(["depth", "plain"]), damped, logarithmic(1e-4, 2e-2), numbers, turning, centers
+    )
 
 
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=30)
-@given(throw=throws("sphere", "viscous"), seed=SEEDS)
-def test_a_sphere_never_gains(throw: Throw, seed: int) -> None:
-    growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
-    assert (growth.change <= TOLERANCE * growth.scale).all()
+@pytest.mark.parametrize(
+    ("kind", "law"), [(kind, law) for kind in KINDS for law in LAWS if (kind, law) != ("sphere", "elastic")]
+)
+def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
+    """Not in one step, halved or not; a sphere's moving point keeps no anchor, so that its friction is viscous."""
 
-
-@pytest.mark.parametrize("law", ["viscous", "elastic"])
-@pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_what_does_not_turn_never_gains(kind: str, law: str) -> None:
-    @settings(max_examples=16)
-    @given(throw=throws(kind, law, turns=False, kt=law == "viscous"), seed=SEEDS)
+    @settings(max_examples=40)
+    @given(throw=throws(kind, law), seed=SEEDS)
     def check(throw: Throw, seed: int) -> None:
         growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
         assert (growth.change <= TOLERANCE * growth.scale).all()
@@ -66,59 +68,27 @@ def test_what_does_not_turn_never_gains(kind: str, law: str) -> None:
     check()
 
 
-@pytest.mark.parametrize("law", ["viscous", "elastic"])
-@pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_what_turns_gains_no_more_than_the_arc(kind: str, law: str) -> None:
-    @settings(max_examples=25)
-    @given(throw=throws(kind, law, kt=law == "viscous"), seed=SEEDS)
-    def check(throw: Throw, seed: int) -> None:
-        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
-        whole = ~growth.halved
-        assert (growth.change <= growth.arc + TOLERANCE * growth.scale)[whole].all()
-
-    check()
-
-
-@pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_motion_gains_no_more_than_elastic_friction_had_stored(kind: str) -> None:
-    """Under the elastic law with damping: all energy but friction's own grows by the arc and by what friction gives."""
-
-    @settings(max_examples=25)
-    @given(throw=throws(kind, "elastic"), seed=SEEDS)
-    def check(throw: Throw, seed: int) -> None:
-        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
-        whole = ~growth.halved
-        assert (growth.mechanical <= growth.arc + growth.stored + TOLERANCE * growth.scale)[whole].all()
-
-    check()
-
-
-def test_the_arc_is_no_empty_bound() -> None:
-    """Boxes that spin fast over long steps do gain, by a good part of the bound; short steps leave nothing of it."""
+def test_what_spins_fast_over_long_steps_never_gains() -> None:
+    """Where a step's points take the longest arcs, and springs hold back nothing; the body's frame off its centre."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
-    largest = []
-    for step in (2e-2, 1e-4):
-        growth = fly(Throw("box", "viscous", "depth", step, numbers), np.random.default_rng(1), bodies=24, steps=150)
-        gains = growth.change > TOLERANCE * growth.scale
-        largest.append(float((growth.change / np.maximum(growth.arc, 1e-30))[gains].max(initial=0.0)))
-    assert largest[0] > 0.3
-    assert largest[1] == 0
+    for kind in ("box", "cylinder"):
+        throw = Throw(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
+        growth = fly(throw, np.random.default_rng(1), bodies=24, steps=150)
+        assert (growth.change <= TOLERANCE * growth.scale).all()
 
 
-def test_what_the_elastic_law_stores_in_a_fast_slip() -> None:
-    """Where k_t v > µ N the anchor of a point that slips lies ahead: −k_s s = f_t + k_t v, and ½ k_s s² appears in the
-    books. It is no motion: the block is braked by µ m g all the while."""
+def test_what_the_elastic_law_stores_in_a_slip() -> None:
+    """A block that slides strains its springs by µ N / k_s and no more, however fast, and is braked by µ m g."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
     throw = Throw("box", "elastic", "depth", 1e-3, numbers, turns=False)
     sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
     points = 9  # of the lower face
     sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
     sim.q[0, 0], sim.v[0, 0] = -10, 1.0  # far from the slope
-    for _ in range(20):
+    for _ in range(100):
         sim.step(np.zeros(0))
-    speed, load = sim.v[0, 0], MASS * GRAVITY / points
-    assert speed == pytest.approx(1 - 0.3 * GRAVITY * 0.02, rel=1e-6)
-    strain = (numbers["kt"] * speed - 0.3 * load) / numbers["ks"]
+    assert sim.v[0, 0] == pytest.approx(1 - 0.3 * GRAVITY * 0.1, rel=1e-6)
+    strain = 0.3 * MASS * GRAVITY / points / numbers["ks"]
     assert gauge.read(sim).friction[0] == pytest.approx(points * 0.5 * numbers["ks"] * strain**2, rel=1e-6)
 
 

@@ -26,22 +26,23 @@ template <class T>
 struct Record {
   Record(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool whole)
       : h(from.h),
-        second(from.shift != nullptr),
+        second(from.history != nullptr),
         whole(whole),
         q0(Eigen::Map<const VX<T>>(from.q0, m.nq)),
         v_star(Eigen::Map<const VX<T>>(from.v_star, m.nv)),
         v1(v_new),
         anchors(from.anchors, from.anchors + m.na),
         anchored(from.anchored, from.anchored + m.na) {
-    if (second) shift = Eigen::Map<const VX<T>>(from.shift, m.nv);
+    if (second) history = Eigen::Map<const VX<T>>(from.history, 2 * m.nv);
   }
   StepStart<T> start(const T* u) const {
-    return {h, q0.data(), v_star.data(), nullptr, second ? shift.data() : nullptr, anchors.data(), anchored.data(), u};
+    return {h, q0.data(), v_star.data(), nullptr, second ? history.data() : nullptr, anchors.data(), anchored.data(),
+            u};
   }
   T h;
   bool second;  // a step of BDF2
   bool whole;   // not one of several substeps: BDF2 goes on from it
-  VX<T> q0, v_star, shift, v1;
+  VX<T> q0, v_star, history, v1;
   std::vector<V3<T>> anchors;
   std::vector<std::uint8_t> anchored;
 };
@@ -70,9 +71,9 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   evaluate<true, T>(m, params, r.start(u), r.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
-    contact_anchors_transposed<true, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.v,
-                                        g.q, g.v, by_anchor.data());
-    marker_anchors_transposed<T>(m, params, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+    contact_anchors_transposed<true, T>(m, params, r.h, r.second, r.anchors.data(), r.anchored.data(), w,
+                                        g.anchors.data(), g.v, g.q, g.v, by_anchor.data());
+    marker_anchors_transposed<T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                                  by_anchor.data());
   }
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
@@ -87,18 +88,20 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   solve<T>(w.tangent, m.nv, w.pivots, b.data(), c);
   multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
-  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c, by_v_star = w.mass.leftCols(m.nv).transpose() * c;
+  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c;
+  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_earlier = VX<T>::Zero(m.nv);
   by_increment += position_by_increment_transposed<T>(m, w.increment, by_q1);
+  floating_bodies_transposed<T>(m, params, r.start(u), w, c, by_v_star, by_increment, by_earlier);
   g.q = position_by_position_transposed<T>(m, w.increment, by_q1);
   g.v = by_v0 + (r.second ? T(4) / T(3) : T(1)) * by_v_star;
   g.history.setZero();
   if (r.second) {
     g.history.head(m.nv) = by_increment / T(3);
-    g.history.segment(m.nv, m.nv) = -by_v_star / T(3);
+    g.history.segment(m.nv, m.nv) = by_earlier - by_v_star / T(3);
   }
   if (m.na > 0) {
-    contact_anchors_transposed<false, T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, nullptr, c, g.q, g.v,
-                                         by_anchor.data());
+    contact_anchors_transposed<false, T>(m, params, r.h, r.second, r.anchors.data(), r.anchored.data(), w, nullptr, c,
+                                         g.q, g.v, by_anchor.data());
     g.anchors.swap(by_anchor);
   }
 }

@@ -207,7 +207,7 @@ void Batch<T>::mass_matrix(T* out) {
     w.residual.setZero();
     w.by_q.setZero();
     w.by_v.setZero();
-    add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, w);
+    add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     for (const Joint& joint : model->joints) {
       for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += params_of(e)[joint.param + 1];
     }
@@ -221,7 +221,7 @@ void Batch<T>::bias(T* out) {
   for (int e = 0; e < n; ++e, out += model->nv) {
     kinematics(e, w);
     w.residual.setZero();
-    add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, w);
+    add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     std::copy_n(w.residual.data(), model->nv, out);
   }
 }

@@ -8,19 +8,19 @@
 
 #include <algorithm>
 
+#include "arc_moments.hpp"
 #include "pair_columns.hpp"
-#include "touching.hpp"
 
 namespace gelflow {
 
 template <class T>
 TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const V3<T>* anchors,
-                        const std::uint8_t* anchored) {
+                        const std::uint8_t* anchored, const T& h = T(0)) {
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
   const PointSet& set = m.point_sets[contact.points];
   // A sphere's size is its first scale; what has no radius need not have scales either (a pad that pushes).
   const T radius = set.radius > 0 ? T(T(set.radius) * params[set.mount.place + 6]) : T(0);
-  return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot};
+  return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot, 1, h};
 }
 
 // What all points of one pair feel: W about the shape's origin in its frame, and with derivatives K and D. Moments come
@@ -260,7 +260,7 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    TouchRule<T> rule = touch_rule<T>(m, contact, params, from.anchors, from.anchored);
+    TouchRule<T> rule = touch_rule<T>(m, contact, params, from.anchors, from.anchored, from.h);
     rule.softness = from.softness;
     find_near_points<T>(frame, set.cloud, rule, found, w.near[n]);
     if (!sum_forces<derivatives, T>(frame, w.near[n], rule, sums)) {
@@ -271,6 +271,9 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
     if constexpr (derivatives) {
       pair_columns<T>(contact.pair, set.mount.body, frame, w);
       subtract_derivatives<T>(from.h, sums, w);
+    }
+    if (contact.on_arc && from.history == nullptr) {
+      subtract_arc_moments<derivatives, T>(m, set.mount.body, frame, w.near[n], rule, w);
     }
   }
 }
@@ -295,23 +298,23 @@ void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, con
 
 // Anchors after an accepted step, the last that was evaluated in w. `next` and `next_set` may be the arrays that are read.
 template <class T>
-void advance_contact_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                             Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
+void advance_contact_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, w.near[n], touch_rule<T>(m, contact, params, anchors, anchored), set.cloud.size(),
+    advance_anchors<T>(frame, w.near[n], touch_rule<T>(m, contact, params, anchors, anchored, h), set.cloud.size(),
                        next + contact.anchor, next_set + contact.anchor);
   }
 }
 
 // The reverse pass of the anchors. First call (`from_next`): gradients of the anchors after the step go to the state at
 // the step's end (by_q, by_v) and to the anchors before (by_anchor). Second call, with c the multipliers of the residual:
-// what the residual says of the anchors before.
+// what the residual says of the anchors before. `second`: the step was one of BDF2.
 template <bool from_next, class T>
-void contact_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+void contact_anchors_transposed(const Model& m, const T* params, const T& h, bool second, const V3<T>* anchors,
                                 const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next,
                                 const VX<T>& multipliers, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   using L = Pack<T>;
@@ -322,7 +325,7 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     pair_columns<T>(contact.pair, first.body, frame, w);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
+    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored, h);
     V3<T>* const by_own = by_anchor + contact.anchor;
     if constexpr (from_next) {
       anchors_transposed<T>(frame, w.near[n], rule, by_next + contact.anchor, by_pose, by_twist, by_own);
@@ -333,11 +336,18 @@ void contact_anchors_transposed(const Model& m, const T* params, const T& h, con
       for (int i = 0; i < c.n; ++i) {
         if (c.dofs->dof[i] >= 0) virtual_twist += c.s[i] * multipliers[c.dofs->dof[i]];
       }
+      const bool arc = contact.on_arc && !second;
+      const Mat3<L> lever = spread<L>(arc ? ArcLever<T>(h * frame.angular, false).value : M3<T>(M3<T>::Zero()));
+      const Vec3<L> origin = spread<L>(arc ? origin_in<T>(frame, first.body, w) : V3<T>(V3<T>::Zero()));
+      const Vec3<L> spin = spread<L>(V3<T>(top(virtual_twist))), slide = spread<L>(V3<T>(bottom(virtual_twist)));
       for_touching_points<true, T>(frame, w.near[n], rule, [&](const Touching<T>& t) {
-        const Vec3<L> weight =
-            L(h) * (spread<L>(V3<T>(bottom(virtual_twist))) + cross(spread<L>(V3<T>(top(virtual_twist))), t.x));
-        const Vec3<L> none = zero3<L>();
-        const Vec3<L> by = point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, none, weight, none).anchor;
+        const Vec3<L> on_friction = L(h) * (slide + cross(spin, t.x)), none = zero3<L>();
+        const Vec3<L> on_spring =
+            L(h) * cross(spin, lever * (t.center - origin));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
+        const L q = yielding(t.law, L(h));
+        const Vec3<L> by = point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, none, on_friction + q * on_spring,
+                                                  (L(1.0) - q) * on_spring, none)
+                               .anchor;
         t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
       });
     }

@@ -12,7 +12,12 @@
 //     force       f = N n + f_t
 // Under the elastic law e = x − X with the anchor X in the shape's frame; a point that just touched has e = 0. The one
 // moving point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
-// On slip the anchor moves so that −k_s s = f_t + k_t v_t.
+//
+// Spring and damper are side by side, and what slips is behind both. After a step of length h that ended in slip, the
+// rate w = (s − s_before)/h of the strain satisfies f_t = −k_s s − k_t w, so that friction takes what the point's motion
+// brings and the spring does not store. As s_before = s* − h v_t with s* the strain that f* speaks of,
+//     −k_s s = k_t v_t + q f_t + (1 − q) f*,     q = h k_s / (h k_s + k_t)
+// which is −k_s s* in stick, where f_t = f*: there the anchor stays. A point that just touched stores nothing.
 #pragma once
 
 #include "shapes.hpp"
@@ -33,7 +38,7 @@ struct PointForce {
   Vec3<L> force;
   Mat3<L> by_x, by_v;  // ∂force/∂(x, v)
   Mask<L> slips;
-  Vec3<L> friction, slip;  // f_t, v_t
+  Vec3<L> friction, slip, wanted;  // f_t, v_t, f*
 };
 
 // What the force is made of.
@@ -77,7 +82,7 @@ GELFLOW_INLINE void force_parts(const PointLaw<L>& law, const Distance<L>& at, c
     p.wanted -= law.ks * (e - p.along * n);  // e is zero where there is no anchor
   }
   const L bound = law.mu * p.normal, squared = dot(p.wanted, p.wanted);
-  // After a slip the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
+  // After a slip without k_t the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
   // reverse and the readings must not take different sides.
   const L limit = law.elastic ? bound * (one + L(1e-14)) + law.ks * law.rounding : bound;
   p.slips = squared > limit * limit;
@@ -97,6 +102,7 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
   const Vec3<L>& n = at.n;
   out.slips = p.slips;
   out.slip = p.slip;
+  out.wanted = p.wanted;
   out.friction = p.ratio * p.wanted;
   out.force = p.normal * n + out.friction;
   if constexpr (derivatives) {
@@ -130,8 +136,8 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
   }
 }
 
-// The reverse: gradients with respect to N n, to f_t and to v_t, carried back to (x, v, X). The anchor moves the friction
-// alone.
+// The reverse: gradients with respect to N n, to f_t, to f* and to v_t, carried back to (x, v, X). The anchor moves the
+// friction alone.
 template <class L>
 struct PointGradient {
   Vec3<L> x, v, anchor;
@@ -142,14 +148,14 @@ template <class L>
 GELFLOW_INLINE PointGradient<L> point_force_transposed(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v,
                                                        const Vec3<L>& e, const Mask<L>& anchored,
                                                        const Vec3<L>& by_push, const Vec3<L>& by_friction,
-                                                       const Vec3<L>& by_slip) {
+                                                       const Vec3<L>& by_wish, const Vec3<L>& by_slip) {
   ForceParts<L> p;
   force_parts(law, at, v, e, p);
   const L zero(0.0);
   const Vec3<L>& n = at.n;
   const Vec3<L> direction = select(p.slips, p.inverse, zero) * p.wanted;
   const L drawn = dot(direction, by_friction);
-  const Vec3<L> by_wanted = p.ratio * (by_friction - drawn * direction);
+  const Vec3<L> by_wanted = p.ratio * (by_friction - drawn * direction) + by_wish;
   const L by_normal = dot(n, by_push) + law.mu * drawn;
   // slip = v − ḋ n, wanted = −k_t slip − k_s (e − (n·e) n)
   const Vec3<L> on_slip = by_slip - law.kt * by_wanted;
@@ -175,26 +181,36 @@ GELFLOW_INLINE PointGradient<L> point_force_transposed(const PointLaw<L>& law, c
   return g;
 }
 
-// The anchor after an accepted step, for a point that is inside (outside, the anchor is cleared).
+// q, see above.
 template <class L>
-GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const PointForce<L>& f, const Vec3<L>& x,
+GELFLOW_INLINE L yielding(const PointLaw<L>& law, const L& h) {
+  const L spring = h * law.ks, both = spring + law.kt;
+  return spring / select(both > L(0.0), both, L(1.0));
+}
+
+// The anchor after an accepted step of length h, for a point that is inside (outside, the anchor is cleared).
+template <class L>
+GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const L& h, const PointForce<L>& f, const Vec3<L>& x,
                                    const Vec3<L>& anchor, const Mask<L>& anchored) {
   const L stiffness = select(law.ks > L(0.0), law.ks, L(1.0));  // of weight 0: what comes out is not used
-  const Vec3<L> s = -(L(1.0) / stiffness) * (f.friction + law.kt * f.slip);
-  return select3<L>(f.slips, x - s, select3<L>(anchored, anchor, x));
+  const L q = yielding(law, h);
+  const Vec3<L> s = -(L(1.0) / stiffness) * (law.kt * f.slip + q * f.friction + (L(1.0) - q) * f.wanted);
+  return select3<L>(anchored, select3<L>(f.slips, x - s, anchor), x);
 }
 
 // Gradient λ of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
 template <class L>
-GELFLOW_INLINE PointGradient<L> next_anchor_transposed(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v,
-                                                       const Vec3<L>& e, const Mask<L>& anchored,
+GELFLOW_INLINE PointGradient<L> next_anchor_transposed(const PointLaw<L>& law, const L& h, const Distance<L>& at,
+                                                       const Vec3<L>& v, const Vec3<L>& e, const Mask<L>& anchored,
                                                        const Vec3<L>& lambda) {
-  const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one);
+  const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one), q = yielding(law, h);
   const Vec3<L> none = zero3<L>(), scaled = one / stiffness * lambda;
-  PointGradient<L> g = point_force_transposed(law, at, v, e, anchored, none, scaled, law.kt * scaled);
-  g.x = select3<L>(g.slips, g.x + lambda, select3<L>(anchored, none, lambda));
-  g.v = select3<L>(g.slips, g.v, none);
-  g.anchor = select3<L>(g.slips, g.anchor, select3<L>(anchored, lambda, none));
+  PointGradient<L> g =
+      point_force_transposed(law, at, v, e, anchored, none, q * scaled, (one - q) * scaled, law.kt * scaled);
+  const Mask<L> yields = g.slips && anchored;
+  g.x = select3<L>(yields, g.x + lambda, select3<L>(anchored, none, lambda));
+  g.v = select3<L>(yields, g.v, none);
+  g.anchor = select3<L>(yields, g.anchor, select3<L>(anchored, lambda, none));
   return g;
 }
 

@@ -15,15 +15,9 @@
 //     I X = (J x + m c × y, m y − m c × x),     B X = (B₁ x, −2 p × x),     B₁ = [ω]× (2 J − tr J) + 2 ((m c · v) − v m cᵀ)
 // (Jacobi's identity, and J (a × b) + J a × b + a × J b = tr J a × b). Where nothing before a slide turns, and it is no
 // hinge, P, Q and its share of B vanish: mass is all that counts (`Model::translates`).
-//
-// A free body that carries nothing is shorter in its own frame, with c and J (about the frame's origin) constant there,
-// a the acceleration of the origin less gravity (world), ω and α in the body's frame:
-//     force (world)  m (a + R y),   y = α × c + ω × (ω × c)         moment (body)  J α + ω × J ω + m c × Rᵀ a
-//     by φ           −m R [y]×                                                     m [c]× [Rᵀ a]×
-//     by ω           −m R ([ω × c]× + [ω]× [c]×)                                   [ω]× J − [J ω]×
 #pragma once
 
-#include "kinematics.hpp"
+#include "floating_body.hpp"
 
 namespace gelflow {
 
@@ -76,59 +70,15 @@ GELFLOW_INLINE V6<T> body_force(const Body& body, const T* params, const M3<T>& 
                   bottom(inertial) + cross<T>(w, momentum));
 }
 
-// The share of a free body that carries nothing.
-template <bool derivatives, class T>
-void add_floating_body(const Model& m, const Body& body, const T* params, const T& h, const T* v, Workspace<T>& w) {
-  const int k = m.joints[body.joint_begin].v;
-  const T* n = params + body.mass;
-  const T mass = n[0];
-  const M3<T>& r = as<T>(w.rotation[&body - m.bodies.data()]);
-  const V3<T> c = vec3(n + 1), spin = vec3(v + k + 3), spin_rate = vec3(w.update.data() + k + 3);
-  const V3<T> a = vec3(w.update.data() + k) - vec3(params + m.gravity);
-  M3<T> inertia;
-  inertia << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
-  const bool centered = std::is_floating_point_v<T> && c == V3<T>::Zero();
-  if (!centered) {
-    inertia -= mass * c * c.transpose();
-    for (int i = 0; i < 3; ++i) inertia(i, i) += mass * c.squaredNorm();
-  }
-  const V3<T> angular_momentum = inertia * spin;
-  V3<T> force = mass * a, moment = inertia * spin_rate + cross<T>(spin, angular_momentum);
-  if (!centered) {
-    force += mass * (r * (cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c))));
-    moment += mass * cross<T>(c, r.transpose() * a);
-  }
-  for (int i = 0; i < 3; ++i) {
-    w.residual[k + i] += h * force[i];
-    w.residual[k + 3 + i] += h * moment[i];
-  }
-  if constexpr (derivatives) {
-    w.mass.template block<3, 3>(k + 3, k + 3) = inertia;
-    w.by_v.template block<3, 3>(k + 3, k + 3) += h * (cross_columns<T>(spin, inertia) - skew<T>(angular_momentum));
-    for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = mass;
-    if (centered) {  // not so for another environment, perhaps
-      w.mass.template block<3, 3>(k, k + 3).setZero();
-      w.mass.template block<3, 3>(k + 3, k).setZero();
-      return;
-    }
-    const M3<T> lever = skew<T>(c), turned = mass * r;
-    const V3<T> y = cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c));
-    w.mass.template block<3, 3>(k, k + 3) = -turned * lever;
-    w.mass.template block<3, 3>(k + 3, k) = lever * turned.transpose();
-    w.by_q.template block<3, 3>(k, k + 3) -= h * (turned * skew<T>(y));
-    w.by_q.template block<3, 3>(k + 3, k + 3) += h * mass * (lever * skew<T>(r.transpose() * a));
-    w.by_v.template block<3, 3>(k, k + 3) -=
-        h * (turned * (skew<T>(cross<T>(spin, c)) + cross_columns<T>(spin, lever)));
-  }
-}
-
 // Adds h · (inverse dynamics) to w.residual; with derivatives also to w.by_q and w.by_v, and sets w.mass (not times h).
+// `from`: where the step started; null: the state (q, v) and accelerations alone, and only w.mass of all derivatives.
 template <bool derivatives, class T>
-void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* v, Workspace<T>& w) {
+void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* v, const StepStart<T>* from,
+                          Workspace<T>& w) {
   const int bodies = static_cast<int>(m.bodies.size());
   for (int i = 0; i < bodies; ++i) {
     if (m.bodies[i].floats) {
-      add_floating_body<derivatives, T>(m, m.bodies[i], params, h, v, w);
+      add_floating_body<derivatives, T>(m, m.bodies[i], params, h, v, from, w);
       continue;
     }
     w.force[i] = body_force<derivatives, T>(m.bodies[i], params, as<T>(w.rotation[i]), as<T>(w.position[i]), w.twist[i],

@@ -428,7 +428,11 @@ Model ModelSpec::build() const {
     }
   }
   for (auto& contact : model.contacts) {
-    contact.pair = model.pair_dofs(model.point_sets[contact.points].mount.body, model.shapes[contact.shape].body);
+    const PointSet& set = model.point_sets[contact.points];
+    const Shape& shape = model.shapes[contact.shape];
+    contact.pair = model.pair_dofs(set.mount.body, shape.body);
+    contact.on_arc = set.mount.body != world && model.bodies[set.mount.body].floats && shape.body == world &&
+                     shape.kind == ShapeKind::plane && (set.radius == 0 || set.cloud.extent > 0);
   }
   for (auto& pad : model.pads) {
     for (const int s : pad.shapes) pad.pairs.push_back(model.pair_dofs(pad.mount.body, model.shapes[s].body));

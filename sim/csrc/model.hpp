@@ -144,6 +144,7 @@ struct Contact {
   int param;   // kn, kt, mu, kd, ks
   int anchor;  // first anchor slot, −1 under the viscous law
   PairDofs pair;
+  bool on_arc = false;  // a free body on a plane of the world (arc_moments.hpp)
 };
 
 struct Pad {

@@ -19,6 +19,7 @@ struct TouchRule {
   const V3<T>* anchors;          // of this cloud against this shape
   const std::uint8_t* anchored;  // both unused under the viscous law
   double softness = 1;           // share of k_t and k_s that is at work
+  T h = T(0);                    // length of the step, where one is taken
 };
 
 // Calls visit(b) for blocks from … to that may reach into the shape grown by `margin`.

@@ -12,7 +12,7 @@ namespace {
 
 // The core's view of one state, in taped numbers, with the parameters watched.
 struct TapedState {
-  std::vector<Taped> params, q0, v0, shift, v1, u;
+  std::vector<Taped> params, q0, v0, history, v1, u;
   std::vector<V3<Taped>> anchors;
 
   TapedState(const Model& m, const double* numbers, const ParamState& s) {
@@ -20,7 +20,7 @@ struct TapedState {
     for (std::size_t i = 0; i < m.param_names.size(); ++i) params.push_back(Taped::watched(numbers[i]));
     q0.assign(s.q0, s.q0 + m.nq);
     v0.assign(s.v0, s.v0 + m.nv);
-    if (s.shift != nullptr) shift.assign(s.shift, s.shift + m.nv);
+    if (s.history != nullptr) history.assign(s.history, s.history + 2 * m.nv);
     if (s.v1 != nullptr) v1.assign(s.v1, s.v1 + m.nv);
     if (s.u != nullptr) u.assign(s.u, s.u + m.actuators.size());
     for (int i = 0; i < m.na; ++i) anchors.push_back(s.anchors[i].cast<Taped>());
@@ -45,14 +45,15 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   Workspace<Taped> w(m);
   const Taped h(s.h);
   const StepStart<Taped> from{
-      h,          t.q0.data(), t.v0.data(), nullptr, t.shift.empty() ? nullptr : t.shift.data(), t.anchors.data(),
+      h,          t.q0.data(), t.v0.data(), nullptr, t.history.empty() ? nullptr : t.history.data(), t.anchors.data(),
       s.anchored, t.u.data()};
   evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {
-    advance_contact_anchors<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, next.data(), next_set.data());
-    advance_marker_anchors<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, next.data(), next_set.data());
+    advance_contact_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(),
+                                   next_set.data());
+    advance_marker_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(), next_set.data());
   }
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (int k = 0; k < m.nv; ++k) weigh(weights, w.residual[k], -multipliers[k]);

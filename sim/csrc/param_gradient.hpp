@@ -8,7 +8,7 @@ namespace gelflow {
 // A step (StepStart of residual.hpp) to v1; or, for a reading, the state (q0, v0) alone.
 struct ParamState {
   double h;
-  const double *q0, *v0, *shift, *v1, *u;  // v0 is the step's v*
+  const double *q0, *v0, *history, *v1, *u;  // v0 is the step's v*
   const V3<double>* anchors;
   const std::uint8_t* anchored;
 };

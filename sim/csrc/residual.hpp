@@ -139,7 +139,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   for (int k = 0; k < m.nv; ++k) {
     w.trial[k] = v[k] - from.v_star[k];
     w.increment[k] = h * v[k];
-    if (from.shift) w.increment[k] += from.shift[k];
+    if (from.history) w.increment[k] += from.history[k] / T(3);
   }
   integrate<T>(m, from.q0, from.low, w.increment, w.q.data());
   w.update = w.trial / h;  // accelerations
@@ -150,7 +150,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
     w.by_q.setZero();
     w.by_v.setZero();
   }
-  add_inverse_dynamics<derivatives, T>(m, params, h, v, w);
+  add_inverse_dynamics<derivatives, T>(m, params, h, v, &from, w);
   if constexpr (derivatives) w.by_v += w.mass;
   if (scale) {
     for (int k = 0; k < m.nv; ++k) w.forces[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));

@@ -75,7 +75,7 @@ void transpose_one(const Model& m, const T* params, std::size_t e, std::size_t N
       substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {
         if (!g.params) return;
         const ParamState at{
-            it->h, it->q0.data(),      it->v_star.data(),  it->second ? it->shift.data() : nullptr, it->v1.data(),
+            it->h, it->q0.data(),      it->v_star.data(),  it->second ? it->history.data() : nullptr, it->v1.data(),
             u,     it->anchors.data(), it->anchored.data()};
         add_step_param_gradient(m, params, at, c.data(), gradient.anchors.data(), g.params + e * m.param_names.size());
       });

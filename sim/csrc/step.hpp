@@ -53,9 +53,9 @@ struct StepReport {
 template <class T>
 struct StepMemory {
   explicit StepMemory(const Model& m)
-      : work(m), q(m.nq), low(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), shift(m.nv), history(m.nh) {}
+      : work(m), q(m.nq), low(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), history(m.nh) {}
   Workspace<T> work;
-  VX<T> q, low, v, v_new, v_star, shift, history;
+  VX<T> q, low, v, v_new, v_star, history;
   std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
   Found found = Found::elsewhere;              // what work was last used for
 
@@ -80,19 +80,16 @@ struct StepMemory {
   }
 };
 
-// How a substep of length h, `whole` or a part of the step, starts from state s: β, v* and γ δ, which are kept in `memory`.
+// How a substep of length h, `whole` or a part of the step, starts from state s: β, v*, which is kept in `memory`, and δ.
 template <class T>
 StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
                       StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
   StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.found};
   if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
-  for (int k = 0; k < m.nv; ++k) {
-    memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
-    memory.shift[k] = s.history[k] / T(3);
-  }
+  for (int k = 0; k < m.nv; ++k) memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
   from.h = h * T(2) / T(3);
-  from.shift = memory.shift.data();
+  from.history = s.history;
   return from;
 }
 
@@ -117,8 +114,8 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   }
   if (status != Status::ok) return status;
   accepted(from, memory);
-  advance_contact_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-  advance_marker_anchors<T>(m, params, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_contact_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_marker_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
   if (m.nh > 0) {
     std::fill(s.history, s.history + m.nh, T(0));
     if (whole) {

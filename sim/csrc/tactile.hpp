@@ -10,12 +10,12 @@
 
 namespace gelflow {
 
-// The markers of a pad against the shape number s of those it feels.
+// The markers of a pad against the shape number s of those it feels; h: of the step that anchors make.
 template <class T>
 TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3<T>* anchors,
-                        const std::uint8_t* anchored) {
+                        const std::uint8_t* anchored, const T& h = T(0)) {
   const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
-  return {params + pad.param, pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot};
+  return {params + pad.param, pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot, 1, h};
 }
 
 // Which readings in an array may be other than zero: all, or those of these markers. Mostly few markers touch, and to
@@ -86,14 +86,14 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
 }
 
 template <class T>
-void advance_marker_anchors(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                            Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
+void advance_marker_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+                            const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.pushes) continue;  // the anchors of its contacts have moved on
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
-      const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
+      const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored, h);
       find_near_points<T>(frame, pad.cloud, rule, Found::elsewhere, w.near_markers);
       advance_anchors<T>(frame, w.near_markers, rule, pad.cloud.size(), next + slot, next_set + slot);
     }
@@ -125,7 +125,7 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
         Vec3<L> by_force{load<L>(numbers[0]), load<L>(numbers[1]), load<L>(numbers[2])};
         if (pad.flat) by_force = axes * by_force;
         const PointGradient<L> g =
-            point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, by_force, by_force, zero3<L>());
+            point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, by_force, by_force, zero3<L>(), zero3<L>());
         const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
         turn += cross(t.x, by_point) + cross(by_force, g.force);  // the axes turn too
         shift += by_point;
@@ -143,16 +143,17 @@ void read_markers_transposed(const Model& m, const T* params, const V3<T>* ancho
 
 // The same for the anchors' turn: gradients of the anchors after the step to the step's end and the anchors before.
 template <class T>
-void marker_anchors_transposed(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                               Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
+void marker_anchors_transposed(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+                               const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q,
+                               VX<T>& by_v, V3<T>* by_anchor) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.pushes) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-      anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), by_next + slot, by_pose,
-                            by_twist, by_anchor + slot);
+      anchors_transposed<T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored, h), by_next + slot,
+                            by_pose, by_twist, by_anchor + slot);
       pair_columns<T>(pad.pairs[s], pad.mount.body, frame, w);
       pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
     }

@@ -130,7 +130,7 @@ void advance_anchors(const PairFrame<T>& frame, const NearPoints<T>& near, const
   for_touching_points<false, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
     PointForce<Pack<T>> force;
     point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
-    const Vec3<Pack<T>> anchor = next_anchor(t.law, force, t.x, t.anchor, t.remembers);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(rule.h), force, t.x, t.anchor, t.remembers);
     t.for_each_inside([&](int k, int i) {
       next[i] = lane3<T>(anchor, k);
       next_set[i] = 1;
@@ -148,7 +148,7 @@ void anchors_transposed(const PairFrame<T>& frame, const Points& points, const T
   for_touching_points<true, T>(frame, points, rule, [&](const Touching<T>& t) {
     Vec3<L> lambda = zero3<L>();
     t.for_each_inside([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
-    const PointGradient<L> g = next_anchor_transposed(t.law, t.at, t.v, t.e, t.remembers, lambda);
+    const PointGradient<L> g = next_anchor_transposed(t.law, L(rule.h), t.at, t.v, t.e, t.remembers, lambda);
     const Vec3<L> by_point = g.x - cross(spread<L>(frame.angular), g.v);
     turn += cross(t.center, by_point);
     shift += by_point;

@@ -79,8 +79,8 @@ template <class T>
 struct StepStart {
   T h;  // β h
   const T *q0, *v_star;
-  const T* low;    // what q0 lacks, or null (StateView)
-  const T* shift;  // γ δ, null under BDF1
+  const T* low;      // what q0 lacks, or null (StateView)
+  const T* history;  // δ and v_{t-2}; null under BDF1
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
