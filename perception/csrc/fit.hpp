@@ -28,6 +28,7 @@ namespace gelflow::perception {
 typedef float Floats __attribute__((vector_size(32)));
 typedef std::int32_t Ints __attribute__((vector_size(32)));
 constexpr int lanes = 8;
+constexpr int coarse_passes = 2;  // the first passes look at every second line: they need not be exact
 
 struct Shape {
   static constexpr int steps = 256;
@@ -45,13 +46,22 @@ struct Fit {
   double quality = 0;   // share of the dot's edge that the shape explains, 0 to 1
 };
 
-// The window: `size` pixels wide (a multiple of `lanes`) and high.
+// The pixels around a dot: `size` of them wide (a multiple of `lanes`) and high.
 struct Window {
+  static constexpr int largest = 48;
   int left, top, size;
+  alignas(32) std::array<float, largest * largest> pixels;
 };
+
+GELFLOW_CLONES inline void take_window(const std::uint8_t* __restrict first, int stride, int size,
+                                       float* __restrict pixels) {
+  for (int row = 0; row < size; ++row)
+    for (int x = 0; x < size; ++x) pixels[row * size + x] = float(first[row * stride + x]);
+}
 
 // Values of the model at one pass, and the sums over the window that it needs.
 struct Pass {
+  int every;                     // only every so many-th line is looked at
   float x, y;                    // the centre, from the window's middle [px]
   float a, b, slope_x, slope_y;  // contrast, light, and β
   float k;                       // residual from which on a pixel counts little [grey levels]
@@ -86,26 +96,25 @@ GELFLOW_INLINE double total(Floats v) {
   return sum;
 }
 
-GELFLOW_CLONES inline void run_pass(const std::uint8_t* first, int stride, const Window& window, int width, int height,
-                                    const Shape& shape, const Oval& oval, Pass& pass) {
+GELFLOW_CLONES inline void run_pass(const Window& window, int width, int height, const Shape& shape, const Oval& oval,
+                                    Pass& pass) {
   const float middle = 0.5f * float(window.size - 1), k2 = 1 / (pass.k * pass.k);
-  Floats px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, kept{}, weight{}, count{};
+  Floats px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, kept{}, weight{};
   const Floats ramp = {0, 1, 2, 3, 4, 5, 6, 7};
-  for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); ++row) {
+  for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); row += pass.every) {
     const float y = float(row) - middle;
-    const std::uint8_t* line = first + std::ptrdiff_t(row) * stride;
+    const float* line = &window.pixels[std::size_t(row * window.size)];
     for (int start = 0; start < window.size; start += lanes) {
       const Floats x = ramp + (float(start) - middle);
       Floats pixel;
-      for (int l = 0; l < lanes; ++l) pixel[l] = float(line[start + l]);
+      std::memcpy(&pixel, line + start, sizeof pixel);
       const Floats column = x + (middle + float(window.left));
       const Sample dot = sample(shape, oval, x - pass.x, y - pass.y);
       const Floats ink = 1 + pass.a * dot.s;
       const Floats r = pixel - pass.b * (1 + pass.slope_x * x + pass.slope_y * y) * ink;
-      Floats w = 1 / (1 + r * r * k2), one = Floats{} + 1;
+      Floats w = 1 / (1 + r * r * k2);
       const auto outside = (column < 0) | (column > float(width - 1));
       w = outside ? Floats{} : w;
-      one = outside ? Floats{} : one;
       const Floats psi = w * r, square = dot.gx * dot.gx + dot.gy * dot.gy, lit = psi * ink;
       px += psi * dot.gx;
       py += psi * dot.gy;
@@ -116,7 +125,6 @@ GELFLOW_CLONES inline void run_pass(const std::uint8_t* first, int stride, const
       edge += square;
       kept += w * square;
       weight += w;
-      count += one;
     }
   }
   const double share = 1.0 / pass.b;
@@ -124,7 +132,7 @@ GELFLOW_CLONES inline void run_pass(const std::uint8_t* first, int stride, const
   const std::array<double, 6> sums = {a * total(px), a * total(py), total(pa), total(pb), total(bx), total(by)};
   for (int i = 0; i < 6; ++i) pass.sums[i] = share * sums[std::size_t(i)];
   pass.edge = total(edge), pass.edge_kept = total(kept);
-  pass.weight = total(weight), pass.count = total(count);
+  pass.weight = total(weight);
 }
 
 // H⁻¹ of a marker, row by row.
@@ -178,27 +186,26 @@ inline Fit fit_dot(const Plane& plane, const FitSettings& settings, const Oval& 
                    double rest_contrast, Point place, int most_passes) {
   const int size = settings.window;
   const double middle = 0.5 * (size - 1), limit = 0.8 * settings.radius + 1;
-  const Window window = {int(std::floor(place.x - middle + 0.5)), int(std::floor(place.y - middle + 0.5)), size};
+  Window window;
+  window.left = int(std::floor(place.x - middle + 0.5)), window.top = int(std::floor(place.y - middle + 0.5));
+  window.size = size;
   const Point corner = {window.left + middle, window.top + middle}, begin = place - corner;
-  const std::uint8_t* first = plane.row(0) + std::ptrdiff_t(window.top) * plane.stride + window.left;
-  // The brightest quarter of a dark dot's window is light, as is the darkest of a bright one's; a coarse guess will do.
+  take_window(plane.row(0) + std::ptrdiff_t(window.top) * plane.stride + window.left, plane.stride, size,
+              window.pixels.data());
+  // A coarse guess of the light will do: what is seen along the window's edge.
   double light = 0;
-  for (int i = 0; i < size; i += size - 1)
-    for (int j = 0; j < size; j += 2) {
-      const int x = std::clamp(window.left + j, 0, plane.width - 1),
-                y = std::clamp(window.top + i, 0, plane.height - 1);
-      const int u = std::clamp(window.left + i, 0, plane.width - 1),
-                v = std::clamp(window.top + j, 0, plane.height - 1);
-      light += plane.row(y)[x] + plane.row(v)[u];
-    }
-  light = std::max(4.0, light / (2 * size));
+  for (int i = 0; i < size; ++i)
+    for (int edge : {i, size * (size - 1) + i, size * i, size * i + size - 1})
+      light += window.pixels[std::size_t(edge)];
+  light = std::max(4.0, light / (4 * size));
   Pass pass{};
   pass.x = float(begin.x), pass.y = float(begin.y), pass.a = float(rest_contrast), pass.b = float(light);
   for (int number = 0; number < most_passes; ++number) {
     pass.k = pass.b * float(std::max(0.2 * std::abs(double(pass.a)), 3 * settings.noise));
-    run_pass(first, plane.stride, window, plane.width, plane.height, settings.shape, oval, pass);
-    // Pixels that count little are missing from the sums, but not from H.
-    const double more = std::min(2.0, pass.count / std::max(pass.weight, 1.0));
+    pass.every = number < coarse_passes ? 2 : 1;
+    run_pass(window, plane.width, plane.height, settings.shape, oval, pass);
+    // Pixels that count little or are left out are missing from the sums, but not from H.
+    const double more = std::min(4.0, double(size * size) / std::max(pass.weight, 1.0));
     std::array<double, 6> step{};
     for (std::size_t i = 0; i < 6; ++i)
       for (std::size_t j = 0; j < 6; ++j) step[i] += more * inverse[6 * i + j] * pass.sums[j];
@@ -210,7 +217,7 @@ inline Fit fit_dot(const Plane& plane, const FitSettings& settings, const Oval& 
     const bool lost = !(std::abs(pass.x - begin.x) < limit && std::abs(pass.y - begin.y) < limit) ||
                       !(pass.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
     if (lost) return {place, 0, 0};
-    if (number > 0 && std::abs(step[0]) < 0.01 && std::abs(step[1]) < 0.01) break;
+    if (number >= coarse_passes && std::abs(step[0]) < 0.01 && std::abs(step[1]) < 0.01) break;
   }
   const double edge = std::max(pass.edge, 1e-9);
   return {corner + Point{pass.x, pass.y}, pass.a, std::clamp(pass.edge_kept / edge, 0.0, 1.0)};

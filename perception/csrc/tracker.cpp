@@ -9,16 +9,19 @@ constexpr double least_quality = 0.4;       // of a fit that is believed
 constexpr double least_quality_lost = 0.6;  // the same where no dot stood out, only the neighbours say where to look
 constexpr double weakest = 0.35, strongest = 2.2;  // contrast that is believed, against that at rest
 constexpr double faintest = 0.3;                   // response of a dot, against the middle one at rest
-constexpr double fastest = 0.25;  // of the spacing per image: more is taken for a jump, not for a velocity
+constexpr double fastest = 0.25;       // of the spacing per image: more is taken for a jump, not for a velocity
+constexpr double unquestioned = 0.85;  // quality from which on the neighbours are not asked
+constexpr double stray = 0.35;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
 constexpr int relaxations = 8;
 
-const int neighbour_row[8] = {0, 0, 1, -1, 1, 1, -1, -1};
-const int neighbour_col[8] = {1, -1, 0, 0, 1, -1, 1, -1};
+// Opposite ones beside each other.
+const int neighbour_row[8] = {0, 0, 1, -1, 1, -1, 1, -1};
+const int neighbour_col[8] = {1, -1, 0, 0, 1, -1, -1, 1};
 
 // As wide as makes the light's slope certain, but without the neighbours' dots.
 int window_size(double radius, double spacing) {
   const int wanted = int(std::ceil(3.8 * radius / lanes)) * lanes, most = int(0.85 * spacing / lanes) * lanes;
-  return std::clamp(wanted, lanes, std::clamp(most, lanes, Plane::margin / 2));
+  return std::clamp(wanted, lanes, std::clamp(most, lanes, Window::largest));
 }
 }  // namespace
 
@@ -46,7 +49,7 @@ void Tracker::start(const std::uint8_t* bgr) {
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
     if (!setup_.seen[m]) continue;
-    const Fit found = fit(m, setup_.rest[m], 12);
+    const Fit found = fit(m, setup_.oval[m], setup_.rest[m], 12);
     quality_[m] = found.quality, contrasts_[m] = found.contrast;
     if (found.quality < least_quality) {
       setup_.seen[m] = 0, quality_[m] = 0;
@@ -91,11 +94,12 @@ void Tracker::measure(const std::vector<int>& owner) {
   for (std::size_t m = 0; m < n; ++m) {
     known_[m] = 0, quality_[m] = 0;
     if (owner[m] < 0 || !setup_.seen[m]) continue;
-    const Fit found = fit(m, dots_[std::size_t(owner[m])].place, 8);
+    const Fit found = fit(m, stretched(m, owner), dots_[std::size_t(owner[m])].place, 8);
     quality_[m] = believed(m, found);
     known_[m] = quality_[m] >= least_quality;
     if (known_[m]) places_[m] = found.place;
   }
+  drop_strays();
   if (std::none_of(known_.begin(), known_.end(), [](char k) { return k != 0; })) {
     std::fill(quality_.begin(), quality_.end(), 0.0);
     return;
@@ -105,20 +109,51 @@ void Tracker::measure(const std::vector<int>& owner) {
     if (known_[m]) continue;
     quality_[m] = 0;
     if (!setup_.seen[m]) continue;
-    const Fit found = fit(m, places_[m], 8);
+    const Fit found = fit(m, stretched(m, owner), places_[m], 8);
     const double quality = believed(m, found);
     if (quality >= least_quality_lost && is_free(int(m), found.place)) {
       places_[m] = found.place, quality_[m] = quality, known_[m] = 1;
     }
   }
+  drop_strays();
   spread();
 }
 
-Fit Tracker::fit(std::size_t marker, Point place, int passes) const {
+// The oval of a marker's dot, which is stretched and turned as the gel around it is: by G = L₀ L⁻¹, where the columns of
+// L are the ways between its neighbours on either side, and L₀ those at rest, Q becomes GᵀQG.
+Oval Tracker::stretched(std::size_t marker, const std::vector<int>& owner) const {
+  const int row = int(marker) / setup_.cols, col = int(marker) % setup_.cols;
+  Point now[2], rest[2];
+  for (int axis = 0; axis < 2; ++axis) {
+    std::size_t ends[2];
+    for (int side = 0; side < 2; ++side) {
+      const int way = side ? 1 : -1;
+      const int r = std::clamp(row + (axis ? way : 0), 0, setup_.rows - 1);
+      const int c = std::clamp(col + (axis ? 0 : way), 0, setup_.cols - 1);
+      ends[side] = std::size_t(r * setup_.cols + c);
+      if (owner[ends[side]] < 0) return setup_.oval[marker];
+    }
+    now[axis] = dots_[std::size_t(owner[ends[1]])].place - dots_[std::size_t(owner[ends[0]])].place;
+    rest[axis] = setup_.rest[ends[1]] - setup_.rest[ends[0]];
+  }
+  const double area = now[0].x * now[1].y - now[0].y * now[1].x;
+  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return setup_.oval[marker];
+  // G = [rest] [now]⁻¹
+  const double xx = (rest[0].x * now[1].y - rest[1].x * now[0].y) / area;
+  const double xy = (rest[1].x * now[0].x - rest[0].x * now[1].x) / area;
+  const double yx = (rest[0].y * now[1].y - rest[1].y * now[0].y) / area;
+  const double yy = (rest[1].y * now[0].x - rest[0].y * now[1].x) / area;
+  const Oval& q = setup_.oval[marker];
+  return {float(q.xx * xx * xx + 2 * q.xy * xx * yx + q.yy * yx * yx),
+          float(q.xx * xx * xy + q.xy * (xx * yy + xy * yx) + q.yy * yx * yy),
+          float(q.xx * xy * xy + 2 * q.xy * xy * yy + q.yy * yy * yy)};
+}
+
+Fit Tracker::fit(std::size_t marker, const Oval& oval, Point place, int passes) const {
   if (!(place.x > -setup_.radius && place.y > -setup_.radius && place.x < setup_.width + setup_.radius &&
         place.y < setup_.height + setup_.radius))
     return {place, 0, 0};
-  return fit_dot(plane_, settings_, setup_.oval[marker], inverse_[marker], setup_.contrast[marker], place, passes);
+  return fit_dot(plane_, settings_, oval, inverse_[marker], setup_.contrast[marker], place, passes);
 }
 
 // The quality of a fit, 0 where it is cut by the image's border or its contrast is not that of the marker.
@@ -142,6 +177,44 @@ bool Tracker::is_free(int marker, Point place) const {
     const std::size_t other = std::size_t(r * setup_.cols + c);
     if (known_[other] && squared(places_[other] - place) < 2 * setup_.radius * setup_.radius) return false;
   }
+  return true;
+}
+
+// Gives up markers that are not where their neighbours say: the less of a dot's edge was seen, the closer it must be.
+void Tracker::drop_strays() {
+  for (std::size_t m = 0; m < steps_.size(); ++m) steps_[m] = places_[m] - setup_.rest[m];
+  filled_ = known_;
+  for (std::size_t m = 0; m < steps_.size(); ++m) {
+    Point told;
+    if (!filled_[m] || quality_[m] > unquestioned || !foretold(int(m), told)) continue;
+    const double most = stray * quality_[m] * quality_[m] * quality_[m] * setup_.spacing;
+    if (squared(steps_[m] - told) > most * most) known_[m] = 0, quality_[m] = 0;
+  }
+}
+
+// The displacement of `marker` that the filled ones around it tell: the middle one of all that follow from two of them
+// in a line with it, on either side or on the same. Right for any displacement that changes linearly. False when there
+// are fewer than three.
+bool Tracker::foretold(int marker, Point& told) const {
+  std::array<double, 12> x, y;
+  std::size_t n = 0;
+  const int row = marker / setup_.cols, col = marker % setup_.cols;
+  const auto filled = [&](int r, int c) {
+    return r >= 0 && r < setup_.rows && c >= 0 && c < setup_.cols && filled_[std::size_t(r * setup_.cols + c)];
+  };
+  const auto step = [&](int r, int c) { return steps_[std::size_t(r * setup_.cols + c)]; };
+  for (int k = 0; k < 8; ++k) {
+    const int down = neighbour_row[k], right = neighbour_col[k];
+    if (!filled(row + down, col + right)) continue;
+    const Point near = step(row + down, col + right);
+    const auto tell = [&](Point p) { x[n] = p.x, y[n] = p.y, ++n; };
+    if (k % 2 == 0 && filled(row - down, col - right)) tell(0.5 * (near + step(row - down, col - right)));
+    if (filled(row + 2 * down, col + 2 * right)) tell(2 * near - step(row + 2 * down, col + 2 * right));
+  }
+  if (n < 3) return false;
+  std::nth_element(x.begin(), x.begin() + n / 2, x.begin() + n);
+  std::nth_element(y.begin(), y.begin() + n / 2, y.begin() + n);
+  told = {x[n / 2], y[n / 2]};
   return true;
 }
 

@@ -40,10 +40,13 @@ class Tracker {
 
  private:
   void measure(const std::vector<int>& owner);
-  Fit fit(std::size_t marker, Point place, int passes) const;
+  Oval stretched(std::size_t marker, const std::vector<int>& owner) const;
+  Fit fit(std::size_t marker, const Oval& oval, Point place, int passes) const;
   double believed(std::size_t marker, const Fit& fit) const;
   bool is_inside(Point place) const;
   bool is_free(int marker, Point place) const;
+  void drop_strays();
+  bool foretold(int marker, Point& told) const;
   void spread();
 
   Setup setup_;
