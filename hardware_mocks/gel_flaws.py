@@ -115,7 +115,8 @@ FACTORS: dict[str, dict[str, Any]] = {
     "cut row": {"cut_row": True},
 }
 
-SIZES: dict[int, tuple[int, int]] = {63: (7, 9), 130: (10, 13), 154: (11, 14)}  # markers → rows, columns
+# markers → rows, columns
+SIZES: dict[int, tuple[int, int]] = {35: (5, 7), 63: (7, 9), 130: (10, 13), 154: (11, 14), 252: (14, 18)}
 
 
 def look_of(
@@ -129,7 +130,7 @@ def look_of(
 ) -> FlawedLook:
     """The look of an image class (one of `PRESETS`), with fields of `FlawedLook` changed by name.
 
-    The grid of `markers` (63, 130 or 154) fills the image; a dot's radius is 0.18 of the spacing. Markers run as in
+    The grid of `markers` (one of `SIZES`) fills the image; a dot's radius is 0.18 of the spacing. Markers run as in
     the image: row by row from the top, each from the left. Raises UsageError for unknown names and values.
     """
     if preset not in PRESETS:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,15 +58,16 @@ class GelSequence:
     def __iter__(self) -> Iterator[Frame]:
         renderer = TruthRenderer(self.look)
         for number in range(self.frames):
-            depth, center = self._strength(number), self._center(number)
-            contact = Contact(self._in_image(center), self._radius() * self.look.spacing, depth) if depth else None
-            yield renderer.render(
-                self.displacement(number),
-                number=number,
-                contact=contact,
-                smear=self._smear(number),
-                progress=number / max(self.frames - 1, 1),
-            )
+            yield renderer.render(self.displacement(number), number=number, **self.surroundings(number))
+
+    def surroundings(self, number: int) -> dict[str, Any]:
+        """What else happens in image `number`: contact, smear and progress, as `TruthRenderer.expose` takes them."""
+        depth, radius = self._strength(number), self._radius() * self.look.spacing
+        return {
+            "contact": Contact(self._in_image(self._center(number)), radius, depth) if depth else None,
+            "smear": self._smear(number),
+            "progress": number / max(self.frames - 1, 1),
+        }
 
     def _strength(self, number: int) -> float:
         """Of the motion, 0 to 1."""

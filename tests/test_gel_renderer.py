@@ -115,7 +115,7 @@ def test_every_class_and_factor_can_be_drawn(name: str, markers: int) -> None:
 def test_wrong_looks_and_sequences_are_refused() -> None:
     for wrong, message in (
         ({"preset": "dirty"}, "expected an image class out of clean, typical, hard, got 'dirty'"),
-        ({"markers": 100}, "expected one of 63, 130, 154 markers, got 100"),
+        ({"markers": 100}, "expected one of 35, 63, 130, 154, 252 markers, got 100"),
         ({"blurr": 1.0}, "a look has no 'blurr'; it has barrel"),
         ({"damaged": 1.5}, "damaged of a flawed look must be within 0.0 to 1.0, got 1.5"),
         ({"blur": 0.2}, "blur of a flawed look must be within 0.5"),

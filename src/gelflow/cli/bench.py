@@ -1,8 +1,9 @@
-"""`gelflow bench`: how fast the simulator is, beside others, and whether what was timed was right."""
+"""`gelflow bench`: how fast simulator and tracker are, beside others, and whether what was timed was right."""
 
 import argparse
 import json
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ MEASUREMENTS = {
     "batch": "many environments on one core and on all",
     "markers": "a marker's reading and its gradient, for each shape",
     "precision": "single precision beside double, errors and speed",
+    "tracking": "marker tracking: errors on images with known truth, speed, beside Lucas-Kanade and dense flow",
     "growth": "time against bodies, touching points, markers, environments",
 }
 
@@ -42,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--markdown", action="store_true", help="print tables for a document")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything to a file, with the machine")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw growth (PNG)")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw growth or tracking (PNG)")
     parser.add_argument(
         "--paper-model", type=Path, metavar="FILE", help="tactile_pad.xml of the paper's simulator, if it is installed"
     )
@@ -62,16 +64,17 @@ def run(args: argparse.Namespace) -> int:
         if name not in MEASUREMENTS:
             raise UsageError(f"no measurement {name!r}; {nearest(name, tuple(MEASUREMENTS))}")
     wanted = list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name != "growth"]
-    if args.picture is not None and "growth" not in wanted:
-        raise UsageError("--picture draws growth: ask for it, as in gelflow bench growth --picture growth.png")
+    if args.picture is not None and ("growth" in wanted) == ("tracking" in wanted):
+        raise UsageError("--picture draws growth or tracking: ask for one, as in gelflow bench growth --picture g.png")
     console = Console(width=WIDTH)
     console.print(f"{processor()}. Medians of {repeats} repeats, all of one table taken in turn.", highlight=False)
-    reports = []
+    reports: list[Report] = []
     for name in wanted:
         with _Bar() as bar:
-            report = _measure(name, Effort(quick=quick, repeats=repeats, watch=bar), args)
-        _show(console, report, markdown=args.markdown)
-        reports.append(report)
+            found = _measure(name, Effort(quick=quick, repeats=repeats, watch=bar), args)
+        for report in found:
+            _show(console, report, markdown=args.markdown)
+        reports += found
     if args.json is not None:
         _write(args.json, reports, quick=quick, repeats=repeats)
         print(args.json)
@@ -86,31 +89,33 @@ def conclude(reports: "Sequence[Report]") -> int:
     return 1 if outside else 0
 
 
-def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "Report":
+def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "list[Report]":
     if name == "rolling":
         from gelflow.sim.benchmark.rolling import measure_rolling
 
-        return measure_rolling(effort, paper_model=args.paper_model)
+        return [measure_rolling(effort, paper_model=args.paper_model)]
     if name == "scenes":
         from gelflow.sim.benchmark.scenes import measure_scenes
 
-        return measure_scenes(effort)
+        return [measure_scenes(effort)]
     if name == "gradients":
         from gelflow.sim.benchmark.gradients import measure_gradients
 
-        return measure_gradients(effort)
+        return [measure_gradients(effort)]
     if name == "batch":
         from gelflow.sim.benchmark.batch import measure_batch
 
-        return measure_batch(effort)
+        return [measure_batch(effort)]
     if name == "markers":
         from gelflow.sim.benchmark.markers import measure_markers
 
-        return measure_markers(effort)
+        return [measure_markers(effort)]
     if name == "precision":
         from gelflow.sim.benchmark.precision import measure_precision
 
-        return measure_precision(effort)
+        return [measure_precision(effort)]
+    if name == "tracking":
+        return _measure_tracking(effort, args.picture)
     from gelflow.sim.benchmark.growth import measure_growth
 
     report, found = measure_growth(effort)
@@ -118,7 +123,20 @@ def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "Report":
         from gelflow.sim.benchmark.growth_picture import draw
 
         draw(found, args.picture)
-    return report
+    return [report]
+
+
+def _measure_tracking(effort: "Effort", picture: Path | None) -> "list[Report]":
+    from gelflow.cli.bench_tracking import measure_tracking
+
+    reports = measure_tracking(effort)
+    if picture is not None:
+        from gelflow.cli.bench_tracking_curves import draw, measure_curves
+
+        curves = measure_curves(effort)
+        draw(curves, picture)
+        reports.append(curves)
+    return reports
 
 
 def _show(console: Console, report: "Report", *, markdown: bool) -> None:
@@ -139,7 +157,8 @@ def _show(console: Console, report: "Report", *, markdown: bool) -> None:
 def _write(file: Path, reports: "Sequence[Report]", *, quick: bool, repeats: int) -> None:
     from gelflow.sim.benchmark import processor, versions
 
-    record = {"format": 1, "processor": processor(), "versions": versions(), "quick": quick, "repeats": repeats}
+    version = versions() | {"opencv-contrib-python-headless": metadata.version("opencv-contrib-python-headless")}
+    record = {"format": 1, "processor": processor(), "versions": version, "quick": quick, "repeats": repeats}
     record |= {report.name: report.plain() for report in reports}
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
