@@ -63,7 +63,7 @@ class Calibration:
         try:
             good = all(type(number) is int and number >= 1 for number in whole)
             good &= np.shape(self.matrix) == (3, 3) and len(self.radial) <= 3 and len(self.center) == 2
-            numbers = np.array([*np.ravel(self.matrix), *self.radial, *self.center, self.spacing_mm])
+            numbers = np.array([*np.ravel(self.matrix), *self.radial, *self.center, self.spacing_mm, self.residual_px])
             good &= numbers.dtype.kind in "if" and bool(np.isfinite(numbers).all())
             good = good and self.spacing_mm > 0 and np.linalg.det(self.matrix) != 0
         except (TypeError, ValueError):

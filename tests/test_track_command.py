@@ -141,7 +141,7 @@ def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, caps
     [
         (["--csv", "notes.txt"], "notes.txt exists; name a new file"),
         (["--overlay", "film.gif"], "suffix must be one of .mp4, .mkv, .avi"),
-        (["--csv", "none/t.csv"], "cannot create none/t.csv: No such file"),
+        (["--csv", "none/t.csv"], "the folder none does not exist"),
         (["--calibration", "none.json"], "cannot read none.json"),
         (["--calibration", "other.json"], "for images of 320 × 427 px, this one has 240 × 320"),
         (["--sensor", "middle"], "sensor must be left or right"),

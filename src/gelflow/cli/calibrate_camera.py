@@ -38,6 +38,8 @@ def run(args: argparse.Namespace) -> int:
     for file in (args.out, picture):
         if file.exists():
             raise UsageError(f"{file} exists; name a new file with --out")
+    if not args.out.parent.is_dir():
+        raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
     image = next(iter(find_source(args.source, sensor=args.sensor))).image
     tracker = MarkerTracker()
     with picture_of_refusal(args.out):

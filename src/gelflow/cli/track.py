@@ -67,6 +67,8 @@ def _check(args: argparse.Namespace) -> None:
     for file in _files(args):
         if file.exists():
             raise UsageError(f"{file} exists; name a new file")
+        if not file.parent.is_dir():
+            raise UsageError(f"{file}: the folder {file.parent} does not exist")
 
 
 def _follow(
