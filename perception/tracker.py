@@ -1,6 +1,7 @@
 """Markers followed through images: where each is, how far it moved from the first image, and whether it is seen.
 
-The first image is the reference: the grid is found in it, and what a dot looks like. In every further image all dots
+The first image is the reference: the grid is found in it, and what a dot looks like; images in which nothing has moved
+yet make it finer. In every further image all dots
 are found anew, so nothing drifts; each is given to the marker that it belongs to, and fitted with the learned shape.
 The work on an image is native, see csrc: contrast.hpp finds, follow.hpp says whose, fit.hpp measures.
 No random numbers, no clock: the same images in the same order give the same numbers.
@@ -54,7 +55,6 @@ class _Started:
     tracker: Tracker
     size: tuple[int, int]  # height and width of the images [px]
     shrink: int  # the native part sees images made smaller by this
-    rest: NDArray[np.float64]  # [px], shape (markers, 2)
     rows: int
     cols: int
     spacing: float  # [px]
@@ -71,11 +71,12 @@ class MarkerTracker:
     def rest(self) -> NDArray[np.float64]:
         """Where the markers are at rest (right, down) [px], shape (markers, 2), line by line.
 
+        As long as nothing moves after the start, up to eight images, it is the mean of them, and so gets finer.
         Raises UsageError before `start`.
         """
         if self._started is None:
             raise UsageError("the tracker has no rest positions yet: start it with an image at rest")
-        return self._started.rest.copy()
+        return _larger(self._started.tracker.rest(), self._started.shrink)
 
     def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> Tracked:
         """Finds the grid in `image` (B G R, or grey) and takes it as the reference; displacements in it are zero.
@@ -95,9 +96,9 @@ class MarkerTracker:
         rest = _larger(learned.rest, shrink)
         size = (image.shape[0], image.shape[1])
         rows, cols = found.shape
-        self._started = _Started(tracker, size, shrink, rest, rows, cols, found.spacing)
+        self._started = _Started(tracker, size, shrink, rows, cols, found.spacing)
         none, seen = np.zeros_like(rest), learned.seen
-        return Tracked(rest.copy(), none, seen, ~seen, learned.quality, rows, cols, found.spacing)
+        return Tracked(rest, none, seen, ~seen, learned.quality, rows, cols, found.spacing)
 
     def track(self, image: NDArray[np.uint8]) -> Tracked:
         """The markers in the next image (B G R, or grey). The first call is `start`.

@@ -76,6 +76,16 @@ py::tuple start(Shared& shared, const Image& image) {
   return py::make_tuple(position, contrast, quality);
 }
 
+py::array_t<double> rest(Shared& shared) {
+  const std::lock_guard lock(shared.busy);
+  const std::vector<Point>& places = shared.tracker.setup().rest;
+  py::array_t<double> out({py::ssize_t(places.size()), py::ssize_t(2)});
+  for (std::size_t m = 0; m < places.size(); ++m) {
+    out.mutable_at(py::ssize_t(m), 0) = places[m].x, out.mutable_at(py::ssize_t(m), 1) = places[m].y;
+  }
+  return out;
+}
+
 py::tuple track(Shared& shared, const Image& image) {
   const std::uint8_t* pixels = shared.pixels(image);
   const py::ssize_t n = shared.tracker.markers();
@@ -119,5 +129,6 @@ PYBIND11_MODULE(_tracker, module) {
            py::arg("cols"), py::arg("spacing"), py::arg("radius"), py::arg("noise"), py::arg("profile"),
            py::arg("reach"), py::arg("rest"), py::arg("seen"), py::arg("oval"), py::arg("contrast"))
       .def("start", &start, py::arg("image").noconvert())
+      .def("rest", &rest)
       .def("track", &track, py::arg("image").noconvert());
 }

@@ -13,6 +13,8 @@ constexpr double fastest = 0.25;       // of the spacing per image: more is take
 constexpr double unquestioned = 0.85;  // quality from which on the neighbours are not asked
 constexpr double stray = 0.35;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
 constexpr int relaxations = 8;
+constexpr int most_at_rest = 8;      // images that make the reference, if nothing moves before
+constexpr double rest_smooth = 0.3;  // largest share of what neighbours have in common, in the squares of noise
 
 // Opposite ones beside each other.
 const int neighbour_row[8] = {0, 0, 1, -1, 1, -1, 1, -1};
@@ -59,6 +61,7 @@ void Tracker::start(const std::uint8_t* bgr) {
     anything_valid_ = true;
   }
   places_ = setup_.rest;
+  at_rest_ = 1;
   std::fill(velocity_.begin(), velocity_.end(), Point{});
   contrast_.find(plane_, 0.0f, 4 * setup_.rest.size() + 64, dots_);
   std::vector<float> strength;
@@ -80,12 +83,34 @@ void Tracker::track(const std::uint8_t* bgr) {
     expected_[m] = char(setup_.seen[m] && is_inside(before_[m] + velocity_[m]));
   measure(follow_.assign(dots_, before_, velocity_, expected_));
   anything_valid_ = std::any_of(known_.begin(), known_.end(), [](char k) { return k != 0; });
+  if (at_rest_ > 0) refine_rest();
   const double most = fastest * setup_.spacing;
   for (std::size_t m = 0; m < places_.size(); ++m) {
     const Point v = places_[m] - before_[m];
     const double length = std::sqrt(squared(v));
     velocity_[m] = length <= most ? v : Point{};
   }
+}
+
+// As long as nothing has moved since the start, the reference becomes the mean of all images: one image's noise alone
+// would stay in every displacement. Noise differs from marker to marker, motion is shared by neighbours: of independent
+// noise, the mean of the eight around a marker has 0.12 times the squares of what differs from it.
+void Tracker::refine_rest() {
+  filled_ = known_;
+  double shared = 0, own = 0;
+  for (std::size_t m = 0; m < steps_.size(); ++m) steps_[m] = places_[m] - setup_.rest[m];
+  for (std::size_t m = 0; m < steps_.size(); ++m) {
+    Point mean;
+    if (!known_[m] || !around(int(m), mean)) continue;
+    shared += squared(mean), own += squared(steps_[m] - mean);
+  }
+  if (!(shared < rest_smooth * own) || at_rest_ == most_at_rest) {
+    at_rest_ = 0;
+    return;
+  }
+  ++at_rest_;
+  for (std::size_t m = 0; m < steps_.size(); ++m)
+    if (known_[m]) setup_.rest[m] = setup_.rest[m] + (1.0 / at_rest_) * steps_[m];
 }
 
 // Fits the dots that markers own, then looks for the others where their neighbours say; guesses what is left.
@@ -186,16 +211,17 @@ void Tracker::drop_strays() {
   filled_ = known_;
   for (std::size_t m = 0; m < steps_.size(); ++m) {
     Point told;
-    if (!filled_[m] || quality_[m] > unquestioned || !foretold(int(m), told)) continue;
-    const double most = stray * quality_[m] * quality_[m] * quality_[m] * setup_.spacing;
+    double discord;
+    if (!filled_[m] || quality_[m] > unquestioned || !foretold(int(m), told, discord)) continue;
+    const double most = stray * quality_[m] * quality_[m] * quality_[m] * setup_.spacing + discord;
     if (squared(steps_[m] - told) > most * most) known_[m] = 0, quality_[m] = 0;
   }
 }
 
 // The displacement of `marker` that the filled ones around it tell: the middle one of all that follow from two of them
-// in a line with it, on either side or on the same. Right for any displacement that changes linearly. False when there
-// are fewer than three.
-bool Tracker::foretold(int marker, Point& told) const {
+// in a line with it, on either side or on the same. Right for any displacement that changes linearly; `discord` is how
+// far the middle one of them is from that. False when there are fewer than three.
+bool Tracker::foretold(int marker, Point& told, double& discord) const {
   std::array<double, 12> x, y;
   std::size_t n = 0;
   const int row = marker / setup_.cols, col = marker % setup_.cols;
@@ -212,9 +238,33 @@ bool Tracker::foretold(int marker, Point& told) const {
     if (filled(row + 2 * down, col + 2 * right)) tell(2 * near - step(row + 2 * down, col + 2 * right));
   }
   if (n < 3) return false;
-  std::nth_element(x.begin(), x.begin() + n / 2, x.begin() + n);
-  std::nth_element(y.begin(), y.begin() + n / 2, y.begin() + n);
-  told = {x[n / 2], y[n / 2]};
+  const auto middle = [n](std::array<double, 12>& values) {
+    std::nth_element(values.begin(), values.begin() + n / 2, values.begin() + n);
+    return values[n / 2];
+  };
+  told = {middle(x), middle(y)};
+  for (std::size_t i = 0; i < n; ++i) x[i] = std::abs(x[i] - told.x), y[i] = std::abs(y[i] - told.y);
+  discord = std::hypot(middle(x), middle(y));
+  return true;
+}
+
+// The mean displacement of the filled markers around one, those next to it with twice the weight of those across; false
+// when there are none.
+bool Tracker::around(int marker, Point& mean) const {
+  Point sum{};
+  double weight = 0;
+  const int row = marker / setup_.cols, col = marker % setup_.cols;
+  for (int k = 0; k < 8; ++k) {
+    const int r = row + neighbour_row[k], c = col + neighbour_col[k];
+    if (r < 0 || r >= setup_.rows || c < 0 || c >= setup_.cols) continue;
+    const std::size_t other = std::size_t(r * setup_.cols + c);
+    if (filled_[other] != 1) continue;
+    const double share = k < 4 ? 2 : 1;
+    sum = sum + share * steps_[other];
+    weight += share;
+  }
+  if (weight == 0) return false;
+  mean = (1 / weight) * sum;
   return true;
 }
 
@@ -229,20 +279,7 @@ void Tracker::spread() {
     for (std::size_t m = 0; m < n; ++m) {
       next_[m] = steps_[m];
       if (known_[m] || (outwards && filled_[m])) continue;
-      Point sum{};
-      double weight = 0;
-      const int row = int(m) / setup_.cols, col = int(m) % setup_.cols;
-      for (int k = 0; k < 8; ++k) {
-        const int r = row + neighbour_row[k], c = col + neighbour_col[k];
-        if (r < 0 || r >= setup_.rows || c < 0 || c >= setup_.cols) continue;
-        const std::size_t other = std::size_t(r * setup_.cols + c);
-        if (filled_[other] != 1) continue;
-        const double share = k < 4 ? 2 : 1;
-        sum = sum + share * steps_[other];
-        weight += share;
-      }
-      if (weight == 0) continue;
-      next_[m] = (1 / weight) * sum;
+      if (!around(int(m), next_[m])) continue;
       if (!filled_[m]) filled_[m] = 2, changed = true;  // counts from the next pass on
     }
     steps_.swap(next_);

@@ -46,8 +46,10 @@ class Tracker {
   bool is_inside(Point place) const;
   bool is_free(int marker, Point place) const;
   void drop_strays();
-  bool foretold(int marker, Point& told) const;
+  bool foretold(int marker, Point& told, double& discord) const;
+  bool around(int marker, Point& mean) const;
   void spread();
+  void refine_rest();
 
   Setup setup_;
   FitSettings settings_;
@@ -61,6 +63,7 @@ class Tracker {
   std::vector<double> quality_, contrasts_;
   std::vector<char> known_, filled_, expected_;
   bool anything_valid_ = false;
+  int at_rest_ = 0;  // images that the reference is the mean of; 0 when it is final
 };
 
 }  // namespace gelflow::perception
