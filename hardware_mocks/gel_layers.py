@@ -121,7 +121,8 @@ def occluder_paths(look: FlawedLook, rng: np.random.Generator) -> NDArray[np.flo
     for k in range(look.occluders):
         turn = first + 0.5 * np.pi * k * rng.uniform(0.6, 1.2)
         way = np.array([np.cos(turn), np.sin(turn)])
-        past = middle + rng.uniform(-0.5, 0.5) * middle[1] * np.array([-way[1], way[0]])
+        aside = (-1) ** k * rng.uniform(0.2, 0.6) * middle[1]  # they do not meet in the middle
+        past = middle + aside * np.array([-way[1], way[0]])
         paths.append((past - far * way, past + far * way))
     return np.array(paths).reshape(-1, 2, 2)
 

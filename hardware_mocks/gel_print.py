@@ -14,6 +14,13 @@ from gelflow.hardware_mocks.gel_layers import SHARP, Layer, places
 Array = NDArray[np.float64]
 Patches = NDArray[np.float32]  # shape (dots, side, side)
 
+# Offsets from the dot's middle and sizes of what is gone, in radii, as on old gels.
+_DAMAGES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
+    "cut": ((0.2, 0.8), (0.0, 0.0)),
+    "scratch": ((-0.6, 0.6), (0.08, 0.22)),
+    "hole": ((0.3, 0.9), (0.15, 0.4)),
+    "worn": ((0.0, 0.0), (0.06, 0.2)),
+}
 _LITTLE = 6  # holes of a worn dot
 _DENSE = 0.96  # usual density of the ink; the look's contrast is that of a density of 1
 
@@ -40,15 +47,14 @@ class Damage:
         for k in range(_LITTLE):
             turn, out = self.angle + 2.4 * k, math.sqrt((k + 0.5) / _LITTLE)  # 2.4: the golden angle
             far = np.hypot(x - out * math.cos(turn), y - out * math.sin(turn))
-            ink = ink * ndtr((far - 0.5 * self.size) / edge)
+            ink = ink * ndtr((far - self.size) / edge)
         return np.asarray(ink)
 
 
 def _drawn_damage(rng: np.random.Generator) -> Damage:
-    offsets = {"cut": (0.1, 0.6), "scratch": (-0.4, 0.4), "hole": (0.2, 0.8), "worn": (0.0, 0.0)}
-    kind = tuple(offsets)[rng.integers(len(offsets))]
-    low, high = offsets[kind]
-    return Damage(kind, rng.uniform(0, 2 * np.pi), rng.uniform(low, high), rng.uniform(0.12, 0.45))
+    kind = tuple(_DAMAGES)[rng.integers(len(_DAMAGES))]
+    offset, size = (rng.uniform(*limits) for limits in _DAMAGES[kind])
+    return Damage(kind, rng.uniform(0, 2 * np.pi), offset, size)
 
 
 @dataclass(frozen=True)

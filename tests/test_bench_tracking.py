@@ -41,6 +41,9 @@ def test_errors_are_distances_of_what_is_measured() -> None:
     valid[1, 5] = False
     one = course(off, valid)
     assert sorted(one.errors())[-2:] == [1.0, 5.0] and len(one.errors()) == 11
+    assert sorted(one.displacement_errors())[-3:] == pytest.approx([np.hypot(9, 9)] * 3), (
+        "from a first image that was off by 9 px right and down"
+    )
     assert one.measured() == 11 / 12 and one.near() == 11 / 12, "5 px are more than 0.1 of 20 px"
     assert one.exchanged() == 0, "9 px off is nobody else's place"
     figures = Figures.of([one, one])

@@ -101,9 +101,10 @@ def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
         assert (grey[down, right] < 0.8 * cv2.blur(grey, (23, 23))[down, right]).all()
 
 
-@pytest.mark.parametrize("name", [*PRESETS, *FACTORS])
-@pytest.mark.parametrize("markers", SIZES)
-def test_every_class_and_factor_can_be_drawn(name: str, markers: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "markers"), [*((name, 130) for name in (*PRESETS, *FACTORS)), *(("hard", markers) for markers in SIZES)]
+)
+def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -> None:
     look = look_of(name, markers=markers) if name in PRESETS else look_of(markers=markers, **FACTORS[name])
     frame = next(iter(GelSequence(look, frames=1)))
     assert frame.image.shape == (240, 320, 3) and frame.position.shape == (markers, 2)

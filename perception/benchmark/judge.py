@@ -51,6 +51,15 @@ class Course:
         """Of all that is said to be measured after the first image [px]."""
         return np.asarray(self.off[1:][self.valid[1:]])
 
+    def displacement_errors(self) -> NDArray[np.float64]:
+        """Of the way from the first image, of all that is measured in both [px].
+
+        What a damaged dot's middle is off by is the same in both, and not in here.
+        """
+        both = self.valid[1:] & self.valid[0]
+        off = (self.found[1:] - self.found[0]) - (self.truth[1:] - self.truth[0])
+        return np.asarray(np.linalg.norm(off, axis=-1)[both])
+
     def near(self) -> float:
         """Share of the visible markers that are within 0.1 spacing of the truth, measured or inferred."""
         seen = self.visible[1:]
@@ -99,6 +108,8 @@ class Figures:
 
     median: float  # endpoint error [px]; infinite when nothing was measured
     high: float  # its 95th percentile [px]
+    displacement_median: float  # error of the displacement from the first image [px]; infinite as above
+    displacement_high: float  # its 95th percentile [px]
     near: float  # share of the visible markers within 0.1 spacing
     measured: float  # share of the visible markers that are measured
     exchanged: int  # markers, in all sequences together
@@ -109,10 +120,13 @@ class Figures:
     def of(cls, courses: Iterable[Course]) -> "Figures":
         """Of several sequences together."""
         courses = list(courses)
-        errors = np.concatenate([course.errors() for course in courses])
+        median, high = _percentiles([course.errors() for course in courses])
+        displacement_median, displacement_high = _percentiles([course.displacement_errors() for course in courses])
         return cls(
-            median=float(np.median(errors)) if len(errors) else float("inf"),
-            high=float(np.percentile(errors, 95)) if len(errors) else float("inf"),
+            median=median,
+            high=high,
+            displacement_median=displacement_median,
+            displacement_high=displacement_high,
             near=float(np.mean([course.near() for course in courses])),
             measured=float(np.mean([course.measured() for course in courses])),
             exchanged=sum(course.exchanged() for course in courses),
@@ -123,7 +137,13 @@ class Figures:
     def plain(self) -> dict[str, Any]:
         """For JSON, which knows no infinity: None."""
         found = asdict(self)
-        return found | {name: found[name] if np.isfinite(found[name]) else None for name in ("median", "high")}
+        return {name: None if value == np.inf else value for name, value in found.items()}
+
+
+def _percentiles(errors: list[NDArray[np.float64]]) -> tuple[float, float]:
+    """Median and 95th percentile of all of them; infinite where there are none."""
+    joined = np.concatenate(errors)
+    return (float(np.median(joined)), float(np.percentile(joined, 95))) if len(joined) else (np.inf, np.inf)
 
 
 def follow(frames: Iterable[TrueFrame], rows: int, cols: int, followers: Mapping[str, Follower]) -> dict[str, Course]:

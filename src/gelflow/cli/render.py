@@ -40,11 +40,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--motion",
         choices=MOTIONS,
         default="smooth",
-        help="to the peak and back to rest every 60 images, at the peak from one image to the next, or not at all "
-        "(default %(default)s)",
+        help="to the peak and back to rest, to the peak within one image, or none (default %(default)s)",
     )
     parser.add_argument("--peak", type=float, default=0.4, help="largest motion in spacings (default %(default)s)")
     parser.add_argument("--frames", type=int, default=64, metavar="N", help="how many images (default %(default)s)")
+    parser.add_argument(
+        "--period", type=int, default=60, metavar="N", help="images of one smooth motion (default %(default)s)"
+    )
     parser.add_argument("--markers", type=int, choices=list(SIZES), default=130, help="default %(default)s")
     parser.add_argument("--size", default="320x240", metavar="WxH", help="of the images [px] (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="another light, print, contact and noise")
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     changed = dict(_factor(text) for text in args.set)
     width, height = (int(part) for part in size.groups())
     look = look_of(args.preset, markers=args.markers, width=width, height=height, seed=args.seed, **changed)
-    sequence = GelSequence(look, args.field, frames=args.frames, peak=args.peak, motion=args.motion)
+    sequence = GelSequence(look, args.field, frames=args.frames, peak=args.peak, motion=args.motion, period=args.period)
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
