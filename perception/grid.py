@@ -15,7 +15,7 @@ from gelflow.perception.refusal import StartRefused, draw_seen
 Polarity = Literal["auto", "dark", "bright"]
 
 _RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of dots that are looked for [px], in an image of about _SEARCH px
-_SEARCH = 480
+_SEARCH = 360
 _MOST = 2500  # dots beyond these, in order of contrast, are texture
 _UNEVEN = 0.12  # a grid whose nodes are further from the middle of their neighbours (share of spacing) is chance
 
@@ -36,10 +36,11 @@ class Found:
     def shape(self) -> tuple[int, int]:
         return self.seen.shape[0], self.seen.shape[1]
 
-    def smaller(self, shrink: int) -> "Found":
-        """The same grid in an image made smaller by `shrink`."""
-        places = (self.positions + 0.5) / shrink - 0.5
-        return replace(self, radius=self.radius / shrink, spacing=self.spacing / shrink, positions=places)
+    def scaled(self, factor: float) -> "Found":
+        """The same grid in an image made larger by `factor`, or smaller."""
+        places = (self.positions + 0.5) * factor - 0.5
+        radius, spacing, areas = factor * self.radius, factor * self.spacing, factor**2 * self.areas
+        return replace(self, radius=radius, spacing=spacing, positions=places, areas=areas)
 
 
 def surroundings(spacing: float) -> int:
@@ -62,27 +63,38 @@ def find_grid(
     Raises StartRefused when there is no grid, or one of other rows and columns than asked for; UsageError when no
     grid can have these.
     """
-    looks = {"dark": DARK, "bright": BRIGHT, "auto": DARK + BRIGHT}[polarity]
+    wanted = _wanted(rows, cols, either_way)
     shrink = max(1, round(max(image.shape[:2]) / _SEARCH))
     small = image
     if shrink > 1:
-        size = (image.shape[1] // shrink, image.shape[0] // shrink)
-        small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    wanted = _wanted(rows, cols, either_way)
+        size = (max(image.shape[1] // shrink, 1), max(image.shape[0] // shrink, 1))
+        part = image[: size[1] * shrink, : size[0] * shrink]
+        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    looks = _looks(small, polarity)
     best = _search(small, looks)
     if best is None:
-        raise StartRefused(f"no grid of markers found in the image{_hint(polarity)}", image.copy())
-    look, radius, spacing = best[0], best[1] * shrink, best[2] * shrink
-    # Once more at full size, now that radius and spacing are known: what tracking will do in every image.
-    dots = _likely(find_dots(contrast(image, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
+        dots = find_dots(contrast(small, looks[0], round(5 * _RADII[2])), radius=_RADII[2], apart=1.5 * _RADII[2])
+        seen = draw_seen(small, dots.centers, _RADII[2], None)
+        raise StartRefused(f"no grid of markers found in the image{_hint(polarity)}", seen)
+    look, radius, spacing = best
+    # Once more, now that radius and spacing are known.
+    dots = _likely(find_dots(contrast(small, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
     lattice = grow(dots.centers)
     if lattice is None or lattice.unevenness > _UNEVEN:
-        picture = draw_seen(image, dots.centers, radius, None)
-        raise StartRefused(f"no regular grid of markers found in the image{_hint(polarity)}", picture)
-    refusal, part = _window(lattice, dots, rows, cols, wanted)
-    if part is None:
-        raise StartRefused(refusal, draw_seen(image, dots.centers, radius, lattice.dots))
-    return _found(look, part, dots)
+        seen = draw_seen(small, dots.centers, radius, None)
+        raise StartRefused(f"no regular grid of markers found in the image{_hint(polarity)}", seen)
+    refusal, part_of_it = _window(lattice, dots, rows, cols, wanted)
+    if part_of_it is None:
+        raise StartRefused(refusal, draw_seen(small, dots.centers, radius, lattice.dots))
+    return _found(look, part_of_it, dots).scaled(shrink)
+
+
+def _looks(image: NDArray[np.uint8], polarity: Polarity) -> tuple[Look, ...]:
+    """The looks to try, likely ones first: dots are few pixels, far from the mean on one side."""
+    if polarity != "auto":
+        return DARK if polarity == "dark" else BRIGHT
+    stands_out = contrast(image, BRIGHT[0], round(5 * _RADII[2]))
+    return BRIGHT + DARK if float((stands_out**3).mean()) > 0 else DARK + BRIGHT
 
 
 def _hint(polarity: Polarity) -> str:
@@ -133,7 +145,7 @@ def _search(image: NDArray[np.uint8], looks: tuple[Look, ...]) -> tuple[Look, fl
             full = _full(lattice, dots)
             top, bottom, left, right = _trim(full)
             inner = full[top:bottom, left:right]
-            texture = 1.5 * float(np.median(np.abs(response))) + 1e-3
+            texture = 1.5 * float(np.median(np.abs(response[::3, ::3]))) + 1e-3
             clear = float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) / texture
             share = float(inner.mean())
             score = float(inner.sum()) * share * (1 - lattice.unevenness / _UNEVEN) * clear / (clear + 4)
@@ -149,7 +161,7 @@ def _are_gaps(response: NDArray[np.float32], dots: Dots, lattice: Lattice) -> bo
 
     Then the opposite contrast, that of the dots, is by far the larger one.
     """
-    opposite = -float(np.quantile(response, 0.01))
+    opposite = -float(np.quantile(response[::3, ::3], 0.01))
     return float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) < 0.5 * opposite
 
 

@@ -132,10 +132,13 @@ def _flood(centers: Points, tree: cKDTree, axes: Points, seed: int) -> dict[tupl
     local = {(0, 0): axes}
     wave = [(0, 0)]
     tolerance = _NEAR * float(np.linalg.norm(axes, axis=1).min())
+    ways = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
+    along = np.array([[sign * (axis == 0), sign * (axis == 1)] for axis, sign in ways], dtype=float)
     while wave:
-        tries = [(node, axis, sign) for node in wave for axis in (0, 1) for sign in (1, -1)]
-        expected = np.array([centers[nodes[node]] + sign * local[node][axis] for node, axis, sign in tries])
-        distance, found = tree.query(expected)
+        here = centers[[nodes[node] for node in wave]]
+        steps = np.einsum("ka,waj->wkj", along, np.array([local[node] for node in wave]))
+        distance, found = (a.reshape(-1) for a in tree.query(here[:, None] + steps))
+        tries = [(node, axis, sign) for node in wave for axis, sign in ways]
         wave = []
         for k in np.argsort(distance, kind="stable"):
             if distance[k] > tolerance:

@@ -17,7 +17,7 @@ from gelflow.perception.grid import Found
 
 Floats = NDArray[np.float64]
 
-_ROUNDS = 3
+_ROUNDS = 2
 _REACH = 2.2  # the profile is known up to this many radii
 _RINGS = 44  # in which it is averaged, as a function of the radius
 
@@ -87,7 +87,7 @@ class _Windows:
         self.seen = np.flatnonzero(found.seen)
         self.corner = np.round(found.positions.reshape(-1, 2)).astype(np.intp)
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
-        steps = np.arange(-half, half + 1)
+        steps = np.arange(-half, half + 1, max(1, round(found.radius / 4)))  # more pixels would tell no more
         down, right = (a.reshape(-1) for a in np.meshgrid(steps, steps, indexing="ij"))
         self.step = np.stack([right, down], axis=1).astype(np.float64)  # shape (pixels, 2)
         at = np.clip(self.corner[self.seen], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
@@ -106,9 +106,9 @@ class _Windows:
         near = np.linalg.norm(self.offset, axis=-1) < 2.0 * found.radius
         weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * near
         total = np.maximum(weight.sum(1), 1e-9)[:, None]
-        mean = np.einsum("np,npi->ni", weight, self.offset) / total
+        mean = (weight[:, None] @ self.offset)[:, 0] / total
         off = self.offset - mean[:, None]
-        moments = np.einsum("np,npi,npj->nij", weight, off, off) / total[..., None]
+        moments = (off * weight[..., None]).transpose(0, 2, 1) @ off / total[..., None]
         steps = _steps(found)
         back = np.linalg.inv(steps)
         # As a share of the steps the print is the same everywhere; a disc of radius 1 has the moments 1/4.
@@ -147,8 +147,9 @@ class _Windows:
 def _plane_through(pixels: Floats, step: Floats, weight: Floats) -> Floats:
     """The least-squares plane through each window's pixels, shape (windows, pixels)."""
     terms = np.concatenate([np.ones((len(step), 1)), step / np.abs(step).max()], axis=1)
-    matrix = np.einsum("np,pi,pj->nij", weight, terms, terms) + 1e-6 * np.eye(3)
-    right = np.einsum("np,np,pi->ni", weight, pixels, terms)
+    products = (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
+    matrix = (weight @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
+    right = (weight * pixels) @ terms
     return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0] @ terms.T)
 
 

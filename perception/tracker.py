@@ -90,7 +90,7 @@ class MarkerTracker:
         found = find_grid(image, rows=rows, cols=cols, either_way=c.either_way, polarity=c.polarity)
         shrink = max(1, int(np.ceil(found.radius / _LARGEST)))
         try:
-            tracker, learned = learn(_smaller(image, shrink), found.smaller(shrink))
+            tracker, learned = learn(_smaller(image, shrink), found.scaled(1 / shrink))
         except ValueError as error:
             raise StartRefused(f"the dots in the image can not be measured: {error}", image.copy()) from None
         rest = _larger(learned.rest, shrink)

@@ -55,6 +55,11 @@ Setup make_setup(int width, int height, int channel, bool bright, int rows, int 
     setup.seen.push_back(char(seen.at(m)));
     setup.oval.push_back({float(oval.at(m, 0)), float(oval.at(m, 1)), float(oval.at(m, 2))});
     setup.contrast.push_back(contrast.at(m));
+    const Oval& q = setup.oval.back();
+    const bool round = q.xx > 0 && q.xx < 16 && q.yy > 0 && q.yy < 16 && double(q.xx) * q.yy > double(q.xy) * q.xy;
+    const bool known = std::abs(rest.at(m, 0)) < 1e6 && std::abs(rest.at(m, 1)) < 1e6 &&
+                       std::abs(contrast.at(m)) > 1e-3 && std::abs(contrast.at(m)) < 1e3;
+    if (!round || !known) throw std::invalid_argument("a marker's place, oval or contrast is out of range");
   }
   return setup;
 }

@@ -158,18 +158,24 @@ inline bool invert(std::array<double, 36>& matrix, Inverse& inverse) {
   return true;
 }
 
-inline bool normal_inverse(const Shape& shape, const Oval& oval, double contrast, int size, Inverse& inverse) {
-  std::array<double, 36> h{};
+GELFLOW_CLONES inline bool normal_inverse(const Shape& shape, const Oval& oval, double contrast, int size,
+                                          Inverse& inverse) {
+  std::array<Floats, 36> sums{};
   const float middle = 0.5f * float(size - 1);
+  const Floats ramp = {0, 1, 2, 3, 4, 5, 6, 7};
   for (int row = 0; row < size; ++row)
-    for (int column = 0; column < size; ++column) {
-      const float x = float(column) - middle, y = float(row) - middle;
-      const Sample dot = sample(shape, oval, Floats{} + x, y);
-      const double ink = 1 + contrast * dot.s[0];
-      const std::array<double, 6> j = {contrast * dot.gx[0], contrast * dot.gy[0], dot.s[0], ink, ink * x, ink * y};
+    for (int start = 0; start < size; start += lanes) {
+      const Floats x = ramp + (float(start) - middle);
+      const float y = float(row) - middle, a = float(contrast);
+      const Sample dot = sample(shape, oval, x, y);
+      const Floats ink = 1 + a * dot.s;
+      const std::array<Floats, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
       for (std::size_t i = 0; i < 6; ++i)
-        for (std::size_t l = 0; l < 6; ++l) h[6 * i + l] += j[i] * j[l];
+        for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += j[i] * j[l];
     }
+  std::array<double, 36> h;
+  for (std::size_t i = 0; i < 6; ++i)
+    for (std::size_t l = 0; l <= i; ++l) h[6 * i + l] = h[6 * l + i] = total(sums[6 * i + l]);
   return invert(h, inverse);
 }
 

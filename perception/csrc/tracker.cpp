@@ -38,8 +38,12 @@ Tracker::Tracker(Setup setup)
   for (std::size_t m = 0; m < n; ++m)
     if (!normal_inverse(setup_.shape, setup_.oval[m], setup_.contrast[m], settings_.window, inverse_[m]))
       throw std::invalid_argument("the shape of a dot does not tell where its centre is");
+  for (const Oval& q : setup_.oval) {  // half the ellipse's width and height, less what a blurred edge may lack
+    const double area = double(q.xx) * q.yy - double(q.xy) * q.xy;
+    half_.push_back({0.9 * std::sqrt(q.yy / area), 0.9 * std::sqrt(q.xx / area)});
+  }
   places_ = before_ = setup_.rest;
-  velocity_.resize(n), steps_.resize(n), next_.resize(n);
+  velocity_.resize(n), steps_.resize(n), next_.resize(n), offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
   known_.resize(n), filled_.resize(n), expected_.resize(n);
   dots_.reserve(2 * n + 64);
@@ -53,7 +57,7 @@ void Tracker::start(const std::uint8_t* bgr) {
     if (!setup_.seen[m]) continue;
     const Fit found = fit(m, setup_.oval[m], setup_.rest[m], 12);
     quality_[m] = found.quality, contrasts_[m] = found.contrast;
-    if (found.quality < least_quality) {
+    if (found.quality < least_quality || !is_inside(m, found.place)) {
       setup_.seen[m] = 0, quality_[m] = 0;
       continue;
     }
@@ -65,10 +69,13 @@ void Tracker::start(const std::uint8_t* bgr) {
   std::fill(velocity_.begin(), velocity_.end(), Point{});
   contrast_.find(plane_, 0.0f, 4 * setup_.rest.size() + 64, dots_);
   std::vector<float> strength;
+  std::fill(offset_.begin(), offset_.end(), Point{});
   for (const Dot& dot : dots_)
     for (std::size_t m = 0; m < setup_.rest.size(); ++m)
-      if (setup_.seen[m] && squared(dot.place - setup_.rest[m]) < setup_.radius * setup_.radius)
+      if (setup_.seen[m] && squared(dot.place - setup_.rest[m]) < setup_.radius * setup_.radius) {
         strength.push_back(dot.response);
+        offset_[m] = setup_.rest[m] - dot.place;
+      }
   if (strength.empty()) return;
   const auto middle = strength.begin() + std::ptrdiff_t(strength.size() / 2);
   std::nth_element(strength.begin(), middle, strength.end());
@@ -80,7 +87,7 @@ void Tracker::track(const std::uint8_t* bgr) {
   contrast_.find(plane_, least_, 2 * setup_.rest.size() + 64, dots_);
   before_ = places_;
   for (std::size_t m = 0; m < places_.size(); ++m)
-    expected_[m] = char(setup_.seen[m] && is_inside(before_[m] + velocity_[m]));
+    expected_[m] = char(setup_.seen[m] && is_inside(m, before_[m] + velocity_[m]));
   measure(follow_.assign(dots_, before_, velocity_, expected_));
   anything_valid_ = std::any_of(known_.begin(), known_.end(), [](char k) { return k != 0; });
   if (at_rest_ > 0) refine_rest();
@@ -119,7 +126,7 @@ void Tracker::measure(const std::vector<int>& owner) {
   for (std::size_t m = 0; m < n; ++m) {
     known_[m] = 0, quality_[m] = 0;
     if (owner[m] < 0 || !setup_.seen[m]) continue;
-    const Fit found = fit(m, stretched(m, owner), dots_[std::size_t(owner[m])].place, 8);
+    const Fit found = fit(m, stretched(m, owner), dots_[std::size_t(owner[m])].place + offset_[m], 8);
     quality_[m] = believed(m, found);
     known_[m] = quality_[m] >= least_quality;
     if (known_[m]) places_[m] = found.place;
@@ -158,7 +165,8 @@ Oval Tracker::stretched(std::size_t marker, const std::vector<int>& owner) const
       ends[side] = std::size_t(r * setup_.cols + c);
       if (owner[ends[side]] < 0) return setup_.oval[marker];
     }
-    now[axis] = dots_[std::size_t(owner[ends[1]])].place - dots_[std::size_t(owner[ends[0]])].place;
+    now[axis] = dots_[std::size_t(owner[ends[1]])].place + offset_[ends[1]] - dots_[std::size_t(owner[ends[0]])].place -
+                offset_[ends[0]];
     rest[axis] = setup_.rest[ends[1]] - setup_.rest[ends[0]];
   }
   const double area = now[0].x * now[1].y - now[0].y * now[1].x;
@@ -184,13 +192,14 @@ Fit Tracker::fit(std::size_t marker, const Oval& oval, Point place, int passes) 
 // The quality of a fit, 0 where it is cut by the image's border or its contrast is not that of the marker.
 double Tracker::believed(std::size_t marker, const Fit& found) const {
   const double growth = found.contrast / setup_.contrast[marker];
-  return is_inside(found.place) && growth > weakest && growth < strongest ? found.quality : 0;
+  return is_inside(marker, found.place) && growth > weakest && growth < strongest ? found.quality : 0;
 }
 
-bool Tracker::is_inside(Point place) const {
-  const double border = 0.9 * setup_.radius;
-  return place.x > border && place.y > border && place.x < setup_.width - 1 - border &&
-         place.y < setup_.height - 1 - border;
+// Whether the dot of a marker at `place` is not cut by the image's border.
+bool Tracker::is_inside(std::size_t marker, Point place) const {
+  const Point half = half_[marker];
+  return place.x > half.x && place.y > half.y && place.x < setup_.width - 1 - half.x &&
+         place.y < setup_.height - 1 - half.y;
 }
 
 // Whether no marker next to `marker` was measured at this place.

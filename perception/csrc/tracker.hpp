@@ -43,7 +43,7 @@ class Tracker {
   Oval stretched(std::size_t marker, const std::vector<int>& owner) const;
   Fit fit(std::size_t marker, const Oval& oval, Point place, int passes) const;
   double believed(std::size_t marker, const Fit& fit) const;
-  bool is_inside(Point place) const;
+  bool is_inside(std::size_t marker, Point place) const;
   bool is_free(int marker, Point place) const;
   void drop_strays();
   bool foretold(int marker, Point& told, double& discord) const;
@@ -59,6 +59,8 @@ class Tracker {
   Follow follow_;
   float least_ = 0.02f;  // response of a dot
   std::vector<Dot> dots_;
+  std::vector<Point> half_;    // of a dot's width and height at rest
+  std::vector<Point> offset_;  // from a dot as found by contrast to its centre, at rest
   std::vector<Point> places_, before_, velocity_, steps_, next_;
   std::vector<double> quality_, contrasts_;
   std::vector<char> known_, filled_, expected_;
