@@ -3,7 +3,8 @@
 #   make test    all tests
 #   make check   lint, format, types, import rules
 #   make core    rebuild the C++ parts after a change
-#   make sanitize   the core's tests on a core that AddressSanitizer and UBSan watch (GCC, Linux)
+#   make sanitize   the core's tests, and random images through the tracker, watched by AddressSanitizer and UBSan
+#                   (GCC, Linux); FUZZ=1000000 images take some ten minutes
 #   make clean   remove what was built (the environment .venv stays; delete it by hand to start afresh)
 # Variables: PYTHON=python3.12 names another Python for the environment; TORCH_INDEX=URL adds an index for torch
 # alone (see the README: CPU builds).
@@ -22,6 +23,8 @@ CXX_FILES = $(foreach folder,sim/csrc perception/csrc,$(wildcard $(folder)/*.cpp
 SANITIZE_BUILD := build/sanitize
 # It is fifty times slower there: one file goes through every part of the core, the others through batches and contact.
 SANITIZE_TESTS = $(patsubst %,tests/test_core_%.py,every_part batch contact)
+# Random images that go through the marker tracker.
+FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
 
 .PHONY: demo test check core sanitize setup clean
@@ -50,6 +53,11 @@ sanitize: core
 	  .venv/bin/cmake --build $(SANITIZE_BUILD) >> $(SANITIZE_BUILD).log 2>&1 || { cat $(SANITIZE_BUILD).log; exit 1; }
 	@LD_PRELOAD="$(SANITIZE_PRELOAD)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
 	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest --capture=sys $(SANITIZE_TESTS)
+	@.venv/bin/cmake -S perception/csrc -B $(SANITIZE_BUILD)-tracker -G Ninja \
+	  -DCMAKE_MAKE_PROGRAM=$(CURDIR)/.venv/bin/ninja -DCMAKE_CXX_COMPILER=$(CXX) -DGELFLOW_SANITIZE=ON \
+	  > $(SANITIZE_BUILD)-tracker.log 2>&1 && .venv/bin/cmake --build $(SANITIZE_BUILD)-tracker \
+	  >> $(SANITIZE_BUILD)-tracker.log 2>&1 || { cat $(SANITIZE_BUILD)-tracker.log; exit 1; }
+	@ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(SANITIZE_BUILD)-tracker/fuzz_tracker $(FUZZ)
 
 setup: $(SETUP)
 

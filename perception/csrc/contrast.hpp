@@ -22,7 +22,7 @@ struct Dot {
 class Contrast {
  public:
   Contrast(int width, int height, double radius, double spacing, bool bright)
-      : shrink_(std::max(1, int(radius / 2 + 0.5))),
+      : shrink_(std::clamp(int(radius / 2 + 0.5), 1, std::min(width, height))),
         width_(width / shrink_),
         height_(height / shrink_),
         inner_(std::max(1, int(0.75 * radius / shrink_))),

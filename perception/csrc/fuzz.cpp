@@ -1,0 +1,115 @@
+// Random images through random trackers, for the sanitizers: `fuzz_tracker IMAGES [SEED]`. It ends at the first bad
+// access, undefined operation, or number that no image may lead to.
+#include <cstdio>
+#include <cstdlib>
+#include <optional>
+#include <random>
+#include <stdexcept>
+
+#include "tracker.hpp"
+
+using namespace gelflow::perception;
+
+namespace {
+
+std::mt19937_64 generator;
+
+int whole(int low, int high) { return std::uniform_int_distribution<int>(low, high)(generator); }
+double real(double low, double high) { return std::uniform_real_distribution<double>(low, high)(generator); }
+
+Setup random_setup() {
+  Setup setup{whole(1, 120),
+              whole(1, 90),
+              whole(3, 7),
+              whole(3, 7),
+              Channel(whole(0, 5)),
+              whole(0, 1) == 1,
+              0,
+              0,
+              0,
+              {},
+              {},
+              {},
+              {},
+              {}};
+  setup.radius = std::exp(real(std::log(0.6), std::log(15)));
+  setup.spacing = setup.radius * real(2.01, 6);
+  setup.noise = real(0, 0.2);
+  setup.shape.reach = float(real(1.5, 6));
+  for (std::size_t i = 0; i < setup.shape.value.size(); ++i)
+    setup.shape.value[i] = float(1 / (1 + std::exp(0.1 * (double(i) - 60))) + (whole(0, 3) ? 0 : real(-0.2, 0.2)));
+  const bool far = whole(0, 9) == 0;  // a grid that is nowhere near the image
+  for (int m = 0; m < setup.rows * setup.cols; ++m) {
+    const double x = (m % setup.cols + 0.5) * setup.spacing, y = double(m / setup.cols + 0.5) * setup.spacing;
+    setup.rest.push_back(far ? Point{real(-1e5, 1e5), real(-1e5, 1e5)} : Point{x + real(-2, 2), y + real(-2, 2)});
+    setup.seen.push_back(char(whole(0, 9) > 0));
+    const double q = 1 / (setup.radius * setup.radius);
+    setup.oval.push_back({float(q * real(0.3, 3)), float(q * real(-0.25, 0.25)), float(q * real(0.3, 3))});
+    setup.contrast.push_back((setup.bright ? 1 : -1) * real(0.01, 2));
+  }
+  return setup;
+}
+
+// Noise, a flat colour, blocks, or dots where the grid is at rest, moved.
+void random_image(const Setup& setup, std::vector<std::uint8_t>& image) {
+  const int kind = whole(0, 5), level = whole(0, 255);
+  const int other = whole(0, 1) ? whole(0, 255) : std::clamp(int(level * (1 + setup.contrast[0])), 0, 255);
+  const double moved = setup.spacing * real(0, 1), dx = real(-1, 1) * moved, dy = real(-1, 1) * moved;
+  for (int y = 0; y < setup.height; ++y)
+    for (int x = 0; x < setup.width; ++x) {
+      int value = level;
+      if (kind == 0) value = whole(0, 255);
+      if (kind == 1) value = ((x / 5 + y / 3) % 2) ? level : other;
+      if (kind >= 3) {
+        const double u = std::remainder(x - dx - 0.5 * setup.spacing, setup.spacing);
+        const double v = std::remainder(y - dy - 0.5 * setup.spacing, setup.spacing);
+        const bool inside = u * u + v * v < setup.radius * setup.radius;
+        value = std::clamp((inside ? other : level) + whole(-kind, kind), 0, 255);
+      }
+      for (int c = 0; c < 3; ++c) image[std::size_t(3 * (y * setup.width + x) + c)] = std::uint8_t(value);
+    }
+}
+
+void check(const Tracker& tracker) {
+  for (int m = 0; m < tracker.markers(); ++m) {
+    const std::size_t i = std::size_t(m);
+    const Point place = tracker.places()[i];
+    const double quality = tracker.quality()[i];
+    const bool sound = std::isfinite(place.x) && std::isfinite(place.y) && quality >= 0 && quality <= 1;
+    const bool in_image =
+        place.x > 0 && place.y > 0 && place.x < tracker.setup().width && place.y < tracker.setup().height;
+    if (sound && (quality == 0 || in_image)) continue;
+    std::fprintf(stderr, "marker %d at (%g, %g) with quality %g\n", m, place.x, place.y, quality);
+    std::abort();
+  }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  const long images = argc > 1 ? std::strtol(argv[1], nullptr, 10) : 10000;
+  generator.seed(argc > 2 ? std::strtoull(argv[2], nullptr, 10) : 1);
+  std::vector<std::uint8_t> image;
+  long done = 0, measured = 0, trackers = 0;
+  while (done < images) {
+    std::optional<Tracker> made;
+    try {
+      made.emplace(random_setup());
+    } catch (const std::invalid_argument&) {  // a shape without an edge is refused
+      continue;
+    }
+    Tracker& tracker = *made;
+    image.resize(std::size_t(3 * tracker.setup().width * tracker.setup().height));
+    ++trackers;
+    for (int number = whole(1, 12); number > 0 && done < images; --number, ++done) {
+      random_image(tracker.setup(), image);
+      if (number % 6 == 1)
+        tracker.start(image.data());
+      else
+        tracker.track(image.data());
+      check(tracker);
+      for (double quality : tracker.quality()) measured += quality > 0;
+    }
+  }
+  std::printf("%ld images through %ld trackers, %ld markers measured, nothing found\n", done, trackers, measured);
+}
