@@ -42,7 +42,6 @@ class Exposure:
 class Frame:
     """One image and what is true in it. Markers row by row."""
 
-    raw: Image  # B G R before the JPEG, shape (height, width, 3)
     jpeg: bytes
     position: Points  # centres of the dots (right, down) [px], shape (markers, 2)
     visible: NDArray[np.bool_]  # printed, wholly in the image, and not covered, shape (markers,)
@@ -66,7 +65,6 @@ class TruthRenderer:
         self._paths = layers.occluder_paths(look, rng)
         self._print = Print(look, rng)
         self._plain = look.to_pixels(look.positions_mm())
-        self.rest = look.warp(self._plain)  # centres at rest [px], shape (markers, 2)
 
     def render(
         self,
@@ -80,14 +78,14 @@ class TruthRenderer:
         """The gel with its markers displaced along the pad's x and y [mm], shape (rows * cols, 2).
 
         `number` chooses the noise; `smear` [px], shape (markers, 2), is each dot's way during the exposure;
-        `progress` (0 to 1) is how far the occluders have come. Raises UsageError for a displacement of another shape
-        or with values that are not finite.
+        `progress` (0 to 1) is how far the occluders have come. Raises UsageError for arrays of another shape and a
+        displacement that is not finite.
         """
         exposed = self.expose(displacement_mm, contact=contact, smear=smear, progress=progress)
         rng = np.random.default_rng((self.look.seed, number))
         picture = layers.noisy(exposed.picture, self.look, rng)
         raw = np.asarray(np.clip(np.rint(picture), 0, 255), dtype=np.uint8)
-        return Frame(raw, _encoded(raw, self.look.quality), exposed.position, exposed.visible)
+        return Frame(_encoded(raw, self.look.quality), exposed.position, exposed.visible)
 
     def expose(
         self,
@@ -106,6 +104,8 @@ class TruthRenderer:
             raise UsageError("displacement of the markers must be finite")
         centers, shapes = self._placed(look.to_pixels(look.positions_mm() + displacement))
         motion = np.zeros_like(centers) if smear is None else np.asarray(smear, dtype=float)
+        if motion.shape != centers.shape:
+            raise UsageError(f"smear must have shape {centers.shape} [px], got {motion.shape}")
         clear, dots = self._print.draw(centers, shapes, motion)
         picture = self._light * layers.shading(look, contact, self._angle) if contact else self._light.copy()
         paint = look.contrast * np.array(_YELLOW if look.bright else _BLACK, dtype=np.float32)
