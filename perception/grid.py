@@ -73,9 +73,7 @@ def find_grid(
     looks = _looks(small, polarity)
     best = _search(small, looks)
     if best is None:
-        dots = find_dots(contrast(small, looks[0], round(5 * _RADII[2])), radius=_RADII[2], apart=1.5 * _RADII[2])
-        seen = draw_seen(small, dots.centers, _RADII[2], None)
-        raise StartRefused(f"no grid of markers found in the image{_hint(polarity)}", seen)
+        raise _nothing(image, looks[0], polarity)
     look, radius, spacing = best
     # Once more, now that radius and spacing are known.
     dots = _likely(find_dots(contrast(small, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
@@ -97,9 +95,25 @@ def _looks(image: NDArray[np.uint8], polarity: Polarity) -> tuple[Look, ...]:
     return BRIGHT + DARK if float((stands_out**3).mean()) > 0 else DARK + BRIGHT
 
 
+def _nothing(image: NDArray[np.uint8], look: Look, polarity: Polarity) -> StartRefused:
+    """The refusal of an image without a grid, by what stands out in it."""
+    sizes = [
+        (r, find_dots(contrast(image, look, round(5 * r)), radius=r, apart=1.5 * r, least=0.1)) for r in _RADII[::2]
+    ]
+    radius, dots = max(sizes, key=lambda size: len(size[1]))
+    if len(dots) > _MOST:
+        seen = f"{len(dots)} spots stand out, and a grid of markers has at most {_MOST}"
+    elif len(dots) >= 9:
+        seen = f"{len(dots)} spots stand out, but they form no lines and columns"
+    else:
+        seen = f"{len(dots) or 'no'} dots stand out, and a grid of markers has at least 3 × 3"
+    picture = draw_seen(image, dots.centers, radius, None)
+    return StartRefused(f"no grid of markers found in the image: {seen}{_hint(polarity)}", picture)
+
+
 def _hint(polarity: Polarity) -> str:
     other = {"dark": " (looked for dark dots only)", "bright": " (looked for bright dots only)", "auto": ""}
-    return f"{other[polarity]}: at least 3 × 3 dots in lines are needed; check light, focus and that it shows a gel"
+    return f"{other[polarity]}; check light, focus and that it shows a gel"
 
 
 def _wanted(rows: int | None, cols: int | None, either_way: bool) -> list[tuple[int, int]]:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from gelflow.perception._tracker import PROFILE_STEPS, Tracker
 from gelflow.perception.detect import PLANES, plane_of
 from gelflow.perception.grid import Found
+from gelflow.perception.refusal import StartRefused, draw_seen
 
 Floats = NDArray[np.float64]
 
 _ROUNDS = 2
 _REACH = 2.2  # the profile is known up to this many radii
+_ALIKE = 0.6  # share of the dots that must have the common shape
 _RINGS = 44  # in which it is averaged, as a function of the radius
 
 
@@ -36,7 +38,10 @@ class Learned:
 
 
 def learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
-    """A tracker for the markers `found` in `image` (B G R), started there. Raises ValueError when no dot fits."""
+    """A tracker for the markers `found` in `image` (B G R), started there.
+
+    Raises StartRefused when the dots do not look alike: then they are no print.
+    """
     plane = plane_of(image, found.look.plane).astype(np.float64)
     window = _Windows(plane, found)
     oval = window.ovals(found)
@@ -48,15 +53,25 @@ def learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
     for _ in range(_ROUNDS):
         tracker = _tracker(image, found, learned)
         rest, measured, quality = tracker.start(image)
-        seen = quality > 0
-        if seen.sum() < 6:
-            raise ValueError("hardly any dot has the shape of the others")
+        seen = _alike(image, found, quality)
         contrast = np.where(seen, measured, np.median(measured[seen]))
         profile, noise = window.profile(rest, oval, seen)
         learned = replace(learned, contrast=contrast, rest=rest, profile=profile, noise=noise)
     tracker = _tracker(image, found, learned)
-    rest, measured, quality = tracker.start(image)
-    return tracker, replace(learned, rest=rest, seen=quality > 0, quality=quality)
+    rest, _, quality = tracker.start(image)
+    return tracker, replace(learned, rest=rest, seen=_alike(image, found, quality), quality=quality)
+
+
+def _alike(image: NDArray[np.uint8], found: Found, quality: Floats) -> NDArray[np.bool_]:
+    """Which dots have the common shape."""
+    seen, dots = quality > 0, int(found.seen.sum())
+    if seen.sum() < max(_ALIKE * dots, 6):
+        raise StartRefused(
+            f"of {dots} spots in lines and columns only {seen.sum()} look alike: they are no printed markers, "
+            "or too blurred or damaged",
+            draw_seen(image, found.positions[found.seen], found.radius, None),
+        )
+    return seen
 
 
 def _tracker(image: NDArray[np.uint8], found: Found, learned: Learned) -> Tracker:

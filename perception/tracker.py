@@ -89,10 +89,7 @@ class MarkerTracker:
         rows, cols = (c.rows, c.cols) if rows is None and cols is None else (rows, cols)
         found = find_grid(image, rows=rows, cols=cols, either_way=c.either_way, polarity=c.polarity)
         shrink = max(1, int(np.ceil(found.radius / _LARGEST)))
-        try:
-            tracker, learned = learn(_smaller(image, shrink), found.scaled(1 / shrink))
-        except ValueError as error:
-            raise StartRefused(f"the dots in the image can not be measured: {error}", image.copy()) from None
+        tracker, learned = learn(_smaller(image, shrink), found.scaled(1 / shrink))
         rest = _larger(learned.rest, shrink)
         size = (image.shape[0], image.shape[1])
         rows, cols = found.shape
