@@ -28,7 +28,8 @@ namespace gelflow::perception {
 typedef float Floats __attribute__((vector_size(32)));
 typedef std::int32_t Ints __attribute__((vector_size(32)));
 constexpr int lanes = 8;
-constexpr int coarse_passes = 2;  // the first passes look at every second line: they need not be exact
+constexpr double nearly = 0.1;   // step of a pass [px] down to which every second line will do
+constexpr double close = 0.015;  // step after which the next one would be a tenth of it: done
 
 struct Shape {
   static constexpr int steps = 256;
@@ -206,9 +207,10 @@ inline Fit fit_dot(const Plane& plane, const FitSettings& settings, const Oval& 
   light = std::max(4.0, light / (4 * size));
   Pass pass{};
   pass.x = float(begin.x), pass.y = float(begin.y), pass.a = float(rest_contrast), pass.b = float(light);
+  bool coarse = true;
   for (int number = 0; number < most_passes; ++number) {
     pass.k = pass.b * float(std::max(0.2 * std::abs(double(pass.a)), 3 * settings.noise));
-    pass.every = number < coarse_passes ? 2 : 1;
+    pass.every = coarse ? 2 : 1;
     run_pass(window, plane.width, plane.height, settings.shape, oval, pass);
     // Pixels that count little or are left out are missing from the sums, but not from H.
     const double more = std::min(4.0, double(size * size) / std::max(pass.weight, 1.0));
@@ -223,7 +225,9 @@ inline Fit fit_dot(const Plane& plane, const FitSettings& settings, const Oval& 
     const bool lost = !(std::abs(pass.x - begin.x) < limit && std::abs(pass.y - begin.y) < limit) ||
                       !(pass.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
     if (lost) return {place, 0, 0};
-    if (number >= coarse_passes && std::abs(step[0]) < 0.01 && std::abs(step[1]) < 0.01) break;
+    const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
+    if (!coarse && moved < close) break;
+    coarse = coarse && moved > nearly;
   }
   const double edge = std::max(pass.edge, 1e-9);
   return {corner + Point{pass.x, pass.y}, pass.a, std::clamp(pass.edge_kept / edge, 0.0, 1.0)};
