@@ -256,6 +256,9 @@ def against_differences(case: Case, *, params: bool = True) -> Agreement:
         estimates = (RATIO**2 * slopes[todo, 1:] - slopes[todo, :-1]) / (RATIO**2 - 1)
         differences = np.abs(np.diff(estimates, axis=1))
         doubt = differences.copy()
+        # A difference that grew from one size to the next is rounding, and no smaller size has less of it.
+        grown = np.where(differences[:, 1:] > differences[:, :-1], differences[:, 1:], 0.0)
+        doubt[:, 1:] = np.fmax(doubt[:, 1:], np.maximum.accumulate(grown, axis=1))
         for column in range(doubt.shape[1] - 2, -1, -1):
             doubt[:, column] = np.fmax(doubt[:, column], doubt[:, column + 1] / RATIO)
         doubt[np.isnan(differences)] = np.inf
