@@ -205,7 +205,10 @@ void Follow::try_placements(const std::vector<char>& expected) {
     high = {std::max(high.x, p.x), std::max(high.y, p.y)};
   }
   const double seeds[5][2] = {{0.5, 0.5}, {0.25, 0.25}, {0.75, 0.75}, {0.75, 0.25}, {0.25, 0.75}};
+  int in_vain = 0;
   for (const auto& seed : seeds) {
+    if (in_vain == 2) return;
+    const double before = best_left_.cost;
     const Point at = {low.x + seed[0] * (high.x - low.x), low.y + seed[1] * (high.y - low.y)};
     clear();
     const int dot = nearest(at, spacing_, false);
@@ -215,8 +218,10 @@ void Follow::try_placements(const std::vector<char>& expected) {
       clear();
       take(m, dot);
       grow();
-      if (consider(expected) && best_left_.torn == 0 && best_left_.unexplained() == 0) break;
+      consider(expected);
+      if (best_left_.unexplained() == 0) return;
     }
+    in_vain = best_left_.cost < before ? 0 : in_vain + 1;
   }
 }
 
