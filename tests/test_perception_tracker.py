@@ -1,13 +1,17 @@
 """Markers in rendered gel images, against where they were drawn."""
 
+import cv2
 import numpy as np
 import pytest
 
-from gelflow.errors import PeerError, UsageError
+from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.hardware_mocks.gel import GelLook, GelRenderer
+from gelflow.hardware_mocks.gel_flaws import FACTORS, look_of
+from gelflow.hardware_mocks.gel_sequences import FIELDS, Field, GelSequence
+from gelflow.hardware_mocks.gel_truth import Frame, TruthRenderer
 from gelflow.observation import Grid
+from gelflow.perception import MarkerTracker, StartRefused, Tracked, TrackerConfig
 from gelflow.perception.frames import CameraMount, decode, tactile_frame
-from gelflow.perception.tracker import MarkerTracker, StartRefused, TrackerConfig
 
 MOUNT = CameraMount(pixels_per_mm=15.7)
 SPACING = 1.4  # [mm]
@@ -137,16 +141,6 @@ def test_it_recovers_after_blank_images() -> None:
     assert frame.valid.all() and np.abs(frame.shear[0] - field).max() < 0.02
 
 
-@pytest.mark.parametrize(
-    "image",
-    [np.full((240, 320, 3), 120), np.random.default_rng(0).integers(0, 255, (240, 320, 3))],
-    ids=["blank", "noise"],
-)
-def test_an_image_without_markers_is_refused(image: np.ndarray) -> None:
-    with pytest.raises(StartRefused, match=r"no .*grid of markers found"):
-        MarkerTracker().start(image.astype(np.uint8))
-
-
 @pytest.mark.parametrize(("rows", "cols"), [(17, 14), (19, 14), (14, 18), (10, 7)])
 def test_wrong_rows_and_columns_are_refused(rows: int, cols: int) -> None:
     image = GelRenderer().render(np.zeros((252, 2)))
@@ -172,3 +166,150 @@ def test_an_image_of_another_size_is_refused() -> None:
     tracker.start(image)
     with pytest.raises(PeerError, match="320 × 427 px to 320 × 400 px"):
         tracker.track(image[:400])
+
+
+def through(sequence: GelSequence) -> list[tuple[Frame, Tracked, np.ndarray]]:
+    """For each image after the first: the truth, what was tracked, and how far the displacements are off [px]."""
+    tracker, frames = MarkerTracker(), list(sequence)
+    first = tracker.start(frames[0].image)
+    assert (first.rows, first.cols) == (sequence.look.grid.rows, sequence.look.grid.cols)
+    results = []
+    for frame in frames[1:]:
+        tracked = tracker.track(frame.image)
+        off = np.linalg.norm(tracked.displacement - (frame.position - frames[0].position), axis=1)
+        results.append((frame, tracked, off))
+    return results
+
+
+def near(sequence: GelSequence) -> float:
+    """Share of the visible markers that are said to be within 0.1 spacing of where they are."""
+    return float(
+        np.mean(np.concatenate([off[f.visible] for f, _, off in through(sequence)]) < 0.1 * sequence.look.spacing)
+    )
+
+
+@pytest.mark.parametrize(
+    ("preset", "median", "high"), [("clean", 0.02, 0.04), ("typical", 0.03, 0.06), ("hard", 0.08, 0.5)]
+)
+def test_errors_are_near_what_noise_allows(preset: str, median: float, high: float) -> None:
+    results = through(GelSequence(look_of(preset, seed=1), "twist", frames=10, period=12))
+    errors = np.concatenate([off[tracked.valid & frame.visible] for frame, tracked, off in results])
+    assert np.median(errors) < median and np.quantile(errors, 0.95) < high
+    assert np.mean([tracked.valid[frame.visible].mean() for frame, tracked, _ in results]) > 0.98
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("changed", [{}, {"missing": 0.05, "bridges": 2}, {"cut_row": True, "markers": 63}])
+def test_a_jump_by_most_of_a_spacing_exchanges_no_marker(field: Field, changed: dict[str, float]) -> None:
+    look = look_of("typical", seed=2, **changed)  # type: ignore[arg-type]
+    for frame, tracked, off in through(GelSequence(look, field, frames=5, motion="jump", peak=0.7)):
+        assert tracked.valid[frame.visible].mean() > 0.99
+        assert (off[tracked.valid] < 0.1 * look.spacing).all()
+
+
+def test_a_whole_grid_that_jumps_back_and_forth_is_told_from_its_neighbouring_line() -> None:
+    look = look_of("typical", cut_row=True)
+    renderer, tracker, still = TruthRenderer(look), MarkerTracker(), np.zeros((130, 2))
+    rest = renderer.render(still).position
+    tracker.start(renderer.render(still).image)
+    for number, way in enumerate([(0.7, 0.0), (0.0, 0.0), (-0.5, 0.4), (-0.1, -0.1)], start=1):
+        frame = renderer.render(still + np.array(way) * look.grid.pitch, number=number)
+        tracked = tracker.track(frame.image)
+        assert tracked.valid.all() and np.abs(tracked.displacement - (frame.position - rest)).max() < 0.5
+
+
+@pytest.mark.parametrize("name", FACTORS)
+def test_every_kind_of_image_is_tracked_without_being_told(name: str) -> None:
+    assert near(GelSequence(look_of("typical", seed=3, **FACTORS[name]), "press", frames=5, period=5)) > 0.99
+
+
+def test_what_is_hidden_is_guessed_and_found_again() -> None:
+    results = through(GelSequence(look_of("typical", occluders=1), "shear", frames=24, period=30))
+    hidden = np.array([~frame.visible for frame, _, _ in results])
+    valid, inferred = (np.array([getattr(one, name) for _, one, _ in results]) for name in ("valid", "inferred"))
+    quality, spacing = np.array([one.quality for _, one, _ in results]), results[0][1].spacing
+    far = np.array([off for _, _, off in results]) > 0.1 * spacing
+    assert hidden.sum() > 30 and inferred[hidden].mean() > 0.5  # of many a dot enough is seen to measure it
+    assert (far & valid)[hidden].mean() < 0.05 and far[hidden].mean() < 0.1
+    assert (valid ^ inferred).all() and not quality[inferred].any() and quality[~hidden].min() > 0.5
+    assert valid[-1].all() and not far[-1].any()
+
+
+def test_at_rest_nothing_jitters_or_drifts_and_the_reference_gets_finer() -> None:
+    frames = list(GelSequence(look_of("typical"), motion="rest", frames=16))
+    tracker = MarkerTracker()
+    tracker.start(frames[0].image)
+    one = tracker.rest
+    places = np.array([tracker.track(frame.image).position for frame in frames[1:]])
+    assert np.median(places.std(axis=0)) < 0.02
+    error, finer = (np.linalg.norm(rest - frames[0].position, axis=1).mean() for rest in (one, tracker.rest))
+    assert finer < 0.7 * error
+    moved = GelSequence(look_of("typical"), "shear", frames=64, period=30)
+    _, _, off = through(moved)[-1]
+    assert np.median(off) < 0.05
+
+
+def garbage(kind: str) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    if kind == "noise":
+        return rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    if kind == "soft noise":
+        return np.asarray(cv2.GaussianBlur(garbage("noise"), (0, 0), 3))
+    image = np.full((240, 320, 3), {"black": 0, "white": 255}.get(kind, 150), dtype=np.uint8)
+    for place in rng.integers((0, 0), (320, 240), ({"one dot": 1, "10 000 dots": 10_000}.get(kind, 0), 2)).tolist():
+        cv2.circle(image, place, 2, (20, 20, 20), -1)
+    return image
+
+
+@pytest.mark.parametrize("kind", ["noise", "soft noise", "black", "white", "one dot", "10 000 dots"])
+def test_an_image_without_markers_is_refused_and_does_no_harm(kind: str) -> None:
+    image = garbage(kind)
+    with pytest.raises(StartRefused, match=r"stand out|look alike|no regular grid") as refusal:
+        MarkerTracker().start(image)
+    assert refusal.value.picture.shape == image.shape and refusal.value.picture.dtype == np.uint8
+    renderer, still = TruthRenderer(look_of("typical")), np.zeros((130, 2))
+    tracker = MarkerTracker()
+    tracker.start(renderer.render(still).image)
+    lost = tracker.track(image)
+    assert lost.valid.mean() < 0.1 and np.isfinite(lost.position).all()
+    assert np.isnan(lost.displacement[~lost.valid & ~lost.inferred]).all()
+    assert tracker.track(renderer.render(still, number=1).image).valid.all()
+
+
+def test_what_is_no_image_is_refused() -> None:
+    image = TruthRenderer(look_of("typical")).render(np.zeros((130, 2))).image
+    tracker = MarkerTracker()
+    tracker.start(image)
+    wrong = [image.astype(float), image[..., :2], np.dstack([image, image[..., :1]]), image[:0], image.tobytes(), None]
+    for thing in wrong:
+        for use in (MarkerTracker().start, tracker.track):
+            with pytest.raises(UsageError, match="expected an image"):
+                use(thing)  # type: ignore[arg-type]
+
+
+def test_size_one_images_and_strips_are_refused() -> None:
+    for shape in ((1, 1, 3), (1, 300, 3), (900, 2, 3), (7, 7, 3)):
+        with pytest.raises(GelflowError, match="no grid of markers"):
+            MarkerTracker().start(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
+
+
+def test_grey_images_and_views_are_images_too() -> None:
+    image = TruthRenderer(look_of("typical")).render(np.zeros((130, 2))).image
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    places = [MarkerTracker().start(one).position for one in (image, np.stack([image, image], axis=1)[:, 0], grey)]
+    assert (places[0] == places[1]).all() and np.abs(places[0] - places[2]).max() < 0.02
+
+
+def test_of_an_image_whose_lower_half_did_not_arrive_the_upper_one_is_tracked() -> None:
+    image = TruthRenderer(look_of("typical")).render(np.zeros((130, 2))).image
+    tracker = MarkerTracker()
+    tracker.start(image)
+    image[120:] = 128
+    tracked = tracker.track(image)
+    valid = tracked.valid.reshape(10, 13)
+    assert valid[:4].all() and not valid[-4:].any() and (tracked.inferred ^ tracked.valid).all()
+
+
+def test_before_the_start_there_is_no_rest() -> None:
+    with pytest.raises(UsageError, match="no rest positions yet"):
+        _ = MarkerTracker().rest
