@@ -47,7 +47,7 @@ Setup make_setup(int width, int height, int channel, bool bright, int rows, int 
   const py::ssize_t n = py::ssize_t(rows) * cols;
   expect(rest, n, 2, "rest"), expect(oval, n, 3, "oval"), expect(seen, n, 0, "seen");
   expect(contrast, n, 0, "contrast"), expect(profile, Shape::steps + 1, 0, "profile");
-  Setup setup{width, height, rows, cols, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}};
+  Setup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}};
   for (py::ssize_t i = 0; i <= Shape::steps; ++i) setup.shape.value[std::size_t(i)] = profile.at(i);
   setup.shape.reach = reach;
   for (py::ssize_t m = 0; m < n; ++m) {

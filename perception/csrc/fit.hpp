@@ -68,7 +68,7 @@ struct Pass {
   float k;                       // residual from which on a pixel counts little [grey levels]
   double sums[6];                // Jᵀψ, in the order of the unknowns
   double edge, edge_kept;        // Σ|∇s|², plain and with the pixels' weights
-  double weight, count;          // of pixels
+  double weight;                 // of all pixels
 };
 
 struct Sample {

@@ -9,16 +9,14 @@ namespace {
 constexpr double sure = 0.28;    // a dot so close to where a marker should be may begin a hypothesis
 constexpr double met = 0.3;      // a dot so close to where the neighbours say is the marker's
 constexpr double torn = 0.45;    // a step that differs so much from its neighbours' belongs to another dot
+constexpr double carried = 0.7;  // share of a change from one marker to the next that goes on to the one after
 constexpr double around = 1.15;  // markers at most so far from a dot are tried for it
 constexpr double motion = 0.1;   // what moving by a spacing costs, against 1 for a marker or dot left over
 constexpr int retry = 10;        // images after which a lasting failure is looked at again
-
-const int neighbour_row[8] = {0, 0, 1, -1, 1, 1, -1, -1};
-const int neighbour_col[8] = {1, -1, 0, 0, 1, -1, 1, -1};
 }  // namespace
 
-Follow::Follow(int rows, int cols, double spacing) : rows_(rows), cols_(cols), spacing_(spacing) {
-  const std::size_t n = std::size_t(rows) * std::size_t(cols);
+Follow::Follow(Grid grid, double spacing) : grid_(grid), spacing_(spacing) {
+  const std::size_t n = std::size_t(grid.size());
   owner_.reserve(n), best_.resize(n), last_.reserve(n), order_.reserve(n), heap_.reserve(16 * n);
 }
 
@@ -99,37 +97,31 @@ void Follow::seed_nearest(const std::vector<Point>& predicted) {
 // Gives up markers whose step fewer than two neighbours share.
 void Follow::prune() {
   order_.clear();
-  for (int m = 0; m < rows_ * cols_; ++m) {
+  for (int m = 0; m < grid_.size(); ++m) {
     if (owner_[std::size_t(m)] < 0) continue;
     const Point own = step_of(m);
     int shared = 0;
-    for (int k = 0; k < 8; ++k) {
-      const int row = m / cols_ + neighbour_row[k], col = m % cols_ + neighbour_col[k];
-      if (!inside(row, col) || owner_[std::size_t(row * cols_ + col)] < 0) continue;
-      shared += squared(step_of(row * cols_ + col) - own) < met * met * spacing_ * spacing_;
+    for (int way = 0; way < Grid::ways; ++way) {
+      const int other = grid_.neighbour(m, way);
+      if (owned(other)) shared += squared(step_of(other) - own) < met * met * spacing_ * spacing_;
     }
     if (shared < 2) order_.push_back(m);
   }
   for (int m : order_) taken_[std::size_t(owner_[std::size_t(m)])] = 0, owner_[std::size_t(m)] = -1;
 }
 
-// The step of `marker` by its known neighbours: where two lie in a row the line through their steps, else the nearer
-// one's; next to it twice the weight of across. False when there is none.
+// The step of `marker` by its known neighbours: where two lie in a line with it, their change is carried on, else the
+// nearer one's step; next to it twice the weight of across. False when there is none.
 bool Follow::expectation(int marker, Point& step) const {
   Point sum{};
   double weight = 0;
-  const int row = marker / cols_, col = marker % cols_;
-  for (int k = 0; k < 8; ++k) {
-    const int r = row + neighbour_row[k], c = col + neighbour_col[k];
-    if (!inside(r, c) || owner_[std::size_t(r * cols_ + c)] < 0) continue;
-    Point here = step_of(r * cols_ + c);
-    const double share = k < 4 ? 2 : 1;
-    const int r2 = r + neighbour_row[k], c2 = c + neighbour_col[k];
-    if (inside(r2, c2) && owner_[std::size_t(r2 * cols_ + c2)] >= 0) {
-      const Point change = here - step_of(r2 * cols_ + c2);
-      here = here + 0.7 * change;
-    }
-    sum = sum + share * here;
+  for (int way = 0; way < Grid::ways; ++way) {
+    const int near = grid_.neighbour(marker, way), behind = grid_.neighbour(marker, way, 2);
+    if (!owned(near)) continue;
+    Point told = step_of(near);
+    if (owned(behind)) told = told + carried * (told - step_of(behind));
+    const double share = way < Grid::straight ? 2 : 1;
+    sum = sum + share * told;
     weight += share;
   }
   if (weight == 0) return false;
@@ -150,7 +142,7 @@ void Follow::offer(int marker) {
 // Grows from the markers that are known, the best met expectation first.
 void Follow::grow() {
   heap_.clear();
-  for (int m = 0; m < rows_ * cols_; ++m) offer(m);
+  for (int m = 0; m < grid_.size(); ++m) offer(m);
   while (!heap_.empty()) {
     const Claim claim = heap_.front();
     std::pop_heap(heap_.begin(), heap_.end());
@@ -161,9 +153,9 @@ void Follow::grow() {
       continue;
     }
     take(claim.marker, claim.dot);
-    for (int k = 0; k < 8; ++k) {
-      const int row = claim.marker / cols_ + neighbour_row[k], col = claim.marker % cols_ + neighbour_col[k];
-      if (inside(row, col)) offer(row * cols_ + col);
+    for (int way = 0; way < Grid::ways; ++way) {
+      const int other = grid_.neighbour(claim.marker, way);
+      if (other >= 0) offer(other);
     }
   }
 }
@@ -171,17 +163,17 @@ void Follow::grow() {
 Follow::Left Follow::judge(const std::vector<char>& expected) const {
   Left left;
   const double unit = 1 / (spacing_ * spacing_);
-  for (int m = 0; m < rows_ * cols_; ++m) {
+  for (int m = 0; m < grid_.size(); ++m) {
     if (owner_[std::size_t(m)] < 0) {
       left.markers += expected[std::size_t(m)];
       continue;
     }
     const Point own = step_of(m);
     left.cost += motion * std::min(squared(own) * unit, 2.0);
-    for (int k : {0, 2}) {  // to the right and down: every pair once
-      const int row = m / cols_ + neighbour_row[k], col = m % cols_ + neighbour_col[k];
-      if (!inside(row, col) || owner_[std::size_t(row * cols_ + col)] < 0) continue;
-      const double apart = squared(step_of(row * cols_ + col) - own) * unit;
+    for (int way : {Grid::to_the_right, Grid::downwards}) {  // every pair once
+      const int other = grid_.neighbour(m, way);
+      if (!owned(other)) continue;
+      const double apart = squared(step_of(other) - own) * unit;
       left.cost += 0.5 * std::min(apart / (torn * torn), 1.0);
       left.torn += apart > torn * torn;
     }
@@ -213,7 +205,7 @@ void Follow::try_placements(const std::vector<char>& expected) {
     clear();
     const int dot = nearest(at, spacing_, false);
     if (dot < 0) continue;
-    for (int m = 0; m < rows_ * cols_; ++m) {
+    for (int m = 0; m < grid_.size(); ++m) {
       if (squared(last_[std::size_t(m)] - places_[std::size_t(dot)]) > around * around * spacing_ * spacing_) continue;
       clear();
       take(m, dot);
@@ -228,14 +220,14 @@ void Follow::try_placements(const std::vector<char>& expected) {
 // Gives up markers that went elsewhere than the middle one of their neighbours.
 void Follow::drop_torn() {
   order_.clear();
-  for (int m = 0; m < rows_ * cols_; ++m) {
+  for (int m = 0; m < grid_.size(); ++m) {
     if (owner_[std::size_t(m)] < 0) continue;
     std::array<double, 8> x, y;
     std::size_t n = 0;
-    for (int k = 0; k < 8; ++k) {
-      const int row = m / cols_ + neighbour_row[k], col = m % cols_ + neighbour_col[k];
-      if (!inside(row, col) || owner_[std::size_t(row * cols_ + col)] < 0) continue;
-      const Point step = step_of(row * cols_ + col);
+    for (int way = 0; way < Grid::ways; ++way) {
+      const int other = grid_.neighbour(m, way);
+      if (!owned(other)) continue;
+      const Point step = step_of(other);
       x[n] = step.x, y[n] = step.y, ++n;
     }
     if (n < 3) continue;

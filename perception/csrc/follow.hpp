@@ -15,15 +15,16 @@
 #include <array>
 
 #include "contrast.hpp"
+#include "grid.hpp"
 
 namespace gelflow::perception {
 
 class Follow {
  public:
-  Follow(int rows, int cols, double spacing);
+  Follow(Grid grid, double spacing);
 
   // For each marker the number of its dot in `dots`, or −1. `last` is where the markers were, `velocity` by how much
-  // they moved in the last image, `expected` which of them should be seen; all of rows × cols.
+  // they moved in the last image, `expected` which of them should be seen; one entry per marker.
   const std::vector<int>& assign(const std::vector<Dot>& dots, const std::vector<Point>& last,
                                  const std::vector<Point>& velocity, const std::vector<char>& expected);
 
@@ -55,12 +56,12 @@ class Follow {
   void try_placements(const std::vector<char>& expected);
   void drop_torn();
 
-  bool inside(int row, int col) const { return row >= 0 && row < rows_ && col >= 0 && col < cols_; }
+  bool owned(int marker) const { return marker >= 0 && owner_[std::size_t(marker)] >= 0; }
   Point step_of(int marker) const {
     return places_[std::size_t(owner_[std::size_t(marker)])] - last_[std::size_t(marker)];
   }
 
-  int rows_, cols_;
+  Grid grid_;
   double spacing_;
   std::vector<Point> places_, last_, predicted_;
   std::vector<int> owner_, best_, order_;

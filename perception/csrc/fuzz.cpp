@@ -18,20 +18,10 @@ int whole(int low, int high) { return std::uniform_int_distribution<int>(low, hi
 double real(double low, double high) { return std::uniform_real_distribution<double>(low, high)(generator); }
 
 Setup random_setup() {
-  Setup setup{whole(1, 120),
-              whole(1, 90),
-              whole(3, 7),
-              whole(3, 7),
-              Channel(whole(0, 5)),
-              whole(0, 1) == 1,
-              0,
-              0,
-              0,
-              {},
-              {},
-              {},
-              {},
-              {}};
+  Setup setup{};
+  setup.width = whole(1, 120), setup.height = whole(1, 90);
+  setup.grid = {whole(3, 7), whole(3, 7)};
+  setup.channel = Channel(whole(0, 5)), setup.bright = whole(0, 1) == 1;
   setup.radius = std::exp(real(std::log(0.6), std::log(15)));
   setup.spacing = setup.radius * real(2.01, 6);
   setup.noise = real(0, 0.2);
@@ -39,8 +29,8 @@ Setup random_setup() {
   for (std::size_t i = 0; i < setup.shape.value.size(); ++i)
     setup.shape.value[i] = float(1 / (1 + std::exp(0.1 * (double(i) - 60))) + (whole(0, 3) ? 0 : real(-0.2, 0.2)));
   const bool far = whole(0, 9) == 0;  // a grid that is nowhere near the image
-  for (int m = 0; m < setup.rows * setup.cols; ++m) {
-    const double x = (m % setup.cols + 0.5) * setup.spacing, y = double(m / setup.cols + 0.5) * setup.spacing;
+  for (int m = 0; m < setup.grid.size(); ++m) {
+    const double x = (m % setup.grid.cols + 0.5) * setup.spacing, y = (m / setup.grid.cols + 0.5) * setup.spacing;
     setup.rest.push_back(far ? Point{real(-1e5, 1e5), real(-1e5, 1e5)} : Point{x + real(-2, 2), y + real(-2, 2)});
     setup.seen.push_back(char(whole(0, 9) > 0));
     const double q = 1 / (setup.radius * setup.radius);

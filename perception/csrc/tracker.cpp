@@ -16,10 +16,6 @@ constexpr int relaxations = 8;
 constexpr int most_at_rest = 8;      // images that make the reference, if nothing moves before
 constexpr double rest_smooth = 0.3;  // largest share of what neighbours have in common, in the squares of noise
 
-// Opposite ones beside each other.
-const int neighbour_row[8] = {0, 0, 1, -1, 1, -1, 1, -1};
-const int neighbour_col[8] = {1, -1, 0, 0, 1, -1, -1, 1};
-
 // As wide as makes the light's slope certain, but without the neighbours' dots.
 int window_size(double radius, double spacing) {
   const int wanted = int(std::ceil(3.8 * radius / lanes)) * lanes, most = int(0.85 * spacing / lanes) * lanes;
@@ -33,7 +29,7 @@ Tracker::Tracker(Setup setup)
       inverse_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
       contrast_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
-      follow_(setup_.rows, setup_.cols, setup_.spacing) {
+      follow_(setup_.grid, setup_.spacing) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m)
     if (!normal_inverse(setup_.shape, setup_.oval[m], setup_.contrast[m], settings_.window, inverse_[m]))
@@ -154,16 +150,14 @@ void Tracker::measure(const std::vector<int>& owner) {
 // The oval of a marker's dot, which is stretched and turned as the gel around it is: by G = L₀ L⁻¹, where the columns of
 // L are the ways between its neighbours on either side, and L₀ those at rest, Q becomes GᵀQG.
 Oval Tracker::stretched(std::size_t marker, const std::vector<int>& owner) const {
-  const int row = int(marker) / setup_.cols, col = int(marker) % setup_.cols;
   Point now[2], rest[2];
   for (int axis = 0; axis < 2; ++axis) {
     std::size_t ends[2];
     for (int side = 0; side < 2; ++side) {
-      const int way = side ? 1 : -1;
-      const int r = std::clamp(row + (axis ? way : 0), 0, setup_.rows - 1);
-      const int c = std::clamp(col + (axis ? 0 : way), 0, setup_.cols - 1);
-      ends[side] = std::size_t(r * setup_.cols + c);
-      if (owner[ends[side]] < 0) return setup_.oval[marker];
+      const int way = (axis ? Grid::downwards : Grid::to_the_right) + side;
+      const int other = setup_.grid.neighbour(int(marker), way);
+      ends[1 - side] = other < 0 ? marker : std::size_t(other);
+      if (owner[ends[1 - side]] < 0) return setup_.oval[marker];
     }
     now[axis] = dots_[std::size_t(owner[ends[1]])].place + offset_[ends[1]] - dots_[std::size_t(owner[ends[0]])].place -
                 offset_[ends[0]];
@@ -204,12 +198,10 @@ bool Tracker::is_inside(std::size_t marker, Point place) const {
 
 // Whether no marker next to `marker` was measured at this place.
 bool Tracker::is_free(int marker, Point place) const {
-  const int row = marker / setup_.cols, col = marker % setup_.cols;
-  for (int k = 0; k < 8; ++k) {
-    const int r = row + neighbour_row[k], c = col + neighbour_col[k];
-    if (r < 0 || r >= setup_.rows || c < 0 || c >= setup_.cols) continue;
-    const std::size_t other = std::size_t(r * setup_.cols + c);
-    if (known_[other] && squared(places_[other] - place) < 2 * setup_.radius * setup_.radius) return false;
+  for (int way = 0; way < Grid::ways; ++way) {
+    const int other = setup_.grid.neighbour(marker, way);
+    if (other < 0 || !known_[std::size_t(other)]) continue;
+    if (squared(places_[std::size_t(other)] - place) < 2 * setup_.radius * setup_.radius) return false;
   }
   return true;
 }
@@ -233,18 +225,15 @@ void Tracker::drop_strays() {
 bool Tracker::foretold(int marker, Point& told, double& discord) const {
   std::array<double, 12> x, y;
   std::size_t n = 0;
-  const int row = marker / setup_.cols, col = marker % setup_.cols;
-  const auto filled = [&](int r, int c) {
-    return r >= 0 && r < setup_.rows && c >= 0 && c < setup_.cols && filled_[std::size_t(r * setup_.cols + c)];
-  };
-  const auto step = [&](int r, int c) { return steps_[std::size_t(r * setup_.cols + c)]; };
-  for (int k = 0; k < 8; ++k) {
-    const int down = neighbour_row[k], right = neighbour_col[k];
-    if (!filled(row + down, col + right)) continue;
-    const Point near = step(row + down, col + right);
-    const auto tell = [&](Point p) { x[n] = p.x, y[n] = p.y, ++n; };
-    if (k % 2 == 0 && filled(row - down, col - right)) tell(0.5 * (near + step(row - down, col - right)));
-    if (filled(row + 2 * down, col + 2 * right)) tell(2 * near - step(row + 2 * down, col + 2 * right));
+  const auto filled = [&](int other) { return other >= 0 && filled_[std::size_t(other)]; };
+  const auto step = [&](int other) { return steps_[std::size_t(other)]; };
+  const auto tell = [&](Point p) { x[n] = p.x, y[n] = p.y, ++n; };
+  for (int way = 0; way < Grid::ways; ++way) {
+    const int near = setup_.grid.neighbour(marker, way), behind = setup_.grid.neighbour(marker, way, 2);
+    const int opposite = setup_.grid.neighbour(marker, way, -1);
+    if (!filled(near)) continue;
+    if (way % 2 == 0 && filled(opposite)) tell(0.5 * (step(near) + step(opposite)));
+    if (filled(behind)) tell(2 * step(near) - step(behind));
   }
   if (n < 3) return false;
   const auto middle = [n](std::array<double, 12>& values) {
@@ -262,14 +251,11 @@ bool Tracker::foretold(int marker, Point& told, double& discord) const {
 bool Tracker::around(int marker, Point& mean) const {
   Point sum{};
   double weight = 0;
-  const int row = marker / setup_.cols, col = marker % setup_.cols;
-  for (int k = 0; k < 8; ++k) {
-    const int r = row + neighbour_row[k], c = col + neighbour_col[k];
-    if (r < 0 || r >= setup_.rows || c < 0 || c >= setup_.cols) continue;
-    const std::size_t other = std::size_t(r * setup_.cols + c);
-    if (filled_[other] != 1) continue;
-    const double share = k < 4 ? 2 : 1;
-    sum = sum + share * steps_[other];
+  for (int way = 0; way < Grid::ways; ++way) {
+    const int other = setup_.grid.neighbour(marker, way);
+    if (other < 0 || filled_[std::size_t(other)] != 1) continue;
+    const double share = way < Grid::straight ? 2 : 1;
+    sum = sum + share * steps_[std::size_t(other)];
     weight += share;
   }
   if (weight == 0) return false;

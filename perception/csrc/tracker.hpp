@@ -8,7 +8,8 @@ namespace gelflow::perception {
 
 // What the start has learned; all vectors have one entry per marker, row by row.
 struct Setup {
-  int width, height, rows, cols;
+  int width, height;
+  Grid grid;
   Channel channel;
   bool bright;
   double spacing, radius;  // [px]
