@@ -12,6 +12,7 @@ constexpr double faintest = 0.3;                   // response of a dot, against
 constexpr double fastest = 0.25;       // of the spacing per image: more is taken for a jump, not for a velocity
 constexpr double unquestioned = 0.85;  // quality from which on the neighbours are not asked
 constexpr double stray = 0.35;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
+constexpr float oval_change = 0.1f;  // of an oval's curvature, that the coarse places of dots show for certain
 constexpr int relaxations = 8;
 constexpr int most_at_rest = 8;      // images that make the reference, if nothing moves before
 constexpr double rest_smooth = 0.3;  // largest share of what neighbours have in common, in the squares of noise
@@ -39,6 +40,7 @@ Tracker::Tracker(Setup setup)
     half_.push_back({0.9 * std::sqrt(q.yy / area), 0.9 * std::sqrt(q.xx / area)});
   }
   places_ = before_ = setup_.rest;
+  oval_ = setup_.oval;
   velocity_.resize(n), steps_.resize(n), next_.resize(n), offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
   known_.resize(n), filled_.resize(n), expected_.resize(n);
@@ -47,11 +49,12 @@ Tracker::Tracker(Setup setup)
 
 void Tracker::start(const std::uint8_t* bgr) {
   take_plane(bgr, plane_, setup_.channel);
+  oval_ = setup_.oval;
   anything_valid_ = false;
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
     if (!setup_.seen[m]) continue;
-    const Fit found = fit(m, setup_.oval[m], setup_.rest[m], 12);
+    const Fit found = fit(m, setup_.rest[m], 12);
     quality_[m] = found.quality, contrasts_[m] = found.contrast;
     if (found.quality < least_quality || !is_inside(m, found.place)) {
       setup_.seen[m] = 0, quality_[m] = 0;
@@ -120,52 +123,58 @@ void Tracker::refine_rest() {
 void Tracker::measure(const std::vector<int>& owner) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m) {
-    known_[m] = 0, quality_[m] = 0;
-    if (owner[m] < 0 || !setup_.seen[m]) continue;
-    const Fit found = fit(m, stretched(m, owner), dots_[std::size_t(owner[m])].place + offset_[m], 8);
-    quality_[m] = believed(m, found);
-    known_[m] = quality_[m] >= least_quality;
-    if (known_[m]) places_[m] = found.place;
+    known_[m] = owner[m] >= 0;
+    if (known_[m]) places_[m] = dots_[std::size_t(owner[m])].place + offset_[m];
+  }
+  for (std::size_t m = 0; m < n; ++m) {
+    const Oval now = stretched(m);
+    if (differ(now, oval_[m])) oval_[m] = now;
+  }
+  for (std::size_t m = 0; m < n; ++m) {
+    quality_[m] = 0;
+    if (!known_[m]) continue;
+    known_[m] = 0;
+    if (setup_.seen[m]) accept(m, fit(m, places_[m], 8), least_quality);
   }
   drop_strays();
   if (std::none_of(known_.begin(), known_.end(), [](char k) { return k != 0; })) {
-    std::fill(quality_.begin(), quality_.end(), 0.0);
+    places_ = before_;
     return;
   }
   spread();
   for (std::size_t m = 0; m < n; ++m) {
-    if (known_[m]) continue;
-    quality_[m] = 0;
-    if (!setup_.seen[m]) continue;
-    const Fit found = fit(m, stretched(m, owner), places_[m], 8);
-    const double quality = believed(m, found);
-    if (quality >= least_quality_lost && is_free(int(m), found.place)) {
-      places_[m] = found.place, quality_[m] = quality, known_[m] = 1;
-    }
+    if (known_[m] || !setup_.seen[m]) continue;
+    const Fit found = fit(m, places_[m], 8);
+    if (is_free(int(m), found.place)) accept(m, found, least_quality_lost);
   }
   drop_strays();
   spread();
+  for (std::size_t m = 0; m < n; ++m) oval_[m] = stretched(m);
+}
+
+// Takes a fit as the marker's place when enough of the dot's edge was seen.
+void Tracker::accept(std::size_t marker, const Fit& found, double least) {
+  const double quality = believed(marker, found);
+  if (quality < least) return;
+  places_[marker] = found.place, quality_[marker] = quality, known_[marker] = 1;
 }
 
 // The oval of a marker's dot, which is stretched and turned as the gel around it is: by G = L₀ L⁻¹, where the columns of
 // L are the ways between its neighbours on either side, and L₀ those at rest, Q becomes GᵀQG.
-Oval Tracker::stretched(std::size_t marker, const std::vector<int>& owner) const {
+Oval Tracker::stretched(std::size_t marker) const {
   Point now[2], rest[2];
   for (int axis = 0; axis < 2; ++axis) {
     std::size_t ends[2];
     for (int side = 0; side < 2; ++side) {
-      const int way = (axis ? Grid::downwards : Grid::to_the_right) + side;
-      const int other = setup_.grid.neighbour(int(marker), way);
-      ends[1 - side] = other < 0 ? marker : std::size_t(other);
-      if (owner[ends[1 - side]] < 0) return setup_.oval[marker];
+      const int other = setup_.grid.neighbour(int(marker), (axis ? Grid::downwards : Grid::to_the_right) + side);
+      ends[side] = other < 0 ? marker : std::size_t(other);
+      if (!known_[ends[side]]) return oval_[marker];
     }
-    now[axis] = dots_[std::size_t(owner[ends[1]])].place + offset_[ends[1]] - dots_[std::size_t(owner[ends[0]])].place -
-                offset_[ends[0]];
-    rest[axis] = setup_.rest[ends[1]] - setup_.rest[ends[0]];
+    now[axis] = places_[ends[0]] - places_[ends[1]];
+    rest[axis] = setup_.rest[ends[0]] - setup_.rest[ends[1]];
   }
   const double area = now[0].x * now[1].y - now[0].y * now[1].x;
-  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return setup_.oval[marker];
-  // G = [rest] [now]⁻¹
+  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return oval_[marker];
   const double xx = (rest[0].x * now[1].y - rest[1].x * now[0].y) / area;
   const double xy = (rest[1].x * now[0].x - rest[0].x * now[1].x) / area;
   const double yx = (rest[0].y * now[1].y - rest[1].y * now[0].y) / area;
@@ -176,11 +185,18 @@ Oval Tracker::stretched(std::size_t marker, const std::vector<int>& owner) const
           float(q.xx * xy * xy + 2 * q.xy * xy * yy + q.yy * yy * yy)};
 }
 
-Fit Tracker::fit(std::size_t marker, const Oval& oval, Point place, int passes) const {
+// Whether two ovals differ by more than what the dots' places, as they are found by contrast, are uncertain by. Where
+// they do not, the last image's oval, from measured places, is the better one.
+bool Tracker::differ(const Oval& one, const Oval& two) {
+  const float most = oval_change * (two.xx + two.yy);
+  return std::abs(one.xx - two.xx) > most || std::abs(one.xy - two.xy) > most || std::abs(one.yy - two.yy) > most;
+}
+
+Fit Tracker::fit(std::size_t marker, Point place, int passes) const {
   if (!(place.x > -setup_.radius && place.y > -setup_.radius && place.x < setup_.width + setup_.radius &&
         place.y < setup_.height + setup_.radius))
     return {place, 0, 0};
-  return fit_dot(plane_, settings_, oval, inverse_[marker], setup_.contrast[marker], place, passes);
+  return fit_dot(plane_, settings_, oval_[marker], inverse_[marker], setup_.contrast[marker], place, passes);
 }
 
 // The quality of a fit, 0 where it is cut by the image's border or its contrast is not that of the marker.

@@ -41,8 +41,10 @@ class Tracker {
 
  private:
   void measure(const std::vector<int>& owner);
-  Oval stretched(std::size_t marker, const std::vector<int>& owner) const;
-  Fit fit(std::size_t marker, const Oval& oval, Point place, int passes) const;
+  void accept(std::size_t marker, const Fit& found, double least);
+  Oval stretched(std::size_t marker) const;
+  static bool differ(const Oval& one, const Oval& two);
+  Fit fit(std::size_t marker, Point place, int passes) const;
   double believed(std::size_t marker, const Fit& fit) const;
   bool is_inside(std::size_t marker, Point place) const;
   bool is_free(int marker, Point place) const;
@@ -55,6 +57,7 @@ class Tracker {
   Setup setup_;
   FitSettings settings_;
   std::vector<Inverse> inverse_;
+  std::vector<Oval> oval_;  // of the markers as the gel is stretched now
   Plane plane_;
   Contrast contrast_;
   Follow follow_;
