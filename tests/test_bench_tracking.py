@@ -77,8 +77,8 @@ def test_jitter_is_along_an_axis_and_drift_is_from_the_first_image() -> None:
 
 def test_a_tracker_that_gives_up_has_nothing_from_there_on() -> None:
     class Fragile:
-        def start(self, image: Any, rest: np.ndarray, rows: int, cols: int) -> Any:
-            return rest, np.ones(len(rest), dtype=bool)
+        def start(self, image: Any, rest: np.ndarray, seen: np.ndarray, rows: int, cols: int) -> Any:
+            return rest, seen
 
         def track(self, image: Any) -> Any:
             raise PeerError("lost it")

@@ -1,6 +1,6 @@
 """Trackers that people use, from OpenCV, as well set as was found: what the project's own is compared with.
 
-Both are told where the markers are in the first image, which on a robot somebody would have to find for them.
+Both are told which markers are in the first image, and where: on a robot somebody would have to find them.
 """
 
 from typing import Protocol
@@ -16,14 +16,15 @@ _WINDOW = 0.5  # side of Lucas-Kanade's window, as a share of the spacing
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
-Found = tuple[Points, NDArray[np.bool_]]  # where each marker is [px], shape (markers, 2), and whether it was measured
+Flags = NDArray[np.bool_]  # shape (markers,)
+Found = tuple[Points, Flags]  # where each marker is [px], shape (markers, 2), and whether it was measured
 
 
 class Follower(Protocol):
     """Follows the markers through images."""
 
-    def start(self, image: Image, rest: Points, rows: int, cols: int) -> Found:
-        """Takes the first image, of `rows` × `cols` markers that truly are at `rest` [px], row by row."""
+    def start(self, image: Image, rest: Points, seen: Flags, rows: int, cols: int) -> Found:
+        """Takes the first image, of `rows` × `cols` markers that truly are at `rest` [px], row by row, if `seen`."""
 
     def track(self, image: Image) -> Found:
         """The markers in the next image."""
@@ -35,7 +36,7 @@ class Own:
     def __init__(self) -> None:
         self._tracker = MarkerTracker()
 
-    def start(self, image: Image, rest: Points, rows: int, cols: int) -> Found:
+    def start(self, image: Image, rest: Points, seen: Flags, rows: int, cols: int) -> Found:
         """Raises StartRefused as the tracker does, and UsageError when it found another grid."""
         tracked = self._tracker.start(image)
         if (tracked.rows, tracked.cols) != (rows, cols):
@@ -54,13 +55,13 @@ class LucasKanade:
     class: this was best. Against the image before, errors are the same at first and add up.
     """
 
-    def start(self, image: Image, rest: Points, rows: int, cols: int) -> Found:
+    def start(self, image: Image, rest: Points, seen: Flags, rows: int, cols: int) -> Found:
         self._first = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self._rest = np.ascontiguousarray(rest, dtype=np.float32)
         self._last = self._rest.copy()
         side = max(5, round(_WINDOW * float(np.linalg.norm(rest[1] - rest[0]))) | 1)
-        self._window = (side, side)
-        return rest, np.ones(len(rest), dtype=bool)
+        self._window, self._seen = (side, side), seen
+        return rest, seen
 
     def track(self, image: Image) -> Found:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -74,7 +75,7 @@ class LucasKanade:
             criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.003),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         )
-        valid = good.reshape(-1).astype(bool)
+        valid = good.reshape(-1).astype(bool) & self._seen
         self._last = np.where(valid[:, None], now, self._last)
         return self._last.astype(np.float64), valid
 
@@ -85,19 +86,19 @@ class DenseFlow:
     The other presets, and each image against the one before, were worse on the typical class.
     """
 
-    def start(self, image: Image, rest: Points, rows: int, cols: int) -> Found:
+    def start(self, image: Image, rest: Points, seen: Flags, rows: int, cols: int) -> Found:
         self._search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._first = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-        self._rest = rest
+        self._rest, self._seen = rest, seen
         self._flow = np.zeros((*image.shape[:2], 2), dtype=np.float32)
-        return rest, np.ones(len(rest), dtype=bool)
+        return rest, seen
 
     def track(self, image: Image) -> Found:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self._flow = self._search.calc(self._first, grey, self._flow)
         right, down = self._rest.astype(np.float32).T[:, :, None]
         moved = cv2.remap(self._flow, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return self._rest + moved[:, 0], np.ones(len(self._rest), dtype=bool)
+        return self._rest + moved[:, 0], self._seen
 
 
 FOLLOWERS: dict[str, type[Follower]] = {"gelflow": Own, "Lucas-Kanade": LucasKanade, "dense flow": DenseFlow}

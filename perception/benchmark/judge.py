@@ -162,7 +162,7 @@ def follow(frames: Iterable[TrueFrame], rows: int, cols: int, followers: Mapping
                 elif truth:
                     said[name].append(follower.track(image))
                 else:
-                    said[name].append(follower.start(image, frame.position, rows, cols))
+                    said[name].append(follower.start(image, frame.position, frame.visible, rows, cols))
             except GelflowError as error:
                 failed[name] = str(error)
                 said[name].append(nothing)

@@ -23,12 +23,13 @@ def measure_speed(
     followers: Mapping[str, type[Follower]],
     images: Sequence[NDArray[np.uint8]],
     rest: NDArray[np.float64],
+    seen: NDArray[np.bool_],
     rows: int,
     cols: int,
     *,
     repeats: int,
 ) -> dict[str, Speed]:
-    """Times each of `followers` on `images`, in turn, `repeats` times; `rest` [px] is as in `Follower.start`."""
+    """Times each of `followers` on `images`, in turn, `repeats` times; the others are as in `Follower.start`."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in followers}
@@ -37,7 +38,7 @@ def measure_speed(
             for name, kind in followers.items():
                 follower = kind()
                 begin = time.process_time()
-                follower.start(images[0], rest, rows, cols)
+                follower.start(images[0], rest, seen, rows, cols)
                 started = time.process_time()
                 for image in images[1:]:
                     follower.track(image)

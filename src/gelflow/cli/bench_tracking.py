@@ -64,7 +64,7 @@ class Case:
 
 CLASSES = tuple(Case(preset, preset, {}) for preset in PRESETS)
 SIZED = tuple(
-    Case(f"{preset}, {markers}{', 640 × 480' if size == LARGE else ''}", preset, {}, markers, size)
+    Case(f"{preset} {markers}{' 640' if size == LARGE else ''}", preset, {}, markers, size)
     for preset in PRESETS
     for size in (SMALL, LARGE)
     for markers in MARKERS
@@ -114,12 +114,12 @@ def _errors(cases: Sequence[Case], effort: Effort) -> Report:
         title="Tracking: endpoint errors on images with known truth, in px",
         columns=("images", "median", "95 %", "disp", "floor", "LK ×", "DIS ×", "near%", "meas%", "end%"),
         rows=rows,
-        note="130 markers on 320 × 240 px where nothing else is said; press, shear, twist and slip up to 0.4 of the "
-        "spacing. disp: 95th percentile of the displacement's error, in which it does not count what the middle of a "
-        "damaged dot is off by. floor: median error of a least-squares fit that knows each dot's image. LK ×, DIS ×: "
-        "how many times as large the median error of Lucas-Kanade and of dense flow is; both are told where the "
-        "markers are at rest. near: of the visible markers, within 0.1 spacing of the truth; meas: measured, not "
-        "guessed; end: both, in the last image.",
+        note="130 markers on 320 × 240 px where no number is said; 640: on 640 × 480 px. Press, shear, twist and slip "
+        "up to 0.4 of the spacing. disp: 95th percentile of the displacement's error, in which it does not count what "
+        "the middle of a damaged dot is off by. floor: median error of a least-squares fit that knows each dot's "
+        "image. LK ×, DIS ×: how many times as large the median error of Lucas-Kanade and of dense flow is; both are "
+        "told where the markers are at rest. near: of the visible markers, within 0.1 spacing of the truth; meas: "
+        "measured, not guessed; end: both, in the last image.",
         results=results,
         outside=outside,
     )
@@ -238,8 +238,10 @@ def _speed(effort: Effort) -> Report:
         look = look_of("typical", markers=markers, width=width, height=height)
         frames = list(GelSequence(look, "press", frames=QUICK_FRAMES if effort.quick else FRAMES))
         images = [frame.image for frame in frames]
-        grid = look.grid
-        taken = measure_speed(FOLLOWERS, images, frames[0].position, grid.rows, grid.cols, repeats=effort.repeats)
+        first, grid = frames[0], look.grid
+        taken = measure_speed(
+            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=effort.repeats
+        )
         own = taken[OWN]
         rows.append(
             (

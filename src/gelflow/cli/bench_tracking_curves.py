@@ -58,8 +58,10 @@ def measure_curves(effort: Effort) -> Report:
     for name, value, markers, size in [timed[0], timed[len(SIZES)]] if effort.quick else timed:
         look = look_of("typical", markers=markers, width=size[0], height=size[1])
         frames = list(GelSequence(look, frames=_TIMED))
-        images, rest, grid = [frame.image for frame in frames], frames[0].position, look.grid
-        taken = measure_speed(FOLLOWERS, images, rest, grid.rows, grid.cols, repeats=effort.repeats)
+        images, first, grid = [frame.image for frame in frames], frames[0], look.grid
+        taken = measure_speed(
+            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=effort.repeats
+        )
         rows.append((f"ms: {name} {value}", *(f"{one.frame:.2f}" for one in taken.values())))
         results.append({"curve": name, "at": value} | {who: asdict(one) for who, one in taken.items()})
     return Report(
@@ -97,6 +99,7 @@ def draw(curves: Report, file: Path) -> None:
         axes.set_yscale("log")
         axes.set_xlabel(label)
         axes.grid(True, which="major", alpha=0.3)
-    figure.axes[0].legend(title="median; dashed: 95 %")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), title="median; dashed: 95 %")
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=90)
