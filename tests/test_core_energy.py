@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gelflow.sim import _core
 from gelflow.sim.energy import EnergyGauge, motor_forces
 from gelflow.sim.motions import motion
-from gelflow.sim.scene import load_scene, scene_names
+from gelflow.sim.scene import INTEGRATORS, load_scene, scene_names
 from gelflow.sim.scene_parts import LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.throws import GRAVITY, KINDS, MASS, SIZE, Kind, Throw, fly
@@ -77,10 +77,11 @@ def test_what_spins_fast_over_long_steps_never_gains() -> None:
         assert (growth.change <= TOLERANCE * growth.scale).all()
 
 
-def test_what_the_elastic_law_stores_in_a_slip() -> None:
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_what_the_elastic_law_stores_in_a_slip(integrator: str) -> None:
     """A block that slides strains its springs by µ N / k_s and no more, however fast, and is braked by µ m g."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
-    throw = Throw("box", "elastic", "depth", 1e-3, numbers, turns=False)
+    throw = Throw("box", "elastic", "depth", 1e-3, numbers, integrator=integrator, turns=False)
     sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
     points = 9  # of the lower face
     sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])

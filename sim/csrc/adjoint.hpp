@@ -71,9 +71,10 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   evaluate<true, T>(m, params, r.start(u), r.v1.data(), Found::elsewhere, false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
-    contact_anchors_transposed<true, T>(m, params, r.h, r.second, r.anchors.data(), r.anchored.data(), w,
+    const T length = r.start(u).length();
+    contact_anchors_transposed<true, T>(m, params, length, r.second, r.anchors.data(), r.anchored.data(), w,
                                         g.anchors.data(), g.v, g.q, g.v, by_anchor.data());
-    marker_anchors_transposed<T>(m, params, r.h, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+    marker_anchors_transposed<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                                  by_anchor.data());
   }
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step

@@ -15,7 +15,8 @@
 //
 // Spring and damper are side by side, and what slips is behind both. After a step of length h that ended in slip, the
 // rate w = (s − s_before)/h of the strain satisfies f_t = −k_s s − k_t w, so that friction takes what the point's motion
-// brings and the spring does not store. As s_before = s* − h v_t with s* the strain that f* speaks of,
+// brings and the spring does not store. With s_before = s* − h v_t, s* the strain that f* speaks of (so it is under BDF1,
+// and under BDF2 but for terms of second order),
 //     −k_s s = k_t v_t + q f_t + (1 − q) f*,     q = h k_s / (h k_s + k_t)
 // which is −k_s s* in stick, where f_t = f*: there the anchor stays. A point that just touched stores nothing.
 #pragma once

@@ -51,9 +51,10 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {
-    advance_contact_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(),
+    advance_contact_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
                                    next_set.data());
-    advance_marker_anchors<Taped>(m, t.params.data(), h, t.anchors.data(), s.anchored, w, next.data(), next_set.data());
+    advance_marker_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
+                                  next_set.data());
   }
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (int k = 0; k < m.nv; ++k) weigh(weights, w.residual[k], -multipliers[k]);

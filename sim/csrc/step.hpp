@@ -114,8 +114,8 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   }
   if (status != Status::ok) return status;
   accepted(from, memory);
-  advance_contact_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-  advance_marker_anchors<T>(m, params, from.h, s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_contact_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_marker_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
   if (m.nh > 0) {
     std::fill(s.history, s.history + m.nh, T(0));
     if (whole) {

@@ -86,6 +86,8 @@ struct StepStart {
   const T* u;
   Found found = Found::elsewhere;  // what the workspace was last used for
   double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+
+  T length() const { return history == nullptr ? h : T(h * T(1.5)); }  // of the step itself
 };
 
 template <class T>
