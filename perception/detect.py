@@ -129,3 +129,12 @@ def plane_of(image: NDArray[np.uint8], name: PlaneName) -> NDArray[np.uint8]:
     if name == "chroma":
         value = cv2.subtract(value, cv2.min(cv2.min(blue, green), red))
     return np.asarray(value, dtype=np.uint8)
+
+
+def smaller(image: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
+    """`image` with `shrink` × `shrink` pixels averaged into one; what is left over, right and below, is cut off."""
+    if shrink == 1:
+        return image
+    width, height = max(image.shape[1] // shrink, 1), max(image.shape[0] // shrink, 1)
+    part = image[: height * shrink, : width * shrink]
+    return np.asarray(cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -3,12 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots
+from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots, smaller
 from gelflow.perception.lattice import Lattice, fill, grow
 from gelflow.perception.refusal import StartRefused, draw_seen
 
@@ -17,6 +16,7 @@ Polarity = Literal["auto", "dark", "bright"]
 _RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of dots that are looked for [px], in an image of about _SEARCH px
 _SEARCH = 360
 _MOST = 2500  # dots beyond these, in order of contrast, are texture
+_BETWEEN = 0.4  # dots between a grid's lines, for each on them, from which on it is another grid
 _UNEVEN = 0.12  # a grid whose nodes are further from the middle of their neighbours (share of spacing) is chance
 
 
@@ -65,11 +65,7 @@ def find_grid(
     """
     wanted = _wanted(rows, cols, either_way)
     shrink = max(1, round(max(image.shape[:2]) / _SEARCH))
-    small = image
-    if shrink > 1:
-        size = (max(image.shape[1] // shrink, 1), max(image.shape[0] // shrink, 1))
-        part = image[: size[1] * shrink, : size[0] * shrink]
-        small = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    small = smaller(image, shrink)
     looks = _looks(small, polarity)
     best = _search(small, looks)
     if best is None:
@@ -78,13 +74,12 @@ def find_grid(
     # Once more, now that radius and spacing are known.
     dots = _likely(find_dots(contrast(small, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
     lattice = grow(dots.centers)
-    if lattice is None or lattice.unevenness > _UNEVEN:
-        seen = draw_seen(small, dots.centers, radius, None)
-        raise StartRefused(f"no regular grid of markers found in the image{_hint(polarity)}", seen)
-    refusal, part_of_it = _window(lattice, dots, rows, cols, wanted)
-    if part_of_it is None:
-        raise StartRefused(refusal, draw_seen(small, dots.centers, radius, lattice.dots))
-    return _found(look, part_of_it, dots).scaled(shrink)
+    refusal, part = _distrust(lattice, dots, polarity), None
+    if lattice is not None and not refusal:
+        refusal, part = _window(lattice, dots, rows, cols, wanted)
+    if part is None:
+        raise StartRefused(refusal, draw_seen(small, dots.centers, radius, lattice.dots if lattice else None))
+    return _found(look, part, dots).scaled(shrink)
 
 
 def _looks(image: NDArray[np.uint8], polarity: Polarity) -> tuple[Look, ...]:
@@ -134,6 +129,28 @@ def _likely(dots: Dots) -> Dots:
         return dots
     middle = np.median(dots.areas)
     return dots.only((dots.areas > 0.3 * middle) & (dots.areas < 3 * middle))
+
+
+def _distrust(lattice: Lattice | None, dots: Dots, polarity: Polarity) -> str:
+    """Why this is no grid of markers; empty when it may be one."""
+    if lattice is None or lattice.unevenness > _UNEVEN:
+        return f"no regular grid of markers found in the image{_hint(polarity)}"
+    between = _between(lattice, dots)
+    if between > _BETWEEN * lattice.found:
+        return (
+            f"{between} dots lie between the lines of the {lattice.found} that form a grid: "
+            "no markers, or a grid turned by more than 30° in the image"
+        )
+    return ""
+
+
+def _between(lattice: Lattice, dots: Dots) -> int:
+    """How many dots lie among those of the grid but are none of them: of a grid of diagonals, as many as it has."""
+    number = lattice.dots[lattice.dots >= 0]
+    low, high = dots.centers[number].min(axis=0), dots.centers[number].max(axis=0)
+    among = ((dots.centers > low) & (dots.centers < high)).all(axis=1)
+    among[number] = False
+    return int(among.sum())
 
 
 def _radius(dots: Dots, lattice: Lattice) -> float:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
+from gelflow.perception.detect import smaller
 from gelflow.perception.grid import Polarity, find_grid
 from gelflow.perception.learn import learn
 from gelflow.perception.refusal import StartRefused
@@ -89,7 +90,7 @@ class MarkerTracker:
         rows, cols = (c.rows, c.cols) if rows is None and cols is None else (rows, cols)
         found = find_grid(image, rows=rows, cols=cols, either_way=c.either_way, polarity=c.polarity)
         shrink = max(1, int(np.ceil(found.radius / _LARGEST)))
-        tracker, learned = learn(_smaller(image, shrink), found.scaled(1 / shrink))
+        tracker, learned = learn(smaller(image, shrink), found.scaled(1 / shrink))
         rest = _larger(learned.rest, shrink)
         size = (image.shape[0], image.shape[1])
         rows, cols = found.shape
@@ -111,7 +112,7 @@ class MarkerTracker:
             got, expected = (f"{width} × {height} px" for height, width in (image.shape[:2], started.size))
             raise PeerError(f"the image's size changed from {expected} to {got}: start the tracker anew for it")
         shrink = started.shrink
-        position, displacement, valid, inferred, quality = started.tracker.track(_smaller(image, shrink))
+        position, displacement, valid, inferred, quality = started.tracker.track(smaller(image, shrink))
         if shrink > 1:
             position, displacement = _larger(position, shrink), shrink * displacement
         grid = started.rows, started.cols, started.spacing
@@ -130,14 +131,6 @@ def _colours(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if image.ndim == 2:
         image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     return np.ascontiguousarray(image)
-
-
-def _smaller(image: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
-    if shrink == 1:
-        return image
-    size = (image.shape[1] // shrink, image.shape[0] // shrink)
-    part = image[: size[1] * shrink, : size[0] * shrink]
-    return np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _larger(position: NDArray[np.float64], shrink: int) -> NDArray[np.float64]:

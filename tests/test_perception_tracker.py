@@ -264,7 +264,7 @@ def garbage(kind: str) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["noise", "soft noise", "black", "white", "one dot", "10 000 dots"])
 def test_an_image_without_markers_is_refused_and_does_no_harm(kind: str) -> None:
     image = garbage(kind)
-    with pytest.raises(StartRefused, match=r"stand out|look alike|no regular grid") as refusal:
+    with pytest.raises(StartRefused, match=r"stand out|look alike|lie between|no regular grid") as refusal:
         MarkerTracker().start(image)
     assert refusal.value.picture.shape == image.shape and refusal.value.picture.dtype == np.uint8
     renderer, still = TruthRenderer(look_of("typical")), np.zeros((130, 2))
@@ -274,6 +274,18 @@ def test_an_image_without_markers_is_refused_and_does_no_harm(kind: str) -> None
     assert lost.valid.mean() < 0.1 and np.isfinite(lost.position).all()
     assert np.isnan(lost.displacement[~lost.valid & ~lost.inferred]).all()
     assert tracker.track(renderer.render(still, number=1).image).valid.all()
+
+
+def test_a_grid_turned_too_far_is_not_taken_for_one_of_its_diagonals() -> None:
+    image = TruthRenderer(look_of("typical")).render(np.zeros((130, 2))).image
+    for angle, right in ((25, True), (43, False)):
+        turn = cv2.getRotationMatrix2D((160, 120), angle, 0.7)
+        turned = np.asarray(cv2.warpAffine(image, turn, (320, 240), borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+        if right:
+            assert MarkerTracker().start(turned).valid.all()
+        else:
+            with pytest.raises(StartRefused, match="between the lines"):
+                MarkerTracker().start(turned)
 
 
 def test_what_is_no_image_is_refused() -> None:
