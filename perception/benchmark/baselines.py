@@ -17,7 +17,8 @@ _WINDOW = 0.5  # side of Lucas-Kanade's window, as a share of the spacing
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
 Flags = NDArray[np.bool_]  # shape (markers,)
-Found = tuple[Points, Flags]  # where each marker is [px], shape (markers, 2), and whether it was measured
+# Where each marker is and how far it went from rest [px], shape (markers, 2), and whether it was measured.
+Found = tuple[Points, Points, Flags]
 
 
 class Follower(Protocol):
@@ -41,11 +42,11 @@ class Own:
         tracked = self._tracker.start(image)
         if (tracked.rows, tracked.cols) != (rows, cols):
             raise UsageError(f"found {tracked.rows} × {tracked.cols} markers, there are {rows} × {cols}")
-        return tracked.position, tracked.valid
+        return tracked.position, tracked.displacement, tracked.valid
 
     def track(self, image: Image) -> Found:
         tracked = self._tracker.track(image)
-        return tracked.position, tracked.valid
+        return tracked.position, tracked.displacement, tracked.valid
 
 
 class LucasKanade:
@@ -61,7 +62,7 @@ class LucasKanade:
         self._last = self._rest.copy()
         side = max(5, round(_WINDOW * float(np.linalg.norm(rest[1] - rest[0]))) | 1)
         self._window, self._seen = (side, side), seen
-        return rest, seen
+        return rest, np.zeros_like(rest), seen
 
     def track(self, image: Image) -> Found:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -77,7 +78,7 @@ class LucasKanade:
         )
         valid = good.reshape(-1).astype(bool) & self._seen
         self._last = np.where(valid[:, None], now, self._last)
-        return self._last.astype(np.float64), valid
+        return self._last.astype(np.float64), self._last.astype(np.float64) - self._rest, valid
 
 
 class DenseFlow:
@@ -91,14 +92,14 @@ class DenseFlow:
         self._first = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self._rest, self._seen = rest, seen
         self._flow = np.zeros((*image.shape[:2], 2), dtype=np.float32)
-        return rest, seen
+        return rest, np.zeros_like(rest), seen
 
     def track(self, image: Image) -> Found:
         grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         self._flow = self._search.calc(self._first, grey, self._flow)
         right, down = self._rest.astype(np.float32).T[:, :, None]
         moved = cv2.remap(self._flow, right, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return self._rest + moved[:, 0], self._seen
+        return self._rest + moved[:, 0], moved[:, 0].astype(np.float64), self._seen
 
 
 FOLLOWERS: dict[str, type[Follower]] = {"gelflow": Own, "Lucas-Kanade": LucasKanade, "dense flow": DenseFlow}

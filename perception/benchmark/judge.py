@@ -36,6 +36,7 @@ class Course:
     """What one tracker said about one sequence, beside the truth. All over (frames, markers), the first one too."""
 
     found: NDArray[np.float64]  # [px], shape (frames, markers, 2)
+    moved: NDArray[np.float64]  # displacement from rest, as the tracker has it [px], shape (frames, markers, 2)
     valid: NDArray[np.bool_]
     truth: NDArray[np.float64]  # [px], shape (frames, markers, 2)
     visible: NDArray[np.bool_]
@@ -52,13 +53,12 @@ class Course:
         return np.asarray(self.off[1:][self.valid[1:]])
 
     def displacement_errors(self) -> NDArray[np.float64]:
-        """Of the way from the first image, of all that is measured in both [px].
+        """Of the displacement from rest, of all that is said to be measured after the first image [px].
 
-        What a damaged dot's middle is off by is the same in both, and not in here.
+        What a damaged dot's middle is off by is off at rest too, and not in here.
         """
-        both = self.valid[1:] & self.valid[0]
-        off = (self.found[1:] - self.found[0]) - (self.truth[1:] - self.truth[0])
-        return np.asarray(np.linalg.norm(off, axis=-1)[both])
+        off = np.linalg.norm(self.moved - (self.truth - self.truth[0]), axis=-1)
+        return np.asarray(off[1:][self.valid[1:]])
 
     def near(self) -> float:
         """Share of the visible markers that are within 0.1 spacing of the truth, measured or inferred."""
@@ -93,13 +93,12 @@ class Course:
         return float(np.median(self.found[:, always].std(axis=0))) if always.any() else None
 
     def drift(self) -> float | None:
-        """Of a sequence that ends as it began: how far the median marker's last place is from its first [px].
+        """Of a sequence that ends as it began: the median marker's displacement at its end [px].
 
-        None when no marker was measured in both images.
+        None when no marker was measured there.
         """
-        both = self.valid[0] & self.valid[-1]
-        moved = self.found[-1, both] - self.found[0, both]
-        return float(np.median(np.linalg.norm(moved, axis=-1))) if both.any() else None
+        last = self.moved[-1, self.valid[-1]]
+        return float(np.median(np.linalg.norm(last, axis=-1))) if len(last) else None
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class Figures:
 
     median: float  # endpoint error [px]; infinite when nothing was measured
     high: float  # its 95th percentile [px]
-    displacement_median: float  # error of the displacement from the first image [px]; infinite as above
+    displacement_median: float  # error of the displacement from rest [px]; infinite as above
     displacement_high: float  # its 95th percentile [px]
     near: float  # share of the visible markers within 0.1 spacing
     measured: float  # share of the visible markers that are measured
@@ -155,7 +154,8 @@ def follow(frames: Iterable[TrueFrame], rows: int, cols: int, followers: Mapping
     for frame in frames:
         image = frame.image
         for name, follower in followers.items():
-            nothing = np.full_like(frame.position, np.nan), np.zeros(rows * cols, dtype=bool)
+            nowhere = np.full_like(frame.position, np.nan)
+            nothing = nowhere, nowhere, np.zeros(rows * cols, dtype=bool)
             try:
                 if failed[name]:
                     said[name].append(nothing)
@@ -172,12 +172,13 @@ def follow(frames: Iterable[TrueFrame], rows: int, cols: int, followers: Mapping
     spacing = float(np.median(np.linalg.norm(np.diff(at_rest, axis=1), axis=-1)))
     return {
         name: Course(
-            np.array([found for found, _ in pairs]),
-            np.array([valid for _, valid in pairs]),
-            np.array(truth),
-            np.array(visible),
-            spacing,
-            failed[name],
+            found=np.array([one[0] for one in all_said]),
+            moved=np.array([one[1] for one in all_said]),
+            valid=np.array([one[2] for one in all_said]),
+            truth=np.array(truth),
+            visible=np.array(visible),
+            spacing=spacing,
+            failed=failed[name],
         )
-        for name, pairs in said.items()
+        for name, all_said in said.items()
     }

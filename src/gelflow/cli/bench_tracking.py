@@ -203,8 +203,8 @@ def _motion(cases: Sequence[Case], effort: Effort) -> Report:
         title="Tracking: at rest, after 240 images, large motion",
         columns=("images", "jitter", "drift", "exch.", "LK", "DIS", "jump", "LK", "DIS"),
         rows=rows,
-        note="jitter: at rest, standard deviation along an axis in px. drift: the median marker's way from its first "
-        f"place after {DRIFT} images (quick: {QUICK_DRIFT}), back at rest, in px. exch.: markers exchanged on the way "
+        note="jitter: at rest, standard deviation along an axis in px. drift: the median marker's displacement "
+        f"after {DRIFT} images (quick: {QUICK_DRIFT}), back at rest, in px. exch.: markers exchanged on the way "
         f"to {IDENTITY:g} of the spacing in six images, all fields together; a marker is exchanged when it is said to "
         "be measured, and lies nearer to another one's place than to its own. jump: largest step from one image to the "
         "next, in spacings, that every field survives with no marker exchanged, and "

@@ -50,7 +50,8 @@ def measure_curves(effort: Effort) -> Report:
             changed, motion = curve.at(value)
             courses = Case(curve.name, "typical", changed).follow(FOLLOWERS, fields, **(sequence | motion))
             figures = {name: Figures.of(found) for name, found in courses.items()}
-            rows.append((f"{curve.name} {value:g}", *(f"{one.median:.3f}" for one in figures.values())))
+            medians = ("gave up" if one.failed else f"{one.median:.3f}" for one in figures.values())
+            rows.append((f"{curve.name} {value:g}", *medians))
             results.append({"curve": curve.name, "at": value} | {name: one.plain() for name, one in figures.items()})
             effort.watch.advance()
     timed = [("markers", markers, markers, LARGE) for markers in SIZES]
