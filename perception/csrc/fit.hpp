@@ -209,7 +209,7 @@ inline Fit fit_dot(const Plane& plane, const FitSettings& settings, const Oval& 
   pass.x = float(begin.x), pass.y = float(begin.y), pass.a = float(rest_contrast), pass.b = float(light);
   bool coarse = true;
   for (int number = 0; number < most_passes; ++number) {
-    pass.k = pass.b * float(std::max(0.2 * std::abs(double(pass.a)), 3 * settings.noise));
+    pass.k = pass.b * float(std::max(0.16 * std::abs(double(pass.a)), 3 * settings.noise));
     pass.every = coarse ? 2 : 1;
     run_pass(window, plane.width, plane.height, settings.shape, oval, pass);
     // Pixels that count little or are left out are missing from the sums, but not from H.

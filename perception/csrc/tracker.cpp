@@ -5,13 +5,13 @@
 namespace gelflow::perception {
 
 namespace {
-constexpr double least_quality = 0.4;       // of a fit that is believed
-constexpr double least_quality_lost = 0.6;  // the same where no dot stood out, only the neighbours say where to look
+constexpr double least_quality = 0.35;       // of a fit that is believed
+constexpr double least_quality_lost = 0.55;  // the same where no dot stood out, only the neighbours say where to look
 constexpr double weakest = 0.35, strongest = 2.2;  // contrast that is believed, against that at rest
 constexpr double faintest = 0.3;                   // response of a dot, against the middle one at rest
-constexpr double fastest = 0.25;       // of the spacing per image: more is taken for a jump, not for a velocity
-constexpr double unquestioned = 0.85;  // quality from which on the neighbours are not asked
-constexpr double stray = 0.35;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
+constexpr double fastest = 0.25;      // of the spacing per image: more is taken for a jump, not for a velocity
+constexpr double unquestioned = 0.8;  // quality from which on the neighbours are not asked
+constexpr double stray = 0.4;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
 constexpr float oval_change = 0.1f;  // of an oval's curvature, that the coarse places of dots show for certain
 constexpr int relaxations = 8;
 constexpr int most_at_rest = 8;      // images that make the reference, if nothing moves before
