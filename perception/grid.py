@@ -29,8 +29,6 @@ class Found:
     spacing: float  # between neighbours [px]
     positions: NDArray[np.float64]  # (right, down) [px], shape (lines, columns, 2); unseen ones are interpolated
     seen: NDArray[np.bool_]  # shape (lines, columns)
-    areas: NDArray[np.float64]  # of each dot [px²], shape (lines, columns)
-    peak: float  # median contrast of a dot
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -39,8 +37,7 @@ class Found:
     def scaled(self, factor: float) -> "Found":
         """The same grid in an image made larger by `factor`, or smaller."""
         places = (self.positions + 0.5) * factor - 0.5
-        radius, spacing, areas = factor * self.radius, factor * self.spacing, factor**2 * self.areas
-        return replace(self, radius=radius, spacing=spacing, positions=places, areas=areas)
+        return replace(self, radius=factor * self.radius, spacing=factor * self.spacing, positions=places)
 
 
 def surroundings(spacing: float) -> int:
@@ -249,9 +246,7 @@ def _found(look: Look, lattice: Lattice, dots: Dots) -> Found:
     area = dots.areas[number]
     seen = (number >= 0) & dots.inside[number] & (area > 0.4 * middle) & (area < 2.0 * middle)
     positions = _interpolate(dots.centers[number], number >= 0)
-    radius = float(np.sqrt(middle / np.pi))
-    areas = np.where(seen, area, middle)
-    return Found(look, radius, lattice.spacing, positions, seen, areas, float(np.median(dots.peaks[number[seen]])))
+    return Found(look, float(np.sqrt(middle / np.pi)), lattice.spacing, positions, seen)
 
 
 def _interpolate(positions: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -40,8 +40,19 @@ class Learned:
 def learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
     """A tracker for the markers `found` in `image` (B G R), started there.
 
-    Raises StartRefused when the dots do not look alike: then they are no print.
+    Raises StartRefused when the dots do not look alike, or like no dots: then they are no print.
     """
+    _alike(image, found, found.seen.astype(np.float64).reshape(-1))
+    try:
+        return _learn(image, found)
+    except ValueError as error:  # of a shape without an edge, of dots that touch
+        picture = draw_seen(image, found.positions[found.seen], found.radius, None)
+        raise StartRefused(
+            f"the spots in lines and columns are no dots that can be measured: {error}", picture
+        ) from None
+
+
+def _learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
     plane = plane_of(image, found.look.plane).astype(np.float64)
     window = _Windows(plane, found)
     oval = window.ovals(found)
