@@ -172,14 +172,7 @@ def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> t
         told = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
     in_core = "grid" if kind == "mesh" else kind
     shape = spec.add_shape("shape", turret, in_core, (1e-3, 0, 0), (1, 0, 0, 0), SHAPES[kind], **told)
-    cloud = rng.normal(size=(60, 3))
-    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
-    points = spec.add_points("cloud", hand, cloud, np.ones(60))
-    numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
-    numbers["ks"] = 100.0 if law == "elastic" else 0.0
-    spec.add_contact("press", points, shape, **numbers)
-    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
-    spec.add_pad("skin", hand, cloud * 1.01, *axes, shapes=[shape], **{**numbers, "kn": 50.0})
+    _add_cloud(spec, hand, {"press": shape}, law, rng)
     spec.add_actuator("turn", hinge, "velocity", kd=2e-3)
     spec.add_actuator("x", slides[0], "general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1)
     spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0, ctrl_lower=-1.0, ctrl_upper=1.0)
@@ -208,15 +201,7 @@ def tumbling(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simul
     slide = spec.add_joint("x", pusher, "slide", (0, 0, 0), (1, 0, 0), damping=0.5)
     ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (0.98, 0.14, 0.14, 0.02), (0, 0, 0))
     ball = spec.add_shape("ball", pusher, "sphere", (0, 0, 0), upright, (0.02, 0, 0))
-    cloud = rng.normal(size=(60, 3))
-    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
-    points = spec.add_points("cloud", body, cloud, np.ones(60))
-    numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
-    numbers["ks"] = 100.0 if law == "elastic" else 0.0
-    spec.add_contact("on ground", points, ground, **numbers)
-    spec.add_contact("on pusher", points, ball, **numbers)
-    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
-    spec.add_pad("skin", body, cloud * 1.01, *axes, shapes=[ground, ball], **{**numbers, "kn": 50.0})
+    _add_cloud(spec, body, {"on ground": ground, "on pusher": ball}, law, rng)
     spec.add_actuator("push", slide, "motor")
     sim = Simulator(_core.Model(spec))
     sim.q[0, :3] = 0, 0, 0.011
@@ -224,3 +209,16 @@ def tumbling(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simul
     sim.step([0.3], 4)
     sim.check()
     return sim, 0.3 + rng.normal(size=(STEPS, 1)) * 0.1
+
+
+def _add_cloud(spec: Any, body: int, contacts: dict[str, int], law: str, rng: np.random.Generator) -> None:
+    """Points all around a body, in contact with shapes (by the contact's name), and markers just outside of them."""
+    cloud = rng.normal(size=(60, 3))
+    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
+    points = spec.add_points("cloud", body, cloud, np.ones(60))
+    numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
+    numbers["ks"] = 100.0 if law == "elastic" else 0.0
+    for name, shape in contacts.items():
+        spec.add_contact(name, points, shape, **numbers)
+    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
+    spec.add_pad("skin", body, cloud * 1.01, *axes, shapes=list(contacts.values()), **{**numbers, "kn": 50.0})
