@@ -5,7 +5,7 @@ runs until answers stay out for CommTimeout, and is started again by the program
 count. Motion goes through the joints (lag, then the speed limit of MaxSpeedDeviation) to an `ArmPlant`.
 
 As on a robot, the controller keeps its 4 ms whatever the physics and the cameras cost: it runs in a process of its own
-(`egm_controller`), and only poses go back and forth.
+(`egm_controller`), and only poses go back and forth. A paced clock waits for it and for the plant's answers.
 """
 
 import select
@@ -53,7 +53,7 @@ class MockEgm:
             joints_of(self._config, pose, self._config.near)
         except SafetyError as error:
             raise UsageError(f"the mock arm cannot start where its plant is: {error}") from None
-        settings = {"clock_factor": self._clock.factor, "config": asdict(self._config), "pose": pose}
+        settings = {"clock": self._clock.settings, "config": asdict(self._config), "pose": pose}
         self._quit.clear()
         self._child = Child.start("gelflow.hardware_mocks.egm_controller", settings)
         self._thread = threading.Thread(target=self._serve, args=(self._child,), name="mock-egm", daemon=True)

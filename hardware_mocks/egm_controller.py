@@ -4,6 +4,7 @@ import gc
 import math
 import os
 import random
+import select
 import socket
 import sys
 from collections import deque
@@ -14,9 +15,12 @@ from typing import Any
 from gelflow.child import Messages, adopted
 from gelflow.clock import Clock, ScaledClock, raise_priority
 from gelflow.errors import PeerError, SafetyError, UsageError
+from gelflow.pace import CONTROLLER
 from gelflow.real.egm_codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
 from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, compose, forward, inverse, invert
 
+_LAG = 0.02  # this process or the plant may be this far behind robot time [s]; further, and robot time waits
+_SHORTEST_WAIT = 2e-4  # for the plant, while robot time stands still [s, wall]
 _IDENTITY: Frame = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -238,7 +242,7 @@ class _Loop:
         self._config = config
         self._clock = clock
         self._parent = parent
-        self._asked = False  # the parent owes an answer: a slow plant is not asked again meanwhile
+        self._asked: float | None = None  # when the parent was asked what it has not answered yet [s, robot time]
         self._move: Frame | None = None
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind(("", 0))
@@ -249,7 +253,7 @@ class _Loop:
         grandparent = os.getppid()
         due = self._clock.now()
         while not self._parent.closed and os.getppid() == grandparent:
-            self._clock.sleep(due - self._clock.now())
+            self._wait_until(due)
             self._listen()
             # The controller's time goes on, whatever this computer does: what was missed is skipped, not made up for.
             missed = int((self._clock.now() - due) / self._config.period)
@@ -258,23 +262,38 @@ class _Loop:
             if data is not None:
                 self._udp.sendto(data, (self._config.host, self._config.port))
             self._move = move or self._move
-            if not self._asked:
+            if self._asked is None:
                 self._parent.send(["cycle", self._move])
-                self._asked, self._move = True, None
+                self._asked, self._move = due, None
+
+    def _wait_until(self, due: float) -> None:
+        """For the next cycle; robot time does not run far ahead of it, nor of a plant that owes an answer."""
+        while True:
+            self._clock.allow(CONTROLLER, _LAG + (due if self._asked is None else self._asked))
+            left = due - self._clock.now()
+            if left <= 0:
+                return
+            if self._asked is None:
+                self._clock.sleep(left)
+            elif select.select((self._parent,), (), (), max(self._clock.wall(left), _SHORTEST_WAIT))[0]:
+                self._hear_parent()
 
     def _listen(self) -> None:
-        for kind, *values in self._parent.read():
-            if kind == "pose":
-                position, quaternion = values
-                self._controller.pose = (tuple(position), tuple(quaternion))
-                self._asked = False
-            else:
-                self._obey(*values)
+        self._hear_parent()
         with suppress(BlockingIOError):
             while True:
                 data, sender = self._udp.recvfrom(4096)
                 if sender[1] == self._config.port:
                     self._controller.hear(data)
+
+    def _hear_parent(self) -> None:
+        for kind, *values in self._parent.read():
+            if kind == "pose":
+                position, quaternion = values
+                self._controller.pose = (tuple(position), tuple(quaternion))
+                self._asked = None
+            else:
+                self._obey(*values)
 
     def _obey(self, number: int, name: str, *values: Any) -> None:
         if name != "report":
@@ -285,13 +304,14 @@ class _Loop:
 def main(arguments: list[str]) -> int:
     """Started by `MockEgm`."""
     settings, parent, _ = adopted(arguments)
-    clock = ScaledClock(settings["clock_factor"])
+    clock = ScaledClock(*settings["clock"])
     config = MockEgmConfig(**{name: _tuple(value) for name, value in settings["config"].items()})
     controller = Controller(config, clock, _tuple(settings["pose"]))
     raise_priority()
     gc.disable()
     with suppress(ConnectionError):
         _Loop(controller, config, clock, parent).run()
+    clock.allow(CONTROLLER, math.inf)
     return 0
 
 

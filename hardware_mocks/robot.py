@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import tempfile
 import threading
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,6 +19,7 @@ from gelflow.hardware_mocks.mjpeg import MjpegServer
 from gelflow.hardware_mocks.world import WorldConfig
 from gelflow.hardware_mocks.world_process import RemoteWorld
 from gelflow.hardware_mocks.wsg import MockWsg
+from gelflow.pace import Pace
 from gelflow.real.kinematics import Joints
 
 Rotation = Literal[0, 90, 180, 270]
@@ -41,10 +43,17 @@ class RobotConfig:
 
 
 class MockRobot:
-    """Starts all mocks; `with` or `start` and `stop`. Order faults from the parts: `gripper`, `arm`, `cameras`."""
+    """Starts all mocks; `with` or `start` and `stop`. Order faults from the parts: `gripper`, `arm`, `cameras`.
 
-    def __init__(self, clock: ScaledClock, config: RobotConfig | None = None) -> None:
+    Its `clock` runs at most `factor` times as fast as the wall clock: as fast as this computer can simulate.
+    """
+
+    def __init__(self, factor: float = 1.0, config: RobotConfig | None = None) -> None:
         self.config = config = config or RobotConfig()
+        self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-")
+        pace = f"{self._folder.name}/pace"
+        Pace.create(pace)
+        self.clock = clock = ScaledClock(factor, pace)
         self.world = RemoteWorld(clock, config.world)
         # CommTimeout is 0.4 s in wall time: this computer's jitter does not shrink when the clock is scaled.
         timeout = 0.4 * max(1.0, clock.factor)
@@ -84,6 +93,7 @@ class MockRobot:
     def stop(self) -> None:
         """Stop all. Raises what went wrong inside a mock."""
         self._stack.close()
+        self._folder.cleanup()
 
     def __enter__(self) -> Self:
         return self.start()

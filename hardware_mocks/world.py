@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.clock import Clock
+from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, rotate, yaw_quaternion
 from gelflow.hardware_mocks.grip import Grip
 from gelflow.observation import Grid, resampling
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.pace import WORLD
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.task import INSERTION, InsertionTask
 
@@ -29,8 +30,8 @@ _HALF_HEIGHT = 0.030  # of the part [m]
 _PART_WIDTH = 0.035  # between the pads [m]
 _HOLE = (0.01975, 0.02725)  # half its opening [m]
 _INTO_WALL = 0.3e-3  # an inserted part may press this far into a wall [m]
-_LONG = 4  # steps that one long step replaces where the simulation is behind
-_LONGEST_LAG = 0.2  # robot time that is simulated late before some is left out [s]
+_SHORTEST_WAIT = 2e-4  # while robot time stands still [s, wall]
+_LAG = 0.02  # the simulation may be this far behind robot time [s]; further, and robot time waits
 
 
 @dataclass(frozen=True)
@@ -90,10 +91,12 @@ class PartTruth:
 class World:
     """The simulated cell. All plant methods may be called from any thread."""
 
-    def __init__(self, clock: Clock, config: WorldConfig | None = None, *, task: InsertionTask = INSERTION) -> None:
+    def __init__(
+        self, clock: ScaledClock, config: WorldConfig | None = None, *, task: InsertionTask = INSERTION
+    ) -> None:
         self.config = config = config or WorldConfig()
         self._clock, self._task = clock, task
-        scene = self._scene(config.step)
+        scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
         self._sim = sim = Simulator(scene, threads=1)
         for name in ("arm_x", "arm_y", "arm_z"):
             self._servo(name, config.arm_stiffness, 1000.0)
@@ -111,8 +114,6 @@ class World:
         self._lock = threading.Lock()
         self._time = clock.now()
         self._still_since = self._time
-        self._long: Simulator | None = None
-        self._coarse = self._skipped = 0.0  # robot time simulated in long steps, and not at all [s]
         self._next_seed = config.seed
         self._hole_to_base = config.hole.inverse()
         self._to_scene = self._hole_to_base  # with the present part's misalignment
@@ -126,30 +127,28 @@ class World:
     # Running
 
     def run(self, ending: threading.Event, *, after_step: Callable[[], None] = lambda: None) -> None:
-        """Step on the clock until `ending` is set. Raises SimulationError when the simulation fails."""
+        """Step on the clock until `ending` is set. Raises SimulationError when the simulation fails.
+
+        A paced clock waits where this computer can't simulate as fast as it runs.
+        """
         step = self.config.step
         self._time = self._clock.now()
         while not ending.is_set():
+            self._clock.settle()
+            self._clock.allow(WORLD, self._time + step + _LAG)
             behind = self._clock.now() - self._time
             if behind < step:
-                self._clock.sleep(step - behind)
+                ending.wait(max(self._clock.wall(step - behind), _SHORTEST_WAIT))
                 continue
             with self._lock:
-                if behind > _LONGEST_LAG:
-                    # The devices' time goes on whatever this computer can simulate; `truth` tells how much is missing.
-                    self._skipped += behind - _LONG * step
-                    self._time += behind - _LONG * step
-                if behind < _LONG * step:
-                    self._step(self._sim, step)
-                else:
-                    self._long_step()
+                self._step()
             after_step()
 
     def advance(self, steps: int) -> None:
         """Take steps by hand, without a clock."""
         with self._lock:
             for _ in range(steps):
-                self._step(self._sim, self.config.step)
+                self._step()
 
     # ArmPlant
 
@@ -201,22 +200,18 @@ class World:
             self._next_seed = seed
 
     def truth(self) -> dict[str, Any]:
-        """What is true now, as plain data: the present part, all parts so far, and how the simulation does."""
+        """What is true now, as plain data: the present part, all parts so far, and how long robot time had to wait."""
         with self._lock:
             if self._current is not None:
                 self._look(self._current)
             return {
                 "part": None if self._current is None else asdict(self._current),
                 "parts": [asdict(part) for part in self.parts],
-                "coarse": self._coarse,
-                "skipped": self._skipped,
+                "waited": self._clock.lost,
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
     # Inside, with the lock held
-
-    def _scene(self, step: float) -> Scene:
-        return load_scene("insertion", preset=self.config.preset, friction="elastic", overrides={"step": step})
 
     def _servo(self, name: str, stiffness: float, force: float) -> None:
         for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
@@ -240,24 +235,13 @@ class World:
                 for first in (0, self._sim.model.nv):
                     self._sim.history[0, first + self._part_v : first + self._part_v + 6] = 0.0
 
-    def _step(self, sim: Simulator, seconds: float) -> None:
-        self._time += seconds
-        self._grip.drive(seconds)
-        sim.step(self._u)
-        sim.check()
-        if sim is not self._sim:
-            _copy_state(sim, self._sim)
+    def _step(self) -> None:
+        self._time += self.config.step
+        self._grip.drive(self.config.step)
+        self._sim.step(self._u)
+        self._sim.check()
         self._hold_part()
         self._hands_on()
-
-    def _long_step(self) -> None:
-        """One step instead of several, where this computer is too busy for each: less exact, and counted."""
-        if self._long is None:
-            self._long = Simulator(self._scene(_LONG * self.config.step), threads=1)
-        _copy_state(self._sim, self._long)
-        self._long.params[:] = self._sim.params
-        self._coarse += _LONG * self.config.step
-        self._step(self._long, _LONG * self.config.step)
 
     def _hands_on(self) -> None:
         """What the person beside the robot does."""
@@ -319,10 +303,3 @@ class World:
         part.slip = float(slip.position[0]), float(slip.position[1]), slip.yaw
         inside = bool((np.abs(corners[:, :2]) < np.array(_HOLE) + _INTO_WALL).all())
         part.inserted = part.phase == "gripped" and inside and part.height < self._task.success_height
-
-
-def _copy_state(source: Simulator, target: Simulator) -> None:
-    """State and contact memory of one simulator into another of the same scene."""
-    target.q[:], target.v[:] = source.q, source.v
-    target.anchors[:], target.anchored[:] = source.anchors, source.anchored
-    target.history[:] = 0  # it holds for the step of the source: BDF2 begins anew

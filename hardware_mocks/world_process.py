@@ -110,7 +110,7 @@ class RemoteWorld:
             theirs.close()
         assert self._process.stdin is not None
         with self._process.stdin as pipe:
-            pickle.dump((self.config, self._clock.factor), pipe)
+            pickle.dump((self.config, self._clock.settings), pipe)
         try:
             self._receive(_START_LIMIT)
         except SimulationError:
@@ -262,9 +262,9 @@ def main(arguments: list[str]) -> int:
     """`arguments`: file descriptors of the socket and of the shared memory; configuration and factor on stdin."""
     # Ctrl-C reaches the whole terminal group; what it means is for the parent to say.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    config, factor = pickle.load(sys.stdin.buffer)  # from our own parent
+    config, settings = pickle.load(sys.stdin.buffer)  # from our own parent
     link = socket.socket(fileno=int(arguments[0]))
-    world = World(ScaledClock(factor), config)
+    world = World(ScaledClock(*settings), config)
     service = _Service(world, link, _Shared(int(arguments[1]), config.grid))
     threading.Thread(target=service.answer, daemon=True).start()
     service.pass_on()

@@ -264,7 +264,7 @@ class EgmArm:
         descriptor = EgmRing.create(self._config.log_records)
         try:
             self._ring = EgmRing(descriptor, self._config.log_records)
-            settings = dataclasses.asdict(self._config) | {"clock_factor": self._clock.factor}
+            settings = dataclasses.asdict(self._config) | {"clock": self._clock.settings}
             self._child = Child.start("gelflow.real.egm_process", settings, descriptors=(udp.fileno(), descriptor))
         finally:
             udp.close()

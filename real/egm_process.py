@@ -158,7 +158,7 @@ class EgmLoop:
 def main(arguments: list[str]) -> int:
     """Started by `EgmArm`, with the UDP socket and the log."""
     settings, parent, (udp_number, ring_number) = adopted(arguments)
-    clock = ScaledClock(settings.pop("clock_factor"))
+    clock = ScaledClock(*settings.pop("clock"))
     config = EgmConfig(**settings)
     udp = socket.socket(fileno=udp_number)
     udp.setblocking(False)

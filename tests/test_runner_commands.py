@@ -45,7 +45,7 @@ def test_mock_and_dry_run(tmp_path: Path, checkpoint: Path, capsys: pytest.Captu
         request = urllib.request.Request(f"{truth}?seed=17", method="POST")
         with urllib.request.urlopen(request, timeout=10) as answer:
             assert json.load(answer) == {"next_seed": 17}
-        assert ask(truth)["skipped"] >= 0
+        assert ask(truth)["waited"] >= 0
     with pytest.raises(PeerError, match="does not tell the truth"):
         ask(truth)  # it ended with its user
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from gelflow.cli.main import main
 from gelflow.cli.mock import lab_for
-from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError, PeerTimeout, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot, RobotConfig
 from gelflow.hardware_mocks.world import WorldConfig
@@ -48,7 +47,7 @@ def free_port(kind: socket.SocketKind) -> int:
 @pytest.fixture
 def robot() -> Iterator[MockRobot]:
     config = RobotConfig(world=WorldConfig(seed=2), egm_port=free_port(socket.SOCK_DGRAM), rotations=(90, 180))
-    with MockRobot(ScaledClock(FACTOR), config) as running:
+    with MockRobot(FACTOR, config) as running:
         yield running
 
 
@@ -77,7 +76,7 @@ class Told:
 
 
 def plan_for(robot: MockRobot, folder: Path, policy: Any, **changes: Any) -> RunPlan:
-    lab = changes.pop("lab", None) or lab_for(robot, FACTOR)
+    lab = changes.pop("lab", None) or lab_for(robot)
     return RunPlan(lab=lab, policy=policy, task=INSERTION, session=folder / "session.mcap", **changes)
 
 
@@ -152,7 +151,7 @@ def test_it_inserts_a_part_and_records_what_it_did(robot: MockRobot, tmp_path: P
 def test_a_dry_run_sends_no_motion_byte(robot: MockRobot, tmp_path: Path) -> None:
     relay = Relay(robot.gripper.tcp_address)
     with relay:
-        lab = lab_for(robot, FACTOR)
+        lab = lab_for(robot)
         lab = replace(lab, gripper=replace(lab.gripper, address=f"tcp:127.0.0.1:{relay.port}"))
         found = dry_run(plan_for(robot, tmp_path, Told(robot), lab=lab))
     assert [item.good for item in found.items] == [True] * 5 and len(found.targets) == 4
@@ -281,7 +280,7 @@ def test_a_policy_that_says_nonsense_moves_nothing(robot: MockRobot, tmp_path: P
 
 
 def test_preflight_names_all_that_is_wrong_and_nothing_moves(robot: MockRobot, tmp_path: Path) -> None:
-    lab = lab_for(robot, FACTOR)
+    lab = lab_for(robot)
     lab = replace(
         lab,
         gripper=replace(lab.gripper, home_at_start=False),
@@ -296,7 +295,7 @@ def test_preflight_names_all_that_is_wrong_and_nothing_moves(robot: MockRobot, t
 
 
 def test_ctrl_c_stops_announces_and_closes_the_recording(robot: MockRobot, tmp_path: Path) -> None:
-    lab = lab_for(robot, FACTOR)
+    lab = lab_for(robot)
     save_lab(lab, tmp_path / "lab.toml", title="test")
     script = tmp_path / "run.py"
     script.write_text(_RUN_UNTIL_INTERRUPTED)
@@ -358,7 +357,7 @@ def test_what_does_not_answer_is_named_in_one_line(
     robot: MockRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
 ) -> None:
     dead = free_port(socket.SOCK_STREAM)
-    lab = lab_for(robot, FACTOR)
+    lab = lab_for(robot)
     named = str(dead)
     if what == "gripper":
         lab = closed_lab(lab, gripper=f"tcp:127.0.0.1:{dead}")

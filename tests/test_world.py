@@ -1,8 +1,10 @@
 """The simulated world behind the mocks: the hand, the grip, what the gels show, the truth."""
 
 import math
+import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from gelflow.errors import SimulationError, UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.world import World, WorldConfig
 from gelflow.hardware_mocks.world_process import RemoteWorld
+from gelflow.pace import Pace
 from gelflow.task import INSERTION
 
 Place = tuple[float, float, float]
@@ -126,18 +129,24 @@ def test_a_chosen_seed_is_the_next_parts() -> None:
     assert cell.truth()["part"]["seed"] == 41
 
 
-def test_a_world_that_falls_behind_takes_long_steps_and_says_so() -> None:
-    cell = grasped()
-    steps = cell.truth()["coarse"]
-    assert steps == 0
-    place = in_line(cell.truth())
-    for _ in range(50):
-        cell._long_step()
-    truth = cell.truth()
-    assert truth["coarse"] == pytest.approx(50 * 4 * cell.config.step)
-    assert truth["part"]["phase"] == "gripped"
-    go(cell, place, 0.0255, steps=400)
-    assert abs(truth["part"]["slip"][0]) < 1e-4
+def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
+    Pace.create(path := str(tmp_path / "pace"))
+    clock = ScaledClock(10.0, path)
+    cell = World(clock, WorldConfig(seed=3))
+    begun, steps = clock.now(), 0
+    ending = threading.Event()
+
+    def dawdle() -> None:
+        nonlocal steps
+        steps += 1
+        time.sleep(2e-3)  # five times too slow
+        if steps == 100:
+            ending.set()
+
+    cell.run(ending, after_step=dawdle)
+    gone = clock.now() - begun
+    assert 0.4 <= gone <= 0.44  # and not the 2 s of the wall clock
+    assert cell.truth()["waited"] == clock.lost > 0.5
 
 
 def test_a_step_that_does_not_divide_the_arms_cycle_is_refused() -> None:

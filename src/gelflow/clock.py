@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gelflow.errors import UsageError
+from gelflow.pace import Pace
+
+_SHORTEST_SLEEP = 2e-4  # while robot time stands still [s, wall]
 
 
 class Clock(Protocol):
@@ -29,24 +32,56 @@ class ScaledClock:
     """Robot time runs `factor` times as fast as the wall clock (1 is real time, the only one for a robot).
 
     Two processes on one machine that are given the same factor agree on the time: both read the system's
-    monotonic clock.
+    monotonic clock. With the `pace` file of a mock robot they also agree on when it stands still, because this computer
+    can't simulate as fast as that: `factor` is then the most.
     """
 
     factor: float = field(default=1.0)
+    pace: str = ""
+    _pace: Pace | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.factor <= 1000:
             raise UsageError(f"clock factor {self.factor} is outside 0.01 to 1000 (1 is real time)")
+        if self.pace:
+            object.__setattr__(self, "_pace", Pace(self.pace))
 
     def now(self) -> float:
-        return time.monotonic() * self.factor
+        return time.monotonic() * self.factor if self._pace is None else self._pace.now(self.factor)
 
     def sleep(self, seconds: float) -> None:
-        if seconds > 0:
-            time.sleep(seconds / self.factor)
+        if self._pace is None:
+            if seconds > 0:
+                time.sleep(seconds / self.factor)
+            return
+        end = self.now() + seconds
+        while (left := end - self.now()) > 0:
+            time.sleep(max(left / self.factor, _SHORTEST_SLEEP))
 
     def wall(self, seconds: float) -> float:
         return seconds / self.factor
+
+    @property
+    def settings(self) -> tuple[float, str]:
+        """What another process makes the same clock of."""
+        return self.factor, self.pace
+
+    # For who plays the robot
+
+    @property
+    def lost(self) -> float:
+        """How far robot time is behind `factor` times the wall clock's since the mock robot was made [s]."""
+        return 0.0 if self._pace is None else self._pace.lost
+
+    def allow(self, slot: int, until: float) -> None:
+        """Robot time may run to `until` [s], as far as the process of `slot` is concerned: see `gelflow.pace`."""
+        if self._pace is not None:
+            self._pace.allow(slot, until)
+
+    def settle(self) -> None:
+        """By the world's process alone, in every step: what was held back is lost, and not made up for."""
+        if self._pace is not None:
+            self._pace.settle(self.factor)
 
 
 def raise_priority() -> bool:

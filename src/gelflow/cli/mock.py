@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from gelflow.cli.presets import PRESET_HELP
-from gelflow.clock import ScaledClock
 
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot, Rotation
@@ -53,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
     # The default of 5 ms lets one busy thread keep the others' 4 ms cycles waiting.
     sys.setswitchinterval(5e-4)
-    with MockRobot(ScaledClock(args.factor), config) as robot:
-        lab = lab_for(robot, args.factor)
+    with MockRobot(args.factor, config) as robot:
+        lab = lab_for(robot)
         if args.lab_out is not None:
             save_lab(lab, args.lab_out, title="Written by gelflow mock: fits the mock robot that is running.")
         _tell(robot, args.lab_out)
@@ -70,11 +69,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def lab_for(robot: "MockRobot", factor: float) -> "Lab":
+def lab_for(robot: "MockRobot") -> "Lab":
     """The lab file's content for a running mock robot."""
     from gelflow.real import lab
 
     world, look = robot.config.world, robot.config.look
+    factor, pace = robot.clock.settings
     # One computer plays robot and runner at once, and its jitter does not shrink when the clock is scaled: in wall time
     # the limits are twelve times those for a robot.
     scale = 12 * max(1.0, factor)
@@ -120,6 +120,7 @@ def lab_for(robot: "MockRobot", factor: float) -> "Lab":
             attempt_time=60.0 * scale,
         ),
         clock_factor=factor,
+        clock_pace=pace,
     )  # fmt: skip
 
 
