@@ -1,6 +1,7 @@
 """A tactile camera's HTTP server: an MJPEG stream like that of a Raspberry Pi's streamer, with faults on demand."""
 
 import contextlib
+import math
 import socket
 import threading
 from collections.abc import Callable
@@ -9,11 +10,12 @@ from types import TracebackType
 from typing import Literal, Self
 from urllib.parse import parse_qs, urlsplit
 
-from gelflow.clock import Clock
+from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
 
 BOUNDARY = "boundarydonotcross"
 Corruption = Literal["truncated", "garbage", "length"]
+_LAG = 0.02  # a frame may be this late before robot time waits [s]
 CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
 
 
@@ -22,17 +24,25 @@ class MjpegServer:
 
     Frames are made `rate` times a second of robot time, in a thread of its own, once for all clients together, and
     only while somebody looks. A client that cannot keep up gets newer frames, not later ones. `port` 0 takes a free
-    one; `url` tells it.
+    one; `url` tells it. With a `slot` of a paced clock (`gelflow.pace`) robot time waits for frames that are late.
     """
 
     def __init__(
-        self, source: Callable[[], bytes], clock: Clock, *, rate: float = 30.0, host: str = "127.0.0.1", port: int = 0
+        self,
+        source: Callable[[], bytes],
+        clock: ScaledClock,
+        *,
+        rate: float = 30.0,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        slot: int | None = None,
     ) -> None:
         if not 0 < rate <= 1000:
             raise UsageError(f"rate must be above 0 and at most 1000 frames/s, got {rate}")
         self._source = source
         self._clock = clock
         self._period = 1 / rate
+        self._slot = slot
         self._where = (host, port)
         self._server: _Server | None = None
         self._threads: list[threading.Thread] = []
@@ -131,14 +141,18 @@ class MjpegServer:
         due = self._clock.now()
         while True:
             with self._changed:
+                if self._watchers == 0 or self._stalled:
+                    self._allow(math.inf)
                 self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._stalled))
                 if self._closing:
+                    self._allow(math.inf)
                     return
             try:
                 frame = self._source()
             except Exception as error:  # noqa: BLE001 - `close` raises it; until then clients see the stream end
                 with self._changed:
                     self._failure = error
+                    self._allow(math.inf)
                     self._changed.notify_all()
                 return
             with self._changed:
@@ -146,7 +160,12 @@ class MjpegServer:
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
+            self._allow(due + _LAG)
             self._clock.sleep(due - self._clock.now())
+
+    def _allow(self, until: float) -> None:
+        if self._slot is not None:
+            self._clock.allow(self._slot, until)
 
     def _watch(self, change: int) -> int:
         """Count a client in or out; returns the current epoch."""

@@ -19,7 +19,7 @@ from gelflow.hardware_mocks.mjpeg import MjpegServer
 from gelflow.hardware_mocks.world import WorldConfig
 from gelflow.hardware_mocks.world_process import RemoteWorld
 from gelflow.hardware_mocks.wsg import MockWsg
-from gelflow.pace import Pace
+from gelflow.pace import LEFT_CAMERA, RIGHT_CAMERA, Pace
 from gelflow.real.kinematics import Joints
 
 Rotation = Literal[0, 90, 180, 270]
@@ -62,9 +62,13 @@ class MockRobot:
         self.gripper = MockWsg(self.world, clock=clock, tcp_port=config.tcp_port, host=config.host)
         self.cameras = tuple(
             MjpegServer(
-                _Gel(self.world, finger, _look(config, finger)), clock, rate=config.camera_rate, host=config.host
+                _Gel(self.world, finger, _look(config, finger)),
+                clock,
+                rate=config.camera_rate,
+                host=config.host,
+                slot=slot,
             )
-            for finger in (0, 1)
+            for finger, slot in enumerate((LEFT_CAMERA, RIGHT_CAMERA))
         )
         self._truth = _TruthServer((config.host, config.truth_port), self.world)
         self._stack = contextlib.ExitStack()

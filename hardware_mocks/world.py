@@ -31,6 +31,7 @@ _PART_WIDTH = 0.035  # between the pads [m]
 _HOLE = (0.01975, 0.02725)  # half its opening [m]
 _INTO_WALL = 0.3e-3  # an inserted part may press this far into a wall [m]
 _SHORTEST_WAIT = 2e-4  # while robot time stands still [s, wall]
+_STILL = (2e-5, math.radians(0.02))  # a tool that stays within this of where it was is still [m, rad]
 _LAG = 0.02  # the simulation may be this far behind robot time [s]; further, and robot time waits
 
 
@@ -120,7 +121,7 @@ class World:
         self._hand: Array | None = _PARKED
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
-        self._tool = self._start = Pose(*config.start_tool())
+        self._tool = self._rest = self._start = Pose(*config.start_tool())
         self._place_arm()
         self._hold_part()
 
@@ -163,8 +164,8 @@ class World:
         if not (np.isfinite(pose.position).all() and np.isfinite(pose.quaternion).all()):
             raise UsageError(f"the arm can not go to {pose}")
         with self._lock:
-            if float(np.abs(pose.position - self._tool.position).max()) > 1e-5:
-                self._still_since = self._time
+            if not pose.near(self._rest, *_STILL):
+                self._rest, self._still_since = pose, self._time
             self._tool = pose
             self._u[self._arm_u] = self._in_scene()
 

@@ -11,6 +11,7 @@ from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import CameraImage
 
 OnImage = Callable[[CameraImage], None]
+_SHORTEST_WAIT = 1e-3  # while the robot time of a mock stands still [s, wall]
 
 
 class StreamCamera(ABC):
@@ -89,7 +90,7 @@ class StreamCamera(ABC):
         with self._changed:
             self._raise_unopened()
             if self._newest is None:
-                self._changed.wait_for(lambda: self._newest or self._failure, self._clock.wall(self.timeout))
+                self._wait_for(lambda: self._newest is not None, self.timeout)
             self._raise_failure()
             if self._newest is None or self._clock.now() - self._newest.stamp > self.timeout:
                 raise self._silent(self.timeout)
@@ -102,14 +103,17 @@ class StreamCamera(ABC):
         """
         with self._changed:
             self._raise_unopened()
-            self._changed.wait_for(
-                lambda: self._failure or (self._newest is not None and self._newest.sequence > after),
-                self._clock.wall(timeout),
-            )
+            self._wait_for(lambda: self._newest is not None and self._newest.sequence > after, timeout)
             if self._newest is not None and self._newest.sequence > after:
                 return self._newest
             self._raise_failure()
             raise self._silent(timeout)
+
+    def _wait_for(self, arrived: Callable[[], bool], timeout: float) -> None:
+        """Until `arrived` or a failure, at most `timeout` [s, robot time]; the lock is held."""
+        end = self._clock.now() + timeout
+        while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
+            self._changed.wait(max(self._clock.wall(left), _SHORTEST_WAIT))
 
     # What a kind of camera brings
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import PeerRefused, PeerTimeout, SafetyError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.observation import FlowMap
+from gelflow.pace import RUNNER
 from gelflow.protocols import Policy
 from gelflow.real.cell import Cell
 from gelflow.real.runner_motion import Mover, PartLost
@@ -24,6 +25,8 @@ from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
 Place = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
+_PROMPT = 0.02  # in which a computer that has nothing else to do finds out from two frames that it must stop [s]
+_REST = 0.1  # until the arm and the cameras' newest frames are at rest after a hold [s]
 _AT_DEPTH = 0.02e-3  # this near its end a descent is over [m]
 
 
@@ -211,7 +214,11 @@ class InsertionRunner:
         arrived = math.inf
         while True:
             self._mover.wait(0.0)
-            reading = touch.next()
+            images = touch.images()
+            with self._clock.urgent(RUNNER, _PROMPT):
+                reading = touch.read(images)
+                if reading is not None and reading.shear > lab.descent.stop_shear_mm:
+                    self._mover.hold()
             now = self._clock.now()
             if now - begun > lab.limits.attempt_time:
                 self._mover.hold()
@@ -220,17 +227,25 @@ class InsertionRunner:
                 depth = start - self._mover.height_at(reading.frame.stamp)
                 touch.keep(Reading(reading.frame, reading.images, depth, reading.shear))
                 if reading.shear > lab.descent.stop_shear_mm:
-                    self._mover.hold()
                     self._recorder.event("stopped by touch", {"shear_mm": reading.shear, "depth": depth})
+                    self._look_at_rest(touch, start)
                     return True
-                # Only a frame that was taken at the end is the end's.
-                if reading.frame.stamp > arrived:
+                # Only frames that were taken at the end are the end's.
+                if min(image.stamp for image in images) > arrived:
                     return False
             if start - self._height() > lab.descent.max_depth:
                 self._mover.hold()
                 raise SafetyError(f"the gripper went deeper than max_depth ({1e3 * lab.descent.max_depth:g} mm)")
             if arrived == math.inf and self._mover.arrived(within=_AT_DEPTH):
                 arrived = now
+
+    def _look_at_rest(self, touch: Touch, start: float) -> None:
+        """Once more where touch stopped a descent: cameras have no common beat, and pads in motion don't compare."""
+        self._mover.wait(_REST)
+        reading = touch.read(touch.images(self._clock.now()))
+        if reading is not None:
+            depth = start - self._mover.height_at(reading.frame.stamp)
+            touch.keep(Reading(reading.frame, reading.images, depth, reading.shear))
 
     def _lower(self, place: Place, touch: Touch) -> bool:
         """Nothing was felt where the rim would be: go on down. False when something is met after all."""

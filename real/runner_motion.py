@@ -146,10 +146,12 @@ class Mover:
 
     def height_at(self, stamp: float) -> float:
         """Measured height of the gripper frame in the base at a robot time [m]."""
+        now = self._arm.state()
         with self._lock:
             history = list(self._heights)
-        if not history:
-            raise PeerTimeout("no pose was measured yet")
+        # The thread fetches measured poses now and then; what came since is between the last of them and the newest.
+        if not history or history[-1][0] < now.stamp:
+            history.append((now.stamp, float(self._lab.gripper_pose(now.position, now.quaternion).position[2])))
         times, heights = zip(*history, strict=True)
         return float(np.interp(stamp, times, heights))
 

@@ -1,5 +1,6 @@
 """What the runner feels: frames of both cameras, tracked from an attempt's reference on, each with its depth."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -51,7 +52,7 @@ class Touch:
 
         Raises Unreadable when they show no markers, PeerTimeout when no frames come.
         """
-        images = self._images(since)
+        images = self.images(since)
         self._last = [image.sequence for image in images]
         try:
             trackeds = self._track(images)
@@ -68,8 +69,24 @@ class Touch:
 
         Raises PeerTimeout when no new frames come.
         """
+        return self.read(self.images())
+
+    def images(self, since: float = -math.inf) -> tuple[CameraImage, ...]:
+        """The newest pair of frames that was not read yet, both from after the robot time `since` [s].
+
+        Raises PeerTimeout when none comes.
+        """
+        images = []
+        for camera, last in zip(self._cameras, self._last, strict=True):
+            image = camera.next(last, self._stale)
+            while image.stamp < since:
+                image = camera.next(image.sequence, self._stale)
+            images.append(image)
+        return tuple(images)
+
+    def read(self, images: tuple[CameraImage, ...]) -> Reading | None:
+        """What a pair of frames shows, with depth 0; None where it is unreadable."""
         assert self.reference is not None, "start comes first"
-        images = tuple(camera.next(last, self._stale) for camera, last in zip(self._cameras, self._last, strict=True))
         self._last = [image.sequence for image in images]
         try:
             frame = self._frame(self._track(images), images)
@@ -95,15 +112,6 @@ class Touch:
         """The flow map of chosen readings against the reference."""
         assert self.reference is not None
         return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)
-
-    def _images(self, since: float) -> tuple[CameraImage, ...]:
-        images = []
-        for camera in self._cameras:
-            image = camera.latest()
-            while image.stamp < since:
-                image = camera.next(image.sequence, self._stale)
-            images.append(image)
-        return tuple(images)
 
     def _track(self, images: Sequence[CameraImage]) -> list[Tracked]:
         trackeds = []

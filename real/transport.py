@@ -16,7 +16,7 @@ from gelflow.clock import Clock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
 
 # A peer on the same machine with a fast clock still needs the scheduler's time: no wait is shorter than this.
-SHORTEST_WALL_TIMEOUT = 0.1  # [s]
+SHORTEST_WALL_TIMEOUT = 0.5  # [s]
 _READ_SIZE = 4096  # bytes
 
 

@@ -1,7 +1,10 @@
 """The one source of time. Everything that waits or stamps takes a clock, so that tests need not be slow."""
 
+import contextlib
+import math
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -74,9 +77,18 @@ class ScaledClock:
         return 0.0 if self._pace is None else self._pace.lost
 
     def allow(self, slot: int, until: float) -> None:
-        """Robot time may run to `until` [s], as far as the process of `slot` is concerned: see `gelflow.pace`."""
+        """Robot time may run to `until` [s], as far as who has `slot` is concerned: see `gelflow.pace`."""
         if self._pace is not None:
-            self._pace.allow(slot, until)
+            self._pace.allow(slot, max(until, self.now()))  # it never runs back
+
+    @contextlib.contextmanager
+    def urgent(self, slot: int, within: float) -> Iterator[None]:
+        """What a robot's computer has done `within` robot time [s]: robot time waits where this one is slower."""
+        self.allow(slot, self.now() + within)
+        try:
+            yield
+        finally:
+            self.allow(slot, math.inf)
 
     def settle(self) -> None:
         """By the world's process alone, in every step: what was held back is lost, and not made up for."""

@@ -1,7 +1,7 @@
 """What lets a scaled clock run no faster than a simulated robot can follow: some numbers in a shared file.
 
-A mock robot is several processes. Each that must keep up writes, again and again, how far robot time may run before it
-has done its next step; robot time stops there until it has. One of them, the pacer, writes down how much was lost so.
+A mock robot is several processes. Who must keep up writes, again and again, how far robot time may run before the next
+step is done; robot time stops there until it is. One of them, the pacer, writes down how much was lost so.
 """
 
 import math
@@ -11,8 +11,8 @@ from array import array
 
 from gelflow.errors import UsageError
 
-_SLOTS = 2  # who must keep up: the world, and the arm's controller
-WORLD, CONTROLLER = range(_SLOTS)
+_SLOTS = 5  # who must keep up; the last one is the robot's user, while a frame may mean that it must stop
+WORLD, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, RUNNER = range(_SLOTS)
 _WORDS = 1 + 2 * _SLOTS  # time lost [s], then for each slot: wall time of its last word [s], its limit [s, robot time]
 _PATIENCE = 5.0  # who says nothing for longer is gone, and holds nobody back [s, wall]
 
