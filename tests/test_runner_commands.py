@@ -56,7 +56,7 @@ def test_demo_inserts_draws_records_and_its_session_replays(
     monkeypatch.setenv("COLUMNS", "100")
     out = tmp_path / "demo"
     options = ["--insertions", "1", "--factor", str(FACTOR), "--checkpoint", str(checkpoint), "--no-real-time"]
-    assert main(["demo", "--out", str(out), *options]) == 0
+    assert main(["demo", "--out", str(out), "--preset", "fast", *options]) == 0
     told = capsys.readouterr().out
     assert "misalignment" in told and f"gelflow replay {out / 'session.mcap'}" in told.replace("\n", "")
     assert "in truth" in told

@@ -127,6 +127,8 @@ def test_it_inserts_a_part_and_records_what_it_did(robot: MockRobot, tmp_path: P
     # The rim was met, which stopped the descent, and every map that the policy saw is normalized.
     first = made[0]
     assert first.contact and first.stopped and 0.3e-3 < first.depth < 1.15e-3
+    # The depth of the last frames is the depth where they were taken, not where the arm was a moment before.
+    assert made[-1].depth == pytest.approx(INSERTION.descent, abs=0.05e-3)
     for seen in policy.seen:
         assert seen.image.shape == INSERTION.observation_shape and seen.unit == "mm"
         assert np.hypot(seen.image[0::2], seen.image[1::2]).max() == pytest.approx(1, abs=1e-5)

@@ -129,6 +129,21 @@ def test_a_chosen_seed_is_the_next_parts() -> None:
     assert cell.truth()["part"]["seed"] == 41
 
 
+def test_the_hand_waits_until_the_gripper_is_at_rest() -> None:
+    cell = world(3)
+    start, quaternion = cell.arm_pose()
+    for left in np.arange(400, 0, -2) * 1e-6:  # half a millimetre a second: slow, but not at rest
+        cell.command_arm(start + np.array([left, 0.0, 0.0]), quaternion)
+        cell.advance(1)
+    assert cell.truth()["part"] is None
+    cell.advance(100)
+    go(cell, (0.0, 0.0, 0.0), cell.config.load_height, steps=1)
+    cell.command_gripper(width=0.032, speed=0.1, force=12.0)
+    cell.advance(120)
+    assert cell.truth()["part"]["phase"] == "gripped"
+    assert cell.truth()["part"]["slip"] == pytest.approx((0.0, 0.0, 0.0), abs=5e-5)
+
+
 def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
     Pace.create(path := str(tmp_path / "pace"))
     clock = ScaledClock(10.0, path)
