@@ -75,6 +75,11 @@ class Told:
         return correction
 
 
+def mean_displacement(robot: MockRobot) -> NDArray[np.float64]:
+    """Of each pad's markers along the finger, now [mm]."""
+    return np.array([robot.world.marker_displacement(finger)[:, 0].mean() for finger in (0, 1)])
+
+
 def plan_for(robot: MockRobot, folder: Path, policy: Any, **changes: Any) -> RunPlan:
     lab = changes.pop("lab", None) or lab_for(robot)
     return RunPlan(lab=lab, policy=policy, task=INSERTION, session=folder / "session.mcap", **changes)
@@ -116,7 +121,8 @@ def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def test_it_inserts_a_part_and_records_what_it_did(robot: MockRobot, tmp_path: Path) -> None:
-    policy = Told(robot)
+    felt: list[NDArray[np.float64]] = []  # mean shear of each pad along the finger, at each decision [mm]
+    policy = Told(robot, answer=lambda: felt.append(mean_displacement(robot)))
     made: list[Attempt] = []
     plan = plan_for(robot, tmp_path, policy, on_attempt=lambda number, attempt: made.append(attempt))
     results: list[Insertion] = run_insertions(plan)
@@ -134,6 +140,10 @@ def test_it_inserts_a_part_and_records_what_it_did(robot: MockRobot, tmp_path: P
         assert np.hypot(seen.image[0::2], seen.image[1::2]).max() == pytest.approx(1, abs=1e-5)
         # Turned cameras and all: the rim pushes both pads towards the fingers' base.
         assert seen.image[0].mean() < -0.2 and seen.image[2].mean() < -0.2
+
+    # Both pads were seen at the same moment, at rest: all differ from the truth by what the grip alone does to them.
+    shown = [seen.divisor * seen.image[[0, 2]].mean(axis=(1, 2)) for seen in policy.seen]
+    assert np.ptp(np.array(shown) - np.array(felt)) < 0.005
 
     with SessionReader(plan.session) as session:
         counts = session.counts()
