@@ -1,6 +1,8 @@
 """N environments side by side: what all cores bring, and what company costs."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +17,7 @@ QUICK_SIZES = SIZES[:4]
 LARGEST_ROLLOUT = 64  # a rollout keeps every state: larger ones would measure memory
 SCENE = "insertion"
 STEPS = 30
+SETTLED = 3e-3  # threads of a simulator that was timed before have gone to sleep by then [s]
 
 
 def differ(sim: Simulator) -> None:
@@ -23,6 +26,19 @@ def differ(sim: Simulator) -> None:
     for name in sim.param_index:
         if name.endswith(".kn"):
             sim.param(name)[1:] *= rng.uniform(0.95, 1.05, sim.num_envs - 1)
+
+
+def in_a_loop(kind: Callable[[Simulator], Work], sim: Simulator) -> Work:
+    """As in a loop of calls: nobody else's threads are about, and the simulator's own have just done the same."""
+    work = kind(sim)
+
+    def prepare() -> None:
+        time.sleep(SETTLED)
+        work.prepare()
+        work.run()
+        work.prepare()
+
+    return replace(work, prepare=prepare)
 
 
 def measure_batch(effort: Effort, *, sizes: Sequence[int] | None = None, steps: int = STEPS) -> Report:
@@ -38,16 +54,17 @@ def measure_batch(effort: Effort, *, sizes: Sequence[int] | None = None, steps: 
 
     # By what is called, environments, and threads: all (None), one, or one of an environment alone (0).
     works: dict[tuple[str, int, int | None], Work] = {
-        ("step", 1, 0): run.work(batch(1, 1)),
-        ("rollout", 1, 0): run.rollout_work(batch(1, 1)),
+        ("step", 1, 0): in_a_loop(run.work, batch(1, 1)),
+        ("rollout", 1, 0): in_a_loop(run.rollout_work, batch(1, 1)),
     }
     checks = {}
     for size in sizes:
         every = batch(size, None)
         checks[size] = check(run, every, scene.describe_to)
-        works["step", size, 1], works["step", size, None] = run.work(batch(size, 1)), run.work(every)
+        works["step", size, 1] = in_a_loop(run.work, batch(size, 1))
+        works["step", size, None] = in_a_loop(run.work, every)
         if size <= LARGEST_ROLLOUT:
-            works["rollout", size, None] = run.rollout_work(batch(size, None))
+            works["rollout", size, None] = in_a_loop(run.rollout_work, batch(size, None))
     effort.watch.begin("batch", len(works) * (effort.repeats + 1))
     taken = dict(zip(works, interleaved(list(works.values()), effort), strict=True))
     rows, results, outside = [], [], []

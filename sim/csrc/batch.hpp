@@ -22,14 +22,15 @@ class ThreadPool {
   ~ThreadPool();
   ThreadPool(const ThreadPool&) = delete;
   ThreadPool& operator=(const ThreadPool&) = delete;
-  int size() const { return static_cast<int>(threads_.size()) + 1; }
+  int size() const;
   // work(item, thread) for every item below `items`; returns when all are done.
   void run(int items, const std::function<void(int, int)>& work);
 
  private:
-  void loop(int thread);
+  struct Helper;
+  void loop(Helper& helper, int thread);
   void take(int thread);
-  std::vector<std::thread> threads_;
+  std::vector<std::unique_ptr<Helper>> helpers_;
   std::mutex mutex_;
   std::condition_variable start_, done_;
   const std::function<void(int, int)>* work_ = nullptr;

@@ -172,7 +172,7 @@ def demonstrate(
     slack = ""
     if waited > _TELL_WAIT * wall:
         real = factor * (1 - waited / wall)
-        slack = f"this computer was busy: it simulated {real:.1f} times as fast as the clock"
+        slack = f"this computer managed {real:.1f} times as fast as the clock"
     return Demonstration(shown, wall, slack, trouble)
 
 
