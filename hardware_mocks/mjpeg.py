@@ -15,8 +15,8 @@ from gelflow.errors import PeerError, UsageError
 
 BOUNDARY = "boundarydonotcross"
 Corruption = Literal["truncated", "garbage", "length"]
-_LAG = 0.02  # a frame may be this late before robot time waits [s]
 CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
+_LAG = 0.02  # a frame may be this late before robot time waits [s]
 
 
 class MjpegServer:
