@@ -15,12 +15,10 @@ from typing import Any
 from gelflow.child import Messages, adopted
 from gelflow.clock import Clock, ScaledClock, raise_priority
 from gelflow.errors import PeerError, SafetyError, UsageError
-from gelflow.pace import CONTROLLER
+from gelflow.pace import CONTROLLER, LAG, SHORTEST_WAIT
 from gelflow.real.egm_codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
 from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, compose, forward, inverse, invert
 
-_LAG = 0.02  # this process or the plant may be this far behind robot time [s]; further, and robot time waits
-_SHORTEST_WAIT = 2e-4  # for the plant, while robot time stands still [s, wall]
 _IDENTITY: Frame = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
@@ -269,13 +267,13 @@ class _Loop:
     def _wait_until(self, due: float) -> None:
         """For the next cycle; robot time does not run far ahead of it, nor of a plant that owes an answer."""
         while True:
-            self._clock.allow(CONTROLLER, _LAG + (due if self._asked is None else self._asked))
+            self._clock.allow(CONTROLLER, LAG + (due if self._asked is None else self._asked))
             left = due - self._clock.now()
             if left <= 0:
                 return
             if self._asked is None:
                 self._clock.sleep(left)
-            elif select.select((self._parent,), (), (), max(self._clock.wall(left), _SHORTEST_WAIT))[0]:
+            elif select.select((self._parent,), (), (), max(self._clock.wall(left), SHORTEST_WAIT))[0]:
                 self._hear_parent()
 
     def _listen(self) -> None:

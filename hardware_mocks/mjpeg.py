@@ -12,11 +12,11 @@ from urllib.parse import parse_qs, urlsplit
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
+from gelflow.pace import LAG
 
 BOUNDARY = "boundarydonotcross"
 Corruption = Literal["truncated", "garbage", "length"]
 CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
-_LAG = 0.02  # a frame may be this late before robot time waits [s]
 
 
 class MjpegServer:
@@ -141,11 +141,10 @@ class MjpegServer:
         due = self._clock.now()
         while True:
             with self._changed:
-                if self._watchers == 0 or self._stalled:
+                if self._closing or self._watchers == 0 or self._stalled:
                     self._allow(math.inf)
                 self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._stalled))
                 if self._closing:
-                    self._allow(math.inf)
                     return
             try:
                 frame = self._source()
@@ -160,7 +159,7 @@ class MjpegServer:
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
-            self._allow(due + _LAG)
+            self._allow(due + LAG)
             self._clock.sleep(due - self._clock.now())
 
     def _allow(self, until: float) -> None:

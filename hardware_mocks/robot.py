@@ -82,6 +82,7 @@ class MockRobot:
     def start(self) -> Self:
         """Start the world, then the devices. Raises UsageError when a port is taken."""
         with contextlib.ExitStack() as stack:
+            stack.callback(self._folder.cleanup)
             self.world.start()
             stack.callback(self.world.stop)
             self.arm.start()
@@ -97,7 +98,6 @@ class MockRobot:
     def stop(self) -> None:
         """Stop all. Raises what went wrong inside a mock."""
         self._stack.close()
-        self._folder.cleanup()
 
     def __enter__(self) -> Self:
         return self.start()

@@ -19,7 +19,7 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, rotate, yaw_quaternion
 from gelflow.hardware_mocks.grip import Grip
 from gelflow.observation import Grid, resampling
-from gelflow.pace import WORLD
+from gelflow.pace import LAG, SHORTEST_WAIT, WORLD
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.task import INSERTION, InsertionTask
@@ -30,9 +30,7 @@ _HALF_HEIGHT = 0.030  # of the part [m]
 _PART_WIDTH = 0.035  # between the pads [m]
 _HOLE = (0.01975, 0.02725)  # half its opening [m]
 _INTO_WALL = 0.3e-3  # an inserted part may press this far into a wall [m]
-_SHORTEST_WAIT = 2e-4  # while robot time stands still [s, wall]
 _STILL = (2e-5, math.radians(0.02))  # a tool that stays within this of where it was is still [m, rad]
-_LAG = 0.02  # the simulation may be this far behind robot time [s]; further, and robot time waits
 
 
 @dataclass(frozen=True)
@@ -136,10 +134,10 @@ class World:
         self._time = self._clock.now()
         while not ending.is_set():
             self._clock.settle()
-            self._clock.allow(WORLD, self._time + step + _LAG)
+            self._clock.allow(WORLD, self._time + step + LAG)
             behind = self._clock.now() - self._time
             if behind < step:
-                ending.wait(max(self._clock.wall(step - behind), _SHORTEST_WAIT))
+                ending.wait(max(self._clock.wall(step - behind), SHORTEST_WAIT))
                 continue
             with self._lock:
                 self._step()

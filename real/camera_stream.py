@@ -8,10 +8,10 @@ from typing import Self
 
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
+from gelflow.pace import SHORTEST_WAIT
 from gelflow.protocols import CameraImage
 
 OnImage = Callable[[CameraImage], None]
-_SHORTEST_WAIT = 1e-3  # while the robot time of a mock stands still [s, wall]
 
 
 class StreamCamera(ABC):
@@ -113,7 +113,7 @@ class StreamCamera(ABC):
         """Until `arrived` or a failure, at most `timeout` [s, robot time]; the lock is held."""
         end = self._clock.now() + timeout
         while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
-            self._changed.wait(max(self._clock.wall(left), _SHORTEST_WAIT))
+            self._changed.wait(max(self._clock.wall(left), SHORTEST_WAIT))
 
     # What a kind of camera brings
 

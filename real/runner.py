@@ -6,7 +6,7 @@ and its watchdog are in `runner_motion`, frames and tracking in `runner_touch`, 
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -25,7 +25,6 @@ from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
 Place = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
-_PROMPT = 0.02  # in which a computer that has nothing else to do finds out from two frames that it must stop [s]
 _REST = 0.1  # until the arm and the cameras' newest frames are at rest after a hold [s]
 _AT_DEPTH = 0.02e-3  # this near its end a descent is over [m]
 
@@ -215,7 +214,7 @@ class InsertionRunner:
         while True:
             self._mover.wait(0.0)
             images = touch.images()
-            with self._clock.urgent(RUNNER, _PROMPT):
+            with self._clock.urgent(RUNNER):
                 reading = touch.read(images)
                 if reading is not None and reading.shear > lab.descent.stop_shear_mm:
                     self._mover.hold()
@@ -224,8 +223,7 @@ class InsertionRunner:
                 self._mover.hold()
                 raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; is the arm following?")
             if reading is not None:
-                depth = start - self._mover.height_at(reading.frame.stamp)
-                touch.keep(Reading(reading.frame, reading.images, depth, reading.shear))
+                depth = self._keep(touch, reading, start)
                 if reading.shear > lab.descent.stop_shear_mm:
                     self._recorder.event("stopped by touch", {"shear_mm": reading.shear, "depth": depth})
                     self._look_at_rest(touch, start)
@@ -244,8 +242,13 @@ class InsertionRunner:
         self._mover.wait(_REST)
         reading = touch.read(touch.images(self._clock.now()))
         if reading is not None:
-            depth = start - self._mover.height_at(reading.frame.stamp)
-            touch.keep(Reading(reading.frame, reading.images, depth, reading.shear))
+            self._keep(touch, reading, start)
+
+    def _keep(self, touch: Touch, reading: Reading, start: float) -> float:
+        """Add a reading to the attempt's; returns its depth below `start` [m]."""
+        depth = start - self._mover.height_at(reading.frame.stamp)
+        touch.keep(replace(reading, depth=depth))
+        return depth
 
     def _lower(self, place: Place, touch: Touch) -> bool:
         """Nothing was felt where the rim would be: go on down. False when something is met after all."""

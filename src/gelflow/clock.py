@@ -9,9 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gelflow.errors import UsageError
-from gelflow.pace import Pace
-
-_SHORTEST_SLEEP = 2e-4  # while robot time stands still [s, wall]
+from gelflow.pace import LAG, SHORTEST_WAIT, Pace
 
 
 class Clock(Protocol):
@@ -59,7 +57,7 @@ class ScaledClock:
             return
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
-            time.sleep(max(left / self.factor, _SHORTEST_SLEEP))
+            time.sleep(max(left / self.factor, SHORTEST_WAIT))
 
     def wall(self, seconds: float) -> float:
         return seconds / self.factor
@@ -82,9 +80,9 @@ class ScaledClock:
             self._pace.allow(slot, max(until, self.now()))  # it never runs back
 
     @contextlib.contextmanager
-    def urgent(self, slot: int, within: float) -> Iterator[None]:
-        """What a robot's computer has done `within` robot time [s]: robot time waits where this one is slower."""
-        self.allow(slot, self.now() + within)
+    def urgent(self, slot: int) -> Iterator[None]:
+        """What a robot's own computer does at once: robot time waits where this one is slower."""
+        self.allow(slot, self.now() + LAG)
         try:
             yield
         finally:

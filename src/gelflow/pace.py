@@ -13,6 +13,8 @@ from gelflow.errors import UsageError
 
 _SLOTS = 5  # who must keep up; the last one is the robot's user, while a frame may mean that it must stop
 WORLD, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, RUNNER = range(_SLOTS)
+LAG = 0.02  # how far robot time may run past what is due, before it waits [s]
+SHORTEST_WAIT = 2e-4  # of those who wait while robot time stands still [s, wall]
 _WORDS = 1 + 2 * _SLOTS  # time lost [s], then for each slot: wall time of its last word [s], its limit [s, robot time]
 _PATIENCE = 5.0  # who says nothing for longer is gone, and holds nobody back [s, wall]
 
