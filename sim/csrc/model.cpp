@@ -317,6 +317,9 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   for (const int s : shapes) {
     if (s < 0 || s >= next_index(model_.shapes)) refuse(owner + ": no such shape");
   }
+  for (const double w : weights) {
+    if (!(w >= 0) || !std::isfinite(w)) refuse(owner + ": weights must be finite and not negative");
+  }
   Pad pad;
   pad.name = name;
   const M3<double> rotation = rotation_from(owner, quat);

@@ -100,6 +100,11 @@ struct PointCloud {
   PointCloud() = default;
   PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& weights);
   int size() const { return static_cast<int>(original.size()); }
+
+  // What single precision makes of places and weights, for who reads them all again and again.
+  struct Rounded {
+    std::vector<float> x, y, z, weights;
+  } rounded;
 };
 
 // The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and

@@ -11,10 +11,10 @@ namespace {
 constexpr int leaf_size = 8;
 constexpr int leaves_per_group = 16;
 
-// Sorts indices [begin, end) so that every run of `leaf_size` is compact: split the longest axis at a multiple of it.
-void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& order, int begin, int end) {
+// Sorts indices [begin, end) so that every run of `leaf` is compact: split the longest axis at a multiple of it.
+void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& order, int begin, int end, int leaf) {
   const int n = end - begin;
-  if (n <= leaf_size) return;
+  if (n <= leaf) return;
   V3<double> low = points[order[begin]], high = low;
   for (int i = begin; i < end; ++i) {
     low = low.cwiseMin(points[order[i]]);
@@ -22,7 +22,7 @@ void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& orde
   }
   int axis = 0;
   (high - low).maxCoeff(&axis);
-  int unit = leaf_size;
+  int unit = leaf;
   while (unit * 2 < n) unit *= 2;  // the left half is a full subtree: groups of leaves stay contiguous
   const int middle = begin + unit;
   // Ties are broken by the index, so that the order is the same with every standard library.
@@ -32,8 +32,41 @@ void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& orde
   });
   std::sort(order.begin() + begin, order.begin() + middle);
   std::sort(order.begin() + middle, order.begin() + end);
-  sort_in_space(points, order, begin, middle);
-  sort_in_space(points, order, middle, end);
+  sort_in_space(points, order, begin, middle, leaf);
+  sort_in_space(points, order, middle, end, leaf);
+}
+
+// The middles of fours of points that follow one another in a row, as in a grid of markers; none where not all do.
+std::vector<V3<double>> middles_of_fours(const std::vector<V3<double>>& points) {
+  std::vector<V3<double>> middles;
+  if (points.size() % 4 != 0) return middles;
+  for (std::size_t i = 0; i < points.size(); i += 4) {
+    const V3<double> first = points[i + 1] - points[i];
+    for (int k = 2; k < 4; ++k) {
+      const V3<double> next = points[i + k] - points[i + k - 1];
+      if ((next - first).norm() > 0.5 * first.norm()) return {};
+    }
+    middles.push_back(0.5 * (points[i] + points[i + 3]));
+  }
+  return middles;
+}
+
+// Indices of points, sorted in space in leaves. Fours stay together, so that what belongs to them is moved at once.
+std::vector<int> sorted_in_space(const std::vector<V3<double>>& points) {
+  const std::vector<V3<double>> middles = middles_of_fours(points);
+  std::vector<int> order(middles.empty() ? points.size() : middles.size());
+  std::iota(order.begin(), order.end(), 0);
+  const int count = static_cast<int>(order.size());
+  if (middles.empty()) {
+    sort_in_space(points, order, 0, count, leaf_size);
+    return order;
+  }
+  sort_in_space(middles, order, 0, count, leaf_size / 4);
+  std::vector<int> all;
+  for (const int four : order) {
+    for (int k = 0; k < 4; ++k) all.push_back(4 * four + k);
+  }
+  return all;
 }
 
 struct Sphere {
@@ -78,9 +111,7 @@ void PointCloud::Places::pad() {
 
 PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& given_weights) {
   const int n = static_cast<int>(given.size());
-  original.resize(n);
-  std::iota(original.begin(), original.end(), 0);
-  sort_in_space(given, original, 0, n);
+  original = sorted_in_space(given);
   for (const int i : original) {
     points.add(given[i]);
     weights.push_back(given_weights[i]);
@@ -98,6 +129,10 @@ PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<d
   }
   points.pad();
   weights.resize(weights.size() + padding);
+  rounded = {{points.x.begin(), points.x.end()},
+             {points.y.begin(), points.y.end()},
+             {points.z.begin(), points.z.end()},
+             {weights.begin(), weights.end()}};
   pad_blocks(leaves);
   pad_blocks(groups);
 }

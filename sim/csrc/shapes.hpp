@@ -26,9 +26,13 @@ GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<
   using std::sqrt;
   const L zero(0.0), one(1.0), squared = dot(x, x);
   const Mask<L> center = squared < L(1e-30);
-  const L length = sqrt(select(center, one, squared)), inverse = one / length;
-  out.d = select(center, -radius, length - radius);
-  out.n = select3<L>(center, Vec3<L>{one, zero, zero}, inverse * x);
+  const L length = sqrt(squared), inverse = one / length;
+  out.d = length - radius;
+  out.n = inverse * x;
+  if (any(center)) [[unlikely]] {
+    out.d = select(center, -radius, out.d);
+    out.n = select3<L>(center, Vec3<L>{one, zero, zero}, out.n);
+  }
   if constexpr (curved) out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
   out.bend = Bend::curved;
 }
@@ -228,28 +232,44 @@ __attribute__((noinline)) void rarer_distance(ShapeKind kind, const T* size, con
   grid_distance<L>(*grid, L(size[0]), x, out);
 }
 
-// `curved`: the Hessian is asked for too.
+// Calls f(of), where of(x, out) is what a shape of this kind says of points. `curved`: the Hessian is asked for too.
+template <bool curved, class L, class T, class F>
+GELFLOW_INLINE void with_distance(ShapeKind kind, const T* size, const DistanceGrid* grid, F&& f) {
+  switch (kind) {
+    case ShapeKind::plane:
+      return f([](const Vec3<L>& x, Distance<L>& out) GELFLOW_LOOP_BODY { plane_distance<L>(x, out); });
+    case ShapeKind::sphere: {
+      const L radius(size[0]);
+      return f([=](const Vec3<L>& x, Distance<L>& out)
+                   GELFLOW_LOOP_BODY { sphere_distance<curved, L>(x, radius, out); });
+    }
+    case ShapeKind::box: {
+      const Vec3<L> half{L(size[0]), L(size[1]), L(size[2])};
+      return f([=](const Vec3<L>& x, Distance<L>& out) GELFLOW_LOOP_BODY { box_distance<L>(x, half, out); });
+    }
+    case ShapeKind::cylinder: {
+      const L radius(size[0]), half(size[1]);
+      return f([=](const Vec3<L>& x, Distance<L>& out)
+                   GELFLOW_LOOP_BODY { cylinder_distance<curved, L>(x, radius, half, out); });
+    }
+    case ShapeKind::capsule: {
+      const L radius(size[0]), half(size[1]);
+      return f([=](const Vec3<L>& x, Distance<L>& out)
+                   GELFLOW_LOOP_BODY { capsule_distance<curved, L>(x, radius, half, out); });
+    }
+    [[unlikely]] default:
+      return f([=](const Vec3<L>& x, Distance<L>& out) GELFLOW_LOOP_BODY {
+        const Vec3<L> at = x;  // called, they need places in memory
+        Distance<L> found;
+        rarer_distance<curved, L, T>(kind, size, grid, at, found);
+        out = found;
+      });
+  }
+}
 template <bool curved, class L, class T>
 GELFLOW_INLINE void distance(ShapeKind kind, const T* size, const DistanceGrid* grid, const Vec3<L>& x,
                              Distance<L>& out) {
-  switch (kind) {
-    case ShapeKind::plane:
-      return plane_distance<L>(x, out);
-    case ShapeKind::sphere:
-      return sphere_distance<curved, L>(x, L(size[0]), out);
-    case ShapeKind::box:
-      return box_distance<L>(x, {L(size[0]), L(size[1]), L(size[2])}, out);
-    case ShapeKind::cylinder:
-      return cylinder_distance<curved, L>(x, L(size[0]), L(size[1]), out);
-    case ShapeKind::capsule:
-      return capsule_distance<curved, L>(x, L(size[0]), L(size[1]), out);
-    [[unlikely]] default: {
-      const Vec3<L> at = x;  // called, they need places in memory
-      Distance<L> found;
-      rarer_distance<curved, L, T>(kind, size, grid, at, found);
-      out = found;
-    }
-  }
+  with_distance<curved, L, T>(kind, size, grid, [&](auto&& of) GELFLOW_LOOP_BODY { of(x, out); });
 }
 
 // One number of the rarer kinds' bounds.

@@ -16,8 +16,8 @@ struct Touching {
   Distance<L> at;
   Vec3<L> center, x;  // the point itself, or the centre of a rolling sphere; the point that touches
   Vec3<L> v;          // relative to the shape
-  Vec3<L> anchor, e;
   Mask<L> remembers;  // has an anchor
+  Vec3<L> anchor, e;  // elastic law
 
   template <class F>
   GELFLOW_INLINE void for_each_inside(F&& f) const {
@@ -28,77 +28,170 @@ struct Touching {
   }
 };
 
-// Looks at points with these places in the first body's frame, of which t knows the anchors. Whether any is inside.
-// `curved`: Hessians of the distance are asked for.
-template <bool curved, class T>
-GELFLOW_INLINE bool touches(const PairFrame<T>& frame, const TouchRule<T>& rule, const Vec3<Pack<T>>& local,
-                            const Pack<T>& weight, Touching<T>& t) {
+// What is the same for all points of a pair, spread over packs.
+template <class T>
+struct PairConstants {
   using L = Pack<T>;
-  t.x = t.center = spread<L>(frame.rotation) * local + spread<L>(frame.offset);
-  if (rule.rolling_radius > T(0)) t.x.z -= L(rule.rolling_radius);  // planes only: n = z
-  distance<curved>(frame.kind, frame.size, frame.grid, t.x, t.at);
-  t.inside = t.at.d < L(0.0) && weight > L(0.0);
-  if (!any(t.inside)) return false;
-  const T* p = rule.params;
-  const L felt = select(t.inside, weight, L(0.0)), share = L(T(rule.softness)) * felt;
-  t.law.kn = felt * L(p[0]);
-  t.law.kt = share * L(p[1]);
-  t.law.mu = L(p[2]);
-  t.law.kd = felt * L(p[3]);
-  t.law.damping = rule.damping;
-  t.law.elastic = rule.law == FrictionLaw::elastic;
-  t.v = spread<L>(frame.linear) + cross(spread<L>(frame.angular), t.x);
-  if (t.law.elastic) {
-    t.law.ks = share * L(p[4]);
-    const L size = abs(t.x.x) + abs(t.x.y) + abs(t.x.z);
-    t.law.rounding = L(T(4 * real_part(Eigen::NumTraits<T>::epsilon()))) * size;
-    t.e = select3<L>(t.remembers, t.x - t.anchor, zero3<L>());
+  Mat3<L> rotation;
+  Vec3<L> offset;  // to the point that touches: the lowest one of a rolling sphere, which only touches planes
+  L lift;          // from there to the sphere's centre
+  Vec3<L> angular, linear;
+  L kn, kt, mu, kd, ks, rounding;
+  DampingLaw damping;
+  bool elastic;
+
+  PairConstants(const PairFrame<T>& frame, const TouchRule<T>& rule)
+      : rotation(spread<L>(frame.rotation)),
+        offset(spread<L>(V3<T>(frame.offset - V3<T>(T(0), T(0), rule.rolling_radius)))),
+        lift(rule.rolling_radius),
+        angular(spread<L>(frame.angular)),
+        linear(spread<L>(frame.linear)),
+        kn(rule.params[0]),
+        kt(T(T(rule.softness) * rule.params[1])),
+        mu(rule.params[2]),
+        kd(rule.params[3]),
+        ks(T(T(rule.softness) * rule.params[4])),
+        rounding(T(4 * real_part(Eigen::NumTraits<T>::epsilon()))),
+        damping(rule.damping),
+        elastic(rule.law == FrictionLaw::elastic) {}
+
+  GELFLOW_INLINE Vec3<L> place(const Vec3<L>& local) const {
+    const auto along = [&](int a) GELFLOW_LOOP_BODY {
+      const Vec3<L>& row = rotation.row[a];
+      return offset[a] + row.x * local.x + row.y * local.y + row.z * local.z;
+    };
+    return {along(0), along(1), along(2)};
   }
-  return true;
+  GELFLOW_INLINE Vec3<L> velocity(const Vec3<L>& x) const {
+    return {linear.x + angular.y * x.z - angular.z * x.y, linear.y + angular.z * x.x - angular.x * x.z,
+            linear.z + angular.x * x.y - angular.y * x.x};
+  }
+};
+
+// What points feel of which t knows the places, the distances and the anchors; `felt`: their weights, 0 where one does
+// not touch.
+template <bool elastic, class T>
+GELFLOW_INLINE void feel(const PairConstants<T>& pair, const Pack<T>& felt, Touching<T>& t) {
+  t.law.kn = felt * pair.kn;
+  t.law.kt = felt * pair.kt;
+  t.law.mu = pair.mu;
+  t.law.kd = felt * pair.kd;
+  t.law.damping = pair.damping;
+  t.law.elastic = elastic;
+  t.v = pair.velocity(t.x);
+  if constexpr (elastic) {
+    t.law.ks = felt * pair.ks;
+    t.law.rounding = pair.rounding * (abs(t.x.x) + abs(t.x.y) + abs(t.x.z));
+    t.e = select3<Pack<T>>(t.remembers, t.x - t.anchor, zero3<Pack<T>>());
+  }
 }
 
-// Calls f(touching) for all points of a cloud that are inside the shape, a pack at a time.
-template <bool curved, class T, class F>
-void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
+// Runs of neighbouring leaves that may touch, as (begin, end) in the cloud. The list is this thread's own and is made anew
+// by the next call.
+template <class T>
+const std::vector<std::pair<int, int>>& near_runs(const PairFrame<T>& frame, const PointCloud& cloud, const T& reach) {
+  thread_local std::vector<std::pair<int, int>> runs;
+  runs.clear();
+  for_near_leaves<T>(frame, cloud, reach, [&](int begin, int end) {
+    if (!runs.empty() && runs.back().second == begin) {
+      runs.back().second = end;
+    } else {
+      runs.emplace_back(begin, end);
+    }
+  });
+  return runs;
+}
+
+// The points of a cloud in a precision; behind the last stand zeros.
+template <class T>
+struct Listed {
+  const double *x, *y, *z, *weights;
+  explicit Listed(const PointCloud& c)
+      : x(c.points.x.data()), y(c.points.y.data()), z(c.points.z.data()), weights(c.weights.data()) {}
+};
+template <>
+struct Listed<float> {
+  const float *x, *y, *z, *weights;
+  explicit Listed(const PointCloud& c)
+      : x(c.rounded.x.data()), y(c.rounded.y.data()), z(c.rounded.z.data()), weights(c.rounded.weights.data()) {}
+};
+
+// Calls f(touching) for all points of a cloud that are inside the shape, a pack at a time, and skipped(begin, end) for
+// those between, in the order of the cloud. Some packs are placed before the first of them is felt: two short loops that
+// keep their constants at hand, of which a processor works at several rounds at once.
+template <bool curved, bool elastic, class T, class F, class Skipped>
+GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
+                                        F&& f, Skipped&& skipped) {
   using L = Pack<T>;
-  constexpr int width = pack_width<T>;
-  const bool elastic = rule.law == FrictionLaw::elastic, weighs = frame.scaled && !cloud.areas.empty();
-  int begin = 0, end = 0;  // a run of neighbouring leaves
-  const auto look = [&] {
-    for (int i = begin; i < end; i += width) {
-      Touching<T> t;
-      const int count = std::min(width, end - i);
-      const Vec3<L> local{load<L>(&cloud.points.x[i]), load<L>(&cloud.points.y[i]), load<L>(&cloud.points.z[i])};
-      L weight = select(first_lanes<L>(count), load<L>(&cloud.weights[i]), L(0.0));
-      if (weighs) {
-        T weights[width] = {};
-        for (int k = 0; k < count; ++k) weights[k] = scaled_weight(frame, cloud, i + k);
-        weight = load<L>(weights);
+  constexpr int width = pack_width<T>, most = 16;
+  struct Placed {
+    Vec3<L> x;
+    L felt;  // weight where it touches, else 0
+    Distance<L> at;
+  };
+  Placed placed[most];
+  const PairConstants<T> pair(frame, rule);
+  const bool weighs = frame.scaled && !cloud.areas.empty();
+  const Listed<T> listed(cloud);
+  const auto place = [&](int begin, int end) GELFLOW_LOOP_BODY {
+    with_distance<curved, L, T>(frame.kind, frame.size, frame.grid, [&](auto&& of) GELFLOW_LOOP_BODY {
+      for (int i = begin, n = 0; i < end; i += width, ++n) {
+        Placed& p = placed[n];
+        const Vec3<L> x = pair.place({load<L>(listed.x + i), load<L>(listed.y + i), load<L>(listed.z + i)});
+        p.x.x = x.x, p.x.y = x.y, p.x.z = x.z;  // one by one they stay in registers
+        of(x, p.at);
+        p.felt = select(p.at.d < L(0.0), load<L>(listed.weights + i), L(0.0));
       }
-      t.anchor = zero3<L>();
-      t.remembers = first_lanes<L>(0);
-      if (elastic) {
-        T anchors[3][width] = {}, remembers[width] = {};
-        for (int k = 0; k < count; ++k) {
-          if (!rule.anchored[i + k]) continue;
-          for (int a = 0; a < 3; ++a) anchors[a][k] = rule.anchors[i + k][a];
-          remembers[k] = T(1);
-        }
-        t.anchor = {load<L>(anchors[0]), load<L>(anchors[1]), load<L>(anchors[2])};
-        t.remembers = load<L>(remembers) > L(0.0);
-      }
-      t.first = i;
-      if (touches<curved, T>(frame, rule, local, weight, t)) f(static_cast<const Touching<T>&>(t));
+    });
+    for (int i = begin; weighs && i < std::min(end, cloud.size()); ++i) {
+      Placed& p = placed[(i - begin) / width];
+      const int k = (i - begin) % width;
+      if (lane(p.felt, k) > T(0)) set_lane(p.felt, k, scaled_weight(frame, cloud, i));
     }
   };
-  for_near_leaves<T>(frame, cloud, rule.rolling_radius, [&](int from, int to) {
-    if (from != end) {
-      look();
-      begin = from;
+  const auto look = [&](int i, const Placed& p) GELFLOW_LOOP_BODY {
+    Touching<T> t;
+    t.inside = p.felt > L(0.0);
+    if (!any(t.inside)) return skipped(i, std::min(i + width, cloud.size()));
+    t.remembers = first_lanes<L>(0);
+    if constexpr (elastic) {
+      T anchors[3][width] = {}, remembers[width] = {};
+      for (int k = 0; k < width && i + k < cloud.size(); ++k) {
+        if (!rule.anchored[i + k]) continue;
+        for (int a = 0; a < 3; ++a) anchors[a][k] = rule.anchors[i + k][a];
+        remembers[k] = T(1);
+      }
+      t.anchor = {load<L>(anchors[0]), load<L>(anchors[1]), load<L>(anchors[2])};
+      t.remembers = load<L>(remembers) > L(0.0);
     }
-    end = to;
-  });
-  look();
+    t.first = i;
+    t.x = p.x;
+    t.center = {p.x.x, p.x.y, p.x.z + pair.lift};
+    t.at = p.at;
+    feel<elastic, T>(pair, p.felt, t);
+    f(static_cast<const Touching<T>&>(t));
+  };
+  int seen = 0;
+  for (const auto& [first, last] : near_runs<T>(frame, cloud, rule.rolling_radius)) {
+    skipped(seen, first);
+    seen = last;
+    for (int begin = first; begin < last; begin += most * width) {
+      const int end = std::min(begin + most * width, last);
+      place(begin, end);
+      for (int i = begin, n = 0; i < end; i += width, ++n) look(i, placed[n]);
+    }
+  }
+  skipped(seen, cloud.size());
+}
+template <bool curved, class T, class F, class Skipped>
+GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
+                                        F&& f, Skipped&& skipped) {
+  if (rule.law == FrictionLaw::elastic) return for_touching_points<curved, true, T>(frame, cloud, rule, f, skipped);
+  for_touching_points<curved, false, T>(frame, cloud, rule, f, skipped);
+}
+template <bool curved, class T, class F>
+void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
+  for_touching_points<curved, T>(frame, cloud, rule, f, [](int, int) {});
 }
 
 // The same for points that were found near.
@@ -106,18 +199,28 @@ template <bool curved, class T, class F>
 GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule,
                                         F&& f) {
   using L = Pack<T>;
-  const bool elastic = rule.law == FrictionLaw::elastic;
+  const PairConstants<T> pair(frame, rule);
   for (int i = 0; i < near.count; i += pack_width<T>) {
+    const Vec3<L> local{load<L>(&near.x[i]), load<L>(&near.y[i]), load<L>(&near.z[i])};
+    const L weight = load<L>(&near.weight[i]);
     Touching<T> t;
-    t.anchor = zero3<L>();
+    t.x = pair.place(local);
+    t.center = {t.x.x, t.x.y, t.x.z + pair.lift};
+    distance<curved>(frame.kind, frame.size, frame.grid, t.x, t.at);
+    t.inside = t.at.d < L(0.0) && weight > L(0.0);
+    if (!any(t.inside)) continue;
     t.remembers = first_lanes<L>(0);
-    if (elastic) {
+    if (pair.elastic) {
       t.anchor = {load<L>(&near.anchor_x[i]), load<L>(&near.anchor_y[i]), load<L>(&near.anchor_z[i])};
       t.remembers = load<L>(&near.remembers[i]) > L(0.0);
     }
     t.index = &near.index[i];
-    const Vec3<L> local{load<L>(&near.x[i]), load<L>(&near.y[i]), load<L>(&near.z[i])};
-    if (touches<curved, T>(frame, rule, local, load<L>(&near.weight[i]), t)) f(static_cast<const Touching<T>&>(t));
+    if (pair.elastic) {
+      feel<true, T>(pair, select(t.inside, weight, L(0.0)), t);
+    } else {
+      feel<false, T>(pair, select(t.inside, weight, L(0.0)), t);
+    }
+    f(static_cast<const Touching<T>&>(t));
   }
 }
 
