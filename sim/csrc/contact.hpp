@@ -201,22 +201,34 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
       store(bottom[a], c.turned.row(3 + a) + i);
     }
   }
-  for (int r = 0; r < c.n; ++r) {
+  // `from`: 3 for a row without an angular part; `carried`: some of its axes are.
+  const auto add_row = [&](int r, auto from, auto carried) GELFLOW_LOOP_BODY {
     const int row = c.dofs->dof[r];
-    if (row < 0) continue;
     L s[6];
-    for (int a = 0; a < 6; ++a) s[a] = L(T(h * c.s.row(a)[r]));
+    for (int a = from; a < 6; ++a) s[a] = L(T(h * c.s.row(a)[r]));
     for (int i = 0; i < c.n; i += width) {
       L by_q(0.0), by_v(0.0), turned(0.0);
-      for (int a = 0; a < 6; ++a) {
+      for (int a = from; a < 6; ++a) {
         by_q += s[a] * load<L>(c.force_q.row(a) + i);
         by_v += s[a] * load<L>(c.force_v.row(a) + i);
-        turned += s[a] * load<L>(c.turned.row(a) + i);
+        if (carried) turned += s[a] * load<L>(c.turned.row(a) + i);
       }
-      const L counts = load<L>(&c.dofs->turned[static_cast<std::size_t>(r) * c.n + i]);
+      if (carried) by_q -= load<L>(&c.dofs->turned[static_cast<std::size_t>(r) * c.n + i]) * turned;
       const std::ptrdiff_t at = row * w.by_q.outerStride() + c.dofs->start[i / width];
-      store(load<L>(w.by_q.data() + at) - by_q + counts * turned, w.by_q.data() + at);
+      store(load<L>(w.by_q.data() + at) - by_q, w.by_q.data() + at);
       store(load<L>(w.by_v.data() + at) - by_v, w.by_v.data() + at);
+    }
+  };
+  using All = std::integral_constant<int, 0>;
+  using Linear = std::integral_constant<int, 3>;
+  for (int r = 0; r < c.n; ++r) {
+    if (c.dofs->dof[r] < 0) continue;
+    if (!c.dofs->slides[r]) {
+      add_row(r, All(), std::true_type());
+    } else if (c.dofs->carried[r]) {
+      add_row(r, Linear(), std::true_type());
+    } else {
+      add_row(r, Linear(), std::false_type());
     }
   }
 }

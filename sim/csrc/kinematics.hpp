@@ -26,7 +26,7 @@ V4<T> vec4(const T* p) {
 // since.
 template <class T>
 Place<T> whole(const T* q, const T* low, int i) {
-  if (low == nullptr) return Place<T>(q[i]);
+  if (std::is_same_v<T, Place<T>> || low == nullptr) return Place<T>(q[i]);
   const Place<T> sum = Place<T>(q[i]) + Place<T>(low[i]);
   return T(sum) == q[i] ? sum : Place<T>(q[i]);
 }

@@ -73,11 +73,14 @@ PairDofs Model::pair_dofs(int first, int second) {
       }
     }
     for (const int row : packed.dof) {
+      packed.slides.push_back(row >= 0 && angular[row] == 0);
+      packed.carried.push_back(0);
       for (const int column : packed.dof) {
         const bool both = row >= 0 && column >= 0;
         const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && carries(column, row)
                                                        : signs[row] > 0 || !carries(column, row));
         packed.turned.push_back(counts ? 1.0 : 0.0);
+        if (counts) packed.carried.back() = 1;
       }
     }
     columns = std::max(columns, static_cast<int>(packed.dof.size()));

@@ -131,6 +131,7 @@ struct PackedDofs {
   std::vector<int> dof;        // per column, −1 where the column is none of the pair's
   std::vector<double> sign;    // +1 where the dof moves the first body, −1 the second, 0 none of the pair's
   std::vector<double> turned;  // columns × columns: 1 where ∂S_row/∂q_column counts (pair_columns.hpp), else 0
+  std::vector<std::uint8_t> slides, carried;  // per column: it never turns; as a row of `turned` it has a 1
 };
 struct PairDofs {
   PackedDofs single, four, eight;
