@@ -111,6 +111,7 @@ class Readings {
   void clear(int begin, int end) const {
     for (int i = begin; i < end; ++i) std::fill_n((*this)[i], 3, T(0));
   }
+  void clear_all(int markers) const { std::fill_n(numbers_, 3 * static_cast<std::ptrdiff_t>(markers), T(0)); }
 
  private:
   static constexpr bool packed = pack_width<T> % 4 == 0;
@@ -175,12 +176,18 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
   };
   for (const Pad& pad : m.pads) {
     const Readings<T, T> readings(pad, out);
-    if (pad.shapes.empty() && stale) readings.clear(0, pad.cloud.size());
+    bool clean = !stale;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
       const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
-      const bool first = s == 0, whole = first && stale;
+      const NearRuns& near = near_runs<T>(frame, pad.cloud, rule.rolling_radius);
+      if (!clean && 2 * near.points < pad.cloud.size()) {  // mostly, few are near
+        readings.clear_all(pad.cloud.size());
+        clean = true;
+      }
+      const bool first = s == 0, whole = !clean;
+      clean = true;
       const auto read = [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
         PointForce<L> force;
         point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
@@ -204,10 +211,11 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
           });
         }
       };
-      for_touching_points<false, T>(frame, pad.cloud, rule, read, [&](int begin, int end) GELFLOW_LOOP_BODY {
+      for_touching_points<false, T>(frame, pad.cloud, near, rule, read, [&](int begin, int end) GELFLOW_LOOP_BODY {
         if (whole) readings.clear(begin, end);
       });
     }
+    if (!clean) readings.clear_all(pad.cloud.size());  // no shape to feel
   }
 }
 

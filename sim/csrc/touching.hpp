@@ -86,20 +86,26 @@ GELFLOW_INLINE void feel(const PairConstants<T>& pair, const Pack<T>& felt, Touc
   }
 }
 
-// Runs of neighbouring leaves that may touch, as (begin, end) in the cloud. The list is this thread's own and is made anew
-// by the next call.
+// Runs of neighbouring leaves that may touch, in the order of the cloud.
+struct NearRuns {
+  std::vector<std::pair<int, int>> runs;  // begin, end
+  int points = 0;
+};
+// They are this thread's own, and made anew by the next call.
 template <class T>
-const std::vector<std::pair<int, int>>& near_runs(const PairFrame<T>& frame, const PointCloud& cloud, const T& reach) {
-  thread_local std::vector<std::pair<int, int>> runs;
-  runs.clear();
+const NearRuns& near_runs(const PairFrame<T>& frame, const PointCloud& cloud, const T& reach) {
+  thread_local NearRuns near;
+  near.runs.clear();
+  near.points = 0;
   for_near_leaves<T>(frame, cloud, reach, [&](int begin, int end) {
-    if (!runs.empty() && runs.back().second == begin) {
-      runs.back().second = end;
+    near.points += end - begin;
+    if (!near.runs.empty() && near.runs.back().second == begin) {
+      near.runs.back().second = end;
     } else {
-      runs.emplace_back(begin, end);
+      near.runs.emplace_back(begin, end);
     }
   });
-  return runs;
+  return near;
 }
 
 // The points of a cloud in a precision; behind the last stand zeros.
@@ -116,12 +122,12 @@ struct Listed<float> {
       : x(c.rounded.x.data()), y(c.rounded.y.data()), z(c.rounded.z.data()), weights(c.rounded.weights.data()) {}
 };
 
-// Calls f(touching) for all points of a cloud that are inside the shape, a pack at a time, and skipped(begin, end) for
-// those between, in the order of the cloud. Some packs are placed before the first of them is felt: two short loops that
+// Calls f(touching) for all points of these runs that are inside the shape, a pack at a time, and skipped(begin, end) for
+// those between and around, in the order of the cloud. Some packs are placed before the first of them is felt: two short loops that
 // keep their constants at hand, of which a processor works at several rounds at once.
 template <bool curved, bool elastic, class T, class F, class Skipped>
-GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
-                                        F&& f, Skipped&& skipped) {
+GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const NearRuns& near,
+                                        const TouchRule<T>& rule, F&& f, Skipped&& skipped) {
   using L = Pack<T>;
   constexpr int width = pack_width<T>, most = 16;
   struct Placed {
@@ -172,7 +178,7 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
     f(static_cast<const Touching<T>&>(t));
   };
   int seen = 0;
-  for (const auto& [first, last] : near_runs<T>(frame, cloud, rule.rolling_radius)) {
+  for (const auto& [first, last] : near.runs) {
     skipped(seen, first);
     seen = last;
     for (int begin = first; begin < last; begin += most * width) {
@@ -184,14 +190,18 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
   skipped(seen, cloud.size());
 }
 template <bool curved, class T, class F, class Skipped>
-GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule,
-                                        F&& f, Skipped&& skipped) {
-  if (rule.law == FrictionLaw::elastic) return for_touching_points<curved, true, T>(frame, cloud, rule, f, skipped);
-  for_touching_points<curved, false, T>(frame, cloud, rule, f, skipped);
+GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const NearRuns& near,
+                                        const TouchRule<T>& rule, F&& f, Skipped&& skipped) {
+  if (rule.law == FrictionLaw::elastic) {
+    for_touching_points<curved, true, T>(frame, cloud, near, rule, f, skipped);
+  } else {
+    for_touching_points<curved, false, T>(frame, cloud, near, rule, f, skipped);
+  }
 }
 template <bool curved, class T, class F>
 void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const TouchRule<T>& rule, F&& f) {
-  for_touching_points<curved, T>(frame, cloud, rule, f, [](int, int) {});
+  for_touching_points<curved, T>(frame, cloud, near_runs<T>(frame, cloud, rule.rolling_radius), rule, f,
+                                 [](int, int) {});
 }
 
 // The same for points that were found near.
