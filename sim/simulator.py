@@ -84,6 +84,7 @@ class Simulator:
         self.scene = scene
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
+        self._own_dtype = np.dtype(self.dtype)
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         workers = max(1, min(num_envs, threads or available))
         batch = _core.Batch if precision == "double" else _core.BatchFloat
@@ -99,8 +100,6 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._readings: NDArray[Any] | None = None  # there from the first reading on
-        self._all = (num_envs, self.model.nu)  # controls of all environments
-        self._u = np.zeros(self._all, self.dtype)  # one control for all is spread out here
 
     @cached_property
     def param_index(self) -> dict[str, int]:
@@ -141,21 +140,18 @@ class Simulator:
         still until `reset`. Raises UsageError when a control or the state is not finite.
         """
         try:
-            self._batch.step(self._controls(u), steps)
+            self._batch.step(self._numbers(u), steps)
         except ValueError as error:
             raise UsageError(str(error)) from None
 
-    def _controls(self, u: ArrayLike) -> NDArray[Any]:
-        array = np.asarray(u, dtype=self.dtype)
-        shape = array.shape
-        if shape == self._all:
-            return array  # the core copies what is not contiguous
-        if shape != self._all[1:]:
-            raise UsageError(f"u must have shape {self._all} or ({self._all[1]},), got {shape}")
-        if self.num_envs == 1:
-            return array.reshape(self._all)
-        self._u[:] = array
-        return self._u
+    def _numbers(self, u: ArrayLike) -> NDArray[Any]:
+        """As the core takes them, which looks at their shape and their order."""
+        if isinstance(u, np.ndarray) and u.dtype is self._own_dtype:
+            return u
+        try:
+            return np.asarray(u, dtype=self.dtype)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"u must be numbers: {error}") from None
 
     def check(self) -> None:
         """Raises SimulationError when an environment has failed, naming the first."""
@@ -171,7 +167,7 @@ class Simulator:
         as its shortest. Raises SimulationError where a step can not be taken.
         """
         try:
-            estimate, status = self._batch.error_estimate(self._controls(u))
+            estimate, status = self._batch.error_estimate(self._numbers(u))
         except ValueError as error:
             raise UsageError(str(error)) from None
         if failed := np.flatnonzero(status).tolist():

@@ -151,6 +151,12 @@ def test_wrong_shapes_and_numbers_are_refused(insertion: Scene) -> None:
     nu = insertion.nu
     with pytest.raises(UsageError, match=rf"u must have shape \(2, {nu}\) or \({nu},\), got \(3, {nu}\)"):
         sim.step(np.zeros((3, nu)))
+    for refusing in (sim.step, sim.error_estimate):
+        for wrong in ("fast", None, print):
+            with pytest.raises(UsageError, match="u must"):
+                refusing(wrong)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match=rf"u must have shape \(2, {nu}\) or \({nu},\), got \(2,\)"):
+            refusing([1.0, 2.0])
     with pytest.raises(UsageError, match="num_envs must be at least 1, got 0"):
         Simulator(insertion, num_envs=0)
     with pytest.raises(UsageError, match="precision must be 'double' or 'single', got 'half'"):

@@ -42,6 +42,13 @@ class ThreadPool {
   int asleep_ = 0;  // threads that wait for `start_`
 };
 
+// What the actuators are told: numbers of every environment (N, nu), or of all alike (nu).
+template <class T>
+struct Controls {
+  const T* numbers;
+  bool alike;
+};
+
 template <class T>
 class Batch {
  public:
@@ -58,11 +65,11 @@ class Batch {
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
   int threads() const { return pool_.size(); }
-  void reset(const std::uint8_t* which);  // null: all; parameters stay
-  void step(const T* u, int steps);       // u (N, nu), held for all steps
+  void reset(const std::uint8_t* which);       // null: all; parameters stay
+  void step(const Controls<T>& u, int steps);  // held for all steps
   // What one step under u differs by from two half steps, per dof (N, nv); where it has to be halved, from parts half as
   // long as its shortest. status (N) as in `status`. Changes nothing.
-  void error_estimate(const T* u, T* out, std::int32_t* status);
+  void error_estimate(const Controls<T>& u, T* out, std::int32_t* status);
   void tactile(T* out);         // (N, markers, 3)
   void tactile();               // the same into `readings`
   void wrenches(T* out);        // (N, contacts, 6)

@@ -79,13 +79,13 @@ void Batch<T>::check_state() const {
 }
 
 template <class T>
-void Batch<T>::step(const T* u, int steps) {
-  check_controls(u, n);
+void Batch<T>::step(const Controls<T>& u, int steps) {
+  check_controls(u.numbers, u.alike ? 1 : n);
   check_state();
-  const std::size_t nu = model->actuators.size();
+  const std::size_t apart = u.alike ? 0 : model->actuators.size();
   pool_.run(n, [&](int e, int thread) {
     for (int i = 0; i < steps && status[e] == 0; ++i) {
-      const StepReport report = gelflow::step<T>(*model, params_of(e), u + static_cast<std::size_t>(e) * nu,
+      const StepReport report = gelflow::step<T>(*model, params_of(e), u.numbers + static_cast<std::size_t>(e) * apart,
                                                  model->polish, state(e), memory_[thread], i > 0);
       status[e] = static_cast<std::int32_t>(report.status);
       iterations[e] += report.iterations;
@@ -95,14 +95,14 @@ void Batch<T>::step(const T* u, int steps) {
 }
 
 template <class T>
-void Batch<T>::error_estimate(const T* u, T* out, std::int32_t* failures) {
-  check_controls(u, n);
+void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
+  check_controls(u.numbers, u.alike ? 1 : n);
   check_state();
   const Model& m = *model;
-  const std::size_t nu = m.actuators.size();
+  const std::size_t apart = u.alike ? 0 : m.actuators.size();
   pool_.run(n, [&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
-    const T* const control = u + static_cast<std::size_t>(e) * nu;
+    const T* const control = u.numbers + static_cast<std::size_t>(e) * apart;
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
     const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory, false);
     Status status = taken.status;

@@ -15,7 +15,7 @@ namespace {
 std::string shape_text(const std::vector<py::ssize_t>& shape) {
   std::string text = "(";
   for (std::size_t i = 0; i < shape.size(); ++i) text += (i ? ", " : "") + std::to_string(shape[i]);
-  return text + ")";
+  return text + (shape.size() == 1 ? ",)" : ")");
 }
 
 template <class T>
@@ -36,6 +36,18 @@ T* writable(py::array& array, const std::vector<py::ssize_t>& shape, const char*
   auto typed = py::reinterpret_borrow<Array<T>>(array);
   check_shape<T>(typed, shape, name);
   return typed.mutable_data();
+}
+
+// Controls (N, nu), or (nu,) for all environments alike.
+template <class T>
+Controls<T> controls_of(const Batch<T>& b, const Array<T>& u) {
+  const auto nu = static_cast<py::ssize_t>(b.model->actuators.size());
+  const bool alike = u.ndim() == 1 && u.shape(0) == nu;
+  if (!alike && !(u.ndim() == 2 && u.shape(0) == b.n && u.shape(1) == nu)) {
+    throw std::invalid_argument("u must have shape " + shape_text({b.n, nu}) + " or (" + std::to_string(nu) +
+                                ",), got " + shape_text({u.shape(), u.shape() + u.ndim()}));
+  }
+  return {u.data(), alike};
 }
 
 // A view of memory that `owner` keeps alive.
@@ -119,18 +131,17 @@ void bind_batch(py::module_& module, const char* name) {
       .def(
           "step",
           [](B& b, const Array<T>& u, int steps) {
-            check_shape<T>(u, {b.n, static_cast<py::ssize_t>(b.model->actuators.size())}, "u");
-            const T* data = u.data();
+            const Controls<T> controls = controls_of<T>(b, u);
             const py::gil_scoped_release release;
-            b.step(data, steps);
+            b.step(controls, steps);
           },
           py::arg("u"), py::arg("steps") = 1)
       .def("error_estimate",
            [](B& b, const Array<T>& u) {
-             check_shape<T>(u, {b.n, static_cast<py::ssize_t>(b.model->actuators.size())}, "u");
+             const Controls<T> controls = controls_of<T>(b, u);
              py::array_t<T> out({static_cast<py::ssize_t>(b.n), static_cast<py::ssize_t>(b.model->nv)});
              py::array_t<std::int32_t> status(static_cast<py::ssize_t>(b.n));
-             b.error_estimate(u.data(), out.mutable_data(), status.mutable_data());
+             b.error_estimate(controls, out.mutable_data(), status.mutable_data());
              return py::make_tuple(out, status);
            })
       .def("tactile",

@@ -123,8 +123,8 @@ struct Listed<float> {
 };
 
 // Calls f(touching) for all points of these runs that are inside the shape, a pack at a time, and skipped(begin, end) for
-// those between and around, in the order of the cloud. Some packs are placed before the first of them is felt: two short loops that
-// keep their constants at hand, of which a processor works at several rounds at once.
+// those between and around, in the order of the cloud. Some packs are placed before the first of them is felt: two short
+// loops that keep their constants at hand, of which a processor works at several rounds at once.
 template <bool curved, bool elastic, class T, class F, class Skipped>
 GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCloud& cloud, const NearRuns& near,
                                         const TouchRule<T>& rule, F&& f, Skipped&& skipped) {
