@@ -84,7 +84,6 @@ class Simulator:
         self.scene = scene
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
-        self._own_dtype = np.dtype(self.dtype)
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         workers = max(1, min(num_envs, threads or available))
         batch = _core.Batch if precision == "double" else _core.BatchFloat
@@ -146,7 +145,7 @@ class Simulator:
 
     def _numbers(self, u: ArrayLike) -> NDArray[Any]:
         """As the core takes them, which looks at their shape and their order."""
-        if isinstance(u, np.ndarray) and u.dtype is self._own_dtype:
+        if isinstance(u, np.ndarray) and u.dtype == self.dtype:
             return u
         try:
             return np.asarray(u, dtype=self.dtype)

@@ -7,6 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
+from gelflow.sim.motions import motion
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[Any]
@@ -75,6 +77,27 @@ def test_readings_are_those_of_their_markers(
         touching.append(float((right[:, 2] > 0).mean()))
     assert touching[2] == 0 and touching[1] > 0.5
     assert len(places) < 500 or 0 < touching[0] < 0.5
+
+
+@pytest.mark.parametrize("side", [10, 60])
+def test_own_readings_are_those_of_a_fresh_array(side: int) -> None:
+    """The simulator's own array is written where markers touch or did; few, many and none of them here."""
+    scene = load_scene("rolling", overrides={"pads.pad.rows": side, "pads.pad.cols": side})
+    moves = motion(scene)
+    sim = Simulator(scene, num_envs=2, threads=1)
+    sim.q[:] = moves.q0
+    counts: set[int] = set()
+    for block in np.array_split(moves.steps(scene.step), 40):
+        for u in block:
+            sim.step(u)
+        sim.q[1] = moves.q0 + 1e-3 * len(counts)  # this one jumps
+        fresh = sim.tactile(np.full((2, side * side, 3), np.nan))
+        own = sim.tactile()
+        np.testing.assert_array_equal(own, fresh)
+        counts.add(int((own[0, :, 2] > 0).sum()))
+    assert len(counts) > 5
+    with pytest.raises(ValueError, match="read-only"):
+        own[0, 0] = 1.0
 
 
 @pytest.mark.parametrize("weight", [-1.0, np.nan, np.inf])
