@@ -299,23 +299,38 @@ void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>&
       if (r.status[e] == 0) transpose_one<T>(*model, params_of(e), e, N, r, g, memory_[thread]);
     });
   } else {
-    // In double precision, at the states that were reached in single: rounding errors would add up on the way back.
+    // In double precision, at the states that were reached in single: rounding errors would add up on the way back. Not
+    // so in readings without a memory, each of which speaks of its own state alone: they come in single precision.
     if (!exact_) exact_ = std::make_unique<Batch<double>>(model, n, threads());
+    const Model& m = *model;
     std::copy(params.begin(), params.end(), exact_->params.begin());
-    const std::size_t rows = static_cast<std::size_t>(r.steps + 1) * N, nu = model->actuators.size();
-    const std::size_t numbers = static_cast<std::size_t>(r.reads) * N * model->markers * 3;
+    const std::size_t rows = static_cast<std::size_t>(r.steps + 1) * N, nu = m.actuators.size();
+    const bool apart = m.na == 0 && g.params == nullptr;
+    const int reads = apart ? 0 : r.reads;
     const auto exact = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
     const auto u = exact(r.u, (rows - N) * nu);
-    auto q = exact(r.q, rows * model->nq), v = exact(r.v, rows * model->nv);
-    auto anchors = exact(r.anchors, rows * model->na * 3), history = exact(r.history, rows * model->nh);
-    const auto by_q = exact(g.q, rows * model->nq), by_v = exact(g.v, rows * model->nv);
-    const auto by_anchors = exact(g.anchors_end, N * model->na * 3);
-    const auto by_history = exact(g.history_end, N * model->nh), by_tactile = exact(g.tactile, numbers);
-    std::vector<double> by_u(u.size()), by_q0(N * model->nq), by_v0(N * model->nv), by_anchors0(by_anchors.size());
+    auto q = exact(r.q, rows * m.nq), v = exact(r.v, rows * m.nv);
+    auto anchors = exact(r.anchors, rows * m.na * 3), history = exact(r.history, rows * m.nh);
+    auto by_q = exact(g.q, rows * m.nq), by_v = exact(g.v, rows * m.nv);
+    const auto by_anchors = exact(g.anchors_end, N * m.na * 3);
+    const auto by_history = exact(g.history_end, N * m.nh);
+    const auto by_tactile = exact(g.tactile, static_cast<std::size_t>(reads) * N * m.markers * 3);
+    pool_.run(apart ? n : 0, [&](int e, int thread) {
+      for (int read = 0; read < r.reads && r.status[e] == 0; ++read) {
+        const std::size_t row = r.read_after[read] * N + e;
+        const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, nullptr, nullptr, nullptr};
+        StateGradient<T> share(m);
+        tactile_transposed<T>(m, params_of(e), now, g.tactile + (read * N + e) * m.markers * 3, share,
+                              memory_[thread].work);
+        add_from_tangent<double>(m, q.data() + row * m.nq, share.q.template cast<double>(), by_q.data() + row * m.nq);
+        for (int k = 0; k < m.nv; ++k) by_v[row * m.nv + k] += share.v[k];
+      }
+    });
+    std::vector<double> by_u(u.size()), by_q0(N * m.nq), by_v0(N * m.nv), by_anchors0(by_anchors.size());
     std::vector<double> by_history0(by_history.size());
     exact_->rollout_transposed(
-        {r.steps, r.reads, u.data(), q.data(), v.data(), anchors.data(), history.data(), r.anchored, r.halvings,
-         r.status, r.read_after, nullptr},
+        {r.steps, reads, u.data(), q.data(), v.data(), anchors.data(), history.data(), r.anchored, r.halvings, r.status,
+         r.read_after, nullptr},
         {by_q.data(), by_v.data(), by_anchors.data(), by_history.data(), by_tactile.data(), by_u.data(), by_q0.data(),
          by_v0.data(), by_anchors0.data(), by_history0.data(), g.params});
     std::copy(by_u.begin(), by_u.end(), g.u);

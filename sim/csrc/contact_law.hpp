@@ -126,12 +126,13 @@ GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, c
       out.by_x = zero33<L>();
     }
     if (at.bend != Bend::flat) {
-      const Vec3<L> hv = at.hessian * v;
+      const Mat3<L> bends = at.curvature();
+      const Vec3<L> hv = bends * v;
       normal_by_x += p.by_rate * hv;
-      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + p.rate * at.hessian);
-      if (law.elastic) wanted_by_x += memory * (outer(n, at.hessian * e) + p.along * at.hessian);
+      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + p.rate * bends);
+      if (law.elastic) wanted_by_x += memory * (outer(n, bends * e) + p.along * bends);
       out.by_x += p.ratio * (wanted_by_x - outer(direction, transposed_times(wanted_by_x, direction)));
-      out.by_x += p.normal * at.hessian;
+      out.by_x += p.normal * bends;
     }
     out.by_x += outer(lever, normal_by_x);
   }
@@ -177,7 +178,7 @@ GELFLOW_INLINE PointGradient<L> point_force_transposed(const PointLaw<L>& law, c
   if (at.bend != Bend::flat) {
     Vec3<L> by_n = p.normal * by_push + by_rate * v - p.rate * on_slip;
     if (law.elastic) by_n += by_along * e + select(anchored, law.ks, zero) * p.along * by_wanted;
-    g.x += at.hessian * by_n;
+    g.x += at.curvature_times(by_n);
   }
   return g;
 }

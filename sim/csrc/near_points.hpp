@@ -22,7 +22,7 @@ struct TouchRule {
   T h = T(0);                    // length of the step, where one is taken
 };
 
-// Calls visit(b) for blocks from … to that may reach into the shape grown by `margin`.
+// Calls visit(first, last) for runs of blocks, among from … to, that may reach into the shape grown by `margin`.
 template <bool scaled, class T, class Visit>
 GELFLOW_INLINE void for_near_blocks(const PairFrame<T>& f, const PointCloud::Blocks& blocks, int from, int to,
                                     const T& margin, Visit&& visit) {
@@ -32,7 +32,11 @@ GELFLOW_INLINE void for_near_blocks(const PairFrame<T>& f, const PointCloud::Blo
     const L radius = load<L>(&blocks.radius[b]);
     const L reach = (scaled ? L(f.stretch) * radius : radius) + L(margin);
     unsigned near = bits(f.template may_reach<scaled, L>(center, reach) && first_lanes<L>(to - b));
-    for (; near != 0; near &= near - 1) visit(b + std::countr_zero(near));
+    while (near != 0) {
+      const int first = std::countr_zero(near), count = std::countr_one(near >> first);
+      visit(b + first, b + first + count);
+      near &= ~0U << (first + count);
+    }
   }
 }
 
@@ -40,9 +44,10 @@ GELFLOW_INLINE void for_near_blocks(const PairFrame<T>& f, const PointCloud::Blo
 template <bool scaled, class T, class Visit>
 GELFLOW_INLINE void for_near_leaves(const PairFrame<T>& f, const PointCloud& cloud, const T& margin, Visit&& visit) {
   const T around = margin + T(reach_slack);
-  for_near_blocks<scaled, T>(f, cloud.groups, 0, cloud.groups.count(), around, [&](int g) {
-    for_near_blocks<scaled, T>(f, cloud.leaves, cloud.groups.begin[g], cloud.groups.end[g], around,
-                               [&](int l) { visit(cloud.leaves.begin[l], cloud.leaves.end[l]); });
+  for_near_blocks<scaled, T>(f, cloud.groups, 0, cloud.groups.count(), around, [&](int first, int last) {
+    for_near_blocks<scaled, T>(
+        f, cloud.leaves, cloud.groups.begin[first], cloud.groups.end[last - 1], around,
+        [&](int begin, int end) { visit(cloud.leaves.begin[begin], cloud.leaves.end[end - 1]); });
   });
 }
 

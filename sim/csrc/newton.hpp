@@ -64,7 +64,8 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
   return true;
 }
 
-// Solves one substep; on success `v` is v_t, and w holds residual and kinematics at (w.q, v).
+// Solves one substep; on success `v` is v_t, w.q and w.increment are those of it; where there are anchors, w holds the
+// kinematics of (w.q, v) too.
 // `polish` more Newton updates follow convergence (dual numbers need three for their derivative part).
 //
 // The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
@@ -74,12 +75,13 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 //
 // An update with derivatives of an earlier one shrinks the residual by some factor and not to its square, and so ends
 // nearer to the tolerance: a margin makes up for it. In single precision there is no room for one. Who asks for the
-// last digits gets them.
+// last digits gets them. The next such update shrinks it by about the same factor: where a tenth of that is enough, what
+// it left is not measured, unless anchors move on from there.
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
-  constexpr int full_steps = 6, patience = 6;
-  constexpr double quick = 0.03, margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, exacting = 1e-9;
+  constexpr int full_steps = 4, patience = 6, most_old = 6;
+  constexpr double quick = 0.15, enough = 0.1, margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, exacting = 1e-9;
   constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
   const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
@@ -108,9 +110,10 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     const bool converged = settled || relative(w.residual, w.forces, m.nv) <= (old ? margin : 1.0) * tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
-    // Where an update made the residual that much smaller, its derivatives do for one more, which costs half as much.
-    old =
-        !fresh && !converged && k <= 3 && tolerance > exacting && std::is_floating_point_v<T> && size < quick * before;
+    // Where an update made the residual that much smaller, its derivatives do for one more, which costs a quarter.
+    old = !fresh && !converged && k <= most_old && tolerance > exacting && std::is_floating_point_v<T> &&
+          size < quick * before;
+    const bool last = old && polish <= 0 && m.na == 0 && size * (size / before) <= enough * tolerance;
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
     solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);
@@ -126,6 +129,10 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     bool better = false;
     for (int tries = 0; tries < 13; ++tries, fraction *= 0.5) {
       v = w.start - w.direction * T(fraction);
+      if (last) {
+        arrive<T>(m, from, v.data(), w);
+        return Status::ok;
+      }
       size = measure(false);
       better = size <= (1 - 1e-4 * fraction) * before;
       if (converged) break;
@@ -135,7 +142,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     if (size < best) {
       best = size;
       w.best = v;
-    } else if (k + 1 == full_steps && !settled) {
+    } else if (k + 1 == full_steps && !settled && !converged) {
       v = w.best;
       mark = best;
       size = measure(true);

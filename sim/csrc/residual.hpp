@@ -129,6 +129,16 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Pl
   }
 }
 
+// Where v leads: w.increment and w.q.
+template <class T>
+void arrive(const Model& m, const StepStart<T>& from, const T* v, Workspace<T>& w) {
+  for (int k = 0; k < m.nv; ++k) {
+    w.increment[k] = from.h * v[k];
+    if (from.history) w.increment[k] += from.history[k] / T(3);
+  }
+  integrate<T>(m, from.q0, from.low, w.increment, w.q.data());
+}
+
 // Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.forces, the impulses at
 // work there, which Newton's tolerance refers to (they take the mass matrix of the last evaluation with derivatives).
 // `found`: what w was last used for.
@@ -136,12 +146,8 @@ template <bool derivatives, class T>
 void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, Found found, bool scale,
               Workspace<T>& w) {
   const T& h = from.h;
-  for (int k = 0; k < m.nv; ++k) {
-    w.trial[k] = v[k] - from.v_star[k];
-    w.increment[k] = h * v[k];
-    if (from.history) w.increment[k] += from.history[k] / T(3);
-  }
-  integrate<T>(m, from.q0, from.low, w.increment, w.q.data());
+  arrive<T>(m, from, v, w);
+  for (int k = 0; k < m.nv; ++k) w.trial[k] = v[k] - from.v_star[k];
   w.update = w.trial / h;  // accelerations
   forward_positions<T>(m, params, w.q.data(), w);
   forward_velocities<derivatives, T>(m, params, v, w.update.data(), w);

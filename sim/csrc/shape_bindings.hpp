@@ -52,7 +52,7 @@ inline py::tuple distance_at(const Model& m, const std::string& name, const Arra
     for (int k = 0; k < width; ++k) set_lane3<double>(at, k, x[std::min(begin + k, n - 1)]);
     Distance<L> found_at;
     distance<true>(found->kind, m.param_defaults.data() + found->size, found->grid.get(), at, found_at);
-    if (found_at.bend == Bend::flat) found_at.hessian = zero33<L>();
+    found_at.hessian = found_at.bend == Bend::flat ? zero33<L>() : found_at.curvature();
     for (int k = 0; k < width && begin + k < n; ++k) {
       const py::ssize_t i = begin + k;
       to_d[i] = lane(found_at.d, k);

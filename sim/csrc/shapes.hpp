@@ -33,8 +33,8 @@ GELFLOW_INLINE void sphere_distance(const Vec3<L>& x, const L& radius, Distance<
     out.d = select(center, -radius, out.d);
     out.n = select3<L>(center, Vec3<L>{one, zero, zero}, out.n);
   }
-  if constexpr (curved) out.hessian = select(center, zero, inverse) * identity_minus_outer(out.n);
-  out.bend = Bend::curved;
+  if constexpr (curved) out.bow = select(center, zero, inverse);
+  out.bend = Bend::round;
 }
 
 template <class L>
@@ -88,7 +88,11 @@ GELFLOW_INLINE void capsule_distance(const Vec3<L>& x, const L& radius, const L&
   [[maybe_unused]] const Mask<L> along = !(x.z > half) && !(x.z < -half);
   sphere_distance<curved, L>({x.x, x.y, x.z - nearest}, radius, out);
   // Beside the segment nothing changes along it: (1 − n nᵀ − z zᵀ)/length.
-  if constexpr (curved) out.hessian.row[2] = select3<L>(along, zero3<L>(), out.hessian.row[2]);
+  if constexpr (curved) {
+    out.hessian = out.curvature();
+    out.hessian.row[2] = select3<L>(along, zero3<L>(), out.hessian.row[2]);
+  }
+  out.bend = Bend::curved;
 }
 
 // One Newton step for t in Σ (a x/(a² + t))² = 1, on whose left end it starts: it then never steps over the root.

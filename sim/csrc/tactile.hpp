@@ -22,6 +22,7 @@ TouchRule<T> touch_rule(const Pad& pad, std::size_t s, const T* params, const V3
 // clear them all costs more than to read those.
 struct Written {
   bool all = true;
+  bool lists = true;  // whether the next reading says which they are: not worth it after one that felt many
   std::vector<int> markers;
 };
 
@@ -131,17 +132,19 @@ class Readings {
   Number* numbers_;
 };
 
-// Forces in the frames of a curved pad's markers: first + k for each bit k of `lanes`.
+// Adds forces to the readings of a curved pad's markers, in their own frames: first + k for each bit k of `lanes`.
 template <class T>
-__attribute__((noinline)) Vec3<Pack<T>> on_curved_pad(const Pad& pad, const PairFrame<T>& frame, int first,
-                                                      unsigned lanes, const Vec3<Pack<T>>& force) {
+__attribute__((noinline)) void add_on_curved_pad(const Pad& pad, const PairFrame<T>& frame, int first, unsigned lanes,
+                                                 const Vec3<Pack<T>>& force, const Readings<T, T>& readings) {
   const Vec3<Pack<T>> in_body = transposed_times(spread<Pack<T>>(frame.rotation), force);
-  Vec3<Pack<T>> felt = zero3<Pack<T>>();
   for (; lanes != 0; lanes &= lanes - 1) {
     const int k = std::countr_zero(lanes);
-    set_lane3<T>(felt, k, pad.frames[first + k].transpose().template cast<T>() * lane3<T>(in_body, k));
+    const V3<T> felt = pad.frames[first + k].transpose().template cast<T>() * lane3<T>(in_body, k);
+    T* const reading = readings[first + k];
+    reading[0] += felt[0];
+    reading[1] += felt[1];
+    reading[2] -= felt[2];
   }
-  return felt;
 }
 template <class T>
 __attribute__((noinline)) Vec3<Pack<T>> from_curved_pad(const Pad& pad, const PairFrame<T>& frame, int first,
@@ -162,17 +165,18 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
   using L = Pack<T>;
   constexpr unsigned whole_pack = (1U << pack_width<T>)-1;
   const bool stale = written == nullptr || written->all;  // what is there must go, touched or not
-  const std::size_t few = static_cast<std::size_t>(m.markers) / 8;
+  const bool lists = written != nullptr && written->lists;
+  const int few = m.markers / 8;
+  int felt_by = 0;  // markers
   if (written != nullptr) {
     for (const int marker : written->markers) std::fill_n(out + 3 * static_cast<std::size_t>(marker), 3, T(0));
-    written->all = false;
     written->markers.clear();
-    written->markers.reserve(few + pack_width<T>);
+    if (lists) written->markers.reserve(static_cast<std::size_t>(few) + pack_width<T>);
   }
-  const auto write_down = [&](const Pad& pad, const Touching<T>& t) GELFLOW_LOOP_BODY {
-    if (written == nullptr || written->all) return;
+  const auto write_down = [&](const Pad& pad, const Touching<T>& t, unsigned inside) GELFLOW_LOOP_BODY {
+    felt_by += std::popcount(inside);
+    if (!lists || felt_by > few) return;
     t.for_each_inside([&](int, int i) { written->markers.push_back(pad.first_marker + pad.cloud.original[i]); });
-    written->all = written->markers.size() > few;
   };
   for (const Pad& pad : m.pads) {
     const Readings<T, T> readings(pad, out);
@@ -182,7 +186,7 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
       const TouchRule<T> rule = touch_rule<T>(pad, s, params, anchors, anchored);
       const Mat3<L> axes = spread<L>(M3<T>(frame.rotation * pad.frames[0].template cast<T>()));
       const NearRuns& near = near_runs<T>(frame, pad.cloud, rule.rolling_radius);
-      if (!clean && 2 * near.points < pad.cloud.size()) {  // mostly, few are near
+      if (!clean && (!pad.flat || 2 * near.points < pad.cloud.size())) {  // mostly, few are near
         readings.clear_all(pad.cloud.size());
         clean = true;
       }
@@ -191,14 +195,13 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
       const auto read = [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
         PointForce<L> force;
         point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
-        write_down(pad, t);
         const unsigned inside = bits(t.inside);
-        Vec3<L> felt = transposed_times(axes, force.force);
+        write_down(pad, t, inside);
         if (!pad.flat) [[unlikely]] {
           const Vec3<L> in_shape = force.force;  // called, it needs a place in memory
-          const Vec3<L> found = on_curved_pad<T>(pad, frame, t.first, inside, in_shape);
-          for (int a = 0; a < 3; ++a) felt[a] = found[a];  // one by one they stay in registers
+          return add_on_curved_pad<T>(pad, frame, t.first, inside, in_shape, readings);
         }
+        Vec3<L> felt = transposed_times(axes, force.force);
         felt.z = -felt.z;
         if (first) {
           if (inside == whole_pack || !whole) return readings.write(t.first, inside, felt);
@@ -217,6 +220,9 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
     }
     if (!clean) readings.clear_all(pad.cloud.size());  // no shape to feel
   }
+  if (written == nullptr) return;
+  written->lists = felt_by <= few;
+  written->all = !lists || !written->lists;
 }
 
 template <class T>

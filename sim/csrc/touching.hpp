@@ -94,7 +94,8 @@ struct NearRuns {
 // They are this thread's own, and made anew by the next call.
 template <class T>
 const NearRuns& near_runs(const PairFrame<T>& frame, const PointCloud& cloud, const T& reach) {
-  thread_local NearRuns near;
+  thread_local NearRuns own;
+  NearRuns& near = own;  // asked for once
   near.runs.clear();
   near.points = 0;
   for_near_leaves<T>(frame, cloud, reach, [&](int begin, int end) {
@@ -131,11 +132,16 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
   using L = Pack<T>;
   constexpr int width = pack_width<T>, most = 16;
   struct Placed {
-    Vec3<L> x;
-    L felt;  // weight where it touches, else 0
-    Distance<L> at;
+    Vec3<L> x, n;
+    L d, felt;  // felt: weight where it touches, else 0
   };
   Placed placed[most];
+  struct Bent {  // of which just what a shape has is written
+    L bow;
+    Mat3<L> hessian;
+  };
+  Bent bent[curved ? most : 1];
+  Bend bend{};
   const PairConstants<T> pair(frame, rule);
   const bool weighs = frame.scaled && !cloud.areas.empty();
   const Listed<T> listed(cloud);
@@ -143,10 +149,21 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
     with_distance<curved, L, T>(frame.kind, frame.size, frame.grid, [&](auto&& of) GELFLOW_LOOP_BODY {
       for (int i = begin, n = 0; i < end; i += width, ++n) {
         Placed& p = placed[n];
+        Distance<L> at;
         const Vec3<L> x = pair.place({load<L>(listed.x + i), load<L>(listed.y + i), load<L>(listed.z + i)});
         p.x.x = x.x, p.x.y = x.y, p.x.z = x.z;  // one by one they stay in registers
-        of(x, p.at);
-        p.felt = select(p.at.d < L(0.0), load<L>(listed.weights + i), L(0.0));
+        of(x, at);
+        p.d = at.d;
+        p.n.x = at.n.x, p.n.y = at.n.y, p.n.z = at.n.z;
+        p.felt = select(at.d < L(0.0), load<L>(listed.weights + i), L(0.0));
+        bend = at.bend;
+        if constexpr (curved) {
+          if (at.bend == Bend::round) {
+            bent[n].bow = at.bow;
+          } else if (at.bend != Bend::flat) {
+            bent[n].hessian = at.hessian;
+          }
+        }
       }
     });
     for (int i = begin; weighs && i < std::min(end, cloud.size()); ++i) {
@@ -155,7 +172,8 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
       if (lane(p.felt, k) > T(0)) set_lane(p.felt, k, scaled_weight(frame, cloud, i));
     }
   };
-  const auto look = [&](int i, const Placed& p) GELFLOW_LOOP_BODY {
+  const auto look = [&](int i, int n) GELFLOW_LOOP_BODY {
+    const Placed& p = placed[n];
     Touching<T> t;
     t.inside = p.felt > L(0.0);
     if (!any(t.inside)) return skipped(i, std::min(i + width, cloud.size()));
@@ -173,7 +191,16 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
     t.first = i;
     t.x = p.x;
     t.center = {p.x.x, p.x.y, p.x.z + pair.lift};
-    t.at = p.at;
+    t.at.d = p.d;
+    t.at.n = p.n;
+    t.at.bend = bend;
+    if constexpr (curved) {
+      if (bend == Bend::round) {
+        t.at.bow = bent[n].bow;
+      } else if (bend != Bend::flat) {
+        t.at.hessian = bent[n].hessian;
+      }
+    }
     feel<elastic, T>(pair, p.felt, t);
     f(static_cast<const Touching<T>&>(t));
   };
@@ -184,7 +211,7 @@ GELFLOW_INLINE void for_touching_points(const PairFrame<T>& frame, const PointCl
     for (int begin = first; begin < last; begin += most * width) {
       const int end = std::min(begin + most * width, last);
       place(begin, end);
-      for (int i = begin, n = 0; i < end; i += width, ++n) look(i, placed[n]);
+      for (int i = begin, n = 0; i < end; i += width, ++n) look(i, n);
     }
   }
   skipped(seen, cloud.size());
