@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 Describe = Callable[[Any], Any]  # tells a model builder what there is, such as `Scene.describe_to`
 
 CONVERGED = 1e-12  # tolerance of a twin's Newton iterations
-TIMED = 2e-6  # and of runs that are timed beside other simulators: what they may be off by asks for no more
+# And of runs that are timed beside other simulators, by law of friction: what they may be off by asks for no more.
+TIMED = {"viscous": 2e-4, "elastic": 2e-5}
 POSITION, TURN, FORCE = 1e-6, 1e-6, 1e-4  # how far from its twin a run may be: [m], [rad], relative
 HOLD = 5  # steps that a motion's controls are held for, and after which markers are read
 

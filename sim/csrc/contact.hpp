@@ -178,8 +178,8 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
   for (int i = 0; i < c.n; i += width) {  // what the displacement of these dofs changes
     L s[6], y[6];
     for (int a = 0; a < 6; ++a) {
-      s[a] = load<L>(c.s.row(a) + i);
-      y[a] = load<L>(c.y.row(a) + i);
+      s[a] = load<L>(c.s.at(i, a));
+      y[a] = load<L>(c.y.at(i, a));
     }
     for (int a = 0; a < 6; ++a) {
       L by_q = L(sums.k(a, 0)) * s[0] + L(sums.d(a, 0)) * y[0], by_v = L(sums.d(a, 0)) * s[0];
@@ -188,8 +188,8 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
         by_q += L(sums.k(a, b)) * s[b] + d * y[b];
         by_v += d * s[b];
       }
-      store(by_q, c.force_q.row(a) + i);
-      store(by_v, c.force_v.row(a) + i);
+      store(by_q, c.force_q.at(i, a));
+      store(by_v, c.force_v.at(i, a));
     }
     // S_j ×* W: −(S_j ×* W) where j moves the first body, + where it moves the second; s_j S_j carries the sign.
     const T* const f = sums.wrench();
@@ -197,21 +197,21 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
         force{L(f[3]), L(f[4]), L(f[5])};
     const Vec3<L> top = cross(turn, moment) + cross(shift, force), bottom = cross(turn, force);
     for (int a = 0; a < 3; ++a) {
-      store(top[a], c.turned.row(a) + i);
-      store(bottom[a], c.turned.row(3 + a) + i);
+      store(top[a], c.turned.at(i, a));
+      store(bottom[a], c.turned.at(i, 3 + a));
     }
   }
   // `from`: 3 for a row without an angular part; `carried`: some of its axes are.
   const auto add_row = [&](int r, auto from, auto carried) GELFLOW_LOOP_BODY {
     const int row = c.dofs->dof[r];
     L s[6];
-    for (int a = from; a < 6; ++a) s[a] = L(T(h * c.s.row(a)[r]));
+    for (int a = from; a < 6; ++a) s[a] = L(T(h * c.s.at(r - r % width, a)[r % width]));
     for (int i = 0; i < c.n; i += width) {
       L by_q(0.0), by_v(0.0), turned(0.0);
       for (int a = from; a < 6; ++a) {
-        by_q += s[a] * load<L>(c.force_q.row(a) + i);
-        by_v += s[a] * load<L>(c.force_v.row(a) + i);
-        if (carried) turned += s[a] * load<L>(c.turned.row(a) + i);
+        by_q += s[a] * load<L>(c.force_q.at(i, a));
+        by_v += s[a] * load<L>(c.force_v.at(i, a));
+        if (carried) turned += s[a] * load<L>(c.turned.at(i, a));
       }
       if (carried) by_q -= load<L>(&c.dofs->turned[static_cast<std::size_t>(r) * c.n + i]) * turned;
       const std::ptrdiff_t at = row * w.by_q.outerStride() + c.dofs->start[i / width];

@@ -172,7 +172,7 @@ GELFLOW_INLINE L load(const S* from) {
   if constexpr (lane_count<L> == 1) {
     return L(*from);
   } else {
-    typedef S Stored __attribute__((vector_size(lane_count<L> * sizeof(S)), aligned(alignof(S)), may_alias));
+    typedef S Stored __attribute__((vector_size(lane_count<L> * sizeof(S)), aligned(alignof(S))));
     return L(__builtin_convertvector(*reinterpret_cast<const Stored*>(from), typename L::Vector));
   }
 }
@@ -182,7 +182,7 @@ GELFLOW_INLINE void store(const T& x, T* to) {
 }
 template <class T, int W>
 GELFLOW_INLINE void store(const Lanes<T, W>& x, T* to) {
-  typedef T Stored __attribute__((vector_size(W * sizeof(T)), aligned(alignof(T)), may_alias));
+  typedef T Stored __attribute__((vector_size(W * sizeof(T)), aligned(alignof(T))));
   *reinterpret_cast<Stored*>(to) = x.v;
 }
 

@@ -75,16 +75,21 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 //
 // An update with derivatives of an earlier one shrinks the residual by some factor and not to its square, and so ends
 // nearer to the tolerance: a margin makes up for it. In single precision there is no room for one. Who asks for the
-// last digits gets them. The next such update shrinks it by about the same factor: where a tenth of that is enough, what
-// it left is not measured, unless anchors move on from there.
+// last digits gets them.
+//
+// Where the residual is within the tolerance, or a tenth of what such an update leaves would be, one more update follows
+// whose residual is not measured, unless it has plenty of room already, or anchors move on from there: it costs little,
+// and takes an error away that would else add up over many steps.
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
   constexpr int full_steps = 4, patience = 6, most_old = 6;
-  constexpr double quick = 0.15, enough = 0.1, margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, exacting = 1e-9;
+  constexpr double quick = 0.15, enough = 0.1, exacting = 1e-9;
+  constexpr double margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, plenty = margin * margin;
   constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
   const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
   const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
+  const bool inexact = std::is_floating_point_v<T> && tolerance > exacting;
   bool fresh = false;  // w holds the derivatives at v
   const auto look = [&](bool derivatives, Found found) {
     if (derivatives) {
@@ -107,13 +112,15 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
   bool past = false;     // v lies just past an edge; the search goes on from w.start before it
   bool old = false;      // the last update was made with the derivatives of an earlier one
   for (int k = 0; k <= m.max_iterations; ++k) {
-    const bool converged = settled || relative(w.residual, w.forces, m.nv) <= (old ? margin : 1.0) * tolerance;
+    // Where an update made the residual that much smaller, its derivatives do for one more, which costs a quarter.
+    const bool again = inexact && !fresh && k <= most_old && size < quick * before;
+    const bool unmeasured = inexact && m.na == 0 && polish <= 0 && (fresh || again);
+    const double left = relative(w.residual, w.forces, m.nv);
+    const bool converged = settled || left <= (unmeasured ? plenty : old ? margin : 1.0) * tolerance;
     if (converged && polish-- <= 0) return Status::ok;
     if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
-    // Where an update made the residual that much smaller, its derivatives do for one more, which costs a quarter.
-    old = !fresh && !converged && k <= most_old && tolerance > exacting && std::is_floating_point_v<T> &&
-          size < quick * before;
-    const bool last = old && polish <= 0 && m.na == 0 && size * (size / before) <= enough * tolerance;
+    old = again && !converged;
+    const bool last = unmeasured && (left <= tolerance || (old && size * (size / before) <= enough * tolerance));
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
     solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);

@@ -42,16 +42,16 @@ void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Worksp
     s.angular = sign * s.angular;
     s.linear = sign * s.linear;
     for (int a = 0; a < 3; ++a) {
-      store(s.angular[a], c.s.row(a) + i);
-      store(s.linear[a], c.s.row(3 + a) + i);
+      store(s.angular[a], c.s.at(i, a));
+      store(s.linear[a], c.s.at(i, 3 + a));
     }
     const PackedMotion<T> before = packed_motion<T>(f, w.twist_before, at);
     const Vec3<L> angular = spread<L>(V3<T>(top(twist))) - before.angular;
     const Vec3<L> linear = spread<L>(V3<T>(bottom(twist))) - before.linear;
     const Vec3<L> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
     for (int a = 0; a < 3; ++a) {
-      store(turn[a], c.y.row(a) + i);
-      store(shift[a], c.y.row(3 + a) + i);
+      store(turn[a], c.y.at(i, a));
+      store(shift[a], c.y.at(i, 3 + a));
     }
   }
 }

@@ -28,6 +28,24 @@ struct SixRows {
   std::vector<T> numbers_;
 };
 
+// The same for packs that are taken one by one: the six of a pack stand together.
+template <class T>
+struct SixPacks {
+  static constexpr int width = pack_width<T>;
+  explicit SixPacks(int n) : numbers_(6 * static_cast<std::size_t>((n + width - 1) / width * width), T(0)) {}
+  // Number a of the pack that begins with vector i.
+  T* at(int i, int a) { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
+  const T* at(int i, int a) const { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
+  V6<T> operator[](int i) const {
+    V6<T> x;
+    for (int a = 0; a < 6; ++a) x[a] = at(i - i % width, a)[i % width];
+    return x;
+  }
+
+ private:
+  std::vector<T> numbers_;
+};
+
 // Bodies that move together, about the world's origin (dynamics.hpp).
 template <class T>
 struct Composite {
@@ -69,9 +87,9 @@ template <class T>
 struct PairColumns {
   explicit PairColumns(int most) : s(most), y(most), force_q(most), force_v(most), turned(most) {}
   const PackedDofs* dofs = nullptr;
-  int n = 0;                            // columns, a whole number of packs
-  SixRows<T> s, y;                      // S and Y, signs applied
-  SixRows<T> force_q, force_v, turned;  // what their displacements change (contact.hpp)
+  int n = 0;                             // columns, a whole number of packs
+  SixPacks<T> s, y;                      // S and Y, signs applied
+  SixPacks<T> force_q, force_v, turned;  // what their displacements change (contact.hpp)
 };
 
 // What a step's residual needs beside v_t.
