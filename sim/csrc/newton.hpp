@@ -83,7 +83,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
-  constexpr int full_steps = 4, patience = 6, most_old = 6;
+  constexpr int full_steps = 6, patience = 6, most_old = 6;
   constexpr double quick = 0.15, enough = 0.1, exacting = 1e-9;
   constexpr double margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, plenty = margin * margin;
   constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
