@@ -116,14 +116,24 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     const bool again = inexact && !fresh && k <= most_old && size < quick * before;
     const bool unmeasured = inexact && m.na == 0 && polish <= 0 && (fresh || again);
     const double left = relative(w.residual, w.forces, m.nv);
-    const bool converged = settled || left <= (unmeasured ? plenty : old ? margin : 1.0) * tolerance;
+    const bool would_do = left <= (old ? margin : 1.0) * tolerance;
+    const bool converged = settled || (unmeasured ? left <= plenty * tolerance : would_do);
     if (converged && polish-- <= 0) return Status::ok;
-    if (k == m.max_iterations || iterations >= m.max_step_iterations) break;
+    if (k == m.max_iterations || iterations >= m.max_step_iterations) {
+      return unmeasured && would_do ? Status::ok : Status::newton;
+    }
     old = again && !converged;
     const bool last = unmeasured && (left <= tolerance || (old && size * (size / before) <= enough * tolerance));
     if (!fresh && !old) size = measure(true);
     if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
     solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);
+    if (last && w.direction.allFinite()) {
+      ++iterations;
+      v -= w.direction;
+      arrive<T>(m, from, v.data(), w);
+      return Status::ok;
+    }
+    if (last && would_do) return Status::ok;  // the matrix is singular
     if (past) {
       w.direction += w.start - v;
     } else {
@@ -136,10 +146,6 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     bool better = false;
     for (int tries = 0; tries < 13; ++tries, fraction *= 0.5) {
       v = w.start - w.direction * T(fraction);
-      if (last) {
-        arrive<T>(m, from, v.data(), w);
-        return Status::ok;
-      }
       size = measure(false);
       better = size <= (1 - 1e-4 * fraction) * before;
       if (converged) break;
