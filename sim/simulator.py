@@ -64,7 +64,7 @@ class Simulator:
     BDF2: last step's displacement (nv), the velocity before it (nv), and 1 where there was one; BDF1 has none, nh = 0.
 
     In single precision the core keeps what `q` rounds away, so that small steps add up, and sees bodies from each other
-    in double; gradients are computed in double, at the states of the trajectory.
+    in double; gradients are computed in double, at the states of the trajectory, but for viscous readings' share.
     """
 
     def __init__(

@@ -55,7 +55,8 @@ def measure_precision(effort: Effort) -> Report:
         rows=rows,
         note="m, rad: largest difference of a body's place and turn. readings: largest norm of a difference over the "
         f"largest norm. gradient: of readings every {READ_EVERY} steps with random weights, by all controls, relative. "
-        "Gradients are computed in double, at the states of single precision." + busy(taken),
+        "Gradients are computed in double, at the states of single precision, but for viscous readings' share."
+        + busy(taken),
         results=results,
         outside=[],
     )
