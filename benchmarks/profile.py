@@ -42,7 +42,10 @@ GROUPS = {
         *("pair_frame", "move_mount"),
     ),
     "dynamics": ("inverse_dynamics", "floating_body", "subtract_joint_forces", "actuator_pull"),
-    "places": ("forward_", "arrive", "integrate", "quaternion", "axis_rotation", "right_jacobian", "position_by", "sincos"),
+    "places": (
+        *("forward_", "arrive", "integrate", "quaternion"),
+        *("axis_rotation", "right_jacobian", "position_by", "sincos"),
+    ),
     "solver": ("factorize", "invert", "solve", "newton", "evaluate", "relative"),
 }
 
