@@ -17,12 +17,12 @@ INSTALL := .venv/bin/python -m pip --disable-pip-version-check install -q --no-c
 BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
-CXX_FILES = $(foreach folder,sim/csrc perception/csrc,$(wildcard $(folder)/*.cpp $(folder)/*.hpp))
+CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc,$(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
 SANITIZE_BUILD := build/sanitize
 # It is fifty times slower there: one file goes through every part of the core, the others through batches and contact.
-SANITIZE_TESTS = $(patsubst %,tests/test_core_%.py,every_part batch contact)
+SANITIZE_TESTS = $(patsubst %,tests/sim/core/test_%.py,every_part batch contact)
 # Random images that go through the marker tracker.
 FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gelflow.errors import GelflowError, UsageError
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

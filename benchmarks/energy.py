@@ -1,6 +1,6 @@
 """What steps do to mechanical energy: `python benchmarks/energy.py`.
 
-First free bodies thrown on planes, where nothing may add any (`gelflow.sim.throws`): the share of the steps in which
+First free bodies thrown on planes, where nothing may add any (`thrown_bodies`): the share of the steps in which
 the energy grew, and by how much at most. Then the scenes' motions, where motors and servos do work: what a step gained
 beyond their work. Servos pull with the force at the step's end, over the way of the step. All but the share is relative
 to the energy at work.
@@ -21,13 +21,14 @@ from rich.progress import Progress
 from rich.table import Table
 
 from gelflow.errors import GelflowError
-from gelflow.sim.benchmark import processor, versions
-from gelflow.sim.energy import EnergyGauge, motor_forces
-from gelflow.sim.motions import SCENES, motion
-from gelflow.sim.scene import INTEGRATORS, load_scene
-from gelflow.sim.scene_parts import LAWS
+from gelflow.measurement.machine import processor
+from gelflow.sim.benchmark import versions
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import INTEGRATORS, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.throws import Kind, Throw, fly
+from gelflow.sim.validation.energy import EnergyGauge, motor_forces
+from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.thrown_bodies import Kind, Throw, fly
 
 STEPS = (1e-4, 1e-3, 5e-3, 2e-2)  # [s], of free bodies
 SCENE_STEPS = (1e-3, 5e-3, 2e-2)  # [s]

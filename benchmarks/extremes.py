@@ -1,7 +1,7 @@
 """Two million random steps at the extremes: `python benchmarks/extremes.py`, a little over 3 minutes on 2 cores.
 
-What is drawn stands in `gelflow.sim.extremes`. Prints how many steps failed, needed substeps, and what they cost; the
-figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
+What is drawn stands in `sim/validation/stress.py`. Prints how many steps failed, needed substeps, and what they cost;
+the figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
 """
 
 import argparse
@@ -14,11 +14,11 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
+from gelflow.measurement.machine import processor
 from gelflow.sim import _core
-from gelflow.sim.benchmark import processor
-from gelflow.sim.extremes import KINDS, Extremes, Tally, draws
-from gelflow.sim.motions import SCENES
 from gelflow.sim.simulator import STATUS
+from gelflow.sim.validation.reference_motions import SCENES
+from gelflow.sim.validation.stress import KINDS, Extremes, Tally, draws
 
 RESULTS = Path(__file__).parent / "results"
 ENVS, STEPS = 250, 20

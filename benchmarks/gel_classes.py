@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gelflow.hardware_mocks.gel_flaws import FACTORS, PRESETS, look_of
-from gelflow.hardware_mocks.gel_sequences import FIELDS, GelSequence
+from gelflow.perception.synthetic.flaws import FACTORS, PRESETS, look_of
+from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
 FILE = Path(__file__).parents[1] / "docs" / "pictures" / "gel_classes.jpg"
 SHOWN = 24  # number of the image: near the peak

@@ -2,7 +2,7 @@
 
 `python benchmarks/gradients.py` prints a table and writes benchmarks/results/gradients.json. For each combination it
 takes as many random states in contact as --states says, each with a scalar of positions, velocities or marker readings,
-in turn. tests/test_core_gradients.py does the same with three. In the table:
+in turn. tests/sim/gradients/test_gradients.py does the same with three. In the table:
 
 where       parameters count in groups of one kind: "kn", "pos", "scale", ...
 dual        largest relative difference to dual numbers, which run the same code: below 1e-10
@@ -23,14 +23,14 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from gelflow.measurement.machine import processor
 from gelflow.sim._core import LEVEL
-from gelflow.sim.benchmark import processor
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.gradient_cases import FREE, SHAPES, exact_simulator, in_contact, on_shape
-from gelflow.sim.gradient_check import Case, Output, against_differences, against_dual
-from gelflow.sim.motions import SCENES
-from gelflow.sim.scene import INTEGRATORS
-from gelflow.sim.scene_parts import LAWS
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import INTEGRATORS
+from gelflow.sim.validation.gradient_cases import FREE, SHAPES, exact_simulator, in_contact, on_shape
+from gelflow.sim.validation.gradient_check import Case, Output, against_differences, against_dual
+from gelflow.sim.validation.reference_motions import SCENES
 
 FILE = Path(__file__).parent / "results" / "gradients.json"
 OUTPUTS: tuple[Output, ...] = ("q", "v", "tactile")

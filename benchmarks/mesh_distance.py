@@ -30,12 +30,13 @@ from rich.progress import track
 from rich.table import Table
 
 from gelflow.errors import GelflowError
-from gelflow.sim import _core, mesh_solids
-from gelflow.sim.benchmark import processor
-from gelflow.sim.mesh import TriangleMesh, nearest_points
-from gelflow.sim.mesh_grid import DistanceGrid, build_grid
-from gelflow.sim.sampling import capsule, mesh_surface
+from gelflow.measurement.machine import processor
+from gelflow.sim import _core
+from gelflow.sim.scene.distance_grid import DistanceGrid, build_grid
+from gelflow.sim.scene.mesh import TriangleMesh, nearest_points
+from gelflow.sim.scene.sampling import capsule, mesh_surface
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation import reference_meshes as mesh_solids
 
 Array = NDArray[np.float64]
 

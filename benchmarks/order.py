@@ -1,6 +1,6 @@
 """How errors fall with the time step on whole scenes, and at what cost: `python benchmarks/order.py`.
 
-Each scene's motion (`gelflow.sim.motions`: touch is made, slides, sticks, breaks, is made again) is run with steps of
+Each scene's motion (`reference_motions`: touch is made, slides, sticks, breaks, is made again) is run with steps of
 5 ms and of halves, quarters, … of that, by BDF1 and BDF2, under both friction laws. The reference is BDF2 with the
 shortest step of all.
 
@@ -41,11 +41,12 @@ from rich.table import Table
 from schemes import Scheme, ball_errors, extrapolated_scene
 
 from gelflow.errors import GelflowError
+from gelflow.measurement.machine import processor
 from gelflow.sim import _core
-from gelflow.sim.benchmark import processor, versions
-from gelflow.sim.motions import Motion, motion
-from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
+from gelflow.sim.benchmark import versions
+from gelflow.sim.scene.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import Motion, motion
 
 Array = NDArray[np.float64]
 Case = tuple[str, str]  # scene, law

@@ -1,6 +1,6 @@
 """Where the instructions of a step go, scene by scene: `python benchmarks/profile.py` (needs valgrind).
 
-Each scene's motion (`gelflow.sim.motions`) runs under valgrind's callgrind, which counts the instructions of every
+Each scene's motion (`reference_motions`) runs under valgrind's callgrind, which counts the instructions of every
 function while a step is taken. They are grouped by what the function is for, and divided by the steps. Counts do not
 depend on how busy the machine is; the time beside them does.
 """
@@ -19,11 +19,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from gelflow.sim.benchmark import processor, versions
+from gelflow.measurement.machine import processor
+from gelflow.sim.benchmark import versions
 from gelflow.sim.benchmark.runs import HOLD
-from gelflow.sim.motions import SCENES, motion
-from gelflow.sim.scene import load_scene
+from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import SCENES, motion
 
 STEPS = 100
 # Groups by the names of functions, looked for in this order; small ones are inlined into those that call them.

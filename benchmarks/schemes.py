@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.sim.gradient_check import difference, retract
-from gelflow.sim.motions import Motion
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.gradient_check import difference, retract
+from gelflow.sim.validation.reference_motions import Motion
 
 Array = NDArray[np.float64]
 

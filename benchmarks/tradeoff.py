@@ -1,6 +1,6 @@
 """Everything that docs/tradeoff.md shows: `python benchmarks/tradeoff.py [SCENE …]`.
 
-For each scene: all settings (`gelflow.sim.tradeoff`) to benchmarks/results/tradeoff_SCENE.json and
+For each scene: all settings (`gelflow.sim.benchmark.tradeoff.sweep`) to benchmarks/results/tradeoff_SCENE.json and
 docs/pictures/tradeoff_SCENE.png, and the errors of its presets over draws of its physics, whose bounds go into the
 table of docs/tradeoff.md. Errors do not depend on the machine; run it where nothing else runs, for the times.
 """
@@ -15,14 +15,15 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from gelflow.cli.tradeoff import plain, short, table
-from gelflow.cli.tradeoff_picture import draw
+from gelflow.cli.commands.tradeoff import plain, short, table
 from gelflow.errors import GelflowError
-from gelflow.sim.benchmark import processor, versions
-from gelflow.sim.scene import load_scene, scene_names
-from gelflow.sim.tradeoff import Tradeoff, measure
-from gelflow.sim.tradeoff_presets import OWN, Bounds, bounds, preset_errors
-from gelflow.sim.tradeoff_run import Errors
+from gelflow.measurement.machine import processor
+from gelflow.sim.benchmark import versions
+from gelflow.sim.benchmark.tradeoff.picture import draw
+from gelflow.sim.benchmark.tradeoff.preset_bounds import OWN, Bounds, bounds, preset_errors
+from gelflow.sim.benchmark.tradeoff.run import Errors
+from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff, measure
+from gelflow.sim.scene.scene import load_scene, scene_names
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tradeoff.md"

@@ -13,14 +13,14 @@ from urllib.parse import parse_qs, urlsplit
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.hardware_mocks.egm import MockEgm, MockEgmConfig
-from gelflow.hardware_mocks.gel import GelLook, GelRenderer
-from gelflow.hardware_mocks.mjpeg import MjpegServer
-from gelflow.hardware_mocks.world import WorldConfig
-from gelflow.hardware_mocks.world_process import RemoteWorld
-from gelflow.hardware_mocks.wsg import MockWsg
-from gelflow.pace import LEFT_CAMERA, RIGHT_CAMERA, Pace
+from gelflow.hardware_mocks.camera.mjpeg_server import MjpegServer
+from gelflow.hardware_mocks.egm.arm import MockEgm, MockEgmConfig
+from gelflow.hardware_mocks.simulated_cell.process import RemoteWorld
+from gelflow.hardware_mocks.simulated_cell.simulation import WorldConfig
+from gelflow.hardware_mocks.wsg.gripper import MockWsg
+from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
 from gelflow.real.kinematics import Joints
+from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, Pace
 
 Rotation = Literal[0, 90, 180, 270]
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots, smaller
+from gelflow.perception.errors import StartRefused, draw_seen
 from gelflow.perception.lattice import Lattice, fill, grow
-from gelflow.perception.refusal import StartRefused, draw_seen
 
 Polarity = Literal["auto", "dark", "bright"]
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
 from gelflow.perception.detect import smaller
+from gelflow.perception.dot_model import learn
+from gelflow.perception.errors import StartRefused
 from gelflow.perception.grid import Polarity, find_grid
-from gelflow.perception.learn import learn
-from gelflow.perception.refusal import StartRefused
 
 __all__ = ["MarkerTracker", "StartRefused", "Tracked", "TrackerConfig"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap, Grid
-from gelflow.policies.mirrors import Mirrors, exponents
+from gelflow.policies.symmetry import Mirrors, exponents
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -152,7 +152,7 @@ class Network:
                 raise UsageError(f"tensor {name} has shape {tensors[name].shape}; expected {shape}")
             if not np.isfinite(tensors[name]).all():
                 raise UsageError(f"tensor {name} has values that are not finite")
-        self._mirrors = Mirrors(architecture, task)
+        self._mirrors = Mirrors(architecture.degree, architecture.history, task)
         self._basis: Array = tensors["basis"].astype(float)
         self._scale: Array = tensors["scale"].astype(float)
         depth = len(architecture.hidden) + 1

@@ -24,9 +24,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from gelflow.errors import UsageError
-from gelflow.policies import checkpoint, curve
-from gelflow.policies.attempts import Attempts, Evaluation, NetworkActor, Noise, evaluate
-from gelflow.policies.curve import Progress
+from gelflow.policies import checkpoint
+from gelflow.policies import learning_curve as curve
+from gelflow.policies.evaluation import Attempts, Evaluation, NetworkActor, Noise, evaluate
+from gelflow.policies.learning_curve import Progress
 from gelflow.policies.networks import Architecture, Network, polynomial_basis, reduce_maps, tensor_shapes
 
 Array = NDArray[np.float64]

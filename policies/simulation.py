@@ -1,6 +1,6 @@
 """The simulated insertion as training and evaluation use it: which environment, which noise."""
 
-from gelflow.policies.attempts import Attempts, Noise
+from gelflow.policies.evaluation import Attempts, Noise
 from gelflow.sim.tasks.gym import InsertionVectorEnv
 from gelflow.task import INSERTION, InsertionTask
 

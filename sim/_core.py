@@ -7,7 +7,7 @@ GELFLOW_CORE=sanitize the one that `make sanitize` builds and runs, which stops 
 import importlib
 import os
 
-from gelflow.sim._core_processor import runs_v3
+from gelflow.sim._core_cpu_features import runs_v3
 
 from gelflow.errors import UsageError
 

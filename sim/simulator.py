@@ -16,7 +16,7 @@ STATUS = {0: "ok", 1: "Newton's method did not converge, even with the shortest 
 
 
 class Buildable(Protocol):
-    """Anything that makes a core model: a `gelflow.sim.scene.Scene`."""
+    """Anything that makes a core model: a `gelflow.sim.scene.scene.Scene`."""
 
     def build(self) -> Any: ...
 

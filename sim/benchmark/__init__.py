@@ -1,37 +1,10 @@
-"""Measurements of speed, for `gelflow bench`. Here: what stands beside every result, the machine and the versions."""
+"""Measurements of the simulator's speed, for `gelflow bench`."""
 
-import os
-import platform
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-
-from gelflow import __version__
-
-
-def cores() -> int:
-    """How many of this machine's cores are ours."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def processor() -> str:
-    """Name of this machine's processor, and how many of its cores are ours."""
-    name = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:  # not Linux
-        lines = []
-    name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), name)
-    return f"{name}, {cores()} cores"
+from gelflow.measurement import machine
 
 
 def versions() -> dict[str, str]:
-    """Of gelflow, of the build of its core, of Python, and of what is measured or measured with."""
-    from gelflow.sim._core import LEVEL  # here: the processor's name is asked for where the core is not built
+    """The versions that every measurement stores, and the build of the C++ core."""
+    from gelflow.sim._core import LEVEL  # imported here: the package can be imported before the core is built
 
-    found = {"gelflow": __version__, "core": LEVEL, "python": platform.python_version(), "system": platform.platform()}
-    for package in ("numpy", "mujoco"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:  # run from a tree that was not installed with pip
-            found[package] = "unknown"
-    return found
+    return {**machine.versions(), "core": LEVEL}

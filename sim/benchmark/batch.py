@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gelflow.sim.benchmark import cores
+from gelflow.measurement.machine import cores
+from gelflow.measurement.timing import Effort, Report, Work, busy, interleaved, times_as_fast
 from gelflow.sim.benchmark.runs import check, motion_run, simulator
-from gelflow.sim.benchmark.timing import Effort, Report, Work, busy, interleaved, times_as_fast
-from gelflow.sim.scene import load_scene
+from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
 SIZES = (1, 2, 4, 16, 64, 256, 1024)

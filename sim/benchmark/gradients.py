@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.measurement.timing import Effort, Report, Work, busy, interleaved, times_as_fast
 from gelflow.sim.benchmark.rolling import rolling_scene
 from gelflow.sim.benchmark.runs import Check, Run, check, motion_run, simulator, twin_of
-from gelflow.sim.benchmark.timing import Effort, Report, Work, busy, interleaved, times_as_fast
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]

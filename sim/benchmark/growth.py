@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved
 from gelflow.sim.benchmark.batch import differ
 from gelflow.sim.benchmark.rolling import rolling_run, rolling_scene
 from gelflow.sim.benchmark.runs import Check, Describe, Run, check, motion_run, simulator
-from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved
-from gelflow.sim.scene import load_scene
+from gelflow.sim.scene.scene import load_scene
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved
 from gelflow.sim import _core
 from gelflow.sim.benchmark.runs import FORCE
-from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved
-from gelflow.sim.mesh_grid import spline_grid
+from gelflow.sim.scene.distance_grid import spline_grid
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

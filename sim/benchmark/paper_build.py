@@ -7,8 +7,8 @@ import tempfile
 from pathlib import Path
 
 from gelflow.errors import UsageError
+from gelflow.measurement.timing import Work
 from gelflow.sim.benchmark.runs import Run
-from gelflow.sim.benchmark.timing import Work
 
 MODULE = "redmax_py"
 

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import angles_between
+from gelflow.measurement.timing import Effort, Report, busy, interleaved, times_as_fast
 from gelflow.sim.benchmark.runs import HOLD, motion_run, simulator
-from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved, times_as_fast
-from gelflow.sim.motions import SCENES, motion
-from gelflow.sim.scene import Scene, load_scene
-from gelflow.sim.scene_parts import LAWS
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import SCENES, motion
 
 Array = NDArray[np.float64]
 

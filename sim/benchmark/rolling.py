@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from gelflow.errors import UsageError
+from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
 from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
 from gelflow.sim.benchmark.paper_build import PaperRolling, why_not
 from gelflow.sim.benchmark.runs import TIMED, Run, check, simulator
-from gelflow.sim.benchmark.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.scene import Scene, load_scene
 
 # The run of the paper's appendix B.1: the force on the pad [N], and the step until which it holds.
 ROLLING_FORCES = (

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import angles_between
+from gelflow.measurement.timing import Work
 from gelflow.sim import _core
-from gelflow.sim.benchmark.timing import Work
-from gelflow.sim.motions import motion
-from gelflow.sim.scene import Scene
+from gelflow.sim.scene.scene import Scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import motion
 
 Array = NDArray[np.float64]
 Describe = Callable[[Any], Any]  # tells a model builder what there is, such as `Scene.describe_to`

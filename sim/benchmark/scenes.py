@@ -1,11 +1,11 @@
 """The five scenes that come along, each on its own motion, under both friction laws."""
 
+from gelflow.measurement.timing import Effort, Report, busy, interleaved
 from gelflow.sim.benchmark.rolling import rolling_scene
 from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
-from gelflow.sim.benchmark.timing import Effort, Report, busy, interleaved
-from gelflow.sim.motions import SCENES
-from gelflow.sim.scene import load_scene
-from gelflow.sim.scene_parts import LAWS
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.validation.reference_motions import SCENES
 
 SIDE = 50  # of the rolling pad's grid
 

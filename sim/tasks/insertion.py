@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import DEFAULT_FLOORS, normalize
-from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.randomization import TABLE_7, Randomization
 from gelflow.task import INSERTION, InsertionTask

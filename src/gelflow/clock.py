@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gelflow.errors import UsageError
-from gelflow.pace import LAG, SHORTEST_WAIT, Pace
+from gelflow.time_sync import LAG, SHORTEST_WAIT, Pace
 
 
 class Clock(Protocol):
@@ -75,7 +75,7 @@ class ScaledClock:
         return 0.0 if self._pace is None else self._pace.lost
 
     def allow(self, slot: int, until: float) -> None:
-        """Robot time may run to `until` [s], as far as who has `slot` is concerned: see `gelflow.pace`."""
+        """Robot time may run to `until` [s], as far as who has `slot` is concerned: see `gelflow.time_sync`."""
         if self._pace is not None:
             self._pace.allow(slot, max(until, self.now()))  # it never runs back
 

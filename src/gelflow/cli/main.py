@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from gelflow import __version__
 from gelflow.errors import GelflowError
 
-# command → (what it does in one line). The module is gelflow.cli.<command>, with _ for -.
+# command → (what it does in one line). The module is gelflow.cli.commands.<command>, with _ for -.
 COMMANDS = {
     "train": "train a policy in simulation",
     "eval": "success of a policy in simulation, beside random actions",
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == chosen:
-            module = importlib.import_module(f"gelflow.cli.{name.replace('-', '_')}")
+            module = importlib.import_module(f"gelflow.cli.commands.{name.replace('-', '_')}")
             module.configure(sub)
     args = parser.parse_args(arguments)
     assert module is not None

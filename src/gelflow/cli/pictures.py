@@ -10,7 +10,7 @@ from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.perception.frames import CameraMount
-    from gelflow.real.runner import Attempt, Insertion
+    from gelflow.real.runner.runner import Attempt, Insertion
     from gelflow.task import InsertionTask
 
 _MOST = 6  # attempts in one picture

@@ -1,0 +1,1 @@
+"""The mock camera server."""

@@ -1,0 +1,271 @@
+"""A tactile camera's HTTP server: an MJPEG stream like that of a Raspberry Pi's streamer, with faults on demand."""
+
+import contextlib
+import math
+import socket
+import threading
+from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import Literal, Self
+from urllib.parse import parse_qs, urlsplit
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError, UsageError
+from gelflow.time_sync import LAG
+
+BOUNDARY = "boundarydonotcross"
+Corruption = Literal["truncated", "garbage", "length"]
+CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
+
+
+class MjpegServer:
+    """Serves one camera to any number of clients: `source` gives one JPEG per call.
+
+    Frames are made `rate` times a second of robot time, in a thread of its own, once for all clients together, and
+    only while somebody looks. A client that cannot keep up gets newer frames, not later ones. `port` 0 takes a free
+    one; `url` tells it. With a `slot` of a paced clock (`gelflow.time_sync`) robot time waits for frames that are late.
+    """
+
+    def __init__(
+        self,
+        source: Callable[[], bytes],
+        clock: ScaledClock,
+        *,
+        rate: float = 30.0,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        slot: int | None = None,
+    ) -> None:
+        if not 0 < rate <= 1000:
+            raise UsageError(f"rate must be above 0 and at most 1000 frames/s, got {rate}")
+        self._source = source
+        self._clock = clock
+        self._period = 1 / rate
+        self._slot = slot
+        self._where = (host, port)
+        self._server: _Server | None = None
+        self._threads: list[threading.Thread] = []
+        self._changed = threading.Condition()
+        self._frame = b""
+        self._number = 0  # of frames made
+        self._watchers = 0
+        self._closing = False
+        self._stalled = False
+        self._epoch = 0  # raised to end all streams
+        self._corrupt: list[Corruption] = []
+        self._failure: Exception | None = None
+
+    # Running
+
+    def start(self) -> Self:
+        """Bind and serve. Raises UsageError when the address is taken."""
+        try:
+            self._server = _Server(self._where, self)
+        except OSError as error:
+            host, port = self._where
+            raise UsageError(f"cannot serve a camera at {host}:{port}: {error.strerror}; take another port") from error
+        serve = threading.Thread(target=self._server.serve_forever, args=(0.05,), name="mjpeg server", daemon=True)
+        produce = threading.Thread(target=self._produce, name="mjpeg frames", daemon=True)
+        self._threads = [serve, produce]
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    @property
+    def port(self) -> int:
+        if self._server is None:
+            raise UsageError("the camera server is not started")
+        return int(self._server.server_address[1])
+
+    @property
+    def url(self) -> str:
+        """Of the stream."""
+        return f"http://{self._where[0]}:{self.port}/?action=stream"
+
+    @property
+    def clients(self) -> int:
+        """How many look at the stream now."""
+        return self._watchers
+
+    def close(self) -> None:
+        """End all streams and stop. Raises PeerError when `source` had failed."""
+        if self._server is None:
+            return
+        server, self._server = self._server, None
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        server.shutdown()
+        server.server_close()
+        for thread in self._threads:
+            thread.join(2.0)
+        if self._failure is not None:
+            kind, message = type(self._failure).__name__, self._failure
+            raise PeerError(f"the mock camera's picture source failed: {kind}: {message}") from self._failure
+
+    def __enter__(self) -> Self:
+        return self if self._server is not None else self.start()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    # Faults
+
+    def stall(self) -> None:
+        """Send nothing more, but keep the connections, until `resume`."""
+        with self._changed:
+            self._stalled = True
+
+    def resume(self) -> None:
+        with self._changed:
+            self._stalled = False
+            self._changed.notify_all()
+
+    def corrupt(self, count: int = 1, *, how: Corruption = "truncated") -> None:
+        """Spoil the next `count` frames sent: cut off, with noise in the image, or with a wrong Content-Length."""
+        if how not in CORRUPTIONS:
+            raise UsageError(f"how must be one of {', '.join(CORRUPTIONS)}, got {how!r}")
+        with self._changed:
+            self._corrupt += [how] * count
+
+    def drop_clients(self) -> None:
+        """Close all streams; new clients are served."""
+        with self._changed:
+            self._epoch += 1
+            self._changed.notify_all()
+
+    # Between the threads
+
+    def _produce(self) -> None:
+        due = self._clock.now()
+        while True:
+            with self._changed:
+                if self._closing or self._watchers == 0 or self._stalled:
+                    self._allow(math.inf)
+                self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._stalled))
+                if self._closing:
+                    return
+            try:
+                frame = self._source()
+            except Exception as error:  # noqa: BLE001 - `close` raises it; until then clients see the stream end
+                with self._changed:
+                    self._failure = error
+                    self._allow(math.inf)
+                    self._changed.notify_all()
+                return
+            with self._changed:
+                self._frame = frame
+                self._number += 1
+                self._changed.notify_all()
+            due = max(due + self._period, self._clock.now() - self._period)
+            self._allow(due + LAG)
+            self._clock.sleep(due - self._clock.now())
+
+    def _allow(self, until: float) -> None:
+        if self._slot is not None:
+            self._clock.allow(self._slot, until)
+
+    def _watch(self, change: int) -> int:
+        """Count a client in or out; returns the current epoch."""
+        with self._changed:
+            self._watchers += change
+            self._changed.notify_all()
+            return self._epoch
+
+    def _next(self, after: int, epoch: int) -> tuple[int, bytes, Corruption | None] | None:
+        """The newest frame once its number is greater than `after`; None when the stream shall end."""
+
+        def ended() -> bool:
+            return self._closing or self._failure is not None or self._epoch != epoch
+
+        with self._changed:
+            self._changed.wait_for(lambda: ended() or (self._number > after and not self._stalled))
+            if ended():
+                return None
+            spoilt = self._corrupt.pop(0) if self._corrupt else None
+            return self._number, self._frame, spoilt
+
+    def _newest(self) -> int:
+        with self._changed:
+            return self._number
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, where: tuple[str, int], camera: MjpegServer) -> None:
+        self.camera = camera
+        super().__init__(where, _Handler)
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that left in mid-frame is no error, and a mock does not print."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = 5.0  # of the socket [s]: a client that neither reads nor leaves is given up
+
+    def do_GET(self) -> None:
+        action = parse_qs(urlsplit(self.path).query).get("action", [""])[0]
+        if action == "stream":
+            self._stream()
+        elif action == "snapshot":
+            self._snapshot()
+        else:
+            self.send_error(404, "expected ?action=stream or ?action=snapshot")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Drivers and mocks do not print."""
+
+    def _stream(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace;boundary={BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        camera = self.server.camera
+        epoch = camera._watch(+1)
+        number = camera._newest()
+        try:
+            self.wfile.write(f"--{BOUNDARY}\r\n".encode())
+            while (step := camera._next(number, epoch)) is not None:
+                number, frame, spoilt = step
+                self.wfile.write(_part(frame, spoilt))
+        except OSError:
+            return  # the client has left
+        finally:
+            camera._watch(-1)
+
+    def _snapshot(self) -> None:
+        camera = self.server.camera
+        epoch = camera._watch(+1)
+        try:
+            step = camera._next(camera._newest(), epoch)
+        finally:
+            camera._watch(-1)
+        if step is None:
+            self.send_error(503, "the camera has no picture")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", "image/jpeg")
+        self.send_header("Content-Length", str(len(step[1])))
+        self.end_headers()
+        with contextlib.suppress(OSError):  # the client has left
+            self.wfile.write(step[1])
+
+
+def _part(frame: bytes, spoilt: Corruption | None) -> bytes:
+    """One part of the stream and the boundary behind it, as the streamer on a camera's computer sends them."""
+    length, body = len(frame), frame
+    if spoilt == "truncated":
+        body = frame[: len(frame) // 2]
+    elif spoilt == "garbage":
+        third = len(frame) // 3
+        body = frame[:third] + bytes((7 * i) & 0xFF for i in range(third)) + frame[2 * third :]
+        length = len(body)
+    elif spoilt == "length":
+        length = 10 * len(frame)
+    head = f"Content-Type: image/jpeg\r\nContent-Length: {length}\r\n\r\n".encode()
+    return head + body + f"\r\n--{BOUNDARY}\r\n".encode()

@@ -1,0 +1,322 @@
+"""The robot's side of EGM in a process of its own: started by `gelflow.hardware_mocks.egm.arm`, which see."""
+
+import gc
+import math
+import os
+import random
+import select
+import socket
+import sys
+from collections import deque
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gelflow.clock import Clock, ScaledClock, raise_priority
+from gelflow.errors import PeerError, SafetyError, UsageError
+from gelflow.helper_process import Messages, adopted
+from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
+from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, compose, forward, inverse, invert
+from gelflow.time_sync import CONTROLLER, LAG, SHORTEST_WAIT
+
+_IDENTITY: Frame = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class MockEgmConfig:
+    """How the controller is set up. Times are robot time."""
+
+    host: str = "127.0.0.1"  # UCDevice: where feedback is sent
+    port: int = 6510
+    period: float = 0.004  # between messages [s]
+    lag: float = 0.010  # of the controller's filter; the plant's own lag comes on top [s]
+    joint_speed: float = math.radians(1.0)  # MaxSpeedDeviation [rad/s]
+    comm_timeout: float = 0.2  # without an answer EGM ends [s]
+    restart_after: float = 1.0  # the RAPID program starts EGM again [s]
+    tool: Frame = _IDENTITY  # the plant's tool in the flange: position [m], quaternion w x y z
+    near: Joints = HOME  # of the joint solutions for the first pose, the one closest to this is taken [rad]
+    convergence: tuple[float, float, float] = (1e-3, math.radians(0.5), 1.0)  # within [m], [rad], for [s]
+
+    def __post_init__(self) -> None:
+        for name in ("period", "lag", "joint_speed", "comm_timeout", "restart_after"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} must be above 0, got {getattr(self, name)}")
+        if not 0 < self.port < 65536:
+            raise UsageError(f"port must be 1 to 65535, got {self.port}")
+
+
+@dataclass
+class MockEgmReport:
+    """What the controller saw: a copy, as it was when asked for."""
+
+    state: str = "waiting"  # waiting for an answer, running, ended
+    reason: str = ""  # why EGM ended last
+    sessions: int = 1  # how often EGM was started
+    sent: int = 0  # messages
+    answers: int = 0  # references taken in
+    invalid: int = 0  # datagrams that were no references
+    late: int = 0  # cycles that were skipped because this computer was busy
+    first_error: float = 0.0  # first reference of the session to the pose then [m]
+    largest_step: float = 0.0  # between two references while running [m]
+    largest_turn: float = 0.0  # [rad]
+    last_sequence: int = -1  # the last answer's count
+
+
+def joints_of(config: MockEgmConfig, pose: Frame, near: Joints) -> Joints:
+    """Joint angles [rad] of the plant's tool at `pose`. Raises SafetyError when there are none in range."""
+    position, quaternion = compose(pose, invert(config.tool))
+    return inverse(position, quaternion, near=near)
+
+
+class Controller:
+    """The controller itself, without I/O: answers go in, messages come out, cycle by cycle."""
+
+    def __init__(self, config: MockEgmConfig, clock: Clock, pose: Frame) -> None:
+        self._config = config
+        self._clock = clock
+        self.report = MockEgmReport()
+        self.pose = pose  # of the plant, as last heard
+        self._joints = joints_of(config, pose, config.near)  # of the controller's own motion
+        self._wanted = self._joints  # of the newest reference
+        self._shown, self._shown_at = self._joints, pose  # of the plant's pose
+        self._way: deque[tuple[Frame, Joints]] = deque(maxlen=4)  # where the plant was sent last
+        self._reference: EgmReference | None = None
+        self._motors = self._rapid = True
+        self._random = random.Random(0)
+        self._lose, self._loss = 0, 0.0
+        self._silent_until = -math.inf
+        self._sequence = self._ticks = 0
+        self._unanswered = self._settled = self._ended = 0.0
+
+    def motors(self, on: bool) -> None:
+        self._motors = on
+        if not on:
+            self._end("motors off")
+
+    def rapid(self, running: bool) -> None:
+        self._rapid = running
+        if not running:
+            self._end("RAPID stopped")
+
+    def restart_sequence(self) -> None:
+        self._sequence = 0
+
+    def lose(self, count: int, share: float) -> None:
+        self._lose, self._loss = count, share
+
+    def silence(self, seconds: float) -> None:
+        self._silent_until = self._clock.now() + seconds
+
+    def hear(self, data: bytes) -> None:
+        """A datagram has come: start to follow, or follow on."""
+        if self._clock.now() < self._silent_until:
+            return
+        report, last = self.report, self._reference
+        try:
+            reference = decode_sensor(data)
+        except PeerError:
+            report.invalid += 1
+            return
+        report.answers += 1
+        report.last_sequence = reference.sequence
+        self._unanswered = 0.0
+        if report.state == "waiting" and self._motors and self._rapid:
+            report.state = "running"
+            report.first_error = math.dist(self.pose[0], reference.position)
+        if report.state != "running":
+            return
+        if last is not None:
+            report.largest_step = max(report.largest_step, math.dist(last.position, reference.position))
+            report.largest_turn = max(report.largest_turn, angle_between(last.quaternion, reference.quaternion))
+        self._reference = reference
+        if last is None or (last.position, last.quaternion) != (reference.position, reference.quaternion):
+            try:
+                self._wanted = joints_of(self._config, (reference.position, reference.quaternion), self._wanted)
+            except SafetyError as error:
+                self._end(f"a reference is out of range: {error}")
+
+    def cycle(self, periods: int) -> tuple[bytes | None, Frame | None]:
+        """One message, after `periods` periods of motion: what to send, and where the plant is to go."""
+        elapsed = periods * self._config.period
+        report = self.report
+        self._ticks += periods
+        report.late += periods - 1
+        move = None
+        if report.state == "running":
+            move = self._move(elapsed)
+            # Skipped cycles sent nothing that could have been answered.
+            self._unanswered += self._config.period
+            if self._unanswered > self._config.comm_timeout:
+                self._end(f"no answer for {self._config.comm_timeout} s")
+        elif report.state == "ended" and self._motors and self._rapid and self._rested():
+            self._begin()
+        data = encode_robot(self._feedback(elapsed))
+        self._sequence += 1
+        return (None if self._is_lost() else data), move
+
+    def _is_lost(self) -> bool:
+        if self._lose > 0:
+            self._lose -= 1
+            return True
+        lost = self._clock.now() < self._silent_until or self._random.random() < self._loss
+        self.report.sent += not lost
+        return lost
+
+    def _rested(self) -> bool:
+        return self._clock.now() - self._ended > self._config.restart_after
+
+    def _begin(self) -> None:
+        self._sequence = 0
+        self._reference = None
+        self._unanswered = 0.0
+        self.report.state = "waiting"
+        self.report.sessions += 1
+
+    def _end(self, reason: str) -> None:
+        """EGM is over: the arm stands where it is."""
+        if self.report.state != "ended":
+            self.report.state, self.report.reason = "ended", reason
+            self._ended = self._clock.now()
+            self._wanted = self._joints
+            self._reference = None
+
+    def _move(self, elapsed: float) -> Frame | None:
+        share = 1 - math.exp(-elapsed / self._config.lag)
+        change = [(w - q) * share for w, q in zip(self._wanted, self._joints, strict=True)]
+        largest = max(map(abs, change))
+        if largest == 0.0:
+            return None
+        # All joints are slowed alike, so that the tool stays on its way.
+        scale = min(1.0, self._config.joint_speed * elapsed / largest)
+        a, b, c, d, e, f = (q + scale * d for q, d in zip(self._joints, change, strict=True))
+        self._joints = (a, b, c, d, e, f)
+        frame = compose(forward(self._joints), self._config.tool)
+        self._way.append((frame, self._joints))
+        return frame
+
+    def _feedback(self, elapsed: float) -> EgmFeedback:
+        self._look()
+        running = self.report.state == "running"
+        self._settled = self._settled + elapsed if running and self._near() else 0.0
+        return EgmFeedback(
+            sequence=self._sequence,
+            time=self._ticks * self._config.period,
+            position=self.pose[0],
+            quaternion=self.pose[1],
+            joints=self._shown,
+            motors="on" if self._motors else "off",
+            mci="running" if running else "stopped",
+            rapid="running" if self._rapid else "stopped",
+            converged=self._settled >= self._config.convergence[2],
+        )
+
+    def _look(self) -> None:
+        """Joints of the plant's pose: known where it is on the way that it was sent, else computed."""
+        if self.pose == self._shown_at:
+            return
+        self._shown_at = self.pose
+        for frame, joints in self._way:
+            if frame == self.pose:
+                self._shown = joints
+                return
+        try:
+            self._shown = joints_of(self._config, self.pose, self._shown)
+        except SafetyError as error:
+            self._end(f"the arm is out of range: {error}")
+
+    def _near(self) -> bool:
+        if self._reference is None:
+            return False
+        within, turned, _ = self._config.convergence
+        apart = math.dist(self.pose[0], self._reference.position)
+        return apart <= within and angle_between(self.pose[1], self._reference.quaternion) <= turned
+
+
+class _Loop:
+    """Sends on time, hears answers, and talks to the parent, which has the plant."""
+
+    def __init__(self, controller: Controller, config: MockEgmConfig, clock: ScaledClock, parent: Messages) -> None:
+        self._controller = controller
+        self._config = config
+        self._clock = clock
+        self._parent = parent
+        self._asked: float | None = None  # when the parent was asked what it has not answered yet [s, robot time]
+        self._move: Frame | None = None
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.bind(("", 0))
+        self._udp.setblocking(False)
+
+    def run(self) -> None:
+        """As the controller does, it looks once a cycle at what has come."""
+        grandparent = os.getppid()
+        due = self._clock.now()
+        while not self._parent.closed and os.getppid() == grandparent:
+            self._wait_until(due)
+            self._listen()
+            # The controller's time goes on, whatever this computer does: what was missed is skipped, not made up for.
+            missed = int((self._clock.now() - due) / self._config.period)
+            due += (1 + missed) * self._config.period
+            data, move = self._controller.cycle(1 + missed)
+            if data is not None:
+                self._udp.sendto(data, (self._config.host, self._config.port))
+            self._move = move or self._move
+            if self._asked is None:
+                self._parent.send(["cycle", self._move])
+                self._asked, self._move = due, None
+
+    def _wait_until(self, due: float) -> None:
+        """For the next cycle; robot time does not run far ahead of it, nor of a plant that owes an answer."""
+        while True:
+            self._clock.allow(CONTROLLER, LAG + (due if self._asked is None else self._asked))
+            left = due - self._clock.now()
+            if left <= 0:
+                return
+            if self._asked is None:
+                self._clock.sleep(left)
+            elif select.select((self._parent,), (), (), max(self._clock.wall(left), SHORTEST_WAIT))[0]:
+                self._hear_parent()
+
+    def _listen(self) -> None:
+        self._hear_parent()
+        with suppress(BlockingIOError):
+            while True:
+                data, sender = self._udp.recvfrom(4096)
+                if sender[1] == self._config.port:
+                    self._controller.hear(data)
+
+    def _hear_parent(self) -> None:
+        for kind, *values in self._parent.read():
+            if kind == "pose":
+                position, quaternion = values
+                self._controller.pose = (tuple(position), tuple(quaternion))
+                self._asked = None
+            else:
+                self._obey(*values)
+
+    def _obey(self, number: int, name: str, *values: Any) -> None:
+        if name != "report":
+            getattr(self._controller, name)(*values)
+        self._parent.send(["done", number, asdict(self._controller.report)])
+
+
+def main(arguments: list[str]) -> int:
+    """Started by `MockEgm`."""
+    settings, parent, _ = adopted(arguments)
+    clock = ScaledClock(*settings["clock"])
+    config = MockEgmConfig(**{name: _tuple(value) for name, value in settings["config"].items()})
+    controller = Controller(config, clock, _tuple(settings["pose"]))
+    raise_priority()
+    gc.disable()
+    with suppress(ConnectionError):
+        _Loop(controller, config, clock, parent).run()
+    clock.allow(CONTROLLER, math.inf)
+    return 0
+
+
+def _tuple(value: Any) -> Any:
+    """What was a tuple before it went through JSON."""
+    return tuple(map(_tuple, value)) if isinstance(value, list) else value
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""The simulated robot cell behind the mock devices."""

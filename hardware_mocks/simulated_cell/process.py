@@ -1,0 +1,277 @@
+"""The simulated world in a process of its own, so that no camera or protocol of the mocks keeps it waiting.
+
+What changes with every step passes through shared memory; what is rarely asked through a socket, as lines of JSON. The
+process ends when its parent does: the socket closes.
+"""
+
+import json
+import mmap
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+import gelflow
+from gelflow.clock import ScaledClock
+from gelflow.errors import SimulationError
+from gelflow.hardware_mocks.simulated_cell.simulation import World, WorldConfig
+from gelflow.observation import Grid
+
+Array = NDArray[np.float64]
+_START_LIMIT = 30.0  # [s, wall]
+_ANSWER_LIMIT = 5.0  # [s, wall]
+_GEL_PERIOD = 0.02  # markers are read this often, several times for every frame of a camera [s]
+
+
+class _Cell:
+    """Some numbers in shared memory: one writer, any readers, never half a value."""
+
+    def __init__(self, words: Array, start: int, size: int) -> None:
+        self._count = words[start : start + 1]
+        self._values = words[start + 1 : start + 1 + size]
+        self.end = start + 1 + size
+
+    def write(self, values: Any) -> None:
+        self._count[0] += 1  # odd while it is written
+        self._values[:] = values
+        self._count[0] += 1
+
+    def read(self) -> tuple[int, Array]:
+        """How often it was written, and the values."""
+        while True:
+            before = self._count[0]
+            values = self._values.copy()
+            if before % 2 == 0 and before == self._count[0]:
+                return int(before) // 2, values
+
+
+class _Shared:
+    """The layout of the memory that both processes map."""
+
+    def __init__(self, descriptor: int, grid: Grid) -> None:
+        markers = grid.rows * grid.cols
+        self.shape = (2, markers, 2)
+        self._map = mmap.mmap(descriptor, self.size(grid))
+        words = np.frombuffer(self._map, dtype=np.float64)
+        self.arm = _Cell(words, 0, 7)  # commanded pose
+        self.command = _Cell(words, self.arm.end, 3)  # of the gripper: width, speed, force
+        self.fingers = _Cell(words, self.command.end, 3)  # measured: width, speed, force
+        self.gels = _Cell(words, self.fingers.end, 4 * markers)
+
+    @staticmethod
+    def size(grid: Grid) -> int:
+        return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols)
+
+
+class RemoteWorld:
+    """The plants of the mock robot, simulated in another process; `with` or `start` and `stop`."""
+
+    def __init__(self, clock: ScaledClock, config: WorldConfig | None = None) -> None:
+        self.config = WorldConfig() if config is None else config
+        self._clock = clock
+        self._shared: _Shared | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._link: socket.socket | None = None
+        self._complaints: IO[bytes] | None = None
+        self._lock = threading.Lock()
+        self._asking = threading.Lock()
+        self._tool = self.config.start_tool()
+
+    def start(self) -> Self:
+        """Start the process and wait until it simulates. Raises SimulationError when it does not."""
+        grid = self.config.grid
+        with tempfile.TemporaryFile() as file:
+            os.ftruncate(file.fileno(), _Shared.size(grid))
+            self._shared = _Shared(file.fileno(), grid)
+            self._shared.arm.write([*self._tool[0], *self._tool[1]])
+            self._link, theirs = socket.socketpair()
+            self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (closed in stop)
+            paths = (str(Path(gelflow.__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
+            numbers = (theirs.fileno(), file.fileno())
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "gelflow.hardware_mocks.simulated_cell.process", *map(str, numbers)],
+                pass_fds=numbers,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=self._complaints,
+                # One core is enough for one cell; numerical libraries would start a thread for each.
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"},
+            )
+            theirs.close()
+        assert self._process.stdin is not None
+        with self._process.stdin as pipe:
+            pickle.dump((self.config, self._clock.settings), pipe)
+        try:
+            self._receive(_START_LIMIT)
+        except SimulationError:
+            self.stop()
+            raise
+        return self
+
+    def stop(self) -> None:
+        """End the process. Raises SimulationError when it had failed before."""
+        process, self._process = self._process, None
+        if process is None or self._link is None:
+            return
+        self._link.close()
+        try:
+            code = process.wait(_ANSWER_LIMIT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        words = self._last_words()
+        if code != 0:
+            raise SimulationError(f"the simulated world failed: {words}")
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.stop()
+
+    # ArmPlant, GripperPlant, GelPlant: see `World`
+
+    def arm_pose(self) -> tuple[Array, Array]:
+        with self._lock:
+            return self._tool[0].copy(), self._tool[1].copy()
+
+    def command_arm(self, position: Array, quaternion: Array) -> None:
+        with self._lock:
+            self._tool = np.array(position, dtype=float), np.array(quaternion, dtype=float)
+            self._running().arm.write([*self._tool[0], *self._tool[1]])
+
+    def gripper_state(self) -> tuple[float, float, float]:
+        if self._shared is None:
+            return self.config.start_width, 0.0, 0.0  # the device looks at its fingers before the world is started
+        _, (width, speed, force) = self._shared.fingers.read()
+        return float(width), float(speed), float(force)
+
+    def command_gripper(self, *, width: float, speed: float, force: float) -> None:
+        with self._lock:
+            self._running().command.write([width, speed, force])
+
+    def marker_displacement(self, finger: int) -> Array:
+        shared = self._running()
+        return np.asarray(shared.gels.read()[1].reshape(shared.shape)[finger])
+
+    # What the devices can not know
+
+    def truth(self) -> dict[str, Any]:
+        """`World.truth`. Raises SimulationError when the world has failed."""
+        return dict(self._ask({"ask": "truth"}))
+
+    def next_seed(self, seed: int) -> None:
+        """`World.next_seed`."""
+        self._ask({"ask": "next_seed", "seed": seed})
+
+    def _running(self) -> _Shared:
+        if self._shared is None:
+            raise SimulationError("the simulated world was not started")
+        return self._shared
+
+    def _ask(self, question: dict[str, Any]) -> Any:
+        with self._asking:
+            if self._link is None or self._process is None:
+                raise SimulationError("the simulated world does not run")
+            try:
+                self._link.sendall(json.dumps(question).encode() + b"\n")
+            except OSError:
+                raise SimulationError(f"the simulated world is gone: {self._last_words()}") from None
+            return self._receive(_ANSWER_LIMIT)
+
+    def _receive(self, limit: float) -> Any:
+        """One line from the process."""
+        assert self._link is not None
+        self._link.settimeout(limit)
+        data = b""
+        try:
+            while not data.endswith(b"\n"):
+                part = self._link.recv(1 << 16)
+                if not part:
+                    raise SimulationError(f"the simulated world is gone: {self._last_words()}")
+                data += part
+        except TimeoutError:
+            raise SimulationError(f"the simulated world did not answer within {limit:g} s") from None
+        except ConnectionError:
+            raise SimulationError(f"the simulated world is gone: {self._last_words()}") from None
+        return json.loads(data)
+
+    def _last_words(self) -> str:
+        if self._complaints is None:
+            return "no reason known"
+        self._complaints.seek(0)
+        lines = self._complaints.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "no reason given"
+
+
+class _Service:
+    """The process's side."""
+
+    def __init__(self, world: World, link: socket.socket, shared: _Shared) -> None:
+        self._world, self._link, self._shared = world, link, shared
+        self._commands = shared.command.read()[0]
+        self._poses = -1
+        self._steps = 0
+        self._gel_every = max(1, round(_GEL_PERIOD / world.config.step))
+        self.ending = threading.Event()
+
+    def pass_on(self) -> None:
+        """After each step: commands in, measurements out."""
+        shared, world = self._shared, self._world
+        poses, pose = shared.arm.read()
+        if poses != self._poses:
+            self._poses = poses
+            world.command_arm(pose[:3], pose[3:])
+        commands, (width, speed, force) = shared.command.read()
+        if commands != self._commands:
+            self._commands = commands
+            world.command_gripper(width=float(width), speed=float(speed), force=float(force))
+        shared.fingers.write(world.gripper_state())
+        if self._steps % self._gel_every == 0:
+            shared.gels.write(world.displacements().reshape(-1))
+        self._steps += 1
+
+    def answer(self) -> None:
+        """A thread: questions of the parent, until it is gone."""
+        try:
+            for line in self._link.makefile("rb"):
+                question = json.loads(line)
+                reply: Any = None
+                if question["ask"] == "truth":
+                    reply = self._world.truth()
+                else:
+                    self._world.next_seed(int(question["seed"]))
+                self._link.sendall(json.dumps(reply).encode() + b"\n")
+        except OSError:
+            return  # the parent is gone in the middle of it
+        finally:
+            self.ending.set()
+
+
+def main(arguments: list[str]) -> int:
+    """`arguments`: file descriptors of the socket and of the shared memory; configuration and factor on stdin."""
+    # Ctrl-C reaches the whole terminal group; what it means is for the parent to say.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    config, settings = pickle.load(sys.stdin.buffer)  # from our own parent
+    link = socket.socket(fileno=int(arguments[0]))
+    world = World(ScaledClock(*settings), config)
+    service = _Service(world, link, _Shared(int(arguments[1]), config.grid))
+    threading.Thread(target=service.answer, daemon=True).start()
+    service.pass_on()
+    link.sendall(b"null\n")
+    world.run(service.ending, after_step=service.pass_on)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

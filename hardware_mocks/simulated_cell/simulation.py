@@ -1,0 +1,304 @@
+"""The world behind the mock robot: the insertion scene under the elastic law, stepped on the robot's clock.
+
+It is the plant of all mocks (gripper, arm, gels), and the hand that a real cell would have: a person who puts a part
+between the open fingers, holds it until it is gripped, and takes it away when it was let go. What the robot was taught
+and what is true differ by a random misalignment for every part; `truth` tells it, the devices never do.
+"""
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
+from gelflow.geometry import Pose, rotate, yaw_quaternion
+from gelflow.hardware_mocks.simulated_cell.gripper_drive import Grip
+from gelflow.observation import Grid, resampling
+from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.simulator import Simulator
+from gelflow.task import INSERTION, InsertionTask
+from gelflow.time_sync import LAG, SHORTEST_WAIT, WORLD
+
+Array = NDArray[np.float64]
+_PARKED = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # where a part waits that is not on the scene [m], w x y z
+_HALF_HEIGHT = 0.030  # of the part [m]
+_PART_WIDTH = 0.035  # between the pads [m]
+_HOLE = (0.01975, 0.02725)  # half its opening [m]
+_INTO_WALL = 0.3e-3  # an inserted part may press this far into a wall [m]
+_STILL = (2e-5, math.radians(0.02))  # a tool that stays within this of where it was is still [m, rad]
+
+
+@dataclass(frozen=True)
+class WorldConfig:
+    """How the mock cell is built. Lengths in metres, angles in radians, times in robot time."""
+
+    hole: Pose = field(default_factory=lambda: Pose(np.array([0.374, 0.05, 0.05]), yaw_quaternion(0.0)))
+    tool: Pose = field(default_factory=lambda: Pose(np.array([0.0, 0.0, 0.18]), np.array([0.0, 1.0, 0.0, 0.0])))
+    grid: Grid = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # markers printed on the gels [mm]
+    grasp_height: float = 0.030  # of the pads' centres above the part's lower face [m]
+    load_height: float = 0.032  # of the lower face above the hole's floor where the hand holds out a part, over it [m]
+    height_error: float = 0.2e-3  # the hand holds it this much too high or too low, at most [m]
+    step: float = 4e-3  # of the simulation [s]; divides EGM's 4 ms
+    arm_stiffness: float = 1e5  # [N/m]
+    yaw_stiffness: float = 500.0  # [N m/rad]
+    start_width: float = 0.060  # between the fingers [m]
+    seed: int = 0  # of the first part; each further part has the next
+    preset: str | None = None  # of the insertion scene, all but its step: see `preset_config`
+
+    def __post_init__(self) -> None:
+        if not 0 < self.step <= 4e-3 or abs(4e-3 / self.step - round(4e-3 / self.step)) > 1e-9:
+            raise UsageError(f"the world's step must divide 4 ms, got {self.step} s")
+
+    def start_tool(self) -> tuple[Array, Array]:
+        """Where the arm stands at first, the gripper ready to be loaded: position [m] and quaternion w x y z."""
+        taught = Pose(np.array([0.0, 0.0, self.load_height + self.grasp_height]), yaw_quaternion(0.0))
+        pose = self.hole @ taught @ self.tool.inverse()
+        return pose.position, pose.quaternion
+
+
+def preset_config(preset: str | None, *, seed: int) -> WorldConfig:
+    """The cell simulated as a preset of the insertion scene says, in steps that divide 4 ms and are no longer.
+
+    Raises UsageError when there is no such preset.
+    """
+    if preset is None:
+        return WorldConfig(seed=seed)
+    step = load_scene("insertion", preset=preset).step
+    return WorldConfig(seed=seed, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
+
+
+@dataclass
+class PartTruth:
+    """What is true of one part, whatever the robot believes."""
+
+    seed: int
+    misalignment: tuple[float, float, float]  # of the gripper at the taught pose, in the hole's frame [m, m, rad]
+    phase: str = "held out"  # held out, gripped, let go
+    height: float = 0.0  # of the lower face's highest corner above the hole's floor, when last held [m]
+    x: float = 0.0  # of the part in the hole, now [m]
+    y: float = 0.0
+    yaw: float = 0.0  # [rad]
+    slip: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the part in the grip, in the gripper's frame [m, m, rad]
+    inserted: bool = False  # in the hole when last held
+
+
+class World:
+    """The simulated cell. All plant methods may be called from any thread."""
+
+    def __init__(
+        self, clock: ScaledClock, config: WorldConfig | None = None, *, task: InsertionTask = INSERTION
+    ) -> None:
+        self.config = config = config or WorldConfig()
+        self._clock, self._task = clock, task
+        scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
+        self._sim = sim = Simulator(scene, threads=1)
+        for name in ("arm_x", "arm_y", "arm_z"):
+            self._servo(name, config.arm_stiffness, 1000.0)
+        self._servo("arm_yaw", config.yaw_stiffness, 200.0)
+        self._arm = [sim.joint_q(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
+        self._part = sim.joint_q("part")
+        self._part_v = sim.joint_v("part")
+        self._pads = [scene.markers_of("left"), scene.markers_of("right")]
+        self._weights = [resampling(grid.positions(), config.grid) for grid in scene.grids]
+        self._u = np.zeros(sim.model.nu)
+        self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
+        sim.reset()
+        sim.q[0] = scene.q0
+        self._grip = Grip(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
+        self._lock = threading.Lock()
+        self._time = clock.now()
+        self._still_since = self._time
+        self._next_seed = config.seed
+        self._hole_to_base = config.hole.inverse()
+        self._to_scene = self._hole_to_base  # with the present part's misalignment
+        self._hand: Array | None = _PARKED
+        self.parts: list[PartTruth] = []
+        self._current: PartTruth | None = None
+        self._tool = self._rest = self._start = Pose(*config.start_tool())
+        self._place_arm()
+        self._hold_part()
+
+    # Running
+
+    def run(self, ending: threading.Event, *, after_step: Callable[[], None] = lambda: None) -> None:
+        """Step on the clock until `ending` is set. Raises SimulationError when the simulation fails.
+
+        A paced clock waits where this computer can't simulate as fast as it runs.
+        """
+        step = self.config.step
+        self._time = self._clock.now()
+        while not ending.is_set():
+            self._clock.settle()
+            self._clock.allow(WORLD, self._time + step + LAG)
+            behind = self._clock.now() - self._time
+            if behind < step:
+                ending.wait(max(self._clock.wall(step - behind), SHORTEST_WAIT))
+                continue
+            with self._lock:
+                self._step()
+            after_step()
+
+    def advance(self, steps: int) -> None:
+        """Take steps by hand, without a clock."""
+        with self._lock:
+            for _ in range(steps):
+                self._step()
+
+    # ArmPlant
+
+    def arm_pose(self) -> tuple[Array, Array]:
+        """The tool as the arm's encoders show it: where it was told to be (the arm's stiffness lies behind them)."""
+        with self._lock:
+            return self._tool.position.copy(), self._tool.quaternion.copy()
+
+    def command_arm(self, position: Array, quaternion: Array) -> None:
+        """Follow this pose from now on: position [m], shape (3,); quaternion w x y z, shape (4,)."""
+        pose = Pose(np.array(position, dtype=float), np.array(quaternion, dtype=float))
+        if not (np.isfinite(pose.position).all() and np.isfinite(pose.quaternion).all()):
+            raise UsageError(f"the arm can not go to {pose}")
+        with self._lock:
+            if not pose.near(self._rest, *_STILL):
+                self._rest, self._still_since = pose, self._time
+            self._tool = pose
+            self._u[self._arm_u] = self._in_scene()
+
+    # GripperPlant
+
+    def gripper_state(self) -> tuple[float, float, float]:
+        """Width between the fingers [m], speed [m/s, positive opens], force on what they press [N]."""
+        with self._lock:
+            return self._grip.state()
+
+    def command_gripper(self, *, width: float, speed: float, force: float) -> None:
+        """Move towards `width` [m] at `speed` [m/s], pushing with at most `force` [N]."""
+        with self._lock:
+            self._grip.command(width=width, speed=speed, force=force)
+
+    # GelPlant
+
+    def marker_displacement(self, finger: int) -> Array:
+        """Displacement of the printed markers [mm], shape (markers, 2)."""
+        return np.asarray(self.displacements()[finger])
+
+    def displacements(self) -> Array:
+        """Displacement of the printed markers on both pads [mm], shape (2, markers, 2)."""
+        with self._lock:
+            moved = 1e3 * self._sim.displacement()[0]
+        return np.stack([weights @ moved[pad, :2] for weights, pad in zip(self._weights, self._pads, strict=True)])
+
+    # What the devices can not know
+
+    def next_seed(self, seed: int) -> None:
+        """The next part that the hand holds out is this one."""
+        with self._lock:
+            self._next_seed = seed
+
+    def truth(self) -> dict[str, Any]:
+        """What is true now, as plain data: the present part, all parts so far, and how long robot time had to wait."""
+        with self._lock:
+            if self._current is not None:
+                self._look(self._current)
+            return {
+                "part": None if self._current is None else asdict(self._current),
+                "parts": [asdict(part) for part in self.parts],
+                "waited": self._clock.lost,
+                "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
+            }
+
+    # Inside, with the lock held
+
+    def _servo(self, name: str, stiffness: float, force: float) -> None:
+        for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
+            self._sim.param(f"{name}.{key}")[:] = value
+
+    def _in_scene(self) -> Array:
+        """The arm's four joints for the present tool pose, in the scene: x, y, z [m], yaw [rad]."""
+        gripper = self._to_scene @ (self._tool @ self.config.tool)
+        return np.array([*gripper.position, gripper.yaw])
+
+    def _place_arm(self) -> None:
+        self._u[self._arm_u] = self._sim.q[0, self._arm] = self._in_scene()
+        self._sim.v[0] = 0.0
+
+    def _hold_part(self) -> None:
+        if self._hand is not None:
+            self._sim.q[0, self._part : self._part + 7] = self._hand
+            self._sim.v[0, self._part_v : self._part_v + 6] = 0.0
+            # What BDF2 remembers of the part: it did not move, and stood still before.
+            if self._sim.history.size:
+                for first in (0, self._sim.model.nv):
+                    self._sim.history[0, first + self._part_v : first + self._part_v + 6] = 0.0
+
+    def _step(self) -> None:
+        self._time += self.config.step
+        self._grip.drive(self.config.step)
+        self._sim.step(self._u)
+        self._sim.check()
+        self._hold_part()
+        self._hands_on()
+
+    def _hands_on(self) -> None:
+        """What the person beside the robot does."""
+        part = self._current
+        if part is None:
+            if self._ready_to_load():
+                self._hold_out()
+        elif part.phase == "held out":
+            if self._grip.locked:
+                self._hand, part.phase = None, "gripped"
+        elif part.phase == "gripped":
+            if not self._grip.locked:
+                self._look(part)
+                part.phase = "let go"
+        elif self._ready_to_load():
+            self._hand, self._current = _PARKED, None
+
+    def _ready_to_load(self) -> bool:
+        """The fingers are open, and the arm stands still where parts are handed over."""
+        open_wide = self._grip.width() > _PART_WIDTH + 0.005
+        there = self._tool.near(self._start, 1e-3, math.radians(1.0))
+        return open_wide and there and self._time - self._still_since > 0.3
+
+    def _hold_out(self) -> None:
+        """Draw the next part's misalignment and hold the part between the fingers."""
+        rng = np.random.default_rng((self._next_seed, 0x6E1))
+        x, y, yaw = self._task.draw_misalignment(rng, 1)[0]
+        self._to_scene = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)) @ self._hole_to_base
+        self._place_arm()
+        gx, gy, gz, turn = self._in_scene()
+        z = gz - self.config.grasp_height + _HALF_HEIGHT + rng.uniform(-1, 1) * self.config.height_error
+        self._hand = np.array([gx, gy, z, *yaw_quaternion(turn)])
+        self._hold_part()
+        self._sim.forget()
+        self._current = PartTruth(self._next_seed, (float(x), float(y), float(yaw)))
+        self.parts.append(self._current)
+        self._next_seed += 1
+
+    def _part_pose(self) -> Pose:
+        q = self._sim.q[0, self._part : self._part + 7]
+        return Pose(q[:3].copy(), q[3:].copy())
+
+    def _lower_face(self, pose: Pose) -> Array:
+        """The corners of the part's lower face in the hole's frame [m], shape (4, 3)."""
+        half = (_PART_WIDTH / 2, 0.025, -_HALF_HEIGHT)
+        corners = [np.array([i * half[0], j * half[1], half[2]]) for i in (-1, 1) for j in (-1, 1)]
+        return np.array([pose.position + rotate(pose.quaternion, corner) for corner in corners])
+
+    def _look(self, part: PartTruth) -> None:
+        """Take the part's true pose, while it is not let go: what counts is where the robot brought it."""
+        if part.phase == "let go":
+            return
+        pose = self._part_pose()
+        corners = self._lower_face(pose)
+        part.x, part.y = float(pose.position[0]), float(pose.position[1])
+        part.yaw, part.height = pose.yaw, float(corners[:, 2].max())
+        x, y, z, yaw = (float(v) for v in self._sim.q[0, self._arm])
+        slip = Pose(np.array([x, y, z]), yaw_quaternion(yaw)).inverse() @ pose
+        part.slip = float(slip.position[0]), float(slip.position[1]), slip.yaw
+        inside = bool((np.abs(corners[:, :2]) < np.array(_HOLE) + _INTO_WALL).all())
+        part.inserted = part.phase == "gripped" and inside and part.height < self._task.success_height

@@ -1,0 +1,1 @@
+"""The mock WSG-50 gripper."""

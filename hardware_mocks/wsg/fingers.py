@@ -1,0 +1,235 @@
+"""What the WSG-50 does with its fingers: motions and their results, the grasping control, FAST STOP, flags."""
+
+import math
+from dataclasses import dataclass
+
+from gelflow.hardware_mocks.plant import GripperPlant
+from gelflow.real.wsg.tables import HOME_INWARDS, Command, GraspState, Status, SystemFlag
+
+_REACHED = 0.2e-3  # this near to its goal a motion is done [m]
+_STILL = 1e-3  # slower than this the fingers stand [m/s]
+_SETTLE = 0.05  # fingers that stand this long before their goal are blocked [s]
+_PRESSED = 0.8  # of the force limit: the grasping force is there
+_SLIPPED = 1.5e-3  # fingers that close this far beyond where they held have lost the part [m]
+_SLACK = 0.1  # of the force limit; less than this for _LOOSE is a lost part
+_LOOSE = 0.1  # [s]
+
+
+@dataclass(frozen=True)
+class WsgDeviceConfig:
+    """What a laboratory sets on the device, or what its type says. SI units."""
+
+    stroke: float = 0.110  # [m]
+    speed: tuple[float, float] = (0.005, 0.420)  # [m/s]
+    acceleration: tuple[float, float] = (0.1, 5.0)  # [m/s²]
+    force: tuple[float, float, float] = (5.0, 80.0, 120.0)  # least, nominal, overdrive [N]
+    clamp_travel: float = 3e-3  # half the band around a part's nominal width in which it is grasped [m]
+    homing_speed: float = 0.060  # [m/s]
+    crc: bool = True  # False: checksums are neither checked nor sent
+    fast_stop_on_disconnect: bool = True  # an unannounced TCP close raises FAST STOP
+    shortest_command_interval: float = 0.0  # faster commands are answered with OVERRUN [s]
+    serial_number: int = 50_110
+
+
+@dataclass
+class _Motion:
+    command: Command
+    goal: float  # [m]
+    sign: int  # +1 opens, −1 closes
+    nominal: float  # a part's expected width [m]
+    started: float
+    still_since: float | None = None
+
+
+class Fingers:
+    """The state machine over a plant. Not thread-safe: the device holds a lock."""
+
+    def __init__(self, plant: GripperPlant, config: WsgDeviceConfig) -> None:
+        self._plant = plant
+        self._config = config
+        self._motion: _Motion | None = None
+        self._held_width = 0.0
+        self._held_sign = -1
+        self._loose_since: float | None = None
+        self._blocked = 0
+        self._reached = False
+        self._stopped = False
+        self._failed = False
+        self._at_limit = 0
+        self.referenced = False
+        self.fast_stopped = False
+        self.grasp = GraspState.IDLE
+        self.force_limit = config.force[1] / 2  # [N]
+        self.acceleration = 1.0  # [m/s²]; kept and reported, the plants don't know it
+        self.soft_limits: tuple[float, float] | None = None  # [m]
+        self.measured = plant.gripper_state()  # width [m], speed [m/s], force [N]
+
+    def home(self, direction: int, now: float) -> Status:
+        """Start homing; PENDING, or why not."""
+        if direction not in (0, 1, 2):
+            return Status.INVALID_PARAMETER
+        goal = 0.0 if direction == HOME_INWARDS else self._config.stroke
+        if refusal := self._refusal(Command.HOME):
+            return refusal
+        self.referenced = False
+        self._start(Command.HOME, goal, self._config.homing_speed, self._config.force[0] * 2, now)
+        return Status.CMD_PENDING
+
+    def travel(self, command: Command, width: float, speed: float, now: float) -> Status:
+        """Start a pre-position, grasp or release [m, m/s]; PENDING, or why not."""
+        if refusal := self._refusal(command):
+            return refusal
+        if not (math.isfinite(width) and math.isfinite(speed)):
+            return Status.INVALID_PARAMETER
+        low, high = self.soft_limits or (0.0, self._config.stroke)
+        slowest, fastest = self._config.speed
+        tiny = 1e-7  # what float32 on the wire may add
+        if not (low - tiny <= width <= high + tiny and slowest - tiny <= speed <= fastest + tiny):
+            if self.soft_limits is not None:
+                self._at_limit = (width > high) - (width < low)
+            return Status.RANGE_ERROR
+        force = self._config.force[1] if command == Command.RELEASE else self.force_limit
+        goal = width
+        if command == Command.GRASP:
+            band = self._config.clamp_travel if width > self.measured[0] else -self._config.clamp_travel
+            goal = min(max(width + band, 0.0), self._config.stroke)
+        self._start(command, goal, speed, force, now, nominal=width)
+        return Status.CMD_PENDING
+
+    def stop(self) -> tuple[Command, Status] | None:
+        """Stop the fingers; the command that this ends, with its status."""
+        ended = (self._motion.command, Status.CMD_ABORTED) if self._motion is not None else None
+        # A held part stays clamped: the drive keeps its position, only the grasping control ends.
+        if self.grasp != GraspState.HOLDING:
+            self._plant.command_gripper(
+                width=self.measured[0], speed=self._config.speed[0], force=self._config.force[0]
+            )
+        self._motion = None
+        self._stopped = True
+        if self.grasp != GraspState.ERROR:
+            self.grasp = GraspState.IDLE
+        return ended
+
+    def fast_stop(self) -> tuple[Command, Status] | None:
+        """Stop and lock; the command that this ends, with its status."""
+        ended = self.stop()
+        self.fast_stopped = True
+        self.grasp = GraspState.ERROR
+        return ended
+
+    def acknowledge(self) -> None:
+        """Leave FAST STOP."""
+        self.fast_stopped = False
+        if self.grasp == GraspState.ERROR:
+            self.grasp = GraspState.IDLE
+
+    def lose_part(self) -> None:
+        """A fault to order: what is held is lost."""
+        if self.grasp == GraspState.HOLDING:
+            self.grasp = GraspState.PART_LOST
+
+    def poll(self, now: float) -> tuple[Command, Status] | None:
+        """Look at the plant; the command that ended now, with its status."""
+        self.measured = self._plant.gripper_state()
+        if self._motion is None:
+            self._monitor(now)
+            return None
+        status = self._result(self._motion, now)
+        if status is None:
+            return None
+        command = self._motion.command
+        self._motion = None
+        self._failed = status != Status.SUCCESS
+        return command, status
+
+    def flags(self) -> SystemFlag:
+        """The system state."""
+        shown = {
+            SystemFlag.REFERENCED: self.referenced,
+            SystemFlag.MOVING: self._motion is not None,
+            SystemFlag.BLOCKED_MINUS: self._blocked < 0,
+            SystemFlag.BLOCKED_PLUS: self._blocked > 0,
+            SystemFlag.SOFT_LIMIT_MINUS: self._at_limit < 0,
+            SystemFlag.SOFT_LIMIT_PLUS: self._at_limit > 0,
+            SystemFlag.AXIS_STOPPED: self._stopped,
+            SystemFlag.TARGET_REACHED: self._reached,
+            SystemFlag.FORCE_CONTROL: self.grasp == GraspState.HOLDING,
+            SystemFlag.FAST_STOP: self.fast_stopped,
+            SystemFlag.CMD_FAILURE: self._failed,
+        }
+        return SystemFlag(sum(flag for flag, on in shown.items() if on))
+
+    def _refusal(self, command: Command) -> Status | None:
+        if self.fast_stopped:
+            return Status.ACCESS_DENIED
+        if self._motion is not None:
+            return Status.ALREADY_RUNNING
+        if command != Command.HOME and not self.referenced:
+            return Status.NOT_INITIALIZED
+        if self.grasp == GraspState.HOLDING and command != Command.RELEASE:
+            return Status.ALREADY_RUNNING
+        return None
+
+    def _start(
+        self, command: Command, goal: float, speed: float, force: float, now: float, *, nominal: float = 0.0
+    ) -> None:
+        self._plant.command_gripper(width=goal, speed=speed, force=force)
+        self._motion = _Motion(command, goal, 1 if goal > self.measured[0] else -1, nominal, now)
+        self._blocked = self._at_limit = 0
+        self._reached = self._stopped = self._failed = False
+        self.grasp = {Command.GRASP: GraspState.GRASPING, Command.RELEASE: GraspState.RELEASING}.get(
+            command, GraspState.POSITIONING
+        )
+
+    def _result(self, motion: _Motion, now: float) -> Status | None:
+        width, speed, force = self.measured
+        there = abs(width - motion.goal) < _REACHED
+        if abs(speed) > _STILL or now - motion.started < _SETTLE:
+            motion.still_since = None
+        elif motion.still_since is None:
+            motion.still_since = now
+        blocked = not there and motion.still_since is not None and now - motion.still_since >= _SETTLE
+        if motion.command == Command.GRASP:
+            pressed = force >= _PRESSED * self.force_limit and abs(speed) < 5 * _STILL
+            return self._grasp_result(motion, now, there=there, pressed=pressed or blocked)
+        if there:
+            self._reached = True
+            self.grasp = GraspState.IDLE
+            if motion.command == Command.HOME:
+                self.referenced = True
+                self.soft_limits = None
+            return Status.SUCCESS
+        return self._block(motion) if blocked else None
+
+    def _grasp_result(self, motion: _Motion, now: float, *, there: bool, pressed: bool) -> Status | None:
+        width = self.measured[0]
+        if pressed:
+            before_band = motion.sign * (motion.nominal - width) > self._config.clamp_travel
+            if before_band:
+                return self._block(motion)
+            self.grasp = GraspState.HOLDING
+            self._held_width, self._held_sign, self._loose_since = width, motion.sign, None
+            return Status.SUCCESS
+        if there:
+            self._reached = True
+            self.grasp = GraspState.NO_PART
+            return Status.CMD_FAILED
+        return None
+
+    def _block(self, motion: _Motion) -> Status:
+        self._blocked = motion.sign
+        self.grasp = GraspState.ERROR
+        return Status.AXIS_BLOCKED
+
+    def _monitor(self, now: float) -> None:
+        """A held part that is no longer felt is lost."""
+        if self.grasp != GraspState.HOLDING:
+            return
+        width, _, force = self.measured
+        if force >= _SLACK * self.force_limit:
+            self._loose_since = None
+        elif self._loose_since is None:
+            self._loose_since = now
+        loose = self._loose_since is not None and now - self._loose_since >= _LOOSE
+        if loose or self._held_sign * (width - self._held_width) > _SLIPPED:
+            self.grasp = GraspState.PART_LOST

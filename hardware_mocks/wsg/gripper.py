@@ -1,0 +1,211 @@
+"""The mock WSG-50 on the wire: the same device behind a pty, a TCP port, or both."""
+
+import contextlib
+import os
+import selectors
+import socket
+import threading
+import tty
+
+from gelflow.clock import Clock
+from gelflow.errors import UsageError
+from gelflow.hardware_mocks.plant import GripperPlant
+from gelflow.hardware_mocks.wsg.device import WsgDevice, WsgSession
+from gelflow.hardware_mocks.wsg.fingers import WsgDeviceConfig
+
+_TICK = 0.005  # how often the device looks at its fingers [s]; half the shortest period of updates
+_SHORTEST_WAIT = 0.0005  # however fast the clock [s, wall]
+_READ_SIZE = 4096  # bytes
+_BACKLOG = 65536  # a TCP client that leaves more than this unread is dropped [bytes]
+
+
+class MockWsg:
+    """Serves one device. Nothing is opened before `open` (or `with`).
+
+    `serial` offers a pty, whose path is `serial_path`; `tcp_port` a TCP port on `host` (0: any free one), which is
+    `tcp_address` then. One TCP client at a time; a second one is turned away.
+    """
+
+    def __init__(
+        self,
+        plant: GripperPlant,
+        *,
+        clock: Clock,
+        config: WsgDeviceConfig | None = None,
+        serial: bool = True,
+        tcp_port: int | None = None,
+        host: str = "127.0.0.1",
+    ) -> None:
+        if not serial and tcp_port is None:
+            raise UsageError("the mock gripper needs a pty (serial=True), a tcp_port, or both")
+        self._device = WsgDevice(plant, clock=clock, config=config)
+        self._clock = clock
+        self._serial = serial
+        self._wanted = None if tcp_port is None else (host, tcp_port)
+        self._selector: selectors.BaseSelector | None = None
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+        self._client_session: WsgSession | None = None
+        self._unsent = b""
+        self._master = self._slave = -1
+        self._line_session: WsgSession | None = None
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+        self.serial_path = ""
+        self.tcp_address = ("", 0)
+
+    def __enter__(self) -> "MockWsg":
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Open pty and port and serve them from a thread. Raises UsageError when the port is taken."""
+        if self._thread is not None:
+            raise UsageError("the mock gripper is already open")
+        self._selector = selectors.DefaultSelector()
+        try:
+            if self._wanted is not None:
+                self._listen(self._wanted)
+            if self._serial:
+                self._open_line()
+        except BaseException:
+            self._close_files()
+            raise
+        self._ending.clear()
+        self._thread = threading.Thread(target=self._serve, name="mock wsg", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Close everything; may be called twice."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close_files()
+
+    def lose_part(self) -> None:
+        """A fault to order: the device reports that the held part is lost."""
+        with self._device.lock:
+            self._device.fingers.lose_part()
+
+    def raise_fast_stop(self) -> None:
+        """A fault to order: FAST STOP."""
+        self._device.stop(fast=True)
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Where it is served, as a driver takes it: `serial:PATH`, `tcp:HOST:PORT`, or both."""
+        line = (f"serial:{self.serial_path}",) if self._serial else ()
+        port = ("tcp:{}:{}".format(*self.tcp_address),) if self._wanted else ()
+        return line + port
+
+    @property
+    def fast_stopped(self) -> bool:
+        """Whether the device is in FAST STOP."""
+        return self._device.fingers.fast_stopped
+
+    def _listen(self, address: tuple[str, int]) -> None:
+        assert self._selector is not None
+        try:
+            self._listener = socket.create_server(address)
+        except (OSError, OverflowError) as error:
+            raise UsageError(f"the mock gripper can't listen on {address[0]}:{address[1]} ({error})") from None
+        self._listener.setblocking(False)
+        self.tcp_address = self._listener.getsockname()[:2]
+        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def _open_line(self) -> None:
+        assert self._selector is not None
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)  # kept open, so that the line outlives its clients
+        os.set_blocking(self._master, False)
+        self.serial_path = os.ttyname(self._slave)
+        self._line_session = WsgSession(self._device)
+        self._selector.register(self._master, selectors.EVENT_READ, self._read_line)
+
+    def _close_files(self) -> None:
+        for open_socket in (self._client, self._listener):
+            if open_socket is not None:
+                open_socket.close()
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        if self._selector is not None:
+            self._selector.close()
+        self._client = self._listener = self._selector = None
+        self._client_session = self._line_session = None
+        self._master = self._slave = -1
+
+    def _serve(self) -> None:
+        assert self._selector is not None
+        wait = max(self._clock.wall(_TICK), _SHORTEST_WAIT)
+        while not self._ending.wait(0):
+            for key, _ in self._selector.select(wait):
+                key.data()
+            self._device.poll()
+            if self._line_session is not None:
+                for frame in self._line_session.tick():
+                    # A line has no flow control: what nobody reads is lost.
+                    with contextlib.suppress(BlockingIOError):
+                        os.write(self._master, frame)
+            if self._client_session is not None:
+                self._unsent += b"".join(self._client_session.tick())
+                self._flush()
+
+    def _read_line(self) -> None:
+        assert self._line_session is not None
+        with contextlib.suppress(BlockingIOError):
+            self._line_session.receive(os.read(self._master, _READ_SIZE))
+
+    def _accept(self) -> None:
+        assert self._listener is not None and self._selector is not None
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return  # it went away before it was accepted
+        self._read_client()  # the end of the client before may wait to be read
+        if self._client is not None:
+            client.close()
+            return
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client, self._client_session, self._unsent = client, WsgSession(self._device), b""
+        self._selector.register(client, selectors.EVENT_READ, self._read_client)
+
+    def _read_client(self) -> None:
+        while self._client is not None and self._client_session is not None:
+            try:
+                data = self._client.recv(_READ_SIZE)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if data:
+                self._client_session.receive(data)
+            else:
+                self._drop_client()
+
+    def _flush(self) -> None:
+        assert self._client is not None
+        if not self._unsent:
+            return
+        try:
+            sent = self._client.send(self._unsent)
+            self._unsent = self._unsent[sent:]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop_client()
+            return
+        if len(self._unsent) > _BACKLOG:
+            self._drop_client()
+
+    def _drop_client(self) -> None:
+        assert self._client is not None and self._client_session is not None and self._selector is not None
+        self._selector.unregister(self._client)
+        self._client.close()
+        self._client_session.lost()
+        self._client = self._client_session = None

@@ -1,0 +1,1 @@
+"""Rendered gel images with known marker positions."""

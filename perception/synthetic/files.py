@@ -1,0 +1,88 @@
+"""Rendered sequences as files: a folder of JPEG images or one MJPEG video, and the truth beside them."""
+
+import dataclasses
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.perception.synthetic.sequences import GelSequence
+
+FORMAT = 1
+TRUTH = "truth.npz"  # in a folder; the truth of a video has the video's name
+VIDEO = ".mjpeg"  # the images' JPEG one after the other: a stream that video players and FFmpeg read
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true in a sequence's images. Markers row by row."""
+
+    position: NDArray[np.float32]  # centres of the dots (right, down) [px], shape (frames, markers, 2)
+    visible: NDArray[np.bool_]  # printed, wholly in the image and not covered, shape (frames, markers)
+    rows: int
+    cols: int
+    spacing: float  # of the markers at rest, in the image's middle [px]
+    made_from: dict[str, Any]  # the sequence's settings, and under "look" those of its look
+
+
+def truth_file(images: Path) -> Path:
+    """Where the truth of a rendered folder or video is."""
+    return images.with_suffix(".npz") if images.suffix == VIDEO else images / TRUTH
+
+
+def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
+    """Draws `sequence` into `out`, a new folder or, where its name ends in .mjpeg, a video; yields the frames done.
+
+    The truth is written last. Raises UsageError where something is there already, or nothing can be written.
+    """
+    video = out.suffix == VIDEO
+    if truth_file(out).exists() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
+        raise UsageError(f"{out} exists, and would be overwritten: give a new name, or delete it")
+    position, visible = [], []
+    try:
+        (out.parent if video else out).mkdir(parents=True, exist_ok=True)
+        for number, frame in enumerate(sequence):
+            file = out if video else out / f"{number:06d}.jpg"
+            with file.open("ab") as images:
+                images.write(frame.jpeg)
+            position.append(frame.position)
+            visible.append(frame.visible)
+            yield number + 1
+        np.savez_compressed(
+            truth_file(out),
+            format=FORMAT,
+            position_px=np.array(position, dtype=np.float32),
+            visible=np.array(visible),
+            rows=sequence.look.grid.rows,
+            cols=sequence.look.grid.cols,
+            spacing_px=sequence.look.spacing,
+            made_from=json.dumps(dataclasses.asdict(sequence)),
+        )
+    except OSError as error:
+        raise UsageError(f"{out} can not be written: {error.strerror}") from None
+
+
+def read_truth(file: Path) -> Truth:
+    """Reads what `write_sequence` wrote. Raises UsageError for other files and newer formats."""
+    try:
+        with np.load(file) as found:
+            if int(found["format"]) > FORMAT:
+                raise UsageError(f"{file} has format {int(found['format'])}, this gelflow reads up to {FORMAT}: update")
+            return Truth(
+                position=found["position_px"],
+                visible=found["visible"],
+                rows=int(found["rows"]),
+                cols=int(found["cols"]),
+                spacing=float(found["spacing_px"]),
+                made_from=json.loads(str(found["made_from"])),
+            )
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        if isinstance(error, UsageError):
+            raise
+        raise UsageError(f"{file} is not the truth of a rendered sequence: {error}") from None

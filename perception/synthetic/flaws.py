@@ -1,0 +1,148 @@
+"""What is wrong with real tactile images, as numbers, and the named classes of images that tests and benchmarks use.
+
+`look_of("typical", blur=2.5)` is a class with one factor changed; `TruthRenderer` and `GelSequence` draw it.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import Grid
+from gelflow.perception.synthetic.gel_image import GelLook
+
+_RADIUS = 0.18  # of a dot, as a share of the spacing
+_MARGIN = 1.0  # between the outer markers and the image's border, as a share of the spacing
+_PITCH = 1.4  # between markers [mm]
+
+_LIMITS: dict[str, tuple[float, float]] = {
+    "gradient": (0.0, 0.9),
+    "shading": (0.0, 1.0),
+    "ridges": (0.0, 1.0),
+    "highlights": (0, 20),
+    "shot": (0.0, 1.0),
+    "damaged": (0.0, 1.0),
+    "bridges": (0, 1000),
+    "dust": (0, 1000),
+    "occluders": (0, 20),
+    "motion_blur": (0.0, 20.0),
+    "keystone": (0.0, 0.5),
+    "barrel": (0.0, 0.2),
+    "oval": (1.0, 3.0),
+    "blur": (0.5, 20.0),  # a sharper edge than a pixel's own has no exact centre
+}
+
+
+@dataclass(frozen=True)
+class FlawedLook(GelLook):
+    """A gel's look with what real prints, lights, lenses and contacts add to it. Without arguments nothing is added.
+
+    `missing`, `damaged` and `bridges` are of the print and move with the gel; light, `dust` and `occluders` stay with
+    the camera; `shading`, `ridges` and `highlights` move with the contact. `noise` is that of the grey picture.
+    """
+
+    gradient: float = 0.0  # by how much the light is above and below its mean at opposite borders, 0 to 0.9
+    shading: float = 0.0  # how much the slopes of a contact lighten and darken the gel, 0 to 1
+    ridges: float = 0.0  # strength of shining wrinkles in a contact and of the shine along its rim, 0 to 1
+    highlights: int = 0  # saturated reflections of about a dot's size in a contact
+    shot: float = 0.0  # variance of the shot noise for each grey level [grey levels], 0 to 1
+    damaged: float = 0.0  # share of the markers that are cut, scratched or have a hole, 0 to 1
+    bridges: int = 0  # pairs of neighbouring dots that are printed as one blot
+    dust: int = 0  # dark specks on the lens
+    occluders: int = 0  # blobs that cross the image between its sequence's first and last frame
+    motion_blur: float = 0.0  # length of the smear of the fastest dot of a sequence [px]
+    keystone: float = 0.0  # how much shorter the image's bottom shows a length than its top, as a share, 0 to 0.5
+    barrel: float = 0.0  # how far the lens draws a corner inwards, as a share of its distance, 0 to 0.2
+    oval: float = 1.0  # a dot's width over its height, 1 to 3
+    cut_row: bool = False  # one more row of dots above the first, cut by the border; its dots are no markers
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, (low, high) in _LIMITS.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UsageError(f"{name} of a flawed look must be within {low} to {high}, got {value}")
+        if min(self.grid.rows, self.grid.cols) < 2:
+            raise UsageError(f"a flawed look needs at least 2 × 2 markers, got {self.grid.rows} × {self.grid.cols}")
+
+    def warp(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where keystone and lens move places of the plain image [px], shape (..., 2)."""
+        middle = np.array([(self.width - 1) / 2, (self.height - 1) / 2])
+        at = places - middle
+        narrowing = self.keystone / (2 - self.keystone)  # (1 - narrowing) / (1 + narrowing) is bottom over top
+        at = at * (1 - narrowing) / (1 + narrowing * at[..., 1:] / middle[1])
+        corner = (middle**2).sum()
+        at = at * (1 - self.barrel * (at**2).sum(axis=-1, keepdims=True) / corner)
+        return np.asarray(at + middle)
+
+    @property
+    def spacing(self) -> float:
+        """Of the markers in the middle of the plain image [px]."""
+        return self.grid.pitch * self.pixels_per_mm
+
+
+# What makes an image class. A `colour` of 0.55 makes each channel's light 30 % more and less at opposite borders.
+PRESETS: dict[str, dict[str, Any]] = {
+    "clean": {"blur": 0.8, "noise": 1.0, "colour": 0.0, "quality": 100},
+    "typical": {
+        **{"blur": 1.0, "noise": 1.5, "shot": 0.02, "quality": 90, "gradient": 0.3, "colour": 0.55},
+        **{"shading": 0.35, "barrel": 0.02, "dust": 2},
+    },
+    "hard": {
+        **{"blur": 1.4, "noise": 2.5, "shot": 0.02, "quality": 75, "gradient": 0.45, "colour": 0.8},
+        **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.6, "missing": 0.03},
+        **{"damaged": 0.06, "bridges": 2, "occluders": 1, "motion_blur": 0.5},
+    },
+}
+
+# One factor at a time, on the typical class.
+FACTORS: dict[str, dict[str, Any]] = {
+    "noise 6": {"noise": 6.0},
+    "blur 2.5 px": {"blur": 2.5},
+    "JPEG 40": {"quality": 40},
+    "5 % missing": {"missing": 0.05},
+    "15 % damaged": {"damaged": 0.15},
+    "four bridges": {"bridges": 4},
+    "two occluders": {"occluders": 2},
+    "contrast 0.3": {"contrast": 0.3},
+    "keystone 15 %": {"keystone": 0.15},
+    "oval 1.8:1": {"oval": 1.8},
+    "bright dots": {"bright": True},
+    "two highlights": {"highlights": 2},
+    "cut row": {"cut_row": True},
+}
+
+# markers → rows, columns
+SIZES: dict[int, tuple[int, int]] = {35: (5, 7), 63: (7, 9), 130: (10, 13), 154: (11, 14), 252: (14, 18)}
+
+
+def look_of(
+    preset: str = "typical",
+    *,
+    markers: int = 130,
+    width: int = 320,
+    height: int = 240,
+    seed: int = 0,
+    **changed: Any,
+) -> FlawedLook:
+    """The look of an image class (one of `PRESETS`), with fields of `FlawedLook` changed by name.
+
+    The grid of `markers` (one of `SIZES`) fills the image; a dot's radius is 0.18 of the spacing. Markers run as in
+    the image: row by row from the top, each from the left. Raises UsageError for unknown names and values.
+    """
+    if preset not in PRESETS:
+        raise UsageError(f"expected an image class out of {', '.join(PRESETS)}, got {preset!r}")
+    if markers not in SIZES:
+        raise UsageError(f"expected one of {', '.join(map(str, SIZES))} markers, got {markers}")
+    known = {field.name for field in dataclasses.fields(FlawedLook)}
+    for name in changed:
+        if name not in known:
+            raise UsageError(f"a look has no {name!r}; it has {', '.join(sorted(known))}")
+    rows, cols = SIZES[markers]
+    spacing = min(height / (rows - 1 + 2 * _MARGIN), width / (cols - 1 + 2 * _MARGIN))
+    print_ = {"grid": Grid(rows, cols, _PITCH), "pixels_per_mm": spacing / _PITCH, "radius": _RADIUS * spacing}
+    camera = {"width": width, "height": height, "mirrored": False, "light": 115.0, "seed": seed}
+    return FlawedLook(**{**print_, **camera, **PRESETS[preset], **changed})

@@ -1,0 +1,61 @@
+"""The learning curve of a training run: its points, as a table and as a picture."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gelflow.policies.evaluation import Evaluation
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One point of the learning curve."""
+
+    attempts: int
+    minutes: float
+    reward: float  # mean over the attempts since the last point; nan at an evaluation
+    success: float  # share of the last training episodes that ended inserted; nan before the first ended
+    spread: float  # standard deviation of the actions, in units of the reach
+    evaluation: Evaluation | None = None
+
+
+COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated attempts")
+
+
+def write_table(path: Path, points: Sequence[Progress]) -> None:
+    """Write the points as CSV with a header line; evaluations fill the last two columns."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for p in points:
+            tail = [f"{p.evaluation.success:.4f}", f"{p.evaluation.attempts:.3f}"] if p.evaluation else ["", ""]
+            numbers = [f"{value:.4f}" for value in (p.minutes, p.reward, p.success, p.spread)]
+            writer.writerow([p.attempts, *numbers, *tail])
+
+
+def draw(path: Path, points: Sequence[Progress]) -> None:
+    """Draw success and reward over attempts to a picture file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # here: training alone draws
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    updates = [p for p in points if p.evaluation is None]
+    evaluated = [(p.attempts, p.evaluation) for p in points if p.evaluation is not None]
+    x = np.array([p.attempts for p in updates]) / 1000
+    top.plot(x, [100 * p.success for p in updates], color="tab:gray", label="training, exploring")
+    x_evaluated = [attempts / 1000 for attempts, _ in evaluated]
+    low, high = np.array([e.interval() for _, e in evaluated]).reshape(-1, 2).T * 100
+    top.plot(x_evaluated, [100 * e.success for _, e in evaluated], "o-", color="tab:blue", label="evaluation, 95 %")
+    top.fill_between(x_evaluated, low, high, color="tab:blue", alpha=0.2, linewidth=0)
+    top.set(ylabel="parts inserted [%]", ylim=(0, 100), title="Insertion policy, simulation")
+    top.legend(loc="lower right")
+    bottom.plot(x, [p.reward for p in updates], color="tab:orange")
+    bottom.set(xlabel="attempts [thousands]", ylabel="mean reward of an attempt")
+    for axes in (top, bottom):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,1 @@
+"""Tactile cameras: MJPEG streams and UVC devices."""

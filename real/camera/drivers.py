@@ -1,0 +1,224 @@
+"""Tactile cameras: an MJPEG stream over HTTP, or a UVC device on this computer."""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from gelflow.clock import Clock
+from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
+from gelflow.real.camera import mjpeg
+from gelflow.real.camera.stream import OnImage, StreamCamera
+
+FRESH = 0.25  # how old a frame may be before it is stale [s]
+
+
+def open_camera(
+    source: str, name: str, clock: Clock, *, timeout: float = FRESH, on_image: OnImage | None = None
+) -> StreamCamera:
+    """The camera at `source`, opened: "http://HOST:PORT/?action=stream", or "uvc:INDEX" or "uvc:/dev/videoN".
+
+    Raises UsageError for another kind of source, and what opening raises.
+    """
+    if source.startswith("http://"):
+        return MjpegCamera(source, name, clock, timeout=timeout, on_image=on_image).open()
+    if source.startswith("uvc:"):
+        device = source.removeprefix("uvc:")
+        chosen = int(device) if device.isdigit() else device
+        return UvcCamera(chosen, name, clock, timeout=timeout, on_image=on_image).open()
+    raise UsageError(f"camera {name}: expected http://HOST:PORT/… or uvc:INDEX, got {source!r}")
+
+
+class MjpegCamera(StreamCamera):
+    """An MJPEG stream over HTTP. The JPEG bytes are handed on as they were received.
+
+    `connect_timeout` [s, robot time] bounds connecting and the answer's head together. A stall leaves the connection
+    as it is: should frames come again they are taken.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        name: str,
+        clock: Clock,
+        *,
+        timeout: float = FRESH,
+        connect_timeout: float = 3.0,
+        on_image: OnImage | None = None,
+    ) -> None:
+        super().__init__(url, name, clock, timeout=timeout, on_image=on_image)
+        parts = urlsplit(url)
+        try:
+            port = parts.port or 80
+        except ValueError as error:
+            raise UsageError(f"camera {name}: {url} has no valid port; expected http://HOST:PORT/path") from error
+        plain = url.isascii() and not any(c.isspace() for c in url) and "@" not in parts.netloc
+        if parts.scheme != "http" or not parts.hostname or not plain:
+            raise UsageError(f"camera {name}: expected http://HOST:PORT/path (no user name), got {url!r}")
+        self._address = (parts.hostname, port)
+        self._host = parts.netloc
+        self._target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+        self._connect_timeout = connect_timeout
+        self._socket: socket.socket | None = None
+        self._parser: mjpeg.MultipartParser | None = None
+        self._early = b""  # what came together with the head
+
+    @property
+    def damaged(self) -> int:
+        return self._parser.damaged if self._parser else 0
+
+    def _connect(self) -> None:
+        deadline = time.monotonic() + self._clock.wall(self._connect_timeout)
+        try:
+            link = socket.create_connection(self._address, timeout=self._left(deadline))
+        except TimeoutError as error:
+            raise self._no_answer() from error
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise PeerError(f"camera {self.name}: cannot reach {self.source}: {reason}; is the camera on?") from error
+        try:
+            link.sendall(mjpeg.request(self._host, self._target))
+            data = b""
+            while (head := mjpeg.parse_head(data)) is None:
+                link.settimeout(self._left(deadline))
+                received = link.recv(65536)
+                if not received:
+                    raise PeerError("closed the connection before it answered")
+                data += received
+            self._parser = mjpeg.MultipartParser(head[0].boundary())
+            self._early = head[1]
+            # The thread wakes this often to see whether it shall end; a stall is measured by whoever waits for frames.
+            link.settimeout(0.2)
+        except TimeoutError as error:
+            link.close()
+            raise self._no_answer() from error
+        except OSError as error:
+            link.close()
+            raise PeerError(f"camera {self.name}: {self.source} failed: {error.strerror or error}") from error
+        except GelflowError as error:
+            link.close()
+            message = f"camera {self.name}: {self.source}: {error}; is it the stream's address?"
+            raise type(error)(message) from error
+        self._socket = link
+
+    def _left(self, deadline: float) -> float:
+        left = deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        return left
+
+    def _no_answer(self) -> PeerTimeout:
+        waited = f"within {self._connect_timeout:g} s"
+        return PeerTimeout(f"camera {self.name}: no answer from {self.source} {waited}; is the camera on?")
+
+    def _disconnect(self) -> None:
+        link, self._socket = self._socket, None
+        if link is not None:
+            with contextlib.suppress(OSError):  # it may be gone already
+                link.shutdown(socket.SHUT_RDWR)
+            link.close()
+
+    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+        link, parser = self._socket, self._parser
+        assert link is not None and parser is not None
+        data = self._early
+        while True:
+            for image in parser.feed(data):
+                yield image, "jpeg"
+            data = b""
+            try:
+                data = link.recv(65536)
+            except TimeoutError:
+                if closing.is_set():
+                    return
+                continue
+            except OSError as error:
+                raise PeerError(
+                    f"camera {self.name}: {self.source} broke off: {error.strerror or error}; look at it, reconnect"
+                ) from error
+            if not data:
+                return
+
+
+class UvcCamera(StreamCamera):
+    """A UVC device by index or path, read with OpenCV.
+
+    The device is asked for MJPEG, whose bytes are handed on as received. Where a driver gives pixels instead, they are
+    stored as PNG, so that a replay decodes what was seen. `size` is (width, height) [px] to ask the device for.
+    """
+
+    def __init__(
+        self,
+        device: int | str | Path,
+        name: str,
+        clock: Clock,
+        *,
+        timeout: float = FRESH,
+        size: tuple[int, int] | None = None,
+        on_image: OnImage | None = None,
+    ) -> None:
+        super().__init__(f"video device {device}", name, clock, timeout=timeout, on_image=on_image)
+        if isinstance(device, int) and device < 0:
+            raise UsageError(f"camera {name}: a device index is 0 or more, got {device}")
+        self._device = device if isinstance(device, int) else str(device)
+        self._size = size
+        self._capture: Any = None
+
+    def _connect(self) -> None:
+        import cv2  # here: a stream over HTTP needs no OpenCV
+
+        with _quiet(cv2):
+            capture = cv2.VideoCapture(self._device)
+        if not capture.isOpened():
+            raise PeerError(f"camera {self.name}: cannot open {self.source}; is it plugged in and free?")
+        wanted = cv2.VideoWriter.fourcc(*"MJPG")
+        capture.set(cv2.CAP_PROP_FOURCC, wanted)
+        if self._size is not None:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
+        if capture.getBackendName() == "V4L2" and int(capture.get(cv2.CAP_PROP_FOURCC)) == wanted:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # hand out the JPEG, not its pixels
+        self._capture = capture
+
+    def _disconnect(self) -> None:
+        """Nothing: OpenCV can not be woken from a read, and the thread that reads releases the device."""
+
+    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+        capture, self._capture = self._capture, None
+        try:
+            while not closing.is_set():
+                read, pixels = capture.read()
+                if not read:
+                    raise PeerError(f"camera {self.name}: {self.source} gave no frame; is it plugged in? reconnect")
+                yield self._encode(pixels)
+        finally:
+            capture.release()
+
+    def _encode(self, pixels: Any) -> tuple[bytes, str]:
+        import cv2
+
+        if 1 in pixels.shape[:2]:  # one line of bytes: the JPEG itself
+            data = pixels.tobytes()
+            end = data.rfind(b"\xff\xd9")  # buffers are longer than the image in them
+            if data.startswith(b"\xff\xd8") and end > 0:
+                return data[: end + 2], "jpeg"
+            raise PeerError(f"camera {self.name}: {self.source} sent {len(data)} bytes that are no JPEG")
+        done, png = cv2.imencode(".png", pixels)
+        if not done:
+            raise PeerError(f"camera {self.name}: {self.source} sent pixels of shape {pixels.shape} that are no image")
+        return png.tobytes(), "png"
+
+
+@contextlib.contextmanager
+def _quiet(cv2: Any) -> Iterator[None]:
+    """OpenCV prints warnings about a missing device; our own error says it."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)

@@ -1,0 +1,174 @@
+"""What all streaming cameras share: a reader thread, the newest frame, waiting with time-outs, errors that stay."""
+
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Self
+
+from gelflow.clock import Clock
+from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
+from gelflow.protocols import CameraImage
+from gelflow.time_sync import SHORTEST_WAIT
+
+OnImage = Callable[[CameraImage], None]
+
+
+class StreamCamera(ABC):
+    """A camera whose frames a thread receives; only the newest is kept (`gelflow.protocols.Camera`).
+
+    `on_image` gets every frame in the reader thread, before anybody else can see it: so a recording holds each
+    frame earlier than any decision made from it. What it raises ends the stream and is raised to the camera's user.
+    Once a stream has ended (closed by its server, failed, or closed here) it stays so until `reconnect`.
+    """
+
+    def __init__(
+        self, source: str, name: str, clock: Clock, *, timeout: float, on_image: OnImage | None = None
+    ) -> None:
+        if not timeout > 0:
+            raise UsageError(f"camera {name}: timeout must be above 0 s, got {timeout}")
+        self.source = source  # what messages call it
+        self.name = name
+        self.timeout = timeout  # robot time without a frame after which `latest` complains [s]
+        self._clock = clock
+        self._on_image = on_image
+        self._changed = threading.Condition()
+        self._newest: CameraImage | None = None
+        self._count = 0  # goes on over a reconnect, so that a sequence number names one frame of a session
+        self._failure: GelflowError | None = None
+        self._thread: threading.Thread | None = None
+        self._closing = threading.Event()
+
+    @property
+    def damaged(self) -> int:
+        """How many frames arrived broken and were left out since the stream was opened."""
+        return 0
+
+    def open(self) -> Self:
+        """Connect and start to receive. Raises a PeerError when the camera cannot be reached or sends no stream."""
+        if self._thread is not None:
+            raise UsageError(f"camera {self.name}: already open")
+        self._connect()
+        self._closing = threading.Event()
+        with self._changed:
+            self._failure = None
+            self._newest = None
+        self._thread = threading.Thread(
+            target=self._receive, args=(self._closing,), name=f"camera {self.name}", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def reconnect(self) -> None:
+        """Close and open again: the only way on after a failure."""
+        self.close()
+        self.open()
+
+    def close(self) -> None:
+        """Stop receiving; may be called twice."""
+        self._closing.set()
+        self._disconnect()
+        if self._thread is not None:
+            self._thread.join(2.0)
+        self._thread = None
+        with self._changed:
+            self._newest = None
+            self._failure = PeerError(f"camera {self.name}: {self.source} is closed here; open or reconnect it")
+            self._changed.notify_all()
+
+    def __enter__(self) -> Self:
+        return self if self._thread is not None else self.open()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    def latest(self) -> CameraImage:
+        """The newest frame, at most `timeout` old; right after opening it waits that long for the first one.
+
+        Raises PeerTimeout when there is none, PeerError when the stream has ended.
+        """
+        with self._changed:
+            self._raise_unopened()
+            if self._newest is None:
+                self._wait_for(lambda: self._newest is not None, self.timeout)
+            self._raise_failure()
+            if self._newest is None or self._clock.now() - self._newest.stamp > self.timeout:
+                raise self._silent(self.timeout)
+            return self._newest
+
+    def next(self, after: int, timeout: float) -> CameraImage:
+        """The newest frame once its `sequence` is greater than `after`; waits up to `timeout` [s, robot time].
+
+        Frames that came and were replaced between two calls are skipped. Raises as `latest` does.
+        """
+        with self._changed:
+            self._raise_unopened()
+            self._wait_for(lambda: self._newest is not None and self._newest.sequence > after, timeout)
+            if self._newest is not None and self._newest.sequence > after:
+                return self._newest
+            self._raise_failure()
+            raise self._silent(timeout)
+
+    def _wait_for(self, arrived: Callable[[], bool], timeout: float) -> None:
+        """Until `arrived` or a failure, at most `timeout` [s, robot time]; the lock is held."""
+        end = self._clock.now() + timeout
+        while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
+            self._changed.wait(max(self._clock.wall(left), SHORTEST_WAIT))
+
+    # What a kind of camera brings
+
+    @abstractmethod
+    def _connect(self) -> None:
+        """Reach the camera, or raise a GelflowError. Called before the thread starts."""
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Let go of the camera and wake the thread if it waits. May be called twice, from any thread."""
+
+    @abstractmethod
+    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+        """Frames (bytes, encoding) until `closing` is set or the stream ends; raises a GelflowError when it fails."""
+
+    # The reader thread
+
+    def _receive(self, closing: threading.Event) -> None:
+        failure: GelflowError = PeerError(f"camera {self.name}: {self.source} closed the stream; look at it, reconnect")
+        try:
+            for data, encoding in self._frames(closing):
+                if closing.is_set():
+                    break
+                self._accept(CameraImage(data, self._clock.now(), self._count, encoding))
+        except GelflowError as error:
+            failure = error
+        except Exception as error:  # noqa: BLE001 - a thread has no caller: it is raised to the camera's user
+            failure = PeerError(f"camera {self.name}: {self.source} failed: {type(error).__name__}: {error}")
+        if not closing.is_set():
+            with self._changed:
+                self._failure = failure
+                self._changed.notify_all()
+            self._disconnect()
+
+    def _accept(self, image: CameraImage) -> None:
+        self._count += 1
+        if self._on_image is not None:
+            self._on_image(image)
+        with self._changed:
+            self._newest = image
+            self._changed.notify_all()
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            # A new exception each time: one instance raised from two threads would share its traceback.
+            raise type(self._failure)(*self._failure.args) from self._failure
+
+    def _raise_unopened(self) -> None:
+        if self._thread is None and self._failure is None:
+            raise UsageError(f"camera {self.name}: open it first")
+
+    def _silent(self, waited: float) -> PeerTimeout:
+        last = "none so far"
+        if self._newest is not None:
+            last = f"the last {self._clock.now() - self._newest.stamp:.2f} s ago"
+        broken = f", {self.damaged} damaged" if self.damaged else ""
+        came = f"no new frame from {self.source} within {waited:g} s ({last}{broken})"
+        return PeerTimeout(f"camera {self.name}: {came}; look at the camera")

@@ -1,0 +1,1 @@
+"""Driver of an ABB arm over EGM (externally guided motion)."""

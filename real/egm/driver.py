@@ -1,0 +1,341 @@
+"""An ABB arm over EGM (externally guided motion): the `Arm` of the robot runner.
+
+EGM runs in a process of its own (`gelflow.real.egm.process`); this side checks targets, posts them, and reads what
+happened from shared memory. This is no safety-rated function: the robot's own safety system must stand behind it.
+"""
+
+import dataclasses
+import math
+import os
+import socket
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
+from gelflow.helper_process import Child
+from gelflow.protocols import ArmState
+from gelflow.real.egm.codec import EgmFeedback
+from gelflow.real.egm.follower import EgmEvent, EgmFlag
+from gelflow.real.egm.limits import EgmConfig, Target, check_target, tool_frame
+from gelflow.real.egm.ring import Counts, EgmRecord, EgmRing
+from gelflow.real.kinematics import Frame
+
+__all__ = ["EgmArm", "EgmConfig", "EgmEvent", "EgmFlag", "EgmRecord"]
+
+# Wall-clock limits on our own process, which owes nothing to the robot's clock [s].
+_START_LIMIT = 30.0
+_OBEY_LIMIT = 1.0
+_POLL = 0.002
+
+
+class EgmArm:
+    """An ABB IRB 120 that follows references over EGM, checked and bounded.
+
+    Nothing is opened before `connect`. Whoever connects must fetch the log with `drain_log` from time to time: a full
+    log stops the arm, no cycle is ever left out.
+    """
+
+    abortable = True
+
+    def __init__(self, config: EgmConfig, *, clock: ScaledClock) -> None:
+        self._config = config
+        self._clock = clock
+        self._lock = threading.RLock()
+        self._child: Child | None = None
+        self._ring: EgmRing | None = None
+        self._events: list[EgmEvent] = []
+        self._latched = ""
+        self._resets = 0
+        self._tool: Frame | None = None
+        self.port = config.port  # the UDP port in use: with port 0 known after `connect`
+
+    def connect(self, timeout: float | None = None) -> None:
+        """Start the EGM process and wait for the robot's first message.
+
+        `timeout` [s, robot time]; None takes the configuration's. Raises UsageError when the port is taken, and
+        PeerTimeout when the robot sends nothing; the process is then gone again, and `connect` may be called anew.
+        """
+        limit = self._config.connect_timeout if timeout is None else timeout
+        if self._child is not None:
+            raise UsageError("the EGM arm is connected already; close() it first")
+        try:
+            self._start()
+            failure = f"the EGM process did not start in {_START_LIMIT} s"
+            self._wait(lambda: self._heard("listening"), _START_LIMIT, failure)
+            self._wait(
+                lambda: self._opened().latest() is not None,
+                self._clock.wall(limit),
+                f"no EGM packet on UDP port {self.port} within {limit:g} s: "
+                "start the RAPID program with EGMRunPose, check UCDevice address",
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    def wait_following(self, timeout: float) -> None:
+        """Wait until the controller follows references, for at most `timeout` [s, robot time].
+
+        Raises PeerTimeout with the controller's state, and SafetyError when the arm is stopped.
+        """
+        try:
+            self._wait(lambda: self._running() or bool(self._latched), self._clock.wall(timeout), "")
+        except PeerTimeout:
+            motors = "on" if self.state().motors_on else "off"
+            raise PeerTimeout(
+                f"the controller does not follow EGM within {timeout:g} s (motors {motors}): "
+                "switch the motors on and start the RAPID program with EGMRunPose"
+            ) from None
+        self._refuse_when_latched()
+
+    def state(self) -> ArmState:
+        """The newest feedback. `operating_mode` is unknown: EGM does not carry it.
+
+        Raises PeerTimeout when the newest feedback is older than the configuration's `silence`, and PeerError when the
+        EGM process is gone. While latched the last feedback is returned, with the reason as `fault`.
+        """
+        with self._lock:
+            self._pump()
+            record = self._latest()
+            age = self._clock.now() - record.stamp
+            if age > self._config.silence and not self._latched:
+                limit = self._config.silence
+                raise PeerTimeout(f"the newest EGM message is {age:.3f} s old, at most {limit} s is allowed")
+            return ArmState(
+                position=np.array(record.measured[0]),
+                quaternion=np.array(record.measured[1]),
+                joints=np.array(record.joints),
+                stamp=record.stamp,
+                motors_on=EgmFlag.MOTORS_ON in record.flags,
+                running=self._running(),
+                operating_mode="unknown",
+                fault=self._latched,
+            )
+
+    def reference(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What was last sent to the robot: position [m], shape (3,); quaternion w x y z, shape (4,).
+
+        Raises PeerError when nothing was answered yet.
+        """
+        record = self._latest()
+        if record.applied is None:
+            raise PeerError("no reference was sent with the newest EGM message: the arm is stopped or in a dry run")
+        return np.array(record.applied[0]), np.array(record.applied[1])
+
+    def target(
+        self,
+        position: NDArray[np.float64],
+        quaternion: NDArray[np.float64],
+        *,
+        lifetime: float,
+        speed: float | None = None,
+        turn_speed: float | None = None,
+    ) -> None:
+        """Go straight to a pose of the controller's tool, for at most `lifetime` seconds; then hold.
+
+        Parameters
+        ----------
+        position: [m], shape (3,), in the robot's base frame
+        quaternion: w x y z, shape (4,)
+        lifetime: [s, robot time]; renew the target before it is over
+        speed, turn_speed: of the reference, at most [m/s, rad/s]; None takes the configuration's, which may not be
+            exceeded
+
+        Raises SafetyError when the target is refused or the arm is stopped, PeerTimeout on stale feedback. In a dry run
+        the target is checked and goes nowhere.
+        """
+        if np.shape(position) != (3,) or np.shape(quaternion) != (4,):
+            shapes = f"{np.shape(position)} and {np.shape(quaternion)}"
+            raise UsageError(f"expected a position (3,) and a quaternion (4,), got shapes {shapes}")
+        if not 0 < lifetime <= self._config.max_lifetime:
+            raise SafetyError(
+                f"target refused: lifetime {lifetime} s is not above 0 and at most {self._config.max_lifetime} s"
+            )
+        x, y, z = (float(v) for v in position)
+        a, b, c, d = (float(v) for v in quaternion)
+        with self._lock:
+            state = self.state()
+            self._refuse_when_latched()
+            target = Target(
+                (x, y, z),
+                _unit((a, b, c, d)),
+                expires=self._clock.now() + lifetime,
+                speed=self._config.max_speed if speed is None else float(speed),
+                turn_speed=self._config.max_turn_speed if turn_speed is None else float(turn_speed),
+            )
+            record = self._latest()
+            if not state.running and not self._config.dry_run:
+                raise SafetyError("target refused: the controller does not follow references; is EGM running?")
+            feedback = EgmFeedback(record.sequence, record.controller_time, *record.measured, record.joints)
+            if self._tool is None:
+                self._tool = tool_frame(feedback)
+            reference = record.applied or record.measured
+            check_target(self._config, target, reference=reference, tool=self._tool, feedback=feedback)
+            if not self._config.dry_run:
+                self._send("target", *dataclasses.astuple(target))
+
+    def hold(self) -> None:
+        """Freeze the reference where it is, within one cycle."""
+        with self._lock:
+            self._send("hold", "hold was called")
+
+    def stop(self, reason: str) -> None:
+        """Cease sending; the controller's CommTimeout ends EGM. Latches until `reset`.
+
+        When the EGM process does not confirm it, it is killed, which has the same effect.
+        """
+        with self._lock:
+            if self._child is None:
+                return
+            try:
+                self._send("stop", reason or "stop was called")
+                self._wait(lambda: bool(self._latched), _OBEY_LIMIT, "the EGM process did not confirm the stop")
+            except PeerError:
+                self._child.kill()
+                self._latched = self._latched or reason or "stop was called"
+
+    def reset(self) -> None:
+        """The operator's word that motion may go on after a stop. The reference starts over at the feedback.
+
+        Raises PeerTimeout when the EGM process does not confirm. A cause that still stands stops the arm again.
+        """
+        with self._lock:
+            before = self._resets
+            self._send("reset")
+            self._wait(lambda: self._resets > before, _OBEY_LIMIT, "the EGM process did not confirm the reset")
+
+    def drain_log(self) -> list[EgmRecord]:
+        """Every cycle since the last call: commanded, applied, measured, and what the cycle was like."""
+        with self._lock:
+            return self._opened().drain()
+
+    def drain_events(self) -> list[EgmEvent]:
+        """Changes of state since the last call, oldest first."""
+        with self._lock:
+            self._pump(tolerant=True)
+            events, self._events = self._events, []
+            return events
+
+    @property
+    def counts(self) -> Counts:
+        """Messages that came in and were not followed."""
+        return self._opened().counts
+
+    @property
+    def pid(self) -> int | None:
+        """Of the EGM process; None when not connected."""
+        return None if self._child is None else self._child.pid
+
+    def close(self) -> None:
+        """Cease sending and end the process. What the log holds is gone with it: drain first."""
+        with self._lock:
+            if self._child is not None:
+                self._child.close()
+            if self._ring is not None:
+                self._ring.close()
+            self._child = self._ring = None
+            self._latched, self._tool = "", None
+
+    def __enter__(self) -> "EgmArm":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _start(self) -> None:
+        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            udp.bind((self._config.host, self._config.port))
+        except OSError as error:
+            udp.close()
+            raise UsageError(
+                f"cannot listen for EGM on {self._config.host}:{self._config.port}: {error.strerror}; "
+                "is another program listening there?"
+            ) from None
+        self.port = udp.getsockname()[1]
+        self._events = []
+        descriptor = EgmRing.create(self._config.log_records)
+        try:
+            self._ring = EgmRing(descriptor, self._config.log_records)
+            settings = dataclasses.asdict(self._config) | {"clock": self._clock.settings}
+            self._child = Child.start("gelflow.real.egm.process", settings, descriptors=(udp.fileno(), descriptor))
+        finally:
+            udp.close()
+            os.close(descriptor)
+
+    def _opened(self) -> EgmRing:
+        if self._ring is None:
+            raise UsageError("the EGM arm is not connected; call connect() first")
+        return self._ring
+
+    def _latest(self) -> EgmRecord:
+        record = self._opened().latest()
+        if record is None:
+            raise PeerTimeout(f"no EGM packet on UDP port {self.port} yet")
+        return record
+
+    def _running(self) -> bool:
+        record = self._opened().latest()
+        return record is not None and EgmFlag.FOLLOWING in record.flags and not self._latched
+
+    def _heard(self, kind: str) -> bool:
+        return any(event.kind == kind for event in self._events)
+
+    def _refuse_when_latched(self) -> None:
+        if self._latched:
+            raise SafetyError(f"the arm is stopped: {self._latched}; when the cause is gone, the operator may reset it")
+
+    def _linked(self) -> Child:
+        if self._child is None:
+            raise UsageError("the EGM arm is not connected; call connect() first")
+        return self._child
+
+    def _pump(self, *, tolerant: bool = False) -> None:
+        """Take in what the process has said. Raises PeerError when it is gone, unless `tolerant`."""
+        child = self._linked()
+        for event in (EgmEvent(*values) for values in child.messages.read()):
+            self._events.append(event)
+            if event.kind == "stopped":
+                self._latched = event.text
+            elif event.kind == "reset":
+                self._latched, self._tool = "", None
+                self._resets += 1
+        if child.messages.closed and not tolerant:
+            raise PeerError(f"the EGM process is gone ({child.last_words()}); nothing is sent to the robot any more")
+
+    def _send(self, *command: Any) -> None:
+        child = self._linked()
+        try:
+            child.messages.send(command, limit=_OBEY_LIMIT)
+        except TimeoutError:
+            raise PeerTimeout(f"the EGM process took no command for {_OBEY_LIMIT} s") from None
+        except OSError:
+            raise PeerError(f"the EGM process is gone ({child.last_words()})") from None
+
+    def _wait(self, done: Callable[[], bool], wall: float, failure: str) -> None:
+        """Until `done`, for at most `wall` seconds of wall time, while what the process says is taken in."""
+        deadline = ScaledClock()
+        end = deadline.now() + wall
+        while True:
+            with self._lock:
+                self._pump()
+                if done():
+                    return
+            if deadline.now() > end:
+                raise PeerTimeout(failure)
+            deadline.sleep(_POLL)
+
+
+def _unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Rounding taken out; what is no unit quaternion stays as it is and is refused by the check."""
+    norm = math.sqrt(sum(c * c for c in q))
+    if not abs(norm - 1) < 1e-3:
+        return q
+    return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)

@@ -1,0 +1,239 @@
+"""What is sent to the robot, cycle by cycle: a state machine without I/O.
+
+Waiting: the reference is the feedback, so that nothing moves when the controller starts to follow. Following: the
+reference goes straight to the newest target, bounded in every cycle, and is frozen when there is none. Latched: nothing
+is sent, whatever comes, until `reset`.
+"""
+
+import math
+from enum import IntFlag
+from typing import NamedTuple
+
+from gelflow.errors import SafetyError
+from gelflow.real.egm.codec import EgmFeedback
+from gelflow.real.egm.limits import EgmConfig, Target, check_target, tool_frame
+from gelflow.real.kinematics import Frame, Quaternion, Vector, angle_between, multiply
+
+# UDP may swap neighbours; a message this far back is no late one, the controller has started to count anew.
+_REORDERED = 10
+
+
+class EgmFlag(IntFlag):
+    """What a cycle was like."""
+
+    MOTORS_ON = 1
+    FOLLOWING = 2  # the controller follows references
+    CONVERGED = 4  # the controller's own convergence condition
+    HOLD = 8  # no target: the reference is frozen
+    WAITING = 16  # the reference waits for the robot to catch up
+    LOST = 32  # feedback is missing before this one
+    UNANSWERED = 64  # a newer message was there already, and was answered instead
+    LATCHED = 128  # stopped: nothing is sent
+
+
+class EgmEvent(NamedTuple):
+    """A change of state."""
+
+    stamp: float  # robot time [s]
+    kind: str  # listening, first message, malformed, following, hold, refused, restarted, stopped, reset
+    text: str
+
+
+class Follower:
+    """Turns feedback and targets into references. `now` is robot time [s] throughout."""
+
+    def __init__(self, config: EgmConfig) -> None:
+        self._config = config
+        self._feedback: EgmFeedback | None = None
+        self._heard = -math.inf
+        self._tool: Frame | None = None
+        self._reference: Frame | None = None
+        self._target: Target | None = None
+        self._rate = 0.0  # of the target's speed, 0 to 1
+        self._following = False
+        self._flags = EgmFlag(0)
+        self.latched = ""
+        self.events: list[EgmEvent] = []  # taken out by whoever drives this
+
+    @property
+    def target(self) -> Target | None:
+        return self._target
+
+    @property
+    def flags(self) -> EgmFlag:
+        """Of the newest feedback."""
+        return self._flags
+
+    def observe(self, feedback: EgmFeedback, now: float) -> bool:
+        """Take a message in. False: it is a duplicate or came late, and is neither answered nor used."""
+        last = self._feedback
+        flags = EgmFlag(0)
+        if last is not None:
+            behind = last.sequence - feedback.sequence
+            if behind == 0 or (0 < behind <= _REORDERED and feedback.time < last.time):
+                return False
+            if behind > 0:
+                self._restarted(last, feedback, now)
+            elif behind < -1:
+                flags |= EgmFlag.LOST
+            self.check_age(now)
+        self._feedback, self._heard = feedback, now
+        trouble = feedback.trouble
+        if self._reference is None or not self._following:
+            # Not followed until now: start from where the robot is, however it got there.
+            self._reference = (feedback.position, feedback.quaternion)
+        if self._following and trouble:
+            self.latch(trouble, now)
+        elif not self._following and not trouble and not self.latched:
+            self._following = True
+            self._tool = tool_frame(feedback)
+            self._event(now, "following", "the controller follows references")
+        if feedback.motors == "on":
+            flags |= EgmFlag.MOTORS_ON
+        if self._following and not self.latched:
+            flags |= EgmFlag.FOLLOWING
+        if feedback.converged:
+            flags |= EgmFlag.CONVERGED
+        self._flags = flags
+        return True
+
+    def advance(self, now: float) -> tuple[Frame | None, EgmFlag]:
+        """The reference that answers the newest feedback, one cycle on; None: nothing may be sent."""
+        if self.latched or self._reference is None:
+            return None, self._flags | EgmFlag.LATCHED
+        if self._target is not None and now >= self._target.expires:
+            self.hold(now, "the target expired")
+        if self._target is None:
+            return self._reference, self._flags | EgmFlag.HOLD
+        if self._too_far_ahead():
+            self._rate = 0.0
+            return self._reference, self._flags | EgmFlag.WAITING
+        self._reference = self._step(self._reference, self._target)
+        return self._reference, self._flags
+
+    def post(self, target: Target, now: float) -> None:
+        """Follow `target` from now on; a wrong one is refused and the arm holds."""
+        if self.latched:
+            return
+        if self._feedback is None or self._reference is None or self._tool is None or not self._following:
+            self._refuse("target refused: the controller does not follow references", now)
+            return
+        try:
+            check_target(self._config, target, reference=self._reference, tool=self._tool, feedback=self._feedback)
+        except SafetyError as error:
+            self._refuse(str(error), now)
+            return
+        self._rate *= self._kept_rate(target)
+        self._target = target
+
+    def hold(self, now: float, reason: str) -> None:
+        """Freeze the reference where it is."""
+        if self._target is not None:
+            self._event(now, "hold", reason)
+        self._target = None
+        self._rate = 0.0
+
+    def latch(self, reason: str, now: float) -> None:
+        """Stop: nothing is sent any more until `reset`. The first reason stays."""
+        if not self.latched:
+            self.latched = reason
+            self._event(now, "stopped", reason)
+        self._target, self._rate, self._following = None, 0.0, False
+
+    def reset(self, now: float) -> None:
+        """The operator's word: start over as if the robot had never been heard of."""
+        self.latched = ""
+        self._feedback, self._heard = None, -math.inf
+        self._tool = self._reference = self._target = None
+        self._rate, self._following, self._flags = 0.0, False, EgmFlag(0)
+        self._event(now, "reset", "latch cleared by the operator")
+
+    def check_age(self, now: float) -> None:
+        """Hold, then stop, when feedback stays out while the controller follows."""
+        if not self._following or self.latched:
+            return
+        age = now - self._heard
+        if age > self._config.silence:
+            self.latch(f"no EGM message for {age:.3f} s, at most {self._config.silence} s is allowed", now)
+        elif age > self._config.stale:
+            self.hold(now, f"no EGM message for {age:.3f} s")
+
+    def _restarted(self, last: EgmFeedback, feedback: EgmFeedback, now: float) -> None:
+        text = f"EGM was restarted: the message count went back from {last.sequence} to {feedback.sequence}"
+        if self._following:
+            self.latch(text, now)
+        else:
+            self._event(now, "restarted", text)
+
+    def _refuse(self, text: str, now: float) -> None:
+        self._event(now, "refused", text)
+        self.hold(now, "a target was refused")
+
+    def _event(self, now: float, kind: str, text: str) -> None:
+        self.events.append(EgmEvent(now, kind, text))
+
+    def _too_far_ahead(self) -> bool:
+        assert self._feedback is not None and self._reference is not None
+        position, quaternion = self._reference
+        lead = math.dist(position, self._feedback.position)
+        turn = angle_between(self._feedback.quaternion, quaternion)
+        return lead > self._config.max_lead or turn > self._config.max_turn_lead
+
+    def _step(self, reference: Frame, target: Target) -> Frame:
+        """One cycle along the straight line and the shorter turn, both ending together; slower near both ends."""
+        move, turn = _difference(reference, target)
+        duration = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
+        # From rest to full rate in ramp_time, and back to rest at the target with the same deceleration.
+        ramp = self._config.ramp_time
+        self._rate = min(1.0, self._rate + self._config.cycle / ramp, math.sqrt(2 * duration / ramp))
+        distance = self._rate * self._config.cycle
+        if distance >= duration:
+            return target.position, target.quaternion
+        share = distance / duration
+        (x, y, z), quaternion = reference
+        position = (x + share * move[0], y + share * move[1], z + share * move[2])
+        return position, _turned(quaternion, turn, share)
+
+    def _kept_rate(self, target: Target) -> float:
+        """How much of the rate a new target may keep: the part of the motion that goes on in the same direction."""
+        assert self._reference is not None
+        old = self._target
+        if old is None:
+            return 0.0
+        a, b = (
+            [c / t.speed for c in move] + [c / t.turn_speed for c in turn]
+            for t, (move, turn) in ((t, _difference(self._reference, t)) for t in (old, target))
+        )
+        size = math.sqrt(sum(c * c for c in a) * sum(c * c for c in b))
+        if size == 0.0:
+            return 0.0
+        aligned = sum(c * d for c, d in zip(a, b, strict=True)) / size
+        return max(0.0, aligned) * min(1.0, old.speed / target.speed)
+
+
+def _difference(reference: Frame, target: Target) -> tuple[Vector, Vector]:
+    """The way to the target: displacement [m], and turn as a rotation vector [rad] in the reference's frame."""
+    (px, py, pz), (rw, rx, ry, rz) = reference
+    x, y, z = target.position
+    w, i, j, k = multiply((rw, -rx, -ry, -rz), target.quaternion)
+    if w < 0:
+        w, i, j, k = -w, -i, -j, -k
+    sine = math.sqrt(i * i + j * j + k * k)
+    # The limit of angle / sine is 2; below this the quotient is only rounding.
+    scale = 2 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
+    return (x - px, y - py, z - pz), (i * scale, j * scale, k * scale)
+
+
+def _turned(quaternion: Quaternion, turn: Vector, share: float) -> Quaternion:
+    angle = _length(turn)
+    if angle == 0.0:
+        return quaternion
+    half = angle * share / 2
+    scale = math.sin(half) / angle
+    w, x, y, z = multiply(quaternion, (math.cos(half), turn[0] * scale, turn[1] * scale, turn[2] * scale))
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    return (w / norm, x / norm, y / norm, z / norm)
+
+
+def _length(v: Vector) -> float:
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])

@@ -1,0 +1,1 @@
+"""The insertion runner, its checks and its lab file."""

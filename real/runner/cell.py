@@ -1,0 +1,128 @@
+"""One robot cell, opened from a lab file and closed in the right order; each value is recorded on its way."""
+
+import contextlib
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import GelflowError
+from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.protocols import CameraImage
+from gelflow.real.camera.drivers import open_camera
+from gelflow.real.camera.stream import StreamCamera
+from gelflow.real.egm.driver import EgmArm, EgmConfig
+from gelflow.real.runner.lab import Lab
+from gelflow.real.transport import transport_for
+from gelflow.real.wsg.config import WsgConfig
+from gelflow.real.wsg.driver import WsgGripper
+from gelflow.session.recorder import SessionRecorder
+
+_MARGIN = 2e-3  # the arm's own box around the workspace is this much larger: the finer check is the supervisor's [m]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A connected cell. Nothing has moved yet."""
+
+    lab: Lab
+    clock: ScaledClock
+    arm: EgmArm
+    gripper: WsgGripper
+    cameras: tuple[StreamCamera, StreamCamera]  # of the left and of the right finger
+    recorder: SessionRecorder
+    dry_run: bool
+
+
+@contextlib.contextmanager
+def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> Iterator[Cell]:
+    """Connect cameras, gripper and arm; on the way out the arm stops first, then the gripper is told, then the rest.
+
+    `recorder` is open already and stays so. Raises the driver's error when something can not be reached; what was
+    open is closed again.
+    """
+    clock = lab.clock
+    with contextlib.ExitStack() as stack:
+        cameras = []
+        for sensor, (name, camera) in enumerate((("left", lab.cameras.left), ("right", lab.cameras.right))):
+
+            def record(image: CameraImage, sensor: int = sensor) -> None:
+                recorder.image(sensor, image)
+
+            timeout = lab.limits.stale_frame
+            cameras.append(open_camera(camera.source, name, clock, timeout=timeout, on_image=record))
+            stack.callback(cameras[-1].close)
+        gripper = WsgGripper(
+            transport_for(lab.gripper.address, clock=clock),
+            clock=clock,
+            config=WsgConfig(
+                stale_after=lab.limits.stale_gripper,
+                reply_timeout=lab.limits.gripper_reply,
+                move_timeout=lab.limits.gripper_motion,
+                home_timeout=max(4.0, lab.limits.gripper_motion),
+                dry_run=dry_run,
+            ),
+            on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
+            on_measurement=recorder.gripper_state,
+        )
+        stack.enter_context(gripper)
+        arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
+        stack.callback(arm.close)
+        arm.connect()
+        stack.enter_context(_StopArm(arm, recorder))
+        yield Cell(lab, clock, arm, gripper, (cameras[0], cameras[1]), recorder, dry_run)
+
+
+def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
+    """The arm driver's own limits: the box that the lab's workspace covers, and the lab's speeds and times."""
+    space = lab.workspace
+    yaw = math.radians(space.yaw_deg)
+    corners = itertools.product(
+        (-space.x, space.x), (-space.y, space.y), (space.height_min, space.height_max), (-yaw, 0.0, yaw)
+    )
+    height = lab.part.grasp_height
+    places = [
+        lab.tool_pose(lab.hole.pose @ Pose(np.array([x, y, z + height]), yaw_quaternion(turn))).position
+        for x, y, z, turn in corners
+    ]
+    low, high = np.min(places, axis=0) - _MARGIN, np.max(places, axis=0) + _MARGIN
+    stale = lab.limits.stale_pose
+    return EgmConfig(
+        workspace_min=(float(low[0]), float(low[1]), float(low[2])),
+        workspace_max=(float(high[0]), float(high[1]), float(high[2])),
+        port=lab.arm.egm_port,
+        host=lab.arm.host,
+        robot=lab.arm.robot,
+        max_speed=lab.arm.max_speed,
+        max_turn_speed=math.radians(lab.arm.max_turn_speed_deg),
+        max_step=space.max_step,
+        max_turn=math.radians(space.max_turn_deg),
+        stale=stale,
+        silence=5 * stale,
+        max_lifetime=max(1.0, lab.limits.target_lifetime),
+        connect_timeout=lab.arm.connect_timeout,
+        dry_run=dry_run,
+    )
+
+
+class _StopArm:
+    """On the way out: stops the arm and says why, whatever ended the run."""
+
+    def __init__(self, arm: EgmArm, recorder: SessionRecorder) -> None:
+        self._arm = arm
+        self._recorder = recorder
+
+    def __enter__(self) -> None:
+        """Nothing to do before the run."""
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        reason = "the run is over" if kind is None else f"{kind.__name__}: {error}"
+        with contextlib.suppress(GelflowError):
+            self._arm.hold()
+        self._arm.stop(reason)
+        with contextlib.suppress(GelflowError):
+            self._recorder.event("arm stopped", {"reason": reason})

@@ -1,0 +1,252 @@
+"""Motion of the runner: one thread that renews the arm's target and watches that everything it relies on is fresh."""
+
+import contextlib
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from gelflow.clock import Clock
+from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
+from gelflow.geometry import Pose, angle_between
+from gelflow.protocols import ArmState, Camera, Gripper
+from gelflow.real.egm.driver import EgmArm, EgmFlag
+from gelflow.real.egm.ring import EgmRecord
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.supervisor import Supervisor
+from gelflow.session.recorder import SessionRecorder
+
+RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, every change of a cycle's kind besides
+_HISTORY = 8192  # measured heights kept, one a cycle: 32 s
+_ARRIVED = (0.1e-3, math.radians(0.1))  # a move has ended when the arm is this near its target [m, rad]
+
+
+class PartLost(PeerError):
+    """The part slipped out of the fingers: the attempt ends."""
+
+
+class Mover:
+    """Moves the gripper frame. A thread posts the newest target again and again; each posting lives only shortly, so
+    that whatever becomes of this program, the arm holds.
+
+    The first thing that goes wrong (a stale pose, frame or gripper state, a controller that stopped, a refused
+    target) makes the arm hold, then stop; `failure` keeps it, and every call raises it from then on.
+    """
+
+    def __init__(
+        self,
+        arm: EgmArm,
+        gripper: Gripper,
+        cameras: Sequence[Camera],
+        *,
+        lab: Lab,
+        clock: Clock,
+        supervisor: Supervisor,
+        recorder: SessionRecorder,
+    ) -> None:
+        self._arm, self._gripper, self._cameras = arm, gripper, cameras
+        self._lab, self._clock = lab, clock
+        self.supervisor = supervisor
+        self._recorder = recorder
+        self._lock = threading.Lock()
+        self._goal: Pose | None = None
+        self._speeds = (lab.arm.max_speed, math.radians(lab.arm.max_turn_speed_deg))
+        self._holding = False
+        self._lost = False
+        self._ending = threading.Event()
+        self._heights: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
+        self._cycles = 0
+        self._flags = EgmFlag(0)
+        self.failure: GelflowError | None = None
+        self._thread = threading.Thread(target=self._run, name="mover", daemon=True)
+
+    def __enter__(self) -> "Mover":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._goal = None
+        self._ending.set()
+        self._thread.join(2.0)
+        with contextlib.suppress(GelflowError):
+            self._arm.hold()
+            self._log()
+
+    # For the runner's thread
+
+    def pose(self) -> Pose:
+        """Where the gripper frame is in the base, as measured."""
+        self._raise_failure()
+        state = self._arm.state()
+        return self._lab.gripper_pose(state.position, state.quaternion)
+
+    def go(self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None) -> None:
+        """Start to move the gripper frame straight to `target` and return; speeds [m/s], [rad/s], None: the lab's.
+
+        Raises SafetyError when the supervisor refuses the target; the arm then holds.
+        """
+        self._raise_failure()
+        fastest = (self._lab.arm.max_speed, math.radians(self._lab.arm.max_turn_speed_deg))
+        speeds = (fastest[0] if speed is None else speed, fastest[1] if turn_speed is None else turn_speed)
+        try:
+            self._post(target, speeds)
+        except SafetyError:
+            self.hold()
+            raise
+        with self._lock:
+            self._goal, self._speeds = target, speeds
+        stamp = self._clock.now()
+        tool = self._lab.tool_pose(target)
+        self._recorder.arm_command(stamp, tool.position, tool.quaternion, kind="command")
+        self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
+
+    def hold(self) -> None:
+        """Freeze the reference where it is."""
+        with self._lock:
+            self._goal = None
+            self._arm.hold()
+
+    def arrived(self, *, within: float = _ARRIVED[0]) -> bool:
+        """Whether the arm is `within` [m] of the newest target."""
+        goal = self._goal
+        if goal is None:
+            return False
+        return self.pose().near(goal, within, _ARRIVED[1])
+
+    def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
+        """Go to `target` and wait until the arm is there. Raises PeerTimeout when it takes far too long."""
+        start = self.pose()
+        self.go(target, speed=speed)
+        way = float(np.linalg.norm(target.position - start.position)) / self._speeds[0]
+        turn = angle_between(start.quaternion, target.quaternion) / self._speeds[1]
+        limit = 2 * max(way, turn) + 3.0
+        end = self._clock.now() + limit
+        while not self.arrived():
+            if while_moving is not None:
+                while_moving()
+            if self._clock.now() > end:
+                self.hold()
+                off = float(np.linalg.norm(self.pose().position - target.position))
+                raise PeerTimeout(f"the arm is {1e3 * off:.2f} mm from its target after {limit:.1f} s; is it blocked?")
+            self.wait(0.02)
+
+    def wait(self, seconds: float) -> None:
+        """Let `seconds` of robot time pass; raises what goes wrong meanwhile."""
+        self._clock.sleep(seconds)
+        self._raise_failure()
+        if self._lost:
+            raise PartLost("the gripper reports that the part was lost")
+
+    def expect_part(self, held: bool) -> None:
+        """Whether the gripper holds a part from now on; losing it raises PartLost in `wait` and stops the arm."""
+        self._lost = False
+        self._holding = held
+
+    def height_at(self, stamp: float) -> float:
+        """Measured height of the gripper frame in the base at a robot time [m]."""
+        now = self._arm.state()
+        with self._lock:
+            history = list(self._heights)
+        # The thread fetches measured poses now and then; what came since is between the last of them and the newest.
+        if not history or history[-1][0] < now.stamp:
+            history.append((now.stamp, float(self._lab.gripper_pose(now.position, now.quaternion).position[2])))
+        times, heights = zip(*history, strict=True)
+        return float(np.interp(stamp, times, heights))
+
+    # The thread
+
+    def _run(self) -> None:
+        period = self._lab.limits.target_lifetime / 4
+        while not self._ending.is_set():
+            try:
+                self._watch()
+                with self._lock:
+                    goal, speeds = self._goal, self._speeds
+                    if goal is not None:
+                        self._post(goal, speeds)
+                self._log()
+            except Exception as error:  # noqa: BLE001 - a thread has no caller: kept, and raised by the next call
+                self._fail(error)
+                return
+            self._ending.wait(self._clock.wall(period))
+
+    def _post(self, goal: Pose, speeds: tuple[float, float]) -> None:
+        state = self._arm.state()
+        now = self._lab.gripper_pose(state.position, state.quaternion)
+        tool = self.supervisor.check(goal, now, speed=speeds[0], turn_speed=speeds[1])
+        lifetime = self._lab.limits.target_lifetime
+        self._arm.target(tool.position, tool.quaternion, lifetime=lifetime, speed=speeds[0], turn_speed=speeds[1])
+
+    def _watch(self) -> None:
+        """Raise when something that motion relies on is stale or wrong."""
+        state = self._arm.state()
+        self.supervisor.watch(state)
+        self._check_age("pose", state, self._lab.limits.stale_pose)
+        for camera in self._cameras:
+            camera.latest()
+        gripper = self._gripper.state()
+        if gripper.fault:
+            raise PeerError(f"the gripper reports {gripper.fault}; look at it before anything moves again")
+        if self._holding and gripper.grasp in ("part lost", "no part") and not self._lost:
+            self._lost = True
+            self.hold()
+            self._recorder.event("part lost", {"grasp": gripper.grasp, "width": gripper.width})
+
+    def _check_age(self, what: str, state: ArmState, limit: float) -> None:
+        age = self._clock.now() - state.stamp
+        if age > limit:
+            raise PeerTimeout(f"the arm's {what} is {1e3 * age:.0f} ms old, at most {1e3 * limit:.0f} ms is allowed")
+
+    def _log(self) -> None:
+        records = self._arm.drain_log()
+        with self._lock:
+            self._heights.extend(zip((r.stamp for r in records), self._gripper_heights(records), strict=True))
+        for record in records:
+            self._cycles += 1
+            if self._cycles % RECORD_EVERY == 0 or record.flags != self._flags:
+                self._record(record)
+            self._flags = record.flags
+        for event in self._arm.drain_events():
+            self._recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
+
+    def _gripper_heights(self, records: Sequence[EgmRecord]) -> list[float]:
+        """Measured heights of the gripper frame in the base [m]: the third row of R t + p, for all records at once."""
+        if not records:
+            return []
+        w, x, y, z = np.array([record.measured[1] for record in records]).T
+        rows = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+        heights = rows @ np.array(self._lab.tool.position) + [record.measured[0][2] for record in records]
+        return [float(height) for height in heights]
+
+    def _record(self, record: EgmRecord) -> None:
+        state = ArmState(
+            position=np.array(record.measured[0]),
+            quaternion=np.array(record.measured[1]),
+            joints=np.array(record.joints),
+            stamp=record.stamp,
+            motors_on=EgmFlag.MOTORS_ON in record.flags,
+            running=EgmFlag.FOLLOWING in record.flags,
+            operating_mode="unknown",
+        )
+        self._recorder.arm_state(state)
+        if record.applied is not None:
+            self._recorder.arm_command(record.stamp, record.applied[0], record.applied[1], kind="applied")
+
+    def _fail(self, error: Exception) -> None:
+        """Hold within this cycle, then stop for good. Nothing is dropped and no power is cut: the grip stays."""
+        known = isinstance(error, GelflowError)
+        self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
+        self._goal = None
+        self.supervisor.latch(str(self.failure))
+        for end in (self._arm.hold, lambda: self._arm.stop(str(self.failure)), self._log):
+            # The first failure is the one to be seen; the other ends are still tried.
+            with contextlib.suppress(GelflowError):
+                end()
+        with contextlib.suppress(GelflowError):
+            self._recorder.event("stopped", {"reason": str(self.failure), "expected": known})
+
+    def _raise_failure(self) -> None:
+        if self.failure is not None:
+            raise type(self.failure)(*self.failure.args) from self.failure

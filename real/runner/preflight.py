@@ -1,0 +1,105 @@
+"""What must hold before anything moves. Every item is looked at, so that one refusal names all that is wrong."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gelflow.errors import GelflowError, PeerError, SafetyError
+from gelflow.perception.frames import CameraMount, decode
+from gelflow.perception.tracker import MarkerTracker
+from gelflow.real.runner.cell import Cell
+from gelflow.real.runner.supervisor import Supervisor, unfit
+
+_FEWEST = 0.8  # of the markers must be seen at rest
+_FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing that was checked."""
+
+    name: str
+    good: bool
+    text: str  # what was found, or what is wrong
+
+
+def preflight(cell: Cell, supervisor: Supervisor) -> list[Item]:
+    """Check cameras, gripper and arm; homes the gripper outwards where the lab allows it, otherwise nothing moves.
+
+    Returns all items. Raises SafetyError, naming each that failed.
+    """
+    lab = cell.lab
+    mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("left camera", lambda: _camera(cell, 0, mounts[0])),
+        ("right camera", lambda: _camera(cell, 1, mounts[1])),
+        ("arm", lambda: _arm(cell)),
+        ("pose", lambda: _pose(cell, supervisor)),
+        ("gripper", lambda: _gripper(cell)),
+    ]
+    items = [_look(name, check) for name, check in checks]
+    cell.recorder.event("preflight", {item.name: {"good": item.good, "text": item.text} for item in items})
+    if wrong := [f"{item.name}: {item.text}" for item in items if not item.good]:
+        raise SafetyError(f"preflight refused: {'; '.join(wrong)}")
+    return items
+
+
+def _look(name: str, check: Callable[[], str]) -> Item:
+    try:
+        return Item(name, True, check())
+    except GelflowError as error:
+        return Item(name, False, str(error))
+
+
+def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
+    image = cell.cameras[sensor].latest()
+    picture = decode(image.data)
+    if mount.calibration is not None:
+        mount.calibration.check_size(picture)
+    tracked = MarkerTracker(mount.tracker_config()).start(picture)
+    seen, total = int(tracked.valid.sum()), mount.rows * mount.cols
+    if seen < _FEWEST * total:
+        raise PeerError(f"{seen} of {total} markers are seen; look at the gel, its light and the camera")
+    age = cell.clock.now() - image.stamp
+    return f"{seen} of {total} markers, {mount.rows} × {mount.cols}; newest frame {1e3 * age:.0f} ms old"
+
+
+def _arm(cell: Cell) -> str:
+    if not cell.dry_run:
+        cell.arm.wait_following(_FOLLOW_TIMEOUT)
+    state = cell.arm.state()
+    age = cell.clock.now() - state.stamp
+    if age > cell.lab.limits.stale_pose:
+        raise PeerError(f"the newest pose is {1e3 * age:.0f} ms old")
+    # In a dry run nothing is answered, so the controller does not follow yet; the rest must hold.
+    if (reason := unfit(state)) and not (cell.dry_run and state.motors_on and not state.fault):
+        raise SafetyError(reason)
+    return f"motors on, mode {state.operating_mode}, {'following' if state.running else 'not following (dry run)'}"
+
+
+def _pose(cell: Cell, supervisor: Supervisor) -> str:
+    state = cell.arm.state()
+    pose = cell.lab.gripper_pose(state.position, state.quaternion)
+    x, y, yaw, height = supervisor.place(pose)
+    try:
+        supervisor.check(pose, pose, speed=1e-6, turn_speed=1e-6)
+    except SafetyError as error:
+        raise SafetyError(f"{error}; jog the gripper above the hole") from None
+    turn = math.degrees(yaw)
+    return f"x {1e3 * x:+.1f}, y {1e3 * y:+.1f}, height {1e3 * height:.1f} mm, yaw {turn:+.1f}° about the hole"
+
+
+def _gripper(cell: Cell) -> str:
+    state = cell.gripper.state()
+    if state.fault:
+        raise PeerError(f"it reports {state.fault}; look at it and acknowledge")
+    if not state.referenced and cell.lab.gripper.home_at_start:
+        if cell.dry_run:
+            return "not homed: a run would home it outwards first"
+        cell.gripper.home()
+        state = cell.gripper.state()
+    if not state.referenced:
+        raise SafetyError("it is not homed: home it outwards, or set home_at_start in the lab file")
+    if state.grasp == "holding":
+        raise SafetyError("it holds a part already; take it out")
+    return f"homed, {state.grasp}, {1e3 * state.width:.1f} mm open"

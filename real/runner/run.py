@@ -1,0 +1,132 @@
+"""A whole run, as the command line and the demo call it: open, preflight, insert, record, close; or a dry run."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.observation import FlowMap, flow_map
+from gelflow.protocols import Policy
+from gelflow.real.runner.cell import Cell, open_cell
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.motion import Mover
+from gelflow.real.runner.observer import Touch
+from gelflow.real.runner.preflight import Item, preflight
+from gelflow.real.runner.runner import Attempt, Insertion, InsertionRunner, Operator
+from gelflow.real.runner.supervisor import Supervisor
+from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import describe_session
+from gelflow.task import InsertionTask
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What to run, and who wants to hear of it."""
+
+    lab: Lab
+    policy: Policy
+    task: InsertionTask
+    session: Path  # the recording, a new file
+    checkpoint: Path | None = None  # of the policy, for the recording
+    insertions: int = 1
+    operator: Callable[[Mover], Operator] | None = None  # None: the lab's waiting time
+    on_preflight: Callable[[list[Item]], None] = lambda items: None
+    on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
+    on_insertion: Callable[[Insertion], None] = lambda insertion: None
+    before_insertion: Callable[[int], None] = lambda number: None
+
+
+class WaitingOperator:
+    """A fixture or a robot-side feeder: the part is there after a while."""
+
+    def __init__(self, mover: Mover, seconds: float) -> None:
+        self._mover, self._seconds = mover, seconds
+
+    def present(self, number: int) -> None:
+        self._mover.wait(self._seconds)
+
+    def take(self, number: int) -> None:
+        self._mover.wait(self._seconds)
+
+
+@dataclass(frozen=True)
+class DryRun:
+    """What a run would have started with; nothing moved."""
+
+    items: list[Item]
+    targets: list[str]  # the first targets, as the supervisor saw them
+    observation: FlowMap  # of two frames at rest: what the pads show without contact
+    action: NDArray[np.float64]  # what the policy says to it
+
+
+def run_insertions(plan: RunPlan) -> list[Insertion]:
+    """Run the plan's insertions and record everything. Raises the first error that makes going on unsafe."""
+    results = []
+    with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
+        supervisor, mover = runner_parts(cell)
+        plan.on_preflight(preflight(cell, supervisor))
+        operator = WaitingOperator(mover, plan.lab.part.load_wait) if plan.operator is None else plan.operator(mover)
+        with mover:
+            runner = InsertionRunner(
+                cell, plan.policy, task=plan.task, mover=mover, operator=operator, on_attempt=plan.on_attempt
+            )
+            for number in range(plan.insertions):
+                plan.before_insertion(number)
+                results.append(runner.insert(number))
+                plan.on_insertion(results[-1])
+    return results
+
+
+def dry_run(plan: RunPlan) -> DryRun:
+    """Everything up to the first motion: connect, preflight, check the first targets, read the pads, ask the policy."""
+    with _recording(plan, dry_run=True) as recorder, open_cell(plan.lab, recorder, dry_run=True) as cell:
+        supervisor, mover = runner_parts(cell)
+        items = preflight(cell, supervisor)
+        runner = InsertionRunner(
+            cell, plan.policy, task=plan.task, mover=mover, operator=WaitingOperator(mover, plan.lab.part.load_wait)
+        )
+        touch = Touch(cell.cameras, runner.mounts, stale=plan.lab.limits.stale_frame)
+        touch.start(0.0)
+        reading = touch.next()
+        while reading is None:
+            reading = touch.next()
+        assert touch.reference is not None
+        observation = flow_map([reading.frame], touch.reference.frame, grid=plan.task.grid)
+        plan.policy.reset()
+        action = np.asarray(plan.policy.act(observation), dtype=float)
+        return DryRun(items, runner.check_plan(supervisor), observation, action)
+
+
+def runner_parts(cell: Cell) -> tuple[Supervisor, Mover]:
+    """The supervisor and the mover of a cell; the mover's thread is started by `with`."""
+    supervisor = Supervisor(cell.lab)
+    mover = Mover(
+        cell.arm,
+        cell.gripper,
+        cell.cameras,
+        lab=cell.lab,
+        clock=cell.clock,
+        supervisor=supervisor,
+        recorder=cell.recorder,
+    )
+    return supervisor, mover
+
+
+@contextmanager
+def _recording(plan: RunPlan, *, dry_run: bool) -> Iterator[SessionRecorder]:
+    mounts = [plan.lab.cameras.left.mount, plan.lab.cameras.right.mount]
+    description = describe_session(
+        task=plan.task,
+        trackers=[mount.tracker_config() for mount in mounts],
+        mounts=mounts,
+        checkpoint=plan.checkpoint,
+        lab=plan.lab,
+        clock_factor=plan.lab.clock_factor,
+        dry_run=dry_run,
+    )
+    with SessionRecorder(plan.session, plan.lab.clock).open() as recorder:
+        recorder.metadata(description)
+        yield recorder

@@ -1,0 +1,353 @@
+"""The insertion runner: grasp, descend, feel, correct, again, until the part is in the hole.
+
+It knows the robot by its drivers only. The order of an attempt, what is recorded, and what ends it stand here; motion
+and its watchdog are in `runner_motion`, frames and tracking in `runner_touch`, limits in `supervisor`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerRefused, PeerTimeout, SafetyError
+from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.observation import FlowMap
+from gelflow.protocols import Policy
+from gelflow.real.runner.cell import Cell
+from gelflow.real.runner.motion import Mover, PartLost
+from gelflow.real.runner.observer import Reading, Touch, Unreadable
+from gelflow.real.runner.supervisor import Supervisor
+from gelflow.session.records import Decision
+from gelflow.task import InsertionTask
+from gelflow.time_sync import RUNNER
+
+Place = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
+_REST = 0.1  # until the arm and the cameras' newest frames are at rest after a hold [s]
+_AT_DEPTH = 0.02e-3  # this near its end a descent is over [m]
+
+
+class Operator(Protocol):
+    """Who hands parts over: a person who is asked, or a fixture that is waited for."""
+
+    def present(self, number: int) -> None:
+        """Return when part `number` is between the open fingers."""
+        ...
+
+    def take(self, number: int) -> None:
+        """Return when somebody is ready to take part `number`, which could not be inserted, from the fingers."""
+        ...
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One lowering, and what came of it."""
+
+    number: int
+    place: Place  # where it was made
+    depth: float  # how deep the gripper came below the start [m]
+    shear: float  # felt at the deepest frame: mean shear along the finger [mm]
+    contact: bool  # the part touched something
+    stopped: bool  # the descent was stopped by touch
+    inserted: bool  # as the robot sees it
+    duration: float  # [s]
+    observation: FlowMap | None = None  # None where the policy was not asked
+    action: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
+    reference: Reading | None = None
+    deepest: Reading | None = None
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """One part, from grasp to release."""
+
+    number: int
+    outcome: str  # inserted, not inserted, part lost, or what went wrong
+    place: Place  # the last one
+    duration: float  # [s]
+    attempts: tuple[Attempt, ...] = field(default=())
+
+    @property
+    def inserted(self) -> bool:
+        return self.outcome == "inserted"
+
+
+class InsertionRunner:
+    """Runs insertions on an open cell. `run` may be called once; use as a context manager around the mover."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        policy: Policy,
+        *,
+        task: InsertionTask,
+        mover: Mover,
+        operator: Operator,
+        on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None,
+    ) -> None:
+        lab = cell.lab
+        if task.descent > lab.descent.max_depth:
+            deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
+            raise SafetyError(f"the task descends {deep:g} mm, the lab's max_depth allows {allowed:g} mm")
+        self._cell, self._policy, self._task = cell, policy, task
+        self._lab, self._clock, self._recorder = lab, cell.clock, cell.recorder
+        self._mover, self._operator, self._on_attempt = mover, operator, on_attempt
+        self.mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
+
+    def insert(self, number: int) -> Insertion:
+        """Insert one part; returns how it went. Raises what makes going on unsafe (a stale feed, a fault, a latch)."""
+        start = self._clock.now()
+        attempts: list[Attempt] = []
+        place: Place = (0.0, 0.0, 0.0)
+        self._policy.reset()
+        self._recorder.event("insertion", {"number": number})
+        try:
+            self._load(number)
+            outcome = "not inserted"
+            for attempt in range(self._task.attempts):
+                made = self._attempt_with_retries(number, attempt, place)
+                attempts.append(made)
+                self._on_attempt(number, made)
+                if made.inserted:
+                    outcome = "inserted"
+                    break
+                place = self._next_place(place, made)
+            self._finish(number, place, inserted=outcome == "inserted")
+        except PartLost:
+            outcome = "part lost"
+            self._give_up(place)
+        except NotGrasped as error:
+            outcome = str(error)
+            self._give_up(place)
+        except Unreadable as error:
+            outcome = str(error)
+            self._finish(number, place, inserted=False)
+        result = Insertion(number, outcome, place, self._clock.now() - start, tuple(attempts))
+        tries = len(attempts)
+        self._recorder.event("insertion ended", {"number": number, "outcome": outcome, "attempts": tries})
+        return result
+
+    def check_plan(self, supervisor: Supervisor) -> list[str]:
+        """The first targets of a run, checked one from the other as they would be sent; nothing moves."""
+        lab, task = self._lab, self._task
+        state = self._cell.arm.state()
+        before = lab.gripper_pose(state.position, state.quaternion)
+        turn_speed = math.radians(lab.arm.max_turn_speed_deg)
+        taught: Place = (0.0, 0.0, 0.0)
+        checked = []
+        for name, height, speed in (
+            ("hand-over", lab.part.load_height, lab.arm.max_speed),
+            ("start of an attempt", task.start_height, lab.arm.max_speed),
+            ("end of an attempt", task.start_height - task.descent, lab.descent.speed),
+            ("in the hole", lab.part.insert_to, lab.arm.max_speed),
+        ):
+            target = self.pose(taught, height)
+            supervisor.check(target, before, speed=speed, turn_speed=turn_speed)
+            checked.append(f"{name}: lower face at {1e3 * height:.1f} mm, {1e3 * speed:g} mm/s")
+            before = target
+        return checked
+
+    # The steps of an insertion
+
+    def pose(self, place: Place, height: float) -> Pose:
+        """The gripper frame in the base, at a place about the taught hole, the part's lower face at `height` [m]."""
+        x, y, yaw = place
+        above = np.array([x, y, height + self._lab.part.grasp_height])
+        return self._lab.hole.pose @ Pose(above, yaw_quaternion(yaw))
+
+    def _load(self, number: int) -> None:
+        """Above the hole, take a part."""
+        part, lab = self._lab.part, self._lab.gripper
+        self._mover.expect_part(False)
+        self._mover.move(self.pose((0.0, 0.0, 0.0), part.load_height))
+        state = self._cell.gripper.state()
+        if abs(state.width - lab.open_width) > 1e-3:
+            self._cell.gripper.move(width=lab.open_width, speed=lab.speed)
+        self._operator.present(number)
+        self._mover.wait(0.0)
+        try:
+            self._cell.gripper.grasp(width=lab.part_width, speed=lab.speed, force=lab.grasp_force)
+        except PeerRefused as error:
+            raise NotGrasped(str(error)) from error
+        self._mover.expect_part(True)
+
+    def _attempt_with_retries(self, number: int, attempt: int, place: Place) -> Attempt:
+        for _ in range(self._lab.limits.retries):
+            try:
+                return self._attempt(number, attempt, place)
+            except Unreadable as error:
+                self._recorder.event("attempt repeated", {"attempt": attempt, "reason": str(error)})
+        return self._attempt(number, attempt, place)
+
+    def _attempt(self, number: int, attempt: int, place: Place) -> Attempt:
+        begun = self._clock.now()
+        self._mover.move(self.pose(place, self._task.start_height))
+        touch = Touch(self._cell.cameras, self.mounts, stale=self._lab.limits.stale_frame)
+        self._mover.wait(self._lab.descent.settle)
+        reference = touch.start(self._clock.now())
+        stopped = self._descend(place, touch, begun)
+        frames = touch.chosen(self._task.frame_depths)
+        deepest = touch.readings[-1]
+        contact = deepest.shear > self._lab.descent.contact_shear_mm
+        reached = self._task.start_height - deepest.depth < self._task.success_height
+        inserted = reached and not contact and not stopped and self._lower(place, touch)
+        observation, action = None, None
+        if not inserted:
+            observation = touch.observe(frames, self._task)
+            action = np.asarray(self._policy.act(observation), dtype=float)
+            self._record_decision(number, attempt, place, touch, frames, observation, action)
+        made = Attempt(
+            attempt, place, deepest.depth, deepest.shear, contact, stopped, inserted,
+            self._clock.now() - begun, observation, action, reference, deepest,
+        )  # fmt: skip
+        self._recorder.attempt_end(_summary(number, made))
+        return made
+
+    def _descend(self, place: Place, touch: Touch, begun: float) -> bool:
+        """Lower the gripper while feeling; True when touch stopped it."""
+        lab = self._lab
+        start = self._height()
+        self._mover.go(self.pose(place, self._task.start_height - self._task.descent), speed=lab.descent.speed)
+        arrived = math.inf
+        while True:
+            self._mover.wait(0.0)
+            images = touch.images()
+            with self._clock.urgent(RUNNER):
+                reading = touch.read(images)
+                if reading is not None and reading.shear > lab.descent.stop_shear_mm:
+                    self._mover.hold()
+            now = self._clock.now()
+            if now - begun > lab.limits.attempt_time:
+                self._mover.hold()
+                raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; is the arm following?")
+            if reading is not None:
+                depth = self._keep(touch, reading, start)
+                if reading.shear > lab.descent.stop_shear_mm:
+                    self._recorder.event("stopped by touch", {"shear_mm": reading.shear, "depth": depth})
+                    self._look_at_rest(touch, start)
+                    return True
+                # Only frames that were taken at the end are the end's.
+                if min(image.stamp for image in images) > arrived:
+                    return False
+            if start - self._height() > lab.descent.max_depth:
+                self._mover.hold()
+                raise SafetyError(f"the gripper went deeper than max_depth ({1e3 * lab.descent.max_depth:g} mm)")
+            if arrived == math.inf and self._mover.arrived(within=_AT_DEPTH):
+                arrived = now
+
+    def _look_at_rest(self, touch: Touch, start: float) -> None:
+        """Once more where touch stopped a descent: cameras have no common beat, and pads in motion don't compare."""
+        self._mover.wait(_REST)
+        reading = touch.read(touch.images(self._clock.now()))
+        if reading is not None:
+            self._keep(touch, reading, start)
+
+    def _keep(self, touch: Touch, reading: Reading, start: float) -> float:
+        """Add a reading to the attempt's; returns its depth below `start` [m]."""
+        depth = start - self._mover.height_at(reading.frame.stamp)
+        touch.keep(replace(reading, depth=depth))
+        return depth
+
+    def _lower(self, place: Place, touch: Touch) -> bool:
+        """Nothing was felt where the rim would be: go on down. False when something is met after all."""
+        stop = self._lab.descent.stop_shear_mm
+
+        def feel() -> None:
+            reading = touch.next()
+            if reading is not None and reading.shear > stop:
+                self._mover.hold()
+                self._recorder.event("met something below the rim", {"shear_mm": reading.shear})
+                raise _Met
+
+        try:
+            self._mover.move(self.pose(place, self._lab.part.insert_to), while_moving=feel)
+        except _Met:
+            self._mover.move(self.pose(place, self._task.start_height))
+            return False
+        return True
+
+    def _record_decision(
+        self,
+        number: int,
+        attempt: int,
+        place: Place,
+        touch: Touch,
+        frames: list[Reading],
+        observation: FlowMap,
+        action: NDArray[np.float64],
+    ) -> None:
+        assert touch.reference is not None
+        target = self.pose(self._corrected(place, action), self._task.start_height)
+        decision = Decision.of(
+            observation,
+            insertion=number,
+            attempt=attempt,
+            tracked=tuple(map(tuple, touch.tracked)),
+            reference=touch.reference.sequences,
+            frames=tuple(reading.sequences for reading in frames),
+            action=action,
+            correction=np.array([target.position[0], target.position[1], target.yaw]),
+            depths=(touch.reference.depth, *(reading.depth for reading in frames)),
+        )
+        self._recorder.decision(decision.to_json())
+
+    def _next_place(self, place: Place, made: Attempt) -> Place:
+        assert made.action is not None
+        self._mover.move(self.pose(place, self._task.start_height))
+        return self._corrected(place, made.action)
+
+    def _corrected(self, place: Place, action: NDArray[np.float64]) -> Place:
+        """Where a correction leads, inside the task's workspace by the rule that the simulated environment has too.
+
+        That rule is part of what an action means; the target made from it is then checked by the supervisor, which
+        refuses and never clamps. Raises SafetyError when the policy's output is not three finite numbers.
+        """
+        if action.shape != (3,) or not np.isfinite(action).all():
+            raise SafetyError(f"correction refused: the policy said {action.tolist()}, expected three finite numbers")
+        x, y, yaw = (float(v) for v in self._task.corrected(np.array(place), action))
+        return x, y, yaw
+
+    def _finish(self, number: int, place: Place, *, inserted: bool) -> None:
+        """Let the part go: in the hole, or into somebody's hand."""
+        part, lab = self._lab.part, self._lab.gripper
+        if not inserted:
+            self._mover.move(self.pose((0.0, 0.0, 0.0), part.load_height))
+            self._operator.take(number)
+        self._mover.expect_part(False)
+        self._mover.wait(0.0)
+        self._cell.gripper.release(width=lab.open_width, speed=lab.speed)
+        if inserted:
+            self._mover.move(self.pose(place, part.load_height))
+
+    def _give_up(self, place: Place) -> None:
+        """The part is gone or was never held: up and away from it, fingers as they are."""
+        self._mover.expect_part(False)
+        self._mover.move(self.pose(place, self._lab.part.load_height))
+
+    def _height(self) -> float:
+        return float(self._mover.pose().position[2])
+
+
+class NotGrasped(PeerRefused):
+    """The gripper closed and holds nothing: this insertion ends, the next one may be tried."""
+
+
+class _Met(Exception):
+    """Something was met below the rim: how the feeling callback ends a move."""
+
+
+def _summary(number: int, made: Attempt) -> dict[str, Any]:
+    """How an attempt went, for the recording."""
+    return {
+        "insertion": number,
+        "attempt": made.number,
+        "outcome": "inserted" if made.inserted else "not inserted",
+        "place": made.place,
+        "depth": made.depth,
+        "shear_mm": made.shear,
+        "contact": made.contact,
+        "stopped_by_touch": made.stopped,
+        "duration": made.duration,
+    }

@@ -1,0 +1,1 @@
+"""Driver of the Weiss WSG-50 gripper."""

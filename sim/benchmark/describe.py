@@ -1,0 +1,353 @@
+"""What a scene amounts to: its parts, what was left out and why, and how large it is; `gelflow describe` prints it."""
+
+import ctypes
+import gc
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import UsageError
+from gelflow.sim.benchmark.step_times import start_controls
+from gelflow.sim.scene.mjcf import WORLD, JointDef, Mechanics, read_mechanics
+from gelflow.sim.scene.mjcf_file import compile_model, names
+from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene.toml_tables import read_toml
+from gelflow.sim.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class ActuatorPart:
+    name: str
+    kind: str  # "motor", "position", "velocity" or "general"
+    gear: float
+    kp: float
+    kd: float
+    gain: float  # of the control; 1 but for a "general" one
+    bias: float
+    force: tuple[float | None, float | None]  # [N] or [N m]; None where unlimited
+    control: tuple[float | None, float | None]  # what the control is clipped to
+
+
+@dataclass(frozen=True)
+class JointPart:
+    name: str
+    type: str
+    axis: tuple[float, ...] | None  # in the body's frame; None where a joint turns about all
+    range: tuple[float, float] | None  # [m] or [rad]
+    limit_stiffness: float
+    damping: float
+    armature: float
+    stiffness: float
+    frictionloss: float
+    actuators: tuple[ActuatorPart, ...]
+
+
+@dataclass(frozen=True)
+class BodyPart:
+    """A moving body, or the world, with all that is rigidly attached to it."""
+
+    name: str
+    parent: str | None  # None: this is the world
+    mass: float  # [kg], of the attached bodies too; 0 for the world
+    merged: tuple[str, ...]  # bodies of the model file that became part of it
+    geometry: tuple[str, ...]  # kind and name
+    joints: tuple[JointPart, ...]
+
+
+@dataclass(frozen=True)
+class ShapePart:
+    """A geometry that is touched otherwise than as the model file has it."""
+
+    name: str
+    kind: str  # "box", "cylinder" or "mesh"
+    rounding: float  # radius of the edges [m]
+    cells: tuple[int, int, int] | None  # of a mesh's grid, along x, y, z
+    spacing: float | None  # [m], edge of a cell
+    bytes: int | None  # of the grid, shared by all environments
+
+
+@dataclass(frozen=True)
+class ContactPart:
+    name: str
+    points: str  # kind and name of the sampled geometry
+    candidates: int  # points
+    against: tuple[str, ...]
+    law: str
+    damping: str
+    unit: str  # "per point", "per area" or "one exact point"
+    numbers: dict[str, float]  # kn, kt, mu, kd, ks
+
+
+@dataclass(frozen=True)
+class PadPart:
+    name: str
+    body: str
+    shape: str  # "rectangle", "disc", "hemisphere" or "points"
+    markers: int
+    rows: int | None  # None where the markers have no rows and columns
+    cols: int | None
+    pitch: float | None  # [mm]
+    against: tuple[str, ...]
+    law: str
+    unit: str
+    numbers: dict[str, float]
+    pushes: bool  # its markers are contact points
+    gel: str | None  # None: its markers have forces only
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the scene is. Bytes are those of double precision."""
+
+    nq: int
+    nv: int
+    nu: int
+    contact_pairs: int  # point sets against one geometry each
+    candidate_points: int  # point-geometry tests that one evaluation of the contacts may need
+    anchors: int  # memory of the elastic law: points and markers, for each geometry
+    markers: int
+    parameters: int
+    state_bytes: int  # per environment
+    parameter_bytes: int  # per environment
+    reading_bytes: int  # per environment
+    workspace_bytes: int | None  # per thread, as allocated; None where the C library cannot tell
+    model_bytes: int | None  # shared by all environments
+
+
+@dataclass(frozen=True)
+class Description:
+    scene: str
+    path: str
+    step: float  # [s]
+    friction: str
+    gravity: tuple[float, ...]  # [m/s²]
+    bodies: tuple[BodyPart, ...]  # the world first
+    shapes: tuple[ShapePart, ...]  # meshes and rounded ones
+    contacts: tuple[ContactPart, ...]
+    pads: tuple[PadPart, ...]
+    left_out: tuple[str, ...]
+    size: Size
+
+
+def describe(scene: Scene) -> Description:
+    """What is modelled of a scene, what is not and why, and how large it is.
+
+    Raises UsageError when the scene's files no longer hold what it was loaded from.
+    """
+    path = scene.path.parent / str(read_toml(scene.path).get("model"))
+    mechanics = read_mechanics(path)
+    if [b.name for b in mechanics.bodies] != [b.name for b in scene.bodies]:
+        raise UsageError(f"{path} has other bodies than the scene; load the scene again")
+    model, _ = compile_model(path)
+    bodies = _bodies(scene, mechanics, model)
+    kinds = {geom.name: geom.kind for geom in mechanics.geoms}
+    return Description(
+        scene=scene.name,
+        path=str(scene.path),
+        step=scene.step,
+        friction=scene.friction,
+        gravity=_plain(scene.gravity),
+        bodies=bodies,
+        shapes=_shapes(scene),
+        contacts=_contacts(scene, kinds),
+        pads=tuple(
+            PadPart(
+                name=pad.name,
+                body=_body_name(scene, pad.body),
+                shape=pad.shape,
+                markers=len(pad.positions),
+                rows=pad.grid.rows if pad.grid else None,
+                cols=pad.grid.cols if pad.grid else None,
+                pitch=pad.grid.pitch if pad.grid else None,
+                against=pad.against,
+                law=pad.law,
+                unit="per point" if (pad.weights == 1).all() else "per area",
+                numbers=dict(pad.numbers),
+                pushes=pad.pushes,
+                gel=None if pad.gel is None else str(pad.gel),
+            )
+            for pad in scene.pads
+        ),
+        left_out=(*scene.left_out, *_left_out(scene, mechanics, model, bodies)),
+        size=_size(scene),
+    )
+
+
+def _plain(values: Any) -> tuple[float, ...]:
+    return tuple(float(x) for x in values)
+
+
+def _body_name(scene: Scene, body: int) -> str:
+    return "world" if body == WORLD else scene.bodies[body].name
+
+
+def _bodies(scene: Scene, mechanics: Mechanics, model: Any) -> tuple[BodyPart, ...]:
+    roots = [0, *np.flatnonzero(model.body_jntnum > 0)]  # of the file's bodies: the world, and those that move
+    file_names = names(model, "body", model.nbody)
+    parts = []
+    for index, root in zip(range(WORLD, len(scene.bodies)), roots, strict=True):
+        welded = [int(b) for b in np.flatnonzero(model.body_weldid == root) if b != root]
+        parts.append(
+            BodyPart(
+                name=_body_name(scene, index),
+                parent=None if index == WORLD else _body_name(scene, scene.bodies[index].parent),
+                mass=0.0 if index == WORLD else scene.bodies[index].mass,
+                merged=tuple(file_names[b] for b in welded),
+                geometry=tuple(f"{g.kind} {g.name}" for g in mechanics.geoms if g.body == index),
+                joints=tuple(
+                    JointPart(
+                        name=joint.name,
+                        type=joint.type,
+                        axis=_plain(joint.axis) if joint.type in ("slide", "hinge") else None,
+                        range=joint.range,
+                        limit_stiffness=limit.stiffness,
+                        damping=joint.damping,
+                        armature=joint.armature,
+                        stiffness=joint.stiffness,
+                        frictionloss=joint.frictionloss,
+                        actuators=_actuators(scene, joint),
+                    )
+                    for joint, limit in zip(scene.joints, scene.limits, strict=True)
+                    if joint.body == index
+                ),
+            )
+        )
+    return tuple(parts)
+
+
+def _actuators(scene: Scene, joint: JointDef) -> tuple[ActuatorPart, ...]:
+    def bounds(pair: tuple[float, float]) -> tuple[float | None, float | None]:
+        low, high = (x if np.isfinite(x) else None for x in pair)
+        return low, high
+
+    return tuple(
+        ActuatorPart(a.name, a.kind, a.gear, a.kp, a.kd, a.gain, a.bias, bounds(a.force), bounds(a.control))
+        for a in scene.actuators
+        if scene.joints[a.joint] is joint
+    )
+
+
+def _shapes(scene: Scene) -> tuple[ShapePart, ...]:
+    return tuple(
+        ShapePart(
+            name=shape.name,
+            kind=shape.kind,
+            rounding=shape.rounding,
+            cells=shape.grid.cells if shape.grid else None,
+            spacing=shape.grid.spacing if shape.grid else None,
+            bytes=shape.grid.nbytes if shape.grid else None,
+        )
+        for shape in scene.shapes
+        if not shape.sharp
+    )
+
+
+def _contacts(scene: Scene, kinds: dict[str, str]) -> tuple[ContactPart, ...]:
+    points = {p.name: p for p in scene.points}
+    parts = []
+    for group, members in itertools.groupby(scene.contacts, lambda contact: contact.group):
+        contacts = list(members)
+        first = contacts[0]
+        sampled = points[first.points]
+        unit = "per area" if sampled.per_area else "per point"
+        parts.append(
+            ContactPart(
+                name=group,
+                points=f"{kinds[sampled.geom]} {sampled.geom}",
+                candidates=len(sampled.points),
+                against=tuple(c.shape for c in contacts),
+                law=first.law,
+                damping=first.damping,
+                unit="one exact point" if sampled.radius > 0 else unit,
+                numbers=dict(first.numbers),
+            )
+        )
+    return tuple(parts)
+
+
+def _left_out(scene: Scene, mechanics: Mechanics, model: Any, bodies: tuple[BodyPart, ...]) -> Iterator[str]:
+    """What the scene itself does not say of what is left out."""
+    for body in bodies:
+        for name in body.merged:
+            merged = "" if body.parent is None else ", merged into it with its mass"
+            yield f"body {name}: rigidly attached to {body.name}{merged}; costs nothing"
+    for pad in scene.pads:
+        if pad.law == "viscous":
+            yield f"pad {pad.name}: viscous markers have no memory; they cost nothing until they are read"
+    shapes = {shape.name: shape.body for shape in scene.shapes}
+    points = {p.name: p.body for p in scene.points}
+    touching = {frozenset((points[c.points], shapes[c.shape])) for c in scene.contacts}
+    solid = sorted({geom.body for geom in mechanics.geoms})
+    apart = [
+        f"{_body_name(scene, b)} and {_body_name(scene, a)}"
+        for a, b in itertools.combinations(solid, 2)
+        if frozenset((a, b)) not in touching and (a == WORLD or scene.bodies[b].parent != a)
+    ]
+    if apart:
+        more = f" and {len(apart) - 6} more pairs" if len(apart) > 6 else ""
+        yield f"contact between {', '.join(apart[:6])}{more}: the scene file has none; they pass through each other"
+    drawn = {"cameras": model.ncam, "lights": model.nlight, "materials": model.nmat, "textures": model.ntex}
+    if any(drawn.values()):
+        yield f"{', '.join(f'{n} {what}' for what, n in drawn.items() if n)}: for drawing only"
+    yield "MuJoCo's contact and solver settings: the scene file says what touches what, and how"
+
+
+def _size(scene: Scene) -> Size:
+    Simulator(scene, threads=1).tactile()  # what is allocated once and for all is not counted below
+    gc.collect()
+    before = _allocated()
+    model = scene.build()
+    built = _allocated()
+    sim = Simulator(model, threads=1)
+    sim.q[:] = scene.q0
+    sim.step(start_controls(scene))
+    sim.tactile()
+    after = _allocated()
+    state = (sim.q, sim.v, sim.anchors, sim.anchored, sim.status, sim.iterations, sim.halved)
+    state_bytes = sum(array.nbytes for array in state)
+    reading_bytes = int(model.markers) * 3 * sim.q.itemsize
+    known = state_bytes + sim.params.nbytes + reading_bytes
+    sizes = {p.name: len(p.points) for p in scene.points}
+    pushing = [pad for pad in scene.pads if pad.pushes]
+    return Size(
+        nq=model.nq,
+        nv=model.nv,
+        nu=model.nu,
+        contact_pairs=len(scene.contacts) + sum(len(pad.against) for pad in pushing),
+        candidate_points=sum(sizes[c.points] for c in scene.contacts)
+        + sum(len(pad.positions) * len(pad.against) for pad in pushing),
+        anchors=model.na,
+        markers=model.markers,
+        parameters=len(model.param_names),
+        state_bytes=state_bytes,
+        parameter_bytes=sim.params.nbytes,
+        reading_bytes=reading_bytes,
+        workspace_bytes=None if built is None or after is None else max(0, after - built - known),
+        model_bytes=None if before is None or built is None else max(0, built - before),
+    )
+
+
+class _Mallinfo2(ctypes.Structure):
+    """glibc's account of what the heap holds, in bytes."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            *("arena", "ordblks", "smblks", "hblks", "hblkhd"),
+            *("usmblks", "fsmblks", "uordblks", "fordblks", "keepcost"),
+        )
+    ]
+
+
+def _allocated() -> int | None:
+    """Bytes that this process has from malloc; None without glibc 2.33 or newer."""
+    try:
+        tell = ctypes.CDLL(None).mallinfo2
+    except (OSError, AttributeError, TypeError):
+        return None
+    tell.restype = _Mallinfo2
+    info = tell()
+    return int(info.uordblks + info.hblkhd)

@@ -1,0 +1,1 @@
+"""Accuracy against computing time: `gelflow tradeoff`."""

@@ -1,0 +1,5 @@
+#include "batch/batch_impl.hpp"
+
+namespace gelflow {
+template class Batch<double>;
+}  // namespace gelflow

@@ -1,0 +1,79 @@
+// Gradients by physical parameters: what the step's residual, the anchors' turn and the readings say of them directly.
+// All else comes through the state, where the reverse pass has it already (adjoint.hpp).
+#include "math/tape.hpp"
+
+// The core's headers look for the overloads of tape.hpp.
+#include "batch/param_gradient.hpp"
+#include "solver/step.hpp"
+
+namespace gelflow {
+
+namespace {
+
+// The core's view of one state, in taped numbers, with the parameters watched.
+struct TapedState {
+  std::vector<Taped> params, q0, v0, history, v1, u;
+  std::vector<V3<Taped>> anchors;
+
+  TapedState(const Model& m, const double* numbers, const ParamState& s) {
+    Tape::current().clear();
+    for (std::size_t i = 0; i < m.param_names.size(); ++i) params.push_back(Taped::watched(numbers[i]));
+    q0.assign(s.q0, s.q0 + m.nq);
+    v0.assign(s.v0, s.v0 + m.nv);
+    if (s.history != nullptr) history.assign(s.history, s.history + 2 * m.nv);
+    if (s.v1 != nullptr) v1.assign(s.v1, s.v1 + m.nv);
+    if (s.u != nullptr) u.assign(s.u, s.u + m.actuators.size());
+    for (int i = 0; i < m.na; ++i) anchors.push_back(s.anchors[i].cast<Taped>());
+  }
+
+  // Adds the gradient by the parameters, whose entries come first on the tape; weights: of all its entries.
+  void add_to(double* by_params, std::vector<double>& weights) const {
+    Tape::current().back(weights);
+    for (std::size_t i = 0; i < params.size(); ++i) by_params[i] += weights[i];
+  }
+};
+
+void weigh(std::vector<double>& weights, const Taped& result, double weight) {
+  if (result.entry >= 0) weights[result.entry] += weight;
+}
+
+}  // namespace
+
+void add_step_param_gradient(const Model& m, const double* params, const ParamState& s, const double* multipliers,
+                             const V3<double>* by_next, double* by_params) {
+  TapedState t(m, params, s);
+  Workspace<Taped> w(m);
+  const Taped h(s.h);
+  const StepStart<Taped> from{
+      h,          t.q0.data(), t.v0.data(), nullptr, t.history.empty() ? nullptr : t.history.data(), t.anchors.data(),
+      s.anchored, t.u.data()};
+  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), Found::elsewhere, false, w);
+  std::vector<V3<Taped>> next = t.anchors;
+  std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
+  if (m.na > 0) {
+    advance_contact_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
+                                   next_set.data());
+    advance_marker_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
+                                  next_set.data());
+  }
+  std::vector<double> weights(Tape::current().size(), 0.0);
+  for (int k = 0; k < m.nv; ++k) weigh(weights, w.residual[k], -multipliers[k]);
+  for (int i = 0; i < m.na; ++i) {
+    for (int a = 0; next_set[i] && a < 3; ++a) weigh(weights, next[i][a], by_next[i][a]);
+  }
+  t.add_to(by_params, weights);
+}
+
+void add_reading_param_gradient(const Model& m, const double* params, const ParamState& s, const double* by_reading,
+                                double* by_params) {
+  TapedState t(m, params, s);
+  Workspace<Taped> w(m);
+  forward_state<false, Taped>(m, t.params.data(), t.q0.data(), nullptr, t.v0.data(), w);
+  std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
+  read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
+  std::vector<double> weights(Tape::current().size(), 0.0);
+  for (std::size_t i = 0; i < readings.size(); ++i) weigh(weights, readings[i], by_reading[i]);
+  t.add_to(by_params, weights);
+}
+
+}  // namespace gelflow

@@ -1,5 +1,0 @@
-#include "batch_impl.hpp"
-
-namespace gelflow {
-template class Batch<double>;
-}  // namespace gelflow

@@ -1,5 +1,0 @@
-#include "batch_impl.hpp"
-
-namespace gelflow {
-template class Batch<float>;
-}  // namespace gelflow

@@ -1,0 +1,71 @@
+// How what is felt between two bodies acts on the joints.
+//
+// For the dofs that move one of the two bodies and not the other (sign s = +1 the first, −1 the second), written in the
+// shape's frame,
+//     displacement of the first body relative to the second   δξ = Σ s_j S_j δq_j
+//     change of the relative twist                            δV = Σ s_j (Y_j δq_j + S_j δv_j),  Y_j = S_j × (V₁ − V_before(j))
+//     ∂S_k/∂q_j · W = c_kj S_k · (S_j ×* W)   with c = −1 if both move the first body and j carries k, +1 if k moves the
+//                     first and j the second, +1 if both move the second and j does not carry k, else 0.
+// Columns stand side by side in packs of neighbouring dofs; those that do not belong to the pair are zero.
+#pragma once
+
+#include "contact/pair_frame.hpp"
+
+namespace gelflow {
+
+// A motion vector of the world in the shape's frame, for a pack of them.
+template <class T>
+struct PackedMotion {
+  using L = Pack<T>;
+  Vec3<L> angular, linear;
+};
+template <class T>
+GELFLOW_INLINE PackedMotion<T> packed_motion(const PairFrame<T>& f, const SixRows<T>& x, int at) {
+  using L = Pack<T>;
+  const Vec3<L> w{load<L>(x.row(0) + at), load<L>(x.row(1) + at), load<L>(x.row(2) + at)};
+  const Vec3<L> v{load<L>(x.row(3) + at), load<L>(x.row(4) + at), load<L>(x.row(5) + at)};
+  const Mat3<L> turn = spread<L>(f.to_world);
+  return {transposed_times(turn, w), transposed_times(turn, v + cross(w, spread<L>(f.origin)))};
+}
+
+template <class T>
+void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Workspace<T>& w) {
+  using L = Pack<T>;
+  PairColumns<T>& c = w.columns;
+  c.dofs = &pair.packed<pack_width<T>>();
+  c.n = static_cast<int>(c.dofs->dof.size());
+  const V6<T> twist = f.motion(first == world ? V6<T>(V6<T>::Zero()) : w.twist[first]);
+  for (int i = 0; i < c.n; i += pack_width<T>) {
+    const int at = c.dofs->start[i / pack_width<T>];
+    const L sign = load<L>(&c.dofs->sign[i]);
+    PackedMotion<T> s = packed_motion<T>(f, w.axis, at);
+    s.angular = sign * s.angular;
+    s.linear = sign * s.linear;
+    for (int a = 0; a < 3; ++a) {
+      store(s.angular[a], c.s.at(i, a));
+      store(s.linear[a], c.s.at(i, 3 + a));
+    }
+    const PackedMotion<T> before = packed_motion<T>(f, w.twist_before, at);
+    const Vec3<L> angular = spread<L>(V3<T>(top(twist))) - before.angular;
+    const Vec3<L> linear = spread<L>(V3<T>(bottom(twist))) - before.linear;
+    const Vec3<L> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
+    for (int a = 0; a < 3; ++a) {
+      store(turn[a], c.y.at(i, a));
+      store(shift[a], c.y.at(i, 3 + a));
+    }
+  }
+}
+
+// Gradients with respect to the relative pose and twist, carried to the joints.
+template <class T>
+void pull_back(const PairColumns<T>& c, const V6<T>& by_pose, const V6<T>& by_twist, VX<T>& by_q, VX<T>& by_v) {
+  for (int i = 0; i < c.n; ++i) {
+    const int dof = c.dofs->dof[i];
+    if (dof < 0) continue;
+    const V6<T> s = c.s[i], y = c.y[i];
+    by_q[dof] += s.dot(by_pose) + y.dot(by_twist);
+    by_v[dof] += s.dot(by_twist);
+  }
+}
+
+}  // namespace gelflow

@@ -1,0 +1,142 @@
+// A few dense linear equations. Up to `small` of them: the inverse, by Gauss and Jordan, since one matrix serves several
+// right-hand sides, each of which is then a product without a chain of divisions. More, or numbers that don't come in
+// packs: Gauss's elimination. Both with row pivots, a pack of columns at a time.
+#pragma once
+
+#include <utility>
+#include <vector>
+
+#include "math/simd_pack.hpp"
+
+namespace gelflow {
+
+constexpr int small = 16;
+
+// Brings the row with the largest number in column k, of those not yet used, to place k.
+template <class T, class Rows>
+T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
+  using std::abs;
+  const std::ptrdiff_t stride = a.outerStride();
+  T* const row = a.data() + k * stride;
+  int largest = k;
+  T size = abs(row[k]);
+  for (int i = k + 1; i < n; ++i) {
+    const T other = abs(a.data()[i * stride + k]);
+    const bool larger = other > size;
+    largest = larger ? i : largest;
+    size = larger ? other : size;
+  }
+  pivots[k] = largest;
+  if (largest != k) std::swap_ranges(row, row + n, a.data() + largest * stride);
+  return row;
+}
+
+// Replaces the first n columns of `a`, which are so many packs, by those of its inverse.
+template <int packs, class T, class Rows>
+void invert(Rows& a, int n, std::vector<int>& pivots) {
+  using L = Pack<T>;
+  constexpr int width = pack_width<T>;
+  const std::ptrdiff_t stride = a.outerStride();
+  T* const start = a.data();
+  L number[packs];
+  for (int i = 0; i < packs * width; ++i) set_lane(number[i / width], i % width, T(i));
+  for (int k = 0; k < n; ++k) {
+    T* const own = pivot_row<T>(a, n, k, pivots);
+    const L inverse(T(1) / own[k]);
+    Mask<L> here[packs];  // column k, which is to be that of the inverse
+    L pivot[packs];
+    for (int p = 0; p < packs; ++p) {
+      here[p] = !(number[p] < L(T(k))) && !(number[p] > L(T(k)));
+      pivot[p] = select(here[p], inverse, inverse * load<L>(own + p * width));
+      store(pivot[p], own + p * width);
+    }
+    for (int i = 0; i < n; ++i) {
+      if (i == k) continue;
+      T* const row = start + i * stride;
+      const L factor(row[k]);
+      for (int p = 0; p < packs; ++p) {
+        const L old = load<L>(row + p * width);
+        store(select(here[p], L(0.0), old) - factor * pivot[p], row + p * width);
+      }
+    }
+  }
+  for (int k = n - 1; k >= 0; --k) {
+    if (pivots[k] == k) continue;
+    for (int i = 0; i < n; ++i) std::swap(a(i, k), a(i, pivots[k]));
+  }
+}
+template <class T, class Rows, int packs = 1>
+void invert(Rows& a, int n, std::vector<int>& pivots) {
+  if constexpr ((packs + 1) * pack_width<T> <= small) {
+    if (n > packs * pack_width<T>) return invert<T, Rows, packs + 1>(a, n, pivots);
+  }
+  invert<packs, T>(a, n, pivots);
+}
+
+template <class T>
+bool inverts(int n) {
+  return pack_width<T> > 1 && n <= small;
+}
+
+// Makes `a`, whose rows are longer than n by a pack or more, ready for `solve`. Where it is singular, what that finds is
+// not finite.
+template <class T, class Rows>
+void factorize(Rows& a, int n, std::vector<int>& pivots) {
+  if constexpr (pack_width<T> > 1) {
+    if (inverts<T>(n)) return invert<T>(a, n, pivots);
+  }
+  // P A = L U; on the diagonal stands 1/U.
+  using L = Pack<T>;
+  const std::ptrdiff_t stride = a.outerStride();
+  T* const start = a.data();
+  for (int k = 0; k < n; ++k) {
+    T* const own = pivot_row<T>(a, n, k, pivots);
+    own[k] = T(1) / own[k];
+    for (int i = k + 1; i < n; ++i) {
+      T* const row = start + i * stride;
+      row[k] *= own[k];
+      const L factor(row[k]);
+      for (int j = k + 1; j < n; j += pack_width<T>) {
+        store(load<L>(row + j) - factor * load<L>(own + j), row + j);
+      }
+    }
+  }
+}
+
+// x = A⁻¹ b, from what `factorize` left.
+template <class T, class Rows>
+void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<T>& x) {
+  const std::ptrdiff_t stride = a.outerStride();
+  const T* const start = a.data();
+  if (inverts<T>(n)) {
+    using L = Pack<T>;
+    constexpr int width = pack_width<T>;
+    T right[small + LaneTypes<float>::width];
+    std::copy(b, b + n, right);
+    std::fill(right + n, right + n + width, T(0));
+    for (int i = 0; i < n; i += width) {
+      L sums[width];
+      for (int k = 0; k < width; ++k) {
+        const T* const row = start + std::min(i + k, n - 1) * stride;
+        L sum = load<L>(row) * load<L>(right);
+        for (int j = width; j < n; j += width) sum += load<L>(row + j) * load<L>(right + j);
+        sums[k] = sum;
+      }
+      T found[width];
+      sum_lanes(sums, width, found);
+      std::copy(found, found + std::min(width, n - i), x.data() + i);
+    }
+    return;
+  }
+  std::copy(b, b + n, x.data());
+  for (int k = 0; k < n; ++k) std::swap(x[k], x[pivots[k]]);
+  for (int j = 0; j < n; ++j) {
+    for (int i = j + 1; i < n; ++i) x[i] -= start[i * stride + j] * x[j];
+  }
+  for (int i = n - 1; i >= 0; --i) {
+    x[i] *= start[i * stride + i];
+    for (int j = 0; j < i; ++j) x[j] -= start[j * stride + i] * x[i];
+  }
+}
+
+}  // namespace gelflow

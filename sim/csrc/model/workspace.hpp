@@ -1,0 +1,182 @@
+// Everything one environment's step writes besides its state; allocated once, reused by every step.
+#pragma once
+
+#include <utility>
+#include <vector>
+
+#include "model/model.hpp"
+
+namespace gelflow {
+
+// Spatial vectors side by side: number a of all of them in row a, with room for a pack behind the last.
+template <class T>
+struct SixRows {
+  explicit SixRows(int n) : stride_(n + PointCloud::padding), numbers_(6 * static_cast<std::size_t>(stride_), T(0)) {}
+  T* row(int a) { return numbers_.data() + static_cast<std::size_t>(a) * stride_; }
+  const T* row(int a) const { return numbers_.data() + static_cast<std::size_t>(a) * stride_; }
+  V6<T> operator[](int i) const {
+    V6<T> x;
+    for (int a = 0; a < 6; ++a) x[a] = row(a)[i];
+    return x;
+  }
+  void set(int i, const V6<T>& x) {
+    for (int a = 0; a < 6; ++a) row(a)[i] = x[a];
+  }
+
+ private:
+  int stride_;
+  std::vector<T> numbers_;
+};
+
+// The same for packs that are taken one by one: the six of a pack stand together.
+template <class T>
+struct SixPacks {
+  static constexpr int width = pack_width<T>;
+  explicit SixPacks(int n) : numbers_(6 * static_cast<std::size_t>((n + width - 1) / width * width), T(0)) {}
+  // Number a of the pack that begins with vector i.
+  T* at(int i, int a) { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
+  const T* at(int i, int a) const { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
+  V6<T> operator[](int i) const {
+    V6<T> x;
+    for (int a = 0; a < 6; ++a) x[a] = at(i - i % width, a)[i % width];
+    return x;
+  }
+
+ private:
+  std::vector<T> numbers_;
+};
+
+// Bodies that move together, about the world's origin (dynamics.hpp).
+template <class T>
+struct Composite {
+  T mass;
+  V3<T> moment;    // Σ m c
+  M3<T> inertia;   // J
+  M3<T> rate;      // B₁
+  V3<T> momentum;  // linear
+};
+
+// What the near points of a step were found for before: another environment perhaps; an earlier step of the same one; the
+// same step.
+enum class Found : std::uint8_t { elsewhere, earlier, now };
+
+// Where a search for near points was made, and how far around the shape.
+template <class T>
+struct Search {
+  M3<T> rotation;  // first body → shape
+  V3<T> offset;
+  double margin;  // [m]
+};
+
+// The points of one cloud that may touch one shape, side by side (near_points.hpp).
+template <class T>
+struct NearPoints {
+  int count = 0, capacity = 0;
+  std::vector<int> index;                                  // in the cloud
+  std::vector<T> x, y, z, weight;                          // in the first body's frame
+  std::vector<T> anchor_x, anchor_y, anchor_z, remembers;  // in the shape's frame, 1 where there is one; elastic law
+  Search<T> search;
+  // Those among which the next steps look.
+  std::vector<int> around;
+  std::vector<double> around_x, around_y, around_z;
+  Search<T> wide;
+};
+
+// The dofs of a pair in the shape's frame (pair_columns.hpp).
+template <class T>
+struct PairColumns {
+  explicit PairColumns(int most) : s(most), y(most), force_q(most), force_v(most), turned(most) {}
+  const PackedDofs* dofs = nullptr;
+  int n = 0;                             // columns, a whole number of packs
+  SixPacks<T> s, y;                      // S and Y, signs applied
+  SixPacks<T> force_q, force_v, turned;  // what their displacements change (contact.hpp)
+};
+
+// What a step's residual needs beside v_t.
+template <class T>
+struct StepStart {
+  T h;  // β h
+  const T *q0, *v_star;
+  const T* low;      // what q0 lacks, or null (StateView)
+  const T* history;  // δ and v_{t-2}; null under BDF1
+  const V3<T>* anchors;
+  const std::uint8_t* anchored;
+  const T* u;
+  Found found = Found::elsewhere;  // what the workspace was last used for
+  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+
+  T length() const { return history == nullptr ? h : T(h * T(1.5)); }  // of the step itself
+};
+
+template <class T>
+struct Workspace {
+  explicit Workspace(const Model& m)
+      : stride(m.nv + PointCloud::padding),
+        rotation(m.bodies.size()),
+        position(m.bodies.size()),
+        twist(m.bodies.size()),
+        acceleration(m.bodies.size()),
+        force(m.bodies.size()),
+        composite(m.bodies.size()),
+        axis(m.nv),
+        twist_before(m.nv),
+        twist_after(m.nv),
+        acceleration_before(m.nv),
+        p(m.nv),
+        q_missing(m.nv),
+        v_missing(m.nv),
+        residual(stride),
+        forces(stride),
+        scale(stride),
+        increment(m.nv),
+        update(m.nv),
+        trial(m.nv),
+        direction(m.nv),
+        start(m.nv),
+        best(m.nv),
+        mass(m.nv, stride),
+        by_q(m.nv, stride),
+        by_v(m.nv, stride),
+        by_u(m.actuators.size()),
+        tangent(m.nv, stride),
+        q(m.nq),
+        pivots(m.nv),
+        columns(m.columns),
+        near(m.contacts.size()) {
+    forces.setZero();
+    mass.setZero();
+    tangent.setZero();
+  }
+
+  // Rows of matrices are longer than they need to be, so that packs may be added to them anywhere.
+  using Rows = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+  int stride;
+
+  // Kinematics, world frame; spatial vectors at the world's origin.
+  std::vector<M3<Place<T>>> rotation;
+  std::vector<V3<Place<T>>> position;
+  std::vector<V6<T>> twist, acceleration, force;
+  std::vector<Composite<T>> composite;  // of the subtree (dynamics.hpp)
+  SixRows<T> axis;                      // S_k per dof
+  SixRows<T> twist_before;              // around the dof's group
+  std::vector<V6<T>> twist_after, acceleration_before;
+
+  std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
+
+  // The step's residual g and its derivatives.
+  VX<T> residual, forces, scale;  // behind the last number as many zeros as rows have (newton.hpp)
+  VX<T> increment;                // q_t = q_{t-1} ⊕ increment
+  VX<T> update, trial;            // accelerations; v_t − v*
+  VX<T> direction, start, best;   // Newton's
+  Rows mass, by_q, by_v;          // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  VX<T> by_u;                     // ∂g_dof/∂u per actuator
+  Rows tangent;                   // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
+  VX<Place<T>> q;                 // q_t of the trial velocity
+  std::vector<int> pivots;
+
+  PairColumns<T> columns;           // of the pair at work
+  std::vector<NearPoints<T>> near;  // per contact
+  NearPoints<T> near_markers;       // of the pad at work
+};
+
+}  // namespace gelflow

@@ -1,0 +1,118 @@
+// The reverse pass of one step (eqs. 19-23).
+//
+// With b the gradient arriving at v_t, directly and through the increment β h v_t + γ δ, and A = ∂g/∂v_t at the accepted
+// state:
+//     Aᵀ c = b,   ∂L/∂u −= cᵀ ∂g/∂u,   ∂L/∂v* = Mᵀ c,
+//     ∂L/∂q_{t-1} = (∂q_t/∂q_{t-1})ᵀ (∂L/∂q_t − (∂g/∂q_t)ᵀ c),   ∂L/∂X_{t-1} −= cᵀ ∂g/∂X_{t-1}.
+// The anchors after the step hang on the state at its end: their gradient joins ∂L/∂q_t and ∂L/∂v_t first. Under BDF2
+// the increment is the next step's δ, and v_{t-1} its v_{t-2}.
+#pragma once
+
+#include "solver/step.hpp"
+
+namespace gelflow {
+
+// Gradients with respect to a state; q as a tangent vector.
+template <class T>
+struct StateGradient {
+  explicit StateGradient(const Model& m)
+      : q(VX<T>::Zero(m.nv)), v(VX<T>::Zero(m.nv)), history(VX<T>::Zero(m.nh)), anchors(m.na, V3<T>::Zero()) {}
+  VX<T> q, v, history;
+  std::vector<V3<T>> anchors;
+};
+
+// What the reverse pass needs of one accepted substep.
+template <class T>
+struct Record {
+  Record(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool whole)
+      : h(from.h),
+        second(from.history != nullptr),
+        whole(whole),
+        q0(Eigen::Map<const VX<T>>(from.q0, m.nq)),
+        v_star(Eigen::Map<const VX<T>>(from.v_star, m.nv)),
+        v1(v_new),
+        anchors(from.anchors, from.anchors + m.na),
+        anchored(from.anchored, from.anchored + m.na) {
+    if (second) history = Eigen::Map<const VX<T>>(from.history, 2 * m.nv);
+  }
+  StepStart<T> start(const T* u) const {
+    return {h, q0.data(), v_star.data(), nullptr, second ? history.data() : nullptr, anchors.data(), anchored.data(),
+            u};
+  }
+  T h;
+  bool second;  // a step of BDF2
+  bool whole;   // not one of several substeps: BDF2 goes on from it
+  VX<T> q0, v_star, history, v1;
+  std::vector<V3<T>> anchors;
+  std::vector<std::uint8_t> anchored;
+};
+
+// A state of one's own.
+template <class T>
+struct StateCopy {
+  StateCopy(const Model& m, const StateView<T>& s)
+      : q(s.q, s.q + m.nq),
+        v(s.v, s.v + m.nv),
+        history(s.history, s.history + m.nh),
+        anchors(s.anchors, s.anchors + m.na),
+        anchored(s.anchored, s.anchored + m.na) {}
+  StateView<T> view() { return {q.data(), v.data(), anchors.data(), anchored.data(), history.data()}; }
+  std::vector<T> q, v, history;
+  std::vector<V3<T>> anchors;
+  std::vector<std::uint8_t> anchored;
+};
+
+// `g` enters as the gradient at the substep's end and leaves as the gradient at its start; by_u is added to. Before the
+// anchors' gradient changes, multipliers(c) is called.
+template <class T, class Multipliers>
+void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
+                        StepMemory<T>& memory, Multipliers&& multipliers) {
+  Workspace<T>& w = memory.work;
+  evaluate<true, T>(m, params, r.start(u), r.v1.data(), Found::elsewhere, false, w);
+  std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
+  if (m.na > 0) {
+    const T length = r.start(u).length();
+    contact_anchors_transposed<true, T>(m, params, length, r.second, r.anchors.data(), r.anchored.data(), w,
+                                        g.anchors.data(), g.v, g.q, g.v, by_anchor.data());
+    marker_anchors_transposed<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+                                 by_anchor.data());
+  }
+  VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
+  if (m.nh > 0 && r.whole) {
+    by_increment = g.history.head(m.nv);
+    by_v0 = g.history.segment(m.nv, m.nv);
+  }
+  const VX<T> b = g.v + r.h * (position_by_increment_transposed<T>(m, w.increment, g.q) + by_increment);
+  w.tangent.leftCols(m.nv).transposeInPlace();
+  factorize<T>(w.tangent, m.nv, w.pivots);
+  VX<T> c(m.nv);
+  solve<T>(w.tangent, m.nv, w.pivots, b.data(), c);
+  multipliers(c);
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
+  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c;
+  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_earlier = VX<T>::Zero(m.nv);
+  by_increment += position_by_increment_transposed<T>(m, w.increment, by_q1);
+  floating_bodies_transposed<T>(m, params, r.start(u), w, c, by_v_star, by_increment, by_earlier);
+  g.q = position_by_position_transposed<T>(m, w.increment, by_q1);
+  g.v = by_v0 + (r.second ? T(4) / T(3) : T(1)) * by_v_star;
+  g.history.setZero();
+  if (r.second) {
+    g.history.head(m.nv) = by_increment / T(3);
+    g.history.segment(m.nv, m.nv) = by_earlier - by_v_star / T(3);
+  }
+  if (m.na > 0) {
+    contact_anchors_transposed<false, T>(m, params, r.h, r.second, r.anchors.data(), r.anchored.data(), w, nullptr, c,
+                                         g.q, g.v, by_anchor.data());
+    g.anchors.swap(by_anchor);
+  }
+}
+
+// Gradient of marker readings at a state, added to g.
+template <class T>
+void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, const T* by_reading,
+                        StateGradient<T>& g, Workspace<T>& w) {
+  forward_state<true, T>(m, params, s.q, s.low, s.v, w);
+  read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
+}
+
+}  // namespace gelflow

@@ -1,0 +1,165 @@
+// One implicit step (eqs. 6-7):
+//
+//     q_t = q_{t-1} ⊕ (β h v_t + γ δ),   δ = q_{t-1} ⊖ q_{t-2}
+//     g(v_t) = M(q_t) (v_t − v*) + β h (C(q_t, v_t) − f(q_t, v_t, u)) = 0
+//     BDF1: β = 1, γ = 0, v* = v_{t-1}         BDF2: β = 2/3, γ = 1/3, v* = 4/3 v_{t-1} − 1/3 v_{t-2}
+//
+// solved for v_t (residual.hpp, newton.hpp). Where that does not succeed the step is taken in shorter ones. BDF2 starts
+// with one step of BDF1, whose local error is of BDF2's order, and does so again after a step that was not taken whole.
+#pragma once
+
+#include <algorithm>
+#include <bit>
+#include <cstring>
+
+#include "solver/newton.hpp"
+#include "contact/tactile.hpp"
+
+namespace gelflow {
+
+// The state of one environment. Anchors live in the frame of the shape that they touch. History is BDF2's: δ (nv),
+// v_{t-2} (nv), and 1 where there is one, else 0.
+template <class T>
+struct StateView {
+  T* q;
+  T* v;
+  V3<T>* anchors;
+  std::uint8_t* anchored;
+  T* history;
+  T* low = nullptr;  // what q lacks in single precision, half a rounding unit at most: so small steps add up
+};
+
+// Calls visit(i) where set[i] is not 0. Most are not: they are looked at eight at a time.
+template <class Visit>
+void for_each_set(const std::uint8_t* set, int n, Visit&& visit) {
+  constexpr int word = sizeof(std::uint64_t);
+  for (int i = 0; i < n; i += word) {
+    const int end = std::min(i + word, n);
+    std::uint64_t any = 1;
+    if (end - i == word) std::memcpy(&any, set + i, word);
+    for (int k = i; any != 0 && k < end; ++k) {
+      if (set[k]) visit(k);
+    }
+  }
+}
+
+struct StepReport {
+  Status status = Status::ok;
+  int iterations = 0;  // Newton iterations, substeps included
+  int halvings = 0;    // of the step, to get the shortest of its substeps
+};
+
+// One environment's memory for steps: the state to fall back on, and the state in the making.
+template <class T>
+struct StepMemory {
+  explicit StepMemory(const Model& m)
+      : work(m), q(m.nq), low(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), history(m.nh) {}
+  Workspace<T> work;
+  VX<T> q, low, v, v_new, v_star, history;
+  std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
+  Found found = Found::elsewhere;              // what work was last used for
+
+  void keep(const Model& m, const StateView<T>& s) {
+    q = Eigen::Map<const VX<T>>(s.q, m.nq);
+    if (s.low != nullptr) low = Eigen::Map<const VX<T>>(s.low, m.nq);
+    v = Eigen::Map<const VX<T>>(s.v, m.nv);
+    history = Eigen::Map<const VX<T>>(s.history, m.nh);
+    anchors.clear();
+    for_each_set(s.anchored, m.na, [&](int i) { anchors.emplace_back(i, s.anchors[i]); });
+  }
+  void give_back(const Model& m, const StateView<T>& s) const {
+    std::copy(q.data(), q.data() + m.nq, s.q);
+    if (s.low != nullptr) std::copy(low.data(), low.data() + m.nq, s.low);
+    std::copy(v.data(), v.data() + m.nv, s.v);
+    std::copy(history.data(), history.data() + m.nh, s.history);
+    std::fill(s.anchored, s.anchored + m.na, 0);
+    for (const auto& [i, anchor] : anchors) {
+      s.anchors[i] = anchor;
+      s.anchored[i] = 1;
+    }
+  }
+};
+
+// How a substep of length h, `whole` or a part of the step, starts from state s: β, v*, which is kept in `memory`, and δ.
+template <class T>
+StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
+                      StepMemory<T>& memory) {
+  memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
+  StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.found};
+  if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
+  for (int k = 0; k < m.nv; ++k) memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
+  from.h = h * T(2) / T(3);
+  from.history = s.history;
+  return from;
+}
+
+// Called after each accepted substep with (its start, memory); memory.work holds the kinematics of its end.
+struct NoObserver {
+  template <class... A>
+  void operator()(const A&...) const {}
+};
+
+// One substep of length h from state s, which moves on only if the substep succeeds. `whole`: it is the step itself, not
+// a part of it.
+template <class T, class Observer>
+Status substep(const Model& m, const T* params, const T& h, bool whole, const T* u, int polish, const StateView<T>& s,
+               StepMemory<T>& memory, int& iterations, Observer&& accepted) {
+  const StepStart<T> from = start_of<T>(m, h, whole, s, u, memory);
+  memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
+  Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+  memory.found = Found::earlier;
+  if (status != Status::ok) {
+    memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
+    status = newton_from_softer<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+  }
+  if (status != Status::ok) return status;
+  accepted(from, memory);
+  advance_contact_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_marker_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  if (m.nh > 0) {
+    std::fill(s.history, s.history + m.nh, T(0));
+    if (whole) {
+      std::copy(memory.work.increment.data(), memory.work.increment.data() + m.nv, s.history);
+      std::copy(s.v, s.v + m.nv, s.history + m.nv);
+      s.history[2 * m.nv] = T(1);
+    }
+  }
+  for (int i = 0; i < m.nq; ++i) {
+    s.q[i] = T(memory.work.q[i]);
+    if (s.low != nullptr) s.low[i] = T(memory.work.q[i] - Place<T>(s.q[i]));
+  }
+  std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
+  return Status::ok;
+}
+
+// One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a
+// substep of half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length
+// again. Where even the shortest fails, the state is left as it was and the report says why.
+// `follows`: memory was last used for a step of the same environment.
+template <class T, class Observer = NoObserver>
+StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
+                bool follows, Observer&& accepted = {}, int parts = 1) {
+  memory.found = follows ? Found::earlier : Found::elsewhere;
+  StepReport report;
+  const double span = m.step / parts;
+  const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep
+  for (int at = 0, length = whole; at < whole;) {
+    const T h = length == whole ? T(span) : T(span * length / whole);
+    const bool itself = length == whole && parts == 1;
+    if (at == 0 && length == whole / 2) memory.keep(m, s);  // only a part of a step may have to be taken back
+    report.status = substep<T>(m, params, h, itself, u, polish, s, memory, report.iterations, accepted);
+    if (report.status == Status::ok) {
+      at += length;
+      if (at % (2 * length) == 0 && at + 2 * length <= whole) length *= 2;
+    } else if (length > 1 && report.iterations < m.max_step_iterations) {
+      length /= 2;
+      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(whole / length)));
+    } else {
+      if (at > 0) memory.give_back(m, s);
+      return report;
+    }
+  }
+  return report;
+}
+
+}  // namespace gelflow

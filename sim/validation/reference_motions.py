@@ -1,0 +1,184 @@
+"""One motion of each scene that comes along, for measurements: touch is made, slides and sticks, breaks, is made again.
+
+Controls are smooth functions of time, so that a motion is the same whatever the step: the controls of a step are those
+of its end.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gelflow.errors import UsageError
+from gelflow.sim.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where a scene starts, at rest, and what its actuators are told."""
+
+    q0: Array  # (nq,)
+    duration: float  # [s]
+    look: float  # when what is felt is worth a look: touch is made and held [s]
+    controls: Callable[[ArrayLike], Array]  # times (K,) [s] → u (K, nu)
+
+    def steps(self, step: float) -> Array:
+        """Controls of all steps of this length [s], (steps, nu). Raises UsageError where none fits in."""
+        count = round(self.duration / step)
+        if count < 1:
+            raise UsageError(f"a step of {step} s is longer than the motion, {self.duration} s")
+        return self.controls(step * np.arange(1, count + 1))
+
+    def varied(self, size: float, pace: float) -> "Motion":
+        """The same motion, its controls' changes `size` times as large and `pace` times as fast, for as long."""
+        rest = self.controls(0.0)
+
+        def controls(times: ArrayLike) -> Array:
+            return rest + size * (self.controls(pace * np.asarray(times, float)) - rest)
+
+        return Motion(self.q0, self.duration, min(self.look / pace, self.duration), controls)
+
+
+def motion(scene: Scene) -> Motion:
+    """The motion of a scene that comes along. Raises UsageError for another scene."""
+    if scene.name not in _MOTIONS:
+        raise UsageError(f"no motion for scene {scene.name!r}; there are {', '.join(_MOTIONS)}")
+    return _MOTIONS[scene.name](scene)
+
+
+def _ramp(times: ArrayLike, start: float, end: float) -> Array:
+    """From 0 to 1 between two times, with a continuous slope."""
+    x = np.clip((np.asarray(times, float) - start) / (end - start), 0, 1)
+    return np.asarray(x * x * (3 - 2 * x))
+
+
+def _follow(scene: Scene, tracks: dict[str, list[tuple[float, float]]]) -> Callable[[ArrayLike], Array]:
+    """Controls that pass through (time, value) points, smooth ramps in between; others are 0."""
+
+    def controls(times: ArrayLike) -> Array:
+        t = np.atleast_1d(np.asarray(times, float))
+        u = np.zeros((len(t), scene.nu))
+        for name, points in tracks.items():
+            column = np.full(len(t), points[0][1])
+            for (start, before), (end, after) in pairwise(points):
+                column += (after - before) * _ramp(t, start, end)
+            u[:, scene.u(name)] = column
+        return u
+
+    return controls
+
+
+def _rolling(scene: Scene) -> Motion:
+    """The pad comes down on the ball, rolls it, lifts off while the ball rolls on, and catches it."""
+    q0 = scene.q0.copy()
+    q0[scene.q("pad_z")] = -0.0145  # half a millimetre above the ball
+    ball = next(b for b in scene.bodies if b.name == "ball")
+    ground = next(c for c in scene.contacts if c.name == "ball_ground")
+    q0[scene.q("ball").start + 2] += scene.gravity[2] * ball.mass / ground.numbers["kn"]  # it would bounce otherwise
+    tracks = {  # the pad weighs 0.245 N
+        "pad_z": [(0.0, 0.18), (0.1, 0.16), (0.3, 0.16), (0.34, 0.30), (0.38, 0.30), (0.42, 0.17)],
+        "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
+        "pad_y": [(0.15, 0.0), (0.25, 0.05), (0.35, 0.0)],
+    }
+    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
+
+
+def _pushing(scene: Scene) -> Motion:
+    """The finger runs into the box, pushes it away and round over the ground, draws back, and pushes again."""
+    tracks = {
+        "gripper_x": [(0.0, 0.3), (0.1, 1.0), (0.3, 0.9), (0.34, -0.6), (0.4, -0.6), (0.44, 0.9)],
+        "gripper_y": [(0.1, 0.0), (0.2, 0.3), (0.3, 0.0)],
+        "gripper_yaw": [(0.12, 0.0), (0.2, 0.1), (0.3, -0.05), (0.4, 0.0)],
+    }
+    return Motion(scene.q0.copy(), 0.64, 0.28, _follow(scene, tracks))
+
+
+def _insertion(scene: Scene) -> Motion:
+    """A held part comes down on the rim beside its hole, slides over it, is lifted off, goes in and leans on a wall."""
+    q0, force, lift, shift = scene.q0.copy(), 5.0, 0.5e-3, 4.5e-3
+    q0[scene.q("arm_z")] += lift
+    q0[scene.q("part").start + 2] += lift
+    for joint in ("arm_x", "part"):
+        q0[scene.q(joint).start] += shift
+    touching = {p.name: p.weights.sum() / 2 for p in scene.points}  # half of a disc's points are on the face
+    numbers = {c.points: c.numbers for c in scene.contacts}
+    for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
+        q0[scene.q(finger)] += force / (numbers[pad]["kn"] * touching[pad])
+    servo = next(a for a in scene.actuators if a.name == "arm_z")
+    weight = -scene.gravity[2] * sum(body.mass for body in scene.bodies)
+    top = float(q0[scene.q("arm_z")][0]) + weight / servo.kp  # the servo does not sag
+    tracks = {
+        "finger_left": [(0.0, force)],
+        "finger_right": [(0.0, force)],
+        "hold_left": [(0.0, q0[scene.q("finger_left").start])],
+        "hold_right": [(0.0, q0[scene.q("finger_right").start])],
+        "arm_x": [
+            (0.0, shift),
+            (0.2, shift),
+            (0.35, 2.7e-3),
+            (0.42, 2.7e-3),
+            (0.5, 2.0e-3),
+            (0.64, 2.0e-3),
+            (0.72, 2.7e-3),
+        ],
+        "arm_yaw": [(0.3, 0.0), (0.35, 0.01), (0.42, 0.0)],
+        "arm_z": [(0.0, top), (0.2, top - 1.6e-3), (0.36, top - 1.6e-3), (0.44, top), (0.48, top), (0.66, top - 3e-3)],
+    }
+    return Motion(q0, 0.8, 0.8, _follow(scene, tracks))
+
+
+def _grasp(scene: Scene) -> Motion:
+    """The fingers close on the bar off its middle, lift it, set it down, and open."""
+    q0 = scene.q0.copy()
+    q0[scene.q("arm_y")] = 0.02
+    servo = next(a for a in scene.actuators if a.name == "arm_z")
+    q0[scene.q("arm_z")] += scene.gravity[2] * sum(b.mass for b in scene.bodies if b.name != "bar") / servo.kp
+    q0[scene.q("bar").start + 2] -= _sag(scene)
+    q0[[scene.q("finger_left").start, scene.q("finger_right").start]] = -0.0127
+    close = [(0.0, 3.0), (0.1, 10.0), (0.52, 10.0), (0.58, -1.0)]
+    tracks = {
+        "arm_y": [(0.0, 0.02)],
+        "arm_z": [(0.1, 0.06), (0.3, 0.075), (0.34, 0.075), (0.5, 0.056)],
+        "finger_left": close,
+        "finger_right": close,
+    }
+    return Motion(q0, 0.64, 0.34, _follow(scene, tracks))
+
+
+def _sag(scene: Scene) -> float:
+    """How far the bar sinks into its two tables [m]. If it fell there it would rattle for as long as the motion."""
+    cloud = next(p for p in scene.points if p.name == "bar")
+    kn = next(c.numbers["kn"] for c in scene.contacts if c.points == "bar")
+    places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
+    tables = [s for s in scene.shapes if s.name.startswith("table")]
+    resting = sum(weights[(np.abs(places - t.pose.pos) <= t.size)[:, :2].all(1)].sum() for t in tables)
+    return float(-scene.gravity[2] * scene.bodies[scene.body("bar")].mass / (kn * resting))
+
+
+def _dclaw(scene: Scene) -> Motion:
+    """Three fingers close on the cap, turn it, open and swing back, and close again."""
+    q0 = scene.q0.copy()
+    start = dict(zip((a.name for a in scene.actuators), q0, strict=False))
+    tracks: dict[str, list[tuple[float, float]]] = {}
+    for finger in (1, 2, 3):
+        bend = start[f"bend{finger}"]
+        tracks |= {
+            f"swing{finger}": [(0.15, 0.0), (0.35, 0.15), (0.42, 0.15), (0.5, 0.0)],
+            f"bend{finger}": [(0.0, bend), (0.15, bend + 0.12), (0.37, bend + 0.12), (0.43, bend), (0.5, bend + 0.1)],
+            f"curl{finger}": [(0.0, start[f"curl{finger}"])],
+        }
+    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
+
+
+_MOTIONS: dict[str, Callable[[Scene], Motion]] = {
+    "rolling": _rolling,
+    "pushing": _pushing,
+    "insertion": _insertion,
+    "grasp": _grasp,
+    "dclaw": _dclaw,
+}
+SCENES = tuple(_MOTIONS)

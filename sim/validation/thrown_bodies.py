@@ -1,0 +1,117 @@
+"""Free bodies thrown on planes, and what each step does to their energy, for measurements."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.scene.sampling import box_surface, cylinder
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.energy import EnergyGauge
+
+Array = NDArray[np.float64]
+Kind = Literal["sphere", "box", "cylinder"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+GRAVITY = 9.8  # [m/s²]
+MASS = 0.3  # [kg]
+SIZE = 0.02  # [m]
+_BOX = SIZE * np.array([1.0, 1.5, 0.6])
+_HALF_LENGTH = 1.2 * SIZE
+
+
+def _body(kind: Kind) -> tuple[Array, Array, float]:
+    """Contact points, principal moments of inertia per kilogram [m²], radius of a moving point or 0."""
+    if kind == "sphere":
+        return np.zeros((1, 3)), np.full(3, 0.4 * SIZE**2), SIZE
+    if kind == "box":
+        square = _BOX**2 / 3
+        return box_surface(_BOX.tolist(), (3, 3, 3))[0], square.sum() - square, 0.0
+    across = SIZE**2 / 4 + _HALF_LENGTH**2 / 3
+    points = cylinder(SIZE, _HALF_LENGTH, angles=24, radii=2, heights=3, faces=("-z", "wall", "+z"))[0]
+    return points, np.array([across, across, SIZE**2 / 2]), 0.0
+
+
+@dataclass(frozen=True)
+class Throw:
+    """A free body over a ground, and a plane that leans at 45° beside it."""
+
+    kind: Kind
+    law: str  # of friction
+    damping: str
+    step: float  # [s]
+    numbers: Mapping[str, float]  # kn, kt, mu, kd, ks per point
+    integrator: str = "bdf1"
+    turns: bool = True  # else it is carried by three slides
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in the body's frame [m]
+    tolerance: float = 1e-9  # of Newton's method
+
+    @property
+    def reach(self) -> float:
+        """The farthest point from the body's centre [m]."""
+        points, _, radius = _body(self.kind)
+        return float(np.linalg.norm(points, axis=1).max()) + radius
+
+    def describe_to(self, spec: Any) -> Any:
+        """Tell a model builder every part; returns it."""
+        points, moments, radius = _body(self.kind)
+        spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), self.step, self.tolerance
+        spec.integrator = self.integrator
+        still, upright = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+        body = spec.add_body("body", -1, still, upright, MASS, self.center, (*(MASS * moments), 0.0, 0.0, 0.0))
+        if self.turns:
+            spec.add_joint("free", body, "free", still, (0.0, 0.0, 1.0))
+        else:
+            for name, axis in zip("xyz", np.eye(3), strict=True):
+                spec.add_joint(name, body, "slide", still, axis)
+        sampled = spec.add_points("points", body, points, np.ones(len(points)), radius=radius)
+        lean = (np.cos(np.pi / 8), 0.0, -np.sin(np.pi / 8), 0.0)  # its normal is (−1, 0, 1) / √2
+        planes = {"ground": (still, upright), "slope": ((3 * SIZE, 0.0, 0.0), lean)}
+        for name, (pos, quat) in planes.items():
+            plane = spec.add_shape(name, -1, "plane", pos, quat, (1.0, 1.0, 1.0))
+            spec.add_contact(f"on {name}", sampled, plane, law=self.law, damping=self.damping, **self.numbers)
+        return spec
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What each step did; arrays (steps, N) [J] but for `halved`, of all steps but those that failed."""
+
+    change: Array  # of the energy
+    scale: Array  # energy at work before the step: kinetic, stored, and the body's weight lifted by its reach
+    halved: NDArray[np.bool_]
+    total: Array  # (steps + 1, N): the energy itself
+
+
+def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> Growth:
+    """Throw bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
+    sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
+    gauge = EnergyGauge(throw, num_envs=bodies)
+    speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)
+    sim.v[:, :3] = speed * rng.normal(size=(bodies, 3))
+    if throw.turns:
+        turn = rng.normal(size=(bodies, 4))
+        turn[: bodies // 3] = 1, 0, 0, 0
+        sim.q[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        sim.v[:, 3:] = speed / SIZE * rng.normal(size=(bodies, 3)) * (rng.random((bodies, 1)) < 0.8)
+    sim.q[:, 2] = throw.reach
+    for _ in range(3):  # out of the planes, or a little into them
+        sim.q[:, 2] += gauge.points(sim)[0].max(1)
+    sim.q[:, 2] += rng.choice([-1e-4, 0.0, 0.3 * throw.reach], bodies)
+    rows: list[tuple[NDArray[Any], ...]] = []
+    before = gauge.read(sim)
+    total = [before.total]
+    for _ in range(steps):
+        halvings = sim.halved.copy()
+        sim.step(np.zeros(0))
+        after = gauge.read(sim)
+        at_work = before.kinetic + before.contact + before.friction + MASS * GRAVITY * throw.reach
+        rows.append((after.total - before.total, at_work, sim.halved > halvings))
+        total.append(after.total)
+        before = after
+    sim.check()
+    change, scale, halved = (np.array(column) for column in zip(*rows, strict=True))
+    return Growth(change, scale, halved, np.array(total))

@@ -1,0 +1,1 @@
+"""The sub-commands of `gelflow`, one module each."""

@@ -1,0 +1,253 @@
+"""`gelflow describe SCENE`: what a scene models, what it leaves out, how large it is, and where a step's time goes."""
+
+import argparse
+import dataclasses
+import json
+from typing import TYPE_CHECKING
+
+from rich.console import Console, Group
+from rich.markup import escape
+from rich.padding import Padding
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.tree import Tree
+
+from gelflow.cli.presets import PRESET_HELP
+from gelflow.errors import UsageError
+
+if TYPE_CHECKING:
+    from gelflow.sim.benchmark.describe import (
+        ActuatorPart,
+        BodyPart,
+        ContactPart,
+        Description,
+        JointPart,
+        PadPart,
+        ShapePart,
+        Size,
+    )
+    from gelflow.sim.benchmark.step_times import StepTimes
+    from gelflow.sim.scene.scene import Scene
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("scene", metavar="SCENE", help="name of a scene that comes with gelflow, or a TOML file")
+    parser.add_argument("--friction", choices=["viscous", "elastic"], help="law, instead of the scene's own")
+    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
+    parser.add_argument("--no-timing", action="store_true", help="leave the measured times out")
+    parser.add_argument("--repeats", type=int, default=60, metavar="N", help="timed repeats (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print an object instead of text")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Describe, then measure; prints text, or JSON."""
+    if args.repeats < 1:
+        raise UsageError(f"--repeats must be at least 1, got {args.repeats}")
+    from gelflow.sim.benchmark.describe import describe
+    from gelflow.sim.scene.scene import load_scene
+
+    scene = load_scene(args.scene, preset=args.preset, friction=args.friction)
+    description = describe(scene)
+    if args.json:
+        times = None if args.no_timing else dataclasses.asdict(_measured(scene, args.repeats))
+        print(json.dumps(dataclasses.asdict(description) | {"times": times}, indent=2, allow_nan=False))
+        return 0
+    console = Console(highlight=False)
+    console.print(tree(description), _left_out(description), _size(description.size))
+    if not args.no_timing:
+        console.print(_times(_measured(scene, args.repeats)))
+    return 0
+
+
+def _measured(scene: "Scene", repeats: int) -> "StepTimes":
+    from gelflow.sim.benchmark.step_times import measure
+
+    bar = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    errors = Console(stderr=True)  # what is piped out of the command stays clean
+    with Progress(*bar, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+        task = progress.add_task("timing", total=repeats)
+        return measure(scene, repeats=repeats, done=lambda: progress.advance(task))
+
+
+def tree(d: "Description") -> Tree:
+    """The scene's parts as a tree."""
+    gravity = " ".join(f"{g:g}" for g in d.gravity)
+    root = Tree(
+        f"[bold]{escape(d.scene)}[/bold]: steps of {d.step * 1e3:g} ms, {d.friction} law, gravity {gravity} m/s²"
+    )
+    bodies = root.add("[bold]bodies[/bold]")
+    for body in d.bodies:
+        _add_body(bodies, body)
+    if d.shapes:
+        shapes = root.add("[bold]shapes[/bold]")
+        for shape in d.shapes:
+            shapes.add(_shape(shape))
+    contacts = root.add("[bold]contacts[/bold]" if d.contacts else "[bold]contacts[/bold]: none")
+    for contact in d.contacts:
+        _add_contact(contacts, contact)
+    pads = root.add("[bold]pads[/bold]" if d.pads else "[bold]pads[/bold]: none")
+    for pad in d.pads:
+        _add_pad(pads, pad)
+    return root
+
+
+def _add_body(at: Tree, body: "BodyPart") -> None:
+    name = f"[cyan]{escape(body.name)}[/cyan]"
+    on = "" if body.parent in (None, "world") else f" on {escape(str(body.parent))}"
+    branch = at.add(name if body.parent is None else f"{name}{on}: {body.mass:.4g} kg")
+    for joint in body.joints:
+        leaf = branch.add(_joint(joint))
+        for actuator in joint.actuators:
+            leaf.add(_actuator(actuator, "N m" if joint.type == "hinge" else "N"))
+    if body.merged:
+        branch.add(escape(f"attached: {', '.join(body.merged)}"))
+    if body.geometry:
+        branch.add(escape(f"geometry: {', '.join(body.geometry)}"))
+
+
+def _joint(joint: "JointPart") -> str:
+    angle = joint.type == "hinge"
+    unit, per = ("rad", "N m/rad") if angle else ("m", "N/m")
+    words = [joint.type]
+    if joint.axis is not None:
+        words[0] += f" {'about' if angle else 'along'} ({' '.join(f'{a:.3g}' for a in joint.axis)})"
+    if joint.range is not None:
+        low, high = joint.range
+        words.append(f"range {low:g} to {high:g} {unit} (stop {joint.limit_stiffness:g} {per})")
+    if joint.damping:
+        words.append(f"damping {joint.damping:g}" + (f" {'N m s/rad' if angle else 'N s/m'}" if joint.axis else ""))
+    if joint.stiffness:
+        words.append(f"spring {joint.stiffness:g} {per}")
+    if joint.frictionloss:
+        words.append(f"dry friction {joint.frictionloss:g} {'N m' if angle else 'N'}")
+    if joint.armature:
+        words.append(f"armature {joint.armature:g} {'kg m²' if angle else 'kg'}")
+    return f"joint [green]{escape(joint.name)}[/green]: {', '.join(words)}"
+
+
+def _actuator(actuator: "ActuatorPart", unit: str) -> str:
+    words = [actuator.kind]
+    if actuator.kp or actuator.kd:
+        words.append(f"k_p {actuator.kp:g}, k_d {actuator.kd:g}")
+    if actuator.gear != 1:
+        words.append(f"gear {actuator.gear:g}")
+    if actuator.gain != 1 or actuator.bias:
+        words.append(f"gain {actuator.gain:g}, bias {actuator.bias:g}")
+    for what, (low, high), of in (("force", actuator.force, f" {unit}"), ("control", actuator.control, "")):
+        if low is not None or high is not None:
+            words.append(f"{what} {'-∞' if low is None else f'{low:g}'} to {'∞' if high is None else f'{high:g}'}{of}")
+    return f"actuator [yellow]{escape(actuator.name)}[/yellow]: {', '.join(words)}"
+
+
+def _shape(shape: "ShapePart") -> str:
+    words = []
+    if shape.cells is not None and shape.spacing is not None and shape.bytes is not None:
+        size = f"{shape.bytes / 1e6:.1f} MB"
+        words.append(f"grid of {' × '.join(map(str, shape.cells))} cells of {shape.spacing * 1e3:.3g} mm, {size}")
+    if shape.rounding:
+        words.append(f"edges rounded by {shape.rounding * 1e3:.3g} mm")
+    return f"[cyan]{escape(shape.name)}[/cyan]: {shape.kind}, {', '.join(words)}"
+
+
+def _add_contact(at: Tree, contact: "ContactPart") -> None:
+    count = "one exact point" if contact.unit == "one exact point" else f"{contact.candidates} points"
+    text = f"{count} on {contact.points} against {', '.join(contact.against)}"
+    branch = at.add(f"[cyan]{escape(contact.name)}[/cyan]: {escape(text)}")
+    plain = ", plain damping" if contact.damping == "plain" else ""
+    branch.add(_law(contact.law, contact.unit, contact.numbers, plain, damped_by_depth=contact.damping == "depth"))
+
+
+def _add_pad(at: Tree, pad: "PadPart") -> None:
+    if pad.pitch is None:
+        markers = (
+            f"{pad.markers} markers at given points"
+            if pad.shape == "points"
+            else f"{pad.markers} markers, a {pad.shape}"
+        )
+    else:
+        markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart"
+    text = f"{markers}, on {pad.body} against {', '.join(pad.against)}"
+    text += ", which they push" if pad.pushes else ""
+    branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")
+    branch.add(_law(pad.law, pad.unit, pad.numbers, "", damped_by_depth=True))
+    if pad.gel is not None:
+        branch.add(escape(f"gel: {pad.gel}"))
+
+
+def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_by_depth: bool) -> str:
+    """A force law in words; units as in docs/conventions.md, plain damping has that of k_t."""
+    stiffness, friction, by_depth = ("N/m³", "N s/m³", "N s/m⁴") if unit == "per area" else ("N/m", "N s/m", "N s/m²")
+    words = [f"k_n {numbers['kn']:g} {stiffness}"]
+    if law == "elastic":
+        words.append(f"k_s {numbers['ks']:g} {stiffness}")
+    words.append(f"k_t {numbers['kt']:g} {friction}")
+    words.append(f"k_d {numbers['kd']:g} {by_depth if damped_by_depth else friction}")
+    words.append(f"µ {numbers['mu']:g}")
+    of = "" if unit == "one exact point" else f" {unit}"
+    return f"{law}{of}{more}: {', '.join(words)}"
+
+
+def _left_out(d: "Description") -> Tree:
+    root = Tree("[bold]left out, and why[/bold]")
+    for line in d.left_out:
+        root.add(escape(line))
+    return root
+
+
+def _size(size: "Size") -> Table:
+    table = Table(title="Size", title_justify="left", show_header=False)
+    table.add_column("what")
+    table.add_column("number", justify="right", no_wrap=True)
+
+    def count(what: str, number: int | None) -> None:
+        table.add_row(what, "not known here" if number is None else f"{number:,}".replace(",", " "))
+
+    count("positions (nq)", size.nq)
+    count("velocities, the unknowns of a step (nv)", size.nv)
+    count("controls (nu)", size.nu)
+    count("contact pairs: points against one geometry", size.contact_pairs)
+    count("candidate points, over all pairs", size.candidate_points)
+    count("anchors: memory of the elastic law", size.anchors)
+    count("markers", size.markers)
+    count("parameters", size.parameters)
+    table.add_section()
+    count("bytes of state, per environment", size.state_bytes)
+    count("bytes of parameters, per environment", size.parameter_bytes)
+    count("bytes of one reading, per environment", size.reading_bytes)
+    count("bytes of workspace, per thread, about", size.workspace_bytes)
+    count("bytes of the model, shared, about", size.model_bytes)
+    return table
+
+
+def _times(times: "StepTimes") -> Group:
+    table = Table(title="Microseconds per step by part", title_justify="left")
+    table.add_column("part")
+    table.add_column("µs", justify="right", no_wrap=True)
+    table.add_column("share", justify="right", no_wrap=True)
+
+    def row(name: str, microseconds: float) -> None:
+        # Rounded first: no −0.0 where a difference is noise.
+        table.add_row(
+            escape(name), f"{round(microseconds, 1) + 0:.1f}", f"{round(100 * microseconds / times.whole) + 0:.0f} %"
+        )
+
+    for part in times.parts:
+        row(part.name, part.microseconds)
+    table.add_section()
+    row("whole step", times.whole)
+    if times.reading is not None:
+        table.add_section()
+        row("one reading of all markers, apart from the step", times.reading)
+    low, high = times.quartiles
+    halved = f", {times.halved_steps} of the steps were halved" if times.halved_steps else ""
+    text = (
+        f"One environment, one thread of {times.machine}. Steps from {times.timed_steps} states of a run: "
+        f"{times.run_steps} steps from the scene's start, servos held there, all other controls 0. A contact or pad is "
+        "what a step takes longer when the scene has it twice, the second one without force; bodies and solver are the "
+        "rest of the whole step. So these are differences of whole steps: a few tenths of a µs are noise. Medians of "
+        f"{times.repeats} repeats in turn; half of the repeats' whole steps took {low:.1f} to {high:.1f} µs, the very "
+        f"first step {times.at_start:.1f} µs. Newton's method needed {times.newton_iterations:.2f} iterations per step"
+        f"{halved}."
+    )
+    return Group(table, Padding(escape(text), (0, 0)))

@@ -1,0 +1,1 @@
+"""Timing of code, and the machine and versions a measurement ran with."""

@@ -1,0 +1,178 @@
+"""`gelflow track` and `gelflow calibrate-camera`: what they write, what a kill leaves, what they refuse in one line."""
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.cli.track_output import Step
+from gelflow.cli.track_summary import Summary
+from gelflow.observation import Grid
+from gelflow.perception.calibration import load_calibration
+from gelflow.perception.sources import Frame
+from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
+from gelflow.perception.tracker import Tracked
+from gelflow.session.reader import SessionReader
+from gelflow.session.recover import recover
+
+MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
+LOOK = GelLook(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320, noise=0.5)
+
+
+def track(*arguments: str) -> tuple[int, str]:
+    """Exit status and standard error of the command in a process of its own: video libraries write there too."""
+    run = subprocess.run([*MAIN, "track", *arguments], capture_output=True, text=True)
+    return run.returncode, run.stderr
+
+
+def field(number: int) -> np.ndarray:
+    """Displacement of every marker in image `number` [mm] on the pad (x down the image, y to its left)."""
+    return np.tile([0.05 * number, -0.03 * number], (48, 1))
+
+
+def draw(folder: Path, images: int) -> Path:
+    renderer = GelRenderer(LOOK)
+    folder.mkdir()
+    for number in range(images):
+        data = renderer.encode(renderer.render(field(number % 12), sequence=number))
+        (folder / f"{number}.jpg").write_bytes(data)
+    return folder
+
+
+def rows_of(file: Path) -> list[dict[str, str]]:
+    with file.open(newline="") as text:
+        return list(csv.DictReader(text))
+
+
+@pytest.mark.parametrize("source", ["broken.jpg", "missing.mp4", "empty", "notes.txt", "zeros.mp4", "none.mcap"])
+def test_a_source_that_is_no_image_is_told_in_one_line(source: str, tmp_path: Path) -> None:
+    (tmp_path / "broken.jpg").write_text("not an image\n" * 50)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.txt").write_text("sechs Gramm, 5 µm\n" * 300)
+    (tmp_path / "zeros.mp4").write_bytes(bytes(5000))
+    status, error = track(str(tmp_path / source), "--csv", str(tmp_path / "out.csv"))
+    assert status == 2
+    assert error.startswith("gelflow track: ")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_stream_that_nobody_serves_is_told_in_one_line() -> None:
+    status, error = track("http://127.0.0.1:9/?action=stream")
+    assert status == 2
+    assert "Connection refused" in error
+    assert error.count("\n") == 1
+
+
+def test_what_is_written_is_what_was_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = draw(tmp_path / "images", 12)
+    fit, table, video, session = (tmp_path / name for name in ("gel.json", "t.csv", "o.mkv", "s.mcap"))
+    assert main(["calibrate-camera", str(folder), "--spacing-mm", "2.2", "--out", str(fit)]) == 0
+    assert load_calibration(fit).residual_px < 0.1 and fit.with_suffix(".png").exists()
+    outputs = ["--csv", str(table), "--overlay", str(video), "--mcap", str(session)]
+    assert main(["track", str(folder), "--calibration", str(fit), *outputs, "--rate", "10"]) == 0
+    told = capsys.readouterr().out
+    for words in ("48: 8 rows of 6", "100.0 %", "rest jitter", "0.64", "a second tracked"):
+        assert words in told
+    rows = rows_of(table)
+    assert len(rows) == 12 * 48
+    for row in rows:
+        x, y = field(int(row["frame"]))[0]
+        assert (int(row["row"]), int(row["col"])) == divmod(int(row["marker"]), 6)
+        assert abs(float(row["dx_mm"]) + y) < 0.02 and abs(float(row["dy_mm"]) - x) < 0.02
+        assert float(row["stamp"]) == pytest.approx(int(row["frame"]) / 10) and row["valid"] == "1"
+    film = cv2.VideoCapture(str(video))
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(10, rel=0.01)
+    assert sum(film.read()[0] for _ in range(13)) == 12
+    with SessionReader(session) as reader:
+        records = [record.value for record in reader.records(["/left/markers"])]
+        assert reader.counts()["/left/image"] == len(records) == 12
+    assert np.allclose(records[-1]["displacement_mm"][0], [-field(11)[0, 1], field(11)[0, 0]], atol=0.02)
+    # Tracked once more from the recording: the same numbers.
+    assert main(["track", str(session), "--csv", str(tmp_path / "again.csv")]) == 0
+    same = [(a["x_px"], a["dx_px"], a["quality"]) for a in rows_of(tmp_path / "again.csv")]
+    assert same == [(a["x_px"], a["dx_px"], a["quality"]) for a in rows]
+
+
+def test_a_killed_run_leaves_files_that_can_be_read(tmp_path: Path) -> None:
+    folder = draw(tmp_path / "images", 12)
+    files = list(folder.iterdir())
+    for number in range(12, 3000):  # far more than it will get to
+        (folder / f"{number}.jpg").hardlink_to(files[number % 12])
+    table, video, session = (tmp_path / name for name in ("t.csv", "o.mkv", "s.mcap"))
+    outputs = ["--csv", str(table), "--overlay", str(video), "--mcap", str(session)]
+    run = subprocess.Popen([*MAIN, "track", str(folder), *outputs], stdout=subprocess.DEVNULL)
+    while not table.exists() or table.stat().st_size < 600_000:  # about 130 images
+        assert run.poll() is None
+        time.sleep(0.05)
+    run.kill()
+    assert run.wait() == -9
+    rows = rows_of(table)
+    images = int(rows[-1]["frame"])
+    assert 100 < images < 2999 and all(None not in row.values() for row in rows[:-48])
+    film = cv2.VideoCapture(str(video))
+    assert sum(film.read()[0] for _ in range(images)) > 5
+    recover(session, tmp_path / "whole.mcap")
+    with SessionReader(tmp_path / "whole.mcap") as reader:
+        assert reader.counts()["/left/markers"] >= images // 50 * 50  # every 50 images it waits for the disk
+
+
+def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
+    table, fit = tmp_path / "t.csv", tmp_path / "gel.json"
+    assert main(["track", str(tmp_path / "blank.png"), "--csv", str(table)]) == 2
+    assert main(["calibrate-camera", str(tmp_path / "blank.png"), "--spacing-mm", "1.4", "--out", str(fit)]) == 2
+    told = capsys.readouterr().err.splitlines()
+    for line, file in zip(told, (table, fit), strict=True):
+        picture = file.with_name(f"{file.stem}-refused.png")
+        seen = cv2.imread(str(picture))
+        assert str(picture) in line and seen is not None and seen.shape == (240, 320, 3)
+        assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--csv", "notes.txt"], "notes.txt exists; name a new file"),
+        (["--overlay", "film.gif"], "suffix must be one of .mp4, .mkv, .avi"),
+        (["--csv", "none/t.csv"], "the folder none does not exist"),
+        (["--calibration", "none.json"], "cannot read none.json"),
+        (["--calibration", "other.json"], "for images of 320 × 427 px, this one has 240 × 320"),
+        (["--sensor", "middle"], "sensor must be left or right"),
+        (["--rate", "0"], "rate must be"),
+        (["--images", "0"], "--images must be at least 1"),
+    ],
+)
+def test_wrong_options_are_told(
+    options: list[str],
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    draw(Path("images"), 1)
+    Path("notes.txt").write_text("mine")
+    if "other.json" in options:
+        Path("big.jpg").write_bytes(GelRenderer().encode(GelRenderer().render(np.zeros((252, 2)))))
+        assert main(["calibrate-camera", "big.jpg", "--spacing-mm", "1.4", "--out", "other.json"]) == 0
+    assert main(["track", "images", *options]) == 2
+    assert expected in capsys.readouterr().err and Path("notes.txt").read_text() == "mine"
+
+
+def test_jitter_is_the_noise_and_not_the_motion() -> None:
+    rng = np.random.default_rng(0)
+    rest = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2) * 20.0
+    summary, yes = Summary(), np.ones(130, dtype=bool)
+    for number in range(60):
+        shake = rng.normal(0, 1.0, 2)  # of the whole camera
+        moved = 0.05 * number * np.sin(rest / 100) + shake + rng.normal(0, 0.03, rest.shape)
+        tracked = Tracked(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
+        summary.add(Step(number, Frame("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
+    assert summary.jitter() == pytest.approx(0.03, rel=0.2)

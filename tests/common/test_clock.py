@@ -1,0 +1,91 @@
+"""Robot time: scaled, and held back by whoever must keep up with it."""
+
+import itertools
+import math
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
+from gelflow.time_sync import CONTROLLER, WORLD, Pace
+
+
+@pytest.fixture
+def paced(tmp_path: Path) -> tuple[ScaledClock, ScaledClock]:
+    """The clocks of two processes of one mock robot."""
+    Pace.create(path := str(tmp_path / "pace"))
+    return ScaledClock(100.0, path), ScaledClock(100.0, path)
+
+
+def test_nobody_who_must_keep_up_nothing_held_back(paced: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, _ = paced
+    assert clock.now() == pytest.approx(ScaledClock(100.0).now(), abs=1.0)
+    assert clock.lost == 0
+
+
+def test_robot_time_stops_at_the_nearest_limit_and_does_not_jump_after_it(
+    paced: tuple[ScaledClock, ScaledClock],
+) -> None:
+    clock, other = paced
+    start = clock.now()
+    clock.allow(WORLD, start + 1.0)
+    clock.allow(CONTROLLER, start + 0.5)
+    time.sleep(0.02)  # two seconds of robot time
+    assert clock.now() == other.now() == start + 0.5
+    clock.settle()
+    assert clock.lost > 1.4
+    clock.allow(CONTROLLER, math.inf)
+    clock.allow(WORLD, math.inf)
+    assert start + 0.5 <= other.now() < start + 0.5 + clock.lost
+
+
+def test_sleep_lasts_until_robot_time_has_gone_that_far(paced: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, other = paced
+    start = clock.now()
+    clock.allow(WORLD, start + 0.1)
+    sleeper = threading.Thread(target=clock.sleep, args=(1.0,))
+    sleeper.start()
+    sleeper.join(0.1)
+    assert sleeper.is_alive()
+    other.settle()
+    other.allow(WORLD, start + 5.0)
+    sleeper.join(10.0)
+    assert not sleeper.is_alive() and clock.now() >= start + 1.0
+
+
+def test_who_says_nothing_for_long_holds_nobody_back(
+    paced: tuple[ScaledClock, ScaledClock], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, _ = paced
+    limit = clock.now()
+    clock.allow(WORLD, limit)
+    real = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: real() + 6.0)
+    assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
+
+
+def test_time_never_runs_back_whoever_writes_meanwhile(paced: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, other = paced
+    ending = threading.Event()
+
+    def world() -> None:
+        done = other.now()
+        while not ending.is_set():
+            other.settle()
+            other.allow(WORLD, done + 0.02)
+            done = max(done, other.now())
+
+    writer = threading.Thread(target=world)
+    writer.start()
+    times = [clock.now() for _ in range(20000)]
+    ending.set()
+    writer.join()
+    assert all(b >= a - 1e-9 for a, b in itertools.pairwise(times))
+
+
+def test_a_mock_robot_that_has_ended_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="there is no mock robot behind"):
+        ScaledClock(1.0, str(tmp_path / "gone"))

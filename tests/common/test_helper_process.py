@@ -1,0 +1,59 @@
+"""The link between a process of ours and its helper."""
+
+import json
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+
+from gelflow.helper_process import Child, Messages
+
+
+def pair() -> tuple[Messages, socket.socket]:
+    ours, theirs = socket.socketpair()
+    return Messages(ours), theirs
+
+
+def test_values_arrive_whole_however_they_are_cut() -> None:
+    messages, other = pair()
+    data = b"".join(json.dumps(value).encode() + b"\n" for value in ({"a": [1.5, None]}, "x", 3))
+    seen = []
+    for i in range(len(data)):
+        other.send(data[i : i + 1])
+        seen += messages.read()
+    assert seen == [{"a": [1.5, None]}, "x", 3]
+    assert not messages.closed
+    other.close()
+    assert messages.read() == []
+    assert messages.closed
+
+
+def test_numbers_keep_every_bit_and_what_is_no_number_stays_so() -> None:
+    ours, theirs = pair()
+    other = Messages(theirs)
+    ours.send([0.1 + 0.2, 1e-300, float("nan"), float("inf")])
+    a, b, c, d = other.read()[0]
+    assert (a, b, d) == (0.1 + 0.2, 1e-300, float("inf"))
+    assert c != c
+
+
+def test_a_reader_that_does_not_read_is_noticed() -> None:
+    messages, other = pair()
+    with pytest.raises(TimeoutError, match="read nothing for"):
+        for _ in range(10_000):
+            messages.send("x" * 1000, limit=0.05)
+    other.close()
+    with pytest.raises(OSError, match=r"."):
+        messages.send("anybody?")
+
+
+def test_last_words_of_a_child_that_fails() -> None:
+    child = Child.start("gelflow.there_is_no_such_module", {})
+    try:
+        assert "exit status 1: " in (words := child.last_words())
+        assert "No module named gelflow.there_is_no_such_module" in words
+        assert "\n" not in words
+        assert Path(sys.executable).name in words
+    finally:
+        child.close()

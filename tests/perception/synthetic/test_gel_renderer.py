@@ -1,0 +1,131 @@
+"""The gel renderer: its truth is where the dots are, its flaws are what their names say, and it repeats itself."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gelflow.errors import UsageError
+from gelflow.perception.synthetic.flaws import FACTORS, PRESETS, SIZES, look_of
+from gelflow.perception.synthetic.ground_truth import TruthRenderer
+from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
+
+# Even light, no noise: then a dot's centre is the mean place of what it darkens.
+EVEN: dict[str, Any] = {
+    **{"noise": 0.0, "shot": 0.0, "gradient": 0.0, "colour": 0.0, "shading": 0.0, "ridges": 0.0, "dust": 0},
+    **{"occluders": 0, "damaged": 0.0, "bridges": 0, "missing": 0.0, "quality": 100},
+}
+
+
+def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarray:
+    """Mean place of the ink within `reach` pixels of each of `centers`, on a gel whose light is even."""
+    found = np.zeros_like(centers)
+    ink = picture[..., 1] - np.median(picture[..., 1])
+    for k, (right, down) in enumerate(np.rint(centers).astype(int)):
+        y, x = np.mgrid[down - reach : down + reach + 1, right - reach : right + reach + 1]
+        patch = ink[y, x]
+        found[k] = (patch * x).sum() / patch.sum(), (patch * y).sum() / patch.sum()
+    return found
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"blur": 2.0},
+        {"keystone": 0.15, "barrel": 0.05},
+        {"oval": 1.8, "barrel": 0.02},
+        {"bright": True, "contrast": 0.5},
+    ],
+    ids=lambda changed: " ".join(changed) or "plain",
+)
+def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
+    look = look_of("typical", markers=63, seed=1, **{**EVEN, **changed})
+    exposed = TruthRenderer(look).expose(GelSequence(look, "twist").displacement(20))
+    assert exposed.visible.all()
+    off = centroids(exposed.picture, exposed.position, reach=12) - exposed.position
+    assert np.abs(off).max() < 0.003
+
+
+def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
+    look = look_of("typical", markers=63, **EVEN)
+    renderer, still = TruthRenderer(look), np.zeros((63, 2))
+    smeared = renderer.expose(still, smear=np.tile([4.0, 0.0], (63, 1)))
+    off = centroids(smeared.picture, smeared.position, reach=12) - smeared.position
+    assert np.abs(off).max() < 0.003
+    plain = renderer.expose(still).picture
+    ink = [(np.median(picture) - picture[..., 1]).clip(0) for picture in (plain, smeared.picture)]
+    right = np.arange(look.width)
+    variance = []
+    for layer in ink:  # of the first dot across, over which a box of 4 px is folded: 4²/12 more
+        x, y = np.rint(smeared.position[0]).astype(int)
+        weight = layer[y - 12 : y + 13, x - 12 : x + 13].sum(axis=0)
+        at = right[x - 12 : x + 13]
+        mean = (weight * at).sum() / weight.sum()
+        variance.append((weight * (at - mean) ** 2).sum() / weight.sum())
+    assert variance[1] - variance[0] == pytest.approx(16 / 12, rel=0.05)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_a_sequence_goes_from_rest_to_its_peak_and_back(field: Any) -> None:
+    look = look_of("hard", markers=63, seed=2)
+    sequence = GelSequence(look, field, peak=0.4)
+    frames = [sequence.displacement(number) for number in range(len(sequence))]
+    lengths = np.linalg.norm(frames, axis=-1).max(axis=1) / look.grid.pitch
+    assert not lengths[:4].any() and lengths[-1] < 1e-12
+    assert 0.35 < lengths.max() <= 0.4
+    steps = np.linalg.norm(np.diff(frames, axis=0), axis=-1).max() / look.grid.pitch
+    assert steps < 0.05, "smooth"
+    jump = GelSequence(look, field, peak=0.7, motion="jump")
+    assert not jump.displacement(2).any() and np.linalg.norm(jump.displacement(3), axis=1).max() > 0.6 * look.grid.pitch
+
+
+def test_the_same_sequence_gives_the_same_images() -> None:
+    look = look_of("hard", seed=5)
+    one, other = (list(GelSequence(look, "slip", frames=6)) for _ in range(2))
+    assert [frame.jpeg for frame in one] == [frame.jpeg for frame in other]
+    assert len({frame.jpeg for frame in one}) == 6, "noise differs from image to image, at rest too"
+    assert next(iter(GelSequence(look_of("hard", seed=6), frames=1))).jpeg != one[0].jpeg
+
+
+def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
+    sequence = list(GelSequence(look_of("typical", occluders=2, missing=0.05, seed=1), frames=25))
+    visible = np.array([frame.visible for frame in sequence])
+    assert visible[0].sum() == visible[-1].sum() == 130 - round(0.05 * 130)
+    hidden_once = visible[0] & ~visible.all(axis=0)
+    assert 8 < hidden_once.sum() < 80
+    for frame in sequence:  # where a dot is visible it is darker than around it
+        grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        right, down = np.rint(frame.position[visible[0] & frame.visible]).astype(int).T
+        assert (grey[down, right] < 0.8 * cv2.blur(grey, (23, 23))[down, right]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "markers"), [*((name, 130) for name in (*PRESETS, *FACTORS)), *(("hard", markers) for markers in SIZES)]
+)
+def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -> None:
+    look = look_of(name, markers=markers) if name in PRESETS else look_of(markers=markers, **FACTORS[name])
+    frame = next(iter(GelSequence(look, frames=1)))
+    assert frame.image.shape == (240, 320, 3) and frame.position.shape == (markers, 2)
+    rows = frame.position.reshape(look.grid.rows, look.grid.cols, 2)
+    assert (np.diff(rows[..., 0], axis=1) > 0).all() and (np.diff(rows[..., 1], axis=0) > 0).all()
+    assert frame.visible.sum() == markers - round(look.missing * markers)
+
+
+def test_wrong_looks_and_sequences_are_refused() -> None:
+    for wrong, message in (
+        ({"preset": "dirty"}, "expected an image class out of clean, typical, hard, got 'dirty'"),
+        ({"markers": 100}, "expected one of 35, 63, 130, 154, 252 markers, got 100"),
+        ({"blurr": 1.0}, "a look has no 'blurr'; it has barrel"),
+        ({"damaged": 1.5}, "damaged of a flawed look must be within 0.0 to 1.0, got 1.5"),
+        ({"blur": 0.2}, "blur of a flawed look must be within 0.5"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            look_of(**wrong)
+    with pytest.raises(UsageError, match="expected a field out of press, shear, twist, slip"):
+        GelSequence(look_of(), "pull")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="at least 1 frame"):
+        GelSequence(look_of(), frames=0)
+    with pytest.raises(UsageError, match="finite"):
+        TruthRenderer(look_of()).render(np.full((130, 2), np.nan))

@@ -1,0 +1,107 @@
+"""The camera's edge of the observation format: bytes to images, image axes to the pad's."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gelflow.errors import PeerError, UsageError
+from gelflow.perception.calibration import Calibration
+from gelflow.perception.frames import CameraMount, decode, tactile_frame
+from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
+from gelflow.perception.tracker import MarkerTracker, Tracked
+from gelflow.session.records import restore, to_json
+
+SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_every_way_to_mount_a_camera_gives_the_pads_own_axes(rotation: int, mirrored: bool) -> None:
+    width, height = SIZES[rotation]
+    look = GelLook(width=width, height=height, rotation=rotation, mirrored=mirrored)  # type: ignore[arg-type]
+    mount = CameraMount(rotation=rotation, mirrored=mirrored, pixels_per_mm=look.pixels_per_mm)  # type: ignore[arg-type]
+    renderer, tracker = GelRenderer(look), MarkerTracker(mount.tracker_config())
+    x, y = look.positions_mm().T
+    field = np.stack([0.3 + 0.02 * y, -0.1 + 0.01 * x], axis=1)  # no symmetry that a wrong sign could hide in
+    reference = tactile_frame([tracker.start(renderer.render(np.zeros_like(field)))], [mount], stamp=1.0)
+    frame = tactile_frame([tracker.track(renderer.render(field, sequence=1))], [mount], stamp=2.0)
+    assert frame.unit == "mm" and frame.grid == look.grid and frame.stamp == 2.0
+    assert frame.valid.all() and np.abs(frame.shear[0] - field).max() < 0.02
+    assert np.abs(reference.shear).max() == 0
+    assert np.allclose(frame.positions, look.positions_mm(), atol=1e-5)
+
+
+def tracked(rows: int = 18, cols: int = 14) -> Tracked:
+    n = rows * cols
+    valid = np.ones(n, dtype=bool)
+    valid[5] = False
+    displacement = np.tile([1.0, 2.0], (n, 1))
+    displacement[5] = np.nan
+    return Tracked(np.zeros((n, 2)), displacement, valid, ~valid, valid.astype(float), rows, cols, 22.0)
+
+
+def test_without_a_scale_the_frame_is_in_pixels() -> None:
+    mounts = [CameraMount(mirrored=False), CameraMount(mirrored=False, pixels_per_mm=10.0)]
+    frame = tactile_frame([tracked(), tracked()], mounts, stamp=0.0)
+    assert frame.unit == "px"
+    assert np.allclose(frame.shear[:, 0], [2.0, 1.0])  # both in px, though one camera's scale is known
+
+
+def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() -> None:
+    # A camera that looks askew: its scale grows from 12 to 18 px/mm over the image. The finger's tip is at the right.
+    matrix = ((13.5, 0.0, 0.0), (0.0, 13.5, 0.0), (0.2, 0.0, 1.0))
+    calibration = Calibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
+    mount = CameraMount(rotation=270, mirrored=True, calibration=calibration)
+    rest_mm = calibration.nodes_mm()
+    moved = np.tile([0.3, -0.2], (len(rest_mm), 1))
+    rest, position = calibration.to_pixels(rest_mm), calibration.to_pixels(rest_mm + moved)
+    all_of_them = np.ones(len(rest), dtype=bool)
+    seen = Tracked(position, position - rest, all_of_them, ~all_of_them, all_of_them.astype(float), 14, 18, 22.0)
+    frame = tactile_frame([seen], [mount], stamp=0.0)
+    assert frame.unit == "mm" and np.allclose(frame.shear, [0.3, -0.2], atol=1e-6)
+    assert restore(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
+    with pytest.raises(UsageError, match="not both"):
+        CameraMount(rotation=270, calibration=calibration, pixels_per_mm=15.7)
+    with pytest.raises(UsageError, match="calibration is of 14 lines of 18 markers"):
+        CameraMount(rotation=0, calibration=calibration)
+
+
+def test_a_marker_not_seen_is_invalid_and_never_zero() -> None:
+    frame = tactile_frame([tracked()], [CameraMount(mirrored=False)], stamp=0.0)
+    assert np.flatnonzero(~frame.valid[0]).tolist() == [5]
+    assert np.isnan(frame.shear[0, 5]).all() and np.isfinite(frame.shear[0][frame.valid[0]]).all()
+
+
+def test_grids_and_mounts_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(UsageError, match="expects 14 lines of 18"):
+        tactile_frame([tracked()], [CameraMount(rotation=90)], stamp=0.0)
+    with pytest.raises(UsageError, match="one tracked image per mount"):
+        tactile_frame([tracked()], [CameraMount(), CameraMount()], stamp=0.0)
+    with pytest.raises(UsageError, match="same grid"):
+        tactile_frame([tracked(), tracked()], [CameraMount(), CameraMount(pitch=1.5)], stamp=0.0)
+
+
+@pytest.mark.parametrize("settings", [{"rotation": 45}, {"pixels_per_mm": 0.0}, {"rows": 0}, {"pitch": -1.0}])
+def test_impossible_mounts_are_refused(settings: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        CameraMount(**settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("data", [b"", b"no image at all", b"\xff\xd8\xff\xe0 cut off"])
+def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
+    with pytest.raises(PeerError, match="expected a JPEG or PNG image"):
+        decode(data)
+
+
+def test_an_image_that_is_cut_off_is_told_so() -> None:
+    renderer = GelRenderer()
+    data = renderer.encode(renderer.render(np.zeros((252, 2))))
+    with pytest.raises(PeerError, match="cut off, or damaged"):
+        decode(data[: len(data) // 2])
+
+
+def test_decoding_is_repeatable() -> None:
+    renderer = GelRenderer()
+    data = renderer.encode(renderer.render(np.zeros((252, 2))))
+    assert decode(data).shape == (427, 320, 3) and (decode(data) == decode(data)).all()

@@ -1,0 +1,61 @@
+"""`gelflow train` and `gelflow eval` as a user starts them, and the policy that comes with gelflow, simulated."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.policies.checkpoint import default_checkpoint, load, load_policy
+from gelflow.policies.evaluation import NetworkActor, Noise, evaluate
+from gelflow.policies.simulation import simulated
+from gelflow.task import INSERTION
+
+
+def test_the_policy_that_comes_with_gelflow_inserts_in_simulation() -> None:
+    path = default_checkpoint()
+    assert path.stat().st_size < 2_000_000
+    checkpoint = load(path)
+    assert checkpoint.training["command"][:3] == ["gelflow", "train", "insertion"]
+    assert checkpoint.training["validation"]["success"] > 0.8
+    network = load_policy(path, task=INSERTION).network
+    result = evaluate("policy", NetworkActor(network, 32), simulated(32, noise=Noise()), episodes=48, seed=5)
+    assert result.successes >= 36  # 48 · 0.9 less more than three standard deviations
+    assert result.attempts < 8
+
+
+def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", "insertion", "--attempts", "64", "--envs", "4", "--seed", "3", "--out", str(tmp_path / "run")]
+    assert main(arguments) == 0
+    assert "checkpoint" in capsys.readouterr().out
+    made = tmp_path / "run" / "insertion.safetensors"
+    assert load(made).training["command"] == ["gelflow", *arguments]
+    assert main(arguments) == 2
+    assert "already holds a trained policy" in capsys.readouterr().err
+    assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "4", "--envs", "4", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"].split(",")[0] for row in rows] == ["policy", "policy", "random", "random"]
+    assert all(row["episodes"] == 4 and 0 <= row["success_95"][0] <= row["success_95"][1] <= 1 for row in rows)
+    assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "2"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["eval", "insertion", "--checkpoint", "nowhere.safetensors"], "no checkpoint at nowhere.safetensors"),
+        (["eval", "insertion", "--checkpoint", "pyproject.toml"], "is no checkpoint"),
+        (["eval", "insertion", "--episodes", "0"], "--episodes"),
+        (["eval", "insertion", "--seed", "-1"], "--seed"),
+        (["train", "insertion", "--envs", "0"], "--envs"),
+        (["train", "insertion", "--attempts", "0"], "above 0"),
+        (["train", "insertion", "--minutes", "nan"], "above 0"),
+        (["train", "insertion", "--seed", "-1"], "--seed"),
+        (["train", "insertion", "--envs", "17"], "multiple of the batch"),
+        (["train", "insertion", "--out", "pyproject.toml"], "pyproject.toml"),
+    ],
+)
+def test_a_wrong_option_gives_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert says in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error

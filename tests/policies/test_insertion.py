@@ -1,0 +1,362 @@
+"""Training, use and storage of the insertion policy, on a toy whose flow map is a simple function of the misalignment.
+
+The toy stands in for the simulator alone (its speed decides whether these tests take seconds); everything else is real.
+"""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import safetensors.numpy
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import FlowMap
+from gelflow.policies.checkpoint import load, load_policy, save
+from gelflow.policies.evaluation import Attempts, NetworkActor, Noise, RandomActor, evaluate, penalty
+from gelflow.policies.networks import (
+    Architecture,
+    History,
+    Network,
+    polynomial_basis,
+    reduce_maps,
+    tensor_shapes,
+)
+from gelflow.policies.ppo import PPOSettings, train
+from gelflow.protocols import Policy
+from gelflow.task import INSERTION
+
+SMALL = Architecture(hidden=(16, 16))
+
+
+class Toy(VectorEnv[Any, Any, Any]):
+    """Insertion as a formula: the part goes in when every error is below a third of the first misalignment.
+
+    Both pads feel an upward force; the pads' differences along x and y of the pad tell x and y, their sum along y yaw.
+    """
+
+    def __init__(self, count: int, *, same_step: bool = True) -> None:
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP if same_step else AutoresetMode.DISABLED}
+        self.num_envs = count
+        self.single_observation_space = gymnasium.spaces.Box(-1, 1, INSERTION.observation_shape, np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        self.error = np.zeros((count, 3))
+        self.tries = np.zeros(count, dtype=int)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        mask = np.ones(self.num_envs, dtype=bool) if options is None else options["reset_mask"]
+        self._restart(mask)
+        return self._observe(), {"pose": self.error.copy()}
+
+    def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        self.error += actions * np.array(INSERTION.action_scale)
+        self.tries += 1
+        reward = penalty(self.error)
+        inserted = (np.abs(self.error) < np.array(INSERTION.misalignment) / 3).all(1)
+        ended = ~inserted & (self.tries >= INSERTION.attempts)
+        if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
+            self._restart(inserted | ended)
+        return self._observe(), reward, inserted, ended, {"pose": self.error.copy()}
+
+    def _restart(self, mask: NDArray[np.bool_]) -> None:
+        self.error[mask] = self.np_random.uniform(-1, 1, (int(mask.sum()), 3)) * np.array(INSERTION.misalignment)
+        self.tries[mask] = 0
+
+    def _observe(self) -> NDArray[np.float32]:
+        x, y, yaw = (self.error / np.array(INSERTION.misalignment)).T / 2
+        flow = np.stack([1 + x, yaw + y, 1 - x, yaw - y], axis=1)[:, :, None, None] * np.ones((1, 1, 13, 10))
+        return np.asarray(flow / np.abs(flow).max(axis=(1, 2, 3), keepdims=True), dtype=np.float32)
+
+
+def tensors(architecture: Architecture = SMALL, seed: int = 0) -> dict[str, NDArray[Any]]:
+    """A network with random weights."""
+    rng = np.random.default_rng(seed)
+    values = {name: rng.normal(0, 0.3, shape) for name, shape in tensor_shapes(architecture, INSERTION).items()}
+    return values | {
+        "basis": polynomial_basis(INSERTION.grid, architecture.degree),
+        "scale": np.ones(architecture.features(INSERTION)),
+    }
+
+
+def flow(image: NDArray[Any]) -> FlowMap:
+    return FlowMap(image.astype(np.float32), 1.0, "N", np.zeros((2, 13, 10), dtype=bool))
+
+
+def images(count: int, seed: int = 0) -> NDArray[np.float32]:
+    shape = (count, *INSERTION.observation_shape)
+    return np.random.default_rng(seed).uniform(-0.5, 0.5, shape).astype(np.float32)
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    path = tmp_path / "policy.safetensors"
+    save(path, task=INSERTION, architecture=SMALL, tensors=tensors(), training={"command": ["made", "by a test"]})
+    return path
+
+
+def test_a_stored_policy_acts_as_before_and_twice_the_same(stored: Path) -> None:
+    before = NetworkActor(Network(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1)
+    expected = [before.act(image[None])[0] for image in images(5)]
+    policy = load_policy(stored)
+    assert isinstance(load(stored).digest, str) and load(stored).training["command"] == ["made", "by a test"]
+    assert stored.stat().st_size < 2_000_000
+    for _ in range(2):
+        policy.reset()
+        assert all((policy.act(flow(image)) == want).all() for image, want in zip(images(5), expected, strict=True))
+
+
+def test_the_policy_fits_the_protocol_and_uses_its_memory(stored: Path) -> None:
+    policy: Policy = load_policy(stored)
+    first = policy.act(flow(images(1)[0]))
+    assert first.shape == (3,) and first.dtype == float
+    assert (np.abs(first) <= SMALL.reach).all()
+    assert (policy.act(flow(images(1)[0])) != first).any()
+    policy.reset()
+    assert (policy.act(flow(images(1)[0])) == first).all()
+
+
+def test_a_wrong_map_is_refused(stored: Path) -> None:
+    policy = load_policy(stored)
+    with pytest.raises(UsageError, match=r"shape \(4, 10, 13\).*takes \(4, 13, 10\)"):
+        policy.act(flow(images(1)[0].transpose(0, 2, 1)))
+    with pytest.raises(UsageError, match="not finite"):
+        policy.act(flow(images(1)[0] * np.nan))
+
+
+def test_another_task_is_refused_by_the_names_of_its_fields(stored: Path) -> None:
+    other = dataclasses.replace(INSERTION, attempts=7, frame_depths=(1.0e-3,))
+    with pytest.raises(UsageError) as caught:
+        load_policy(stored, task=other)
+    line = str(caught.value)
+    assert "attempts 15 (here 7)" in line and "frame_depths [0.0011] (here [0.001])" in line
+    assert "workspace" not in line and "\n" not in line
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Save a checkpoint again with a changed header."""
+    data = path.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["gelflow"])
+    change(header)
+    path.write_bytes(safetensors.numpy.save(safetensors.numpy.load(data), metadata={"gelflow": json.dumps(header)}))
+
+
+def test_a_newer_format_is_refused(stored: Path) -> None:
+    rewrite(stored, lambda header: header.update(format=2))
+    with pytest.raises(UsageError, match="has format 2; this gelflow reads format 1"):
+        load_policy(stored)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda header: header["architecture"].update(kind="transformer"), "kind 'transformer'"),
+        (lambda header: header["architecture"].update(depth=3), "unknown keys"),
+        (lambda header: header["architecture"].update(hidden=[8, 8]), "tensor 0.weight has shape"),
+        (lambda header: header["architecture"].update(hidden="wide"), "damaged"),
+        (lambda header: header.pop("training"), "damaged"),
+    ],
+)
+def test_a_header_that_does_not_fit_gives_one_line(stored: Path, change: Callable[[Any], None], says: str) -> None:
+    rewrite(stored, change)
+    with pytest.raises(UsageError, match=says) as caught:
+        load_policy(stored)
+    assert "\n" not in str(caught.value) and str(stored) in str(caught.value)
+
+
+def test_every_cut_and_flipped_byte_gives_one_line(stored: Path, tmp_path: Path) -> None:
+    data = stored.read_bytes()
+    damaged = tmp_path / "damaged.safetensors"
+    rng = np.random.default_rng(0)
+    header = 8 + int.from_bytes(data[:8], "little")
+    for place in [*range(0, 64, 7), *rng.integers(0, header, 20), *rng.integers(header, len(data), 20)]:
+        for bad in (data[:place], data[:place] + bytes([data[place] ^ 0x15]) + data[place + 1 :]):
+            damaged.write_bytes(bad)
+            try:
+                load_policy(damaged)
+            except UsageError as error:
+                assert "\n" not in str(error)
+            else:  # only a flip inside the words of the header, which no number depends on
+                assert place < header and len(bad) == len(data)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 a zip", b"\x80\x04\x95 a pickle", b"{}" * 40, b"\x00" * 100])
+def test_a_foreign_file_gives_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "foreign"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="no checkpoint of gelflow"):
+        load_policy(path)
+    path.write_bytes(safetensors.numpy.save({"a": np.zeros(3)}))
+    with pytest.raises(UsageError, match="no checkpoint of gelflow"):
+        load_policy(path)
+
+
+def test_a_missing_file_a_folder_and_a_giant_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no checkpoint at"):
+        load_policy(tmp_path / "none.safetensors")
+    with pytest.raises(UsageError, match="cannot read"):
+        load_policy(tmp_path)
+    with pytest.raises(UsageError, match="more than 2000000"):
+        wide = Architecture(hidden=(800, 800))
+        save(tmp_path / "giant", task=INSERTION, architecture=wide, tensors=tensors(wide), training={})
+    (tmp_path / "giant").write_bytes(b"\0" * 2_000_001)
+    with pytest.raises(UsageError, match="larger than any checkpoint"):
+        load(tmp_path / "giant")
+
+
+def test_features_reproduce_low_polynomials_and_average_noise() -> None:
+    basis = polynomial_basis(INSERTION.grid, 2)
+    assert np.allclose(basis.T @ basis * 130, np.eye(6))
+    x, y = (INSERTION.grid.positions() - INSERTION.grid.positions().mean(0)).T
+    smooth = (0.3 + 0.02 * x - 0.01 * x * y).reshape(1, 1, 13, 10)
+    back = reduce_maps(smooth, basis).reshape(6) @ basis.T * 130
+    assert np.allclose(back, smooth.ravel())
+    noise = np.random.default_rng(0).normal(size=(2000, 1, 13, 10))
+    assert np.allclose(reduce_maps(noise, basis).std(0), 1 / np.sqrt(130), rtol=0.1)
+
+
+def test_history_layout_and_the_way_as_the_gripper_sees_it() -> None:
+    one = Architecture(degree=0, history=2, reach=(1e-3, 1e-3, 0.1))
+    history = History(one, INSERTION)
+    first = history.observe(np.array([[1.0, 2, 3, 4]]))[0]
+    assert first.tolist() == [1, 2, 3, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1 / 15]
+    history.record(np.array([[1e-3, 0, np.pi / 2]]))
+    second = history.observe(np.array([[5.0, 6, 7, 8]]))[0]
+    assert second[:8].tolist() == [5, 6, 7, 8, 1, 2, 3, 4]
+    assert np.allclose(second[8:12], [1, 0, np.pi / 0.2, 1])
+    assert np.allclose(second[12:], [0, -1, np.pi / 0.2, 2 / 15])  # turned left: the start's +x is now its -y
+    assert len(second) == one.inputs(INSERTION)
+
+
+def test_parts_in_one_history_do_not_mix() -> None:
+    network = Network(SMALL, INSERTION, tensors())
+    together, alone = NetworkActor(network, 3), NetworkActor(network, 1)
+    for i in range(6):
+        if i == 2:
+            together.forget(np.array([True, False, True]))
+        stack = images(3, seed=i)
+        both = together.act(stack)
+        assert np.allclose(both[1], alone.act(stack[1:2])[0], rtol=1e-12, atol=1e-15)
+
+
+def mirrored(image: NDArray[Any], in_x: bool, in_y: bool) -> NDArray[Any]:
+    """What the pads feel of a scene mirrored in the gripper's x, y or both, worked out pad by pad."""
+    pads = image.reshape(2, 2, 13, 10)
+    if in_x:
+        pads = pads[::-1]
+    if in_x != in_y:  # a reflection turns each pad's y axis over; mirroring both is a half turn and does not
+        pads = pads[:, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
+    return np.asarray(pads.reshape(image.shape))
+
+
+@pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
+def test_a_mirrored_part_gets_the_mirrored_corrections(in_x: bool, in_y: bool) -> None:
+    network = Network(SMALL, INSERTION, tensors())
+    one, other = NetworkActor(network, 8), NetworkActor(network, 8)
+    signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
+    for i in range(5):
+        stack = images(8, seed=i)
+        reflected = np.stack([mirrored(image, in_x, in_y) for image in stack])
+        assert np.allclose(other.act(reflected), one.act(stack) * signs, atol=1e-9)
+
+
+def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
+    env = Toy(4)
+    attempts = Attempts(env, INSERTION)
+    attempts.reset(0)
+    total = penalty(env.error)
+    for _ in range(3):
+        outcome = attempts.step(np.full((4, 3), 1e-3))
+        total = np.where(outcome.done, penalty(env.error), total + outcome.better)
+        assert np.allclose(total[~outcome.done], outcome.reward[~outcome.done])
+
+
+@pytest.mark.parametrize("same_step", [True, False])
+def test_random_actions_are_counted_by_episode(same_step: bool) -> None:
+    attempts = Attempts(Toy(16, same_step=same_step), INSERTION)
+    result = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
+    again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
+    assert result == again
+    assert result.episodes == 50 and 0 < result.successes < 50
+    assert 1 <= result.attempts <= INSERTION.attempts
+    low, high = result.interval()
+    assert low < result.success < high
+
+
+def test_an_environment_of_another_shape_or_late_reset_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"observes \(4, 13, 10\); the task describes \(8, 13, 10\)"):
+        Attempts(Toy(2), dataclasses.replace(INSERTION, frame_depths=(5e-4, 1.1e-3)))
+    late = Toy(2)
+    late.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    with pytest.raises(UsageError, match="same step"):
+        Attempts(late, INSERTION)
+
+
+def test_noise_keeps_the_longest_vector_and_turns_both_components() -> None:
+    rng = np.random.default_rng(0)
+    maps = images(50)
+    noise = Noise()
+    noisy = noise.apply(maps, noise.part(50, 2, rng), rng)
+    length = np.sqrt((noisy.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2))
+    assert np.allclose(length, np.sqrt((maps.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2)), rtol=1e-5)
+    assert 0.02 < np.std(noisy - maps) < 0.2
+    none = Noise(marker=0, offset=0, gain=0, turn=0)
+    assert np.allclose(none.apply(maps, none.part(50, 2, rng), rng), maps, atol=1e-6)
+    still = np.zeros_like(maps)
+    assert not np.abs(noise.apply(still, noise.part(50, 2, rng), rng)).max() > 0
+
+
+SHORT = PPOSettings(attempts=20_480, batch=256, evaluate_every=5_000, evaluate_episodes=128, calibration=500)
+
+
+def test_a_short_run_beats_random_and_is_repeatable(tmp_path: Path) -> None:
+    points: list[Any] = []
+    made = train(
+        Attempts(Toy(32), INSERTION, Noise()),
+        Attempts(Toy(32, same_step=False), INSERTION, Noise()),
+        out=tmp_path / "run",
+        architecture=SMALL,
+        settings=SHORT,
+        command=["gelflow", "train"],
+        report=points.append,
+    )
+    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), Attempts(Toy(32), INSERTION), episodes=256, seed=1)
+    checkpoint = load(made.checkpoint)
+    actor = NetworkActor(Network(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
+    policy = evaluate("policy", actor, Attempts(Toy(32), INSERTION, Noise()), episodes=256, seed=1)
+    assert policy.success > 0.9 and policy.success > random.success + 0.2
+    assert policy.attempts < random.attempts
+    assert checkpoint.training["command"] == ["gelflow", "train"]
+    assert checkpoint.training["validation"]["success"] == made.best.success
+    lines = made.curve.read_text().splitlines()
+    assert lines[0].startswith("attempts,minutes,reward,success") and len(lines) == 1 + len(points)
+    assert made.picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_same_seed_makes_the_same_tensors_and_time_ends_a_run(tmp_path: Path) -> None:
+    def run(name: str, **changes: Any) -> Any:
+        settings = dataclasses.replace(SHORT, attempts=2048, evaluate_episodes=32, **changes)
+        sides = [Attempts(Toy(32), INSERTION, Noise()) for _ in range(2)]
+        return load(train(*sides, out=tmp_path / name, architecture=SMALL, settings=settings).checkpoint)
+
+    first, second, other = run("a"), run("b"), run("c", seed=1)
+    assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
+    assert any((first.tensors[name] != other.tensors[name]).any() for name in first.tensors)
+    assert run("d", minutes=1e-9).training["attempts"] <= 64
+
+
+def test_settings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    for changes in ({"attempts": 0}, {"minutes": 0.0}, {"batch": 300}):
+        with pytest.raises(UsageError):
+            sides = [Attempts(Toy(32), INSERTION) for _ in range(2)]
+            train(*sides, out=tmp_path, settings=dataclasses.replace(SHORT, **changes))

@@ -1,0 +1,307 @@
+"""Cameras over real HTTP and, for OpenCV's side, from a file: newest frames, faults, no hanging."""
+
+import socket
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError, PeerRefused, PeerTimeout, UsageError
+from gelflow.hardware_mocks.camera.mjpeg_server import Corruption, MjpegServer
+from gelflow.protocols import Camera, CameraImage
+from gelflow.real.camera.drivers import MjpegCamera, UvcCamera, open_camera
+
+CLOCK = ScaledClock(1.0)
+PATIENT = 10.0  # a time-out that only a failing test reaches [s]
+
+
+class Source:
+    """JPEGs that get brighter one by one; some are filled up with zeros, as some cameras' are."""
+
+    def __init__(self) -> None:
+        self.made: list[bytes] = []
+
+    def __call__(self) -> bytes:
+        picture = np.full((24, 32, 3), len(self.made) % 250, np.uint8)
+        self.made.append(cv2.imencode(".jpg", picture)[1].tobytes() + bytes(len(self.made) % 3))
+        return self.made[-1]
+
+
+@contextmanager
+def served(rate: float = 100.0) -> Iterator[tuple[MjpegServer, Source]]:
+    source = Source()
+    with MjpegServer(source, CLOCK, rate=rate) as server:
+        yield server, source
+
+
+@contextmanager
+def raw_server(answer: bytes, *, close: bool = False) -> Iterator[str]:
+    """A server that sends these bytes to whoever connects, and then nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        links: list[socket.socket] = []
+
+        def serve() -> None:
+            try:
+                while True:
+                    link, _ = listener.accept()
+                    links.append(link)
+                    link.recv(4096)
+                    link.sendall(answer)
+                    if close:
+                        link.close()
+            except OSError:
+                return
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/?action=stream"
+        listener.shutdown(socket.SHUT_RDWR)
+        for link in links:
+            link.close()
+        thread.join(2)
+
+
+def test_frames_arrive_as_they_were_sent_in_order_and_stamped() -> None:
+    seen: list[CameraImage] = []
+    with served() as (server, source):
+        before = CLOCK.now()
+        with MjpegCamera(server.url, "left", CLOCK, on_image=seen.append) as camera:
+            assert isinstance(camera, Camera)
+            image = camera.next(-1, PATIENT)
+            for _ in range(5):
+                later = camera.next(image.sequence, PATIENT)
+                assert later.sequence > image.sequence and later.stamp >= image.stamp
+                image = later
+        after = CLOCK.now()
+    assert [image.sequence for image in seen] == list(range(len(seen)))
+    assert all(before <= image.stamp <= after and image.encoding == "jpeg" for image in seen)
+    order = [source.made.index(image.data) for image in seen]
+    assert order == sorted(order)
+
+
+def test_latest_is_the_newest_and_a_slow_reader_skips() -> None:
+    with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=PATIENT) as camera:
+        first = camera.latest()
+        deadline = time.monotonic() + PATIENT
+        while camera.latest().sequence < first.sequence + 10 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert camera.next(first.sequence, PATIENT).sequence >= first.sequence + 10
+
+
+def test_two_clients_and_a_snapshot_share_one_source() -> None:
+    with served() as (server, source):
+        with MjpegCamera(server.url, "a", CLOCK) as a, MjpegCamera(server.url, "b", CLOCK) as b:
+            one, two = a.next(5, PATIENT), b.next(5, PATIENT)
+            assert one.data in source.made and two.data in source.made
+            with urllib.request.urlopen(server.url.replace("stream", "snapshot"), timeout=PATIENT) as answer:
+                assert answer.headers["Content-Type"] == "image/jpeg" and answer.read() in source.made
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(server.url.replace("stream", "dance"), timeout=PATIENT)
+
+
+def test_nobody_looks_nothing_is_drawn() -> None:
+    with served() as (server, source):
+        time.sleep(0.1)
+        assert source.made == [] and server.clients == 0
+
+
+def test_a_stall_is_told_by_name_and_frames_may_come_again() -> None:
+    with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=0.3) as camera:
+        image = camera.next(3, PATIENT)
+        server.stall()
+        with pytest.raises(PeerTimeout, match=r"left.*action=stream") as caught:
+            while True:
+                image = camera.next(image.sequence, 0.2)
+        assert "\n" not in str(caught.value)
+        time.sleep(0.3)
+        with pytest.raises(PeerTimeout):
+            camera.latest()
+        server.resume()
+        assert camera.next(image.sequence, PATIENT).sequence > image.sequence
+
+
+def test_a_closed_stream_stays_closed_until_reconnect() -> None:
+    with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=PATIENT) as camera:
+        image = camera.next(-1, PATIENT)
+        server.drop_clients()
+        with pytest.raises(PeerError, match=r"left.*closed the stream"):
+            while True:
+                image = camera.next(image.sequence, PATIENT)
+        for _ in range(2):
+            with pytest.raises(PeerError, match="closed the stream"):
+                camera.latest()
+        camera.reconnect()
+        assert camera.latest().sequence > image.sequence  # numbers never repeat within a session
+
+
+@pytest.mark.parametrize("how", ["truncated", "length"])
+def test_damaged_frames_are_left_out_and_counted(how: Corruption) -> None:
+    seen: list[CameraImage] = []
+    with served() as (server, source), MjpegCamera(server.url, "left", CLOCK, on_image=seen.append) as camera:
+        image = camera.next(3, PATIENT)
+        server.corrupt(3, how=how)
+        while camera.damaged < 3:
+            image = camera.next(image.sequence, PATIENT)
+        camera.next(image.sequence, PATIENT)
+        assert {image.data for image in seen} <= set(source.made)
+
+
+def test_noise_within_an_image_comes_through_as_received() -> None:
+    seen: list[CameraImage] = []
+    with served() as (server, source), MjpegCamera(server.url, "left", CLOCK, on_image=seen.append) as camera:
+        server.corrupt(1, how="garbage")
+        camera.next(20, PATIENT)
+    assert len([image for image in seen if image.data not in source.made]) == 1
+
+
+def test_a_source_that_fails_ends_the_streams_and_is_raised() -> None:
+    def broken() -> bytes:
+        raise ValueError("no gel")
+
+    server = MjpegServer(broken, CLOCK).start()
+    with MjpegCamera(server.url, "left", CLOCK) as camera, pytest.raises(PeerError, match="closed the stream"):
+        camera.next(-1, PATIENT)
+    with pytest.raises(PeerError, match="no gel"):
+        server.close()
+
+
+def test_an_address_that_nobody_answers() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    with pytest.raises(PeerError, match=rf"cannot reach http://127.0.0.1:{port}/") as caught:
+        MjpegCamera(f"http://127.0.0.1:{port}/", "left", CLOCK).open()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind", "says"),
+    [
+        (b"", PeerTimeout, "no answer from"),
+        (b"HTTP/1.0 200 O", PeerTimeout, "no answer from"),
+        (b"HTTP/1.0 404 Not Found\r\n\r\n", PeerRefused, "404"),
+        (b"220 ftp ready\r\n", PeerError, "expected an HTTP answer"),
+        (b"HTTP/1.0 200 OK\r\nContent-Type: text/html\r\n\r\n", PeerError, "text/html"),
+    ],
+)
+def test_other_servers_are_told_apart(answer: bytes, kind: type[PeerError], says: str) -> None:
+    with raw_server(answer) as url, pytest.raises(kind, match=says) as caught:
+        MjpegCamera(url, "left", CLOCK, connect_timeout=0.3 if kind is PeerTimeout else PATIENT).open()
+    assert url in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_server_that_closes_before_it_answers() -> None:
+    with raw_server(b"", close=True) as url, pytest.raises(PeerError, match=r"before it answered|failed"):
+        MjpegCamera(url, "left", CLOCK, connect_timeout=PATIENT).open()
+
+
+def test_half_a_frame_and_then_nothing_is_a_timeout() -> None:
+    head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x123\r\n\r\n"
+    half = b"--x123\r\nContent-Length: 500\r\n\r\n\xff\xd8half"
+    with raw_server(head + half) as url, MjpegCamera(url, "left", CLOCK, timeout=0.2) as camera:
+        with pytest.raises(PeerTimeout, match="none so far"):
+            camera.latest()
+        with pytest.raises(PeerTimeout):
+            camera.next(-1, 0.1)
+
+
+def test_a_camera_is_used_only_when_open() -> None:
+    with served() as (server, _):
+        camera = MjpegCamera(server.url, "left", CLOCK)
+        with pytest.raises(UsageError, match="open it first"):
+            camera.latest()
+        camera.open()
+        camera.close()
+        camera.close()
+        with pytest.raises(PeerError, match="closed here"):
+            camera.next(-1, PATIENT)
+        camera.open()
+        camera.next(-1, PATIENT)
+        with pytest.raises(UsageError, match="already open"):
+            camera.open()
+        camera.close()
+
+
+def test_what_the_recorder_raises_reaches_the_camera_s_user() -> None:
+    def full(image: CameraImage) -> None:
+        raise PeerError("the disk is full")
+
+    with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, on_image=full) as camera:
+        for _ in range(2):
+            with pytest.raises(PeerError, match="the disk is full"):
+                camera.next(-1, PATIENT)
+
+
+def test_frames_come_no_faster_than_their_rate_in_robot_time() -> None:
+    clock, source = ScaledClock(10.0), Source()
+    begun = clock.now()
+    server = MjpegServer(source, clock, rate=20)
+    with server, MjpegCamera(server.url, "left", clock, timeout=PATIENT) as camera:
+        camera.next(40, 10 * PATIENT)
+    assert 40 < len(source.made) <= (clock.now() - begun) * 20 + 3
+
+
+@pytest.mark.parametrize(
+    "url", ["ftp://host/", "http://", "http://host:port/", "http://user:word@host/", "http://ho st/", "http://höst/"]
+)
+def test_wrong_addresses(url: str) -> None:
+    with pytest.raises(UsageError, match="camera left"):
+        MjpegCamera(url, "left", CLOCK)
+
+
+def test_wrong_sources_and_settings() -> None:
+    with pytest.raises(UsageError, match="uvc:INDEX"):
+        open_camera("left.jpg", "left", CLOCK)
+    with pytest.raises(UsageError, match="timeout"):
+        MjpegCamera("http://host/", "left", CLOCK, timeout=0)
+    with pytest.raises(UsageError, match="rate"):
+        MjpegServer(Source(), CLOCK, rate=0)
+    with served() as (server, _):
+        with pytest.raises(UsageError, match="another port"):
+            MjpegServer(Source(), CLOCK, port=server.port).start()
+        with pytest.raises(UsageError, match="how must be"):
+            server.corrupt(how="painted")  # type: ignore[arg-type]
+
+
+def test_a_device_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(PeerError, match="video device 97"):
+        open_camera("uvc:97", "left", CLOCK)
+    assert capfd.readouterr().err == ""
+
+
+def test_pixels_of_a_device_are_kept_without_loss(tmp_path: Path) -> None:
+    path = tmp_path / "gel.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
+    assert writer.isOpened()
+    rng = np.random.default_rng(1)
+    for _ in range(4):
+        writer.write(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    expected = []
+    capture = cv2.VideoCapture(str(path))
+    while (read := capture.read())[0]:
+        expected.append(read[1])
+
+    seen: list[CameraImage] = []
+    device = UvcCamera(str(path), "left", CLOCK, timeout=PATIENT, on_image=seen.append)
+    with device as camera, pytest.raises(PeerError, match="gave no frame"):
+        camera.next(99, PATIENT)
+    assert len(seen) == 4
+    for image, pixels in zip(seen, expected, strict=True):
+        decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert image.encoding == "png" and decoded is not None and np.array_equal(decoded, pixels)
+
+
+def test_jpeg_bytes_of_a_device_are_handed_on() -> None:
+    camera = UvcCamera(0, "left", CLOCK)
+    jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
+    buffer = np.frombuffer(jpeg + bytes(100), np.uint8).reshape(1, -1)
+    assert camera._encode(buffer) == (jpeg, "jpeg")
+    with pytest.raises(PeerError, match="no JPEG"):
+        camera._encode(np.zeros((1, 50), np.uint8))

@@ -1,0 +1,95 @@
+"""`gelflow mock`, `run`, `demo` and `replay` as a user starts them, the mock robot in a process of its own."""
+
+import json
+import socket
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gelflow.cli.commands.demo import ask, mock_robot
+from gelflow.cli.main import main
+from gelflow.errors import PeerError
+from gelflow.policies.checkpoint import save
+from gelflow.policies.networks import Architecture, tensor_shapes
+from gelflow.real.runner.lab_file import load_lab
+from gelflow.task import INSERTION
+
+FACTOR = 4.0
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """A policy that knows nothing, but is a policy."""
+    rng = np.random.default_rng(0)
+    architecture = Architecture(hidden=(8, 8))
+    shapes = tensor_shapes(architecture, INSERTION)
+    tensors = {name: 0.1 * rng.standard_normal(shape) for name, shape in shapes.items()}
+    path = tmp_path / "untrained.safetensors"
+    save(path, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "none"})
+    return path
+
+
+def test_mock_and_dry_run(tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with mock_robot(factor=FACTOR, seed=9) as (lab_path, truth):
+        lab = load_lab(lab_path)
+        assert lab.clock_factor == FACTOR and lab.gripper.address.startswith("serial:")
+        arguments = ["--lab", str(lab_path), "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out")]
+        assert main(["run", "insertion", *arguments, "--dry-run"]) == 0
+        told = capsys.readouterr().out
+        assert "nothing was moved" in told and "252 of 252 markers" in told
+        # The session is never overwritten.
+        assert main(["run", "insertion", *arguments, "--dry-run"]) == 2
+        assert "a recording never overwrites" in capsys.readouterr().err
+        request = urllib.request.Request(f"{truth}?seed=17", method="POST")
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            assert json.load(answer) == {"next_seed": 17}
+        assert ask(truth)["waited"] >= 0
+    with pytest.raises(PeerError, match="does not tell the truth"):
+        ask(truth)  # it ended with its user
+
+
+def test_demo_inserts_draws_records_and_its_session_replays(
+    tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    out = tmp_path / "demo"
+    options = ["--insertions", "1", "--factor", str(FACTOR), "--checkpoint", str(checkpoint), "--no-real-time"]
+    assert main(["demo", "--out", str(out), "--preset", "fast", *options]) == 0
+    told = capsys.readouterr().out
+    assert "misalignment" in told and f"gelflow replay {out / 'session.mcap'}" in told.replace("\n", "")
+    assert "in truth" in told
+    picture = out / "insertion-1.png"
+    assert picture.read_bytes()[:4] == b"\x89PNG" and picture.stat().st_size > 50_000
+    assert main(["replay", str(out / "session.mcap")]) == 0
+    assert "decisions identical; largest difference: action 0" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_mock_that_can_not_start_says_why(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert main(["mock", "--tcp-port", port]) == 2
+    told = capsys.readouterr().err
+    assert port in told and told.count("\n") == 1
+
+
+def test_the_demo_says_when_its_mock_does_not_start() -> None:
+    with pytest.raises(PeerError, match="did not start"), mock_robot(factor=-3.0, seed=0):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["demo", "--insertions", "0"], "--insertions must be at least 1"),
+        (["demo", "--checkpoint", "/nowhere/policy.safetensors"], "no checkpoint at /nowhere/policy.safetensors"),
+        (["mock", "--factor", "0"], "clock factor 0.0 is outside 0.01 to 1000"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(
+    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert named in told and told.count("\n") == 1

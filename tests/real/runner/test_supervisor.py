@@ -1,0 +1,98 @@
+"""The supervisor: a wrong target is refused, never clamped; a latch holds."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gelflow.real
+from gelflow.errors import SafetyError
+from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.protocols import ArmState
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.lab_file import load_lab
+from gelflow.real.runner.supervisor import Supervisor, unfit
+
+LAB: Lab = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
+
+
+def gripper(x: float = 0.0, y: float = 0.0, height: float = 0.03, yaw: float = 0.0) -> Pose:
+    above = np.array([x, y, height + LAB.part.grasp_height])
+    return LAB.hole.pose @ Pose(above, yaw_quaternion(yaw))
+
+
+def check(target: Pose, previous: Pose | None = None, *, speed: float = 0.01, turn_speed: float = 0.1) -> Pose:
+    before = gripper() if previous is None else previous
+    return Supervisor(LAB).check(target, before, speed=speed, turn_speed=turn_speed)
+
+
+def test_a_good_target_goes_on_unchanged() -> None:
+    target = gripper(0.015, -0.015, 0.026, math.radians(15))
+    tool = check(target)
+    back = LAB.gripper_pose(tool.position, tool.quaternion)
+    assert back.position == pytest.approx(target.position, abs=1e-12)
+    assert back.yaw == pytest.approx(target.yaw)
+
+
+@pytest.mark.parametrize(
+    ("target", "named"),
+    [
+        (gripper(x=0.0161), r"\|x\| = 16\.10 mm is outside ±16 mm"),
+        (gripper(x=-0.05), r"\|x\| = 50\.00 mm"),
+        (gripper(y=0.0161), r"\|y\|"),
+        (gripper(yaw=math.radians(-16.1)), r"\|yaw\| = 16\.10 °"),
+        (gripper(height=0.0005), r"height 0\.50 mm is outside 1 to 60 mm"),
+        (gripper(height=0.061), "height"),
+        (gripper(x=math.nan), "not finite"),
+        (gripper(height=math.inf), "not finite"),
+        (Pose(gripper().position, np.array([1.0, 0.1, 0.0, 0.0])), "length 1"),
+        (Pose(gripper().position, np.array([math.cos(0.01), math.sin(0.01), 0.0, 0.0])), "tilt"),
+    ],
+)
+def test_a_target_outside_is_refused(target: Pose, named: str) -> None:
+    with pytest.raises(SafetyError, match=named):
+        check(target)
+
+
+def test_too_far_and_too_fast_are_refused() -> None:
+    with pytest.raises(SafetyError, match=r"step 57 mm is more than 50 mm"):
+        check(gripper(height=0.059), gripper(height=0.002))
+    with pytest.raises(SafetyError, match=r"speed 21 mm/s is more than 20 mm/s"):
+        check(gripper(), speed=0.021)
+    with pytest.raises(SafetyError, match=r"turning speed 11\.46 °/s is more than 10 °/s"):
+        check(gripper(), turn_speed=0.2)
+    for speed in (0.0, -1.0, math.nan):
+        with pytest.raises(SafetyError, match="speed"):
+            check(gripper(), speed=speed)
+
+
+def test_a_latch_holds_and_keeps_its_first_reason() -> None:
+    supervisor = Supervisor(LAB)
+    supervisor.latch("emergency stop")
+    supervisor.latch("something later")
+    with pytest.raises(SafetyError, match="latched: emergency stop"):
+        supervisor.check(gripper(), gripper(), speed=0.01, turn_speed=0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({}, ""),
+        ({"motors_on": False}, "motors are off"),
+        ({"running": False}, "not running"),
+        ({"fault": "EGM was restarted"}, "EGM was restarted"),
+        ({"operating_mode": "manual full"}, "manual full"),
+    ],
+)
+def test_what_makes_an_arm_unfit(values: dict[str, object], reason: str) -> None:
+    good = {"motors_on": True, "running": True, "operating_mode": "auto", "fault": ""}
+    state = ArmState(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(6), 0.0, **{**good, **values})  # type: ignore[arg-type]
+    assert reason in unfit(state) and bool(unfit(state)) == bool(reason)
+    supervisor = Supervisor(LAB)
+    if reason:
+        with pytest.raises(SafetyError):
+            supervisor.watch(state)
+        assert supervisor.latched
+    else:
+        supervisor.watch(state)

@@ -1,0 +1,241 @@
+"""`gelflow bench`: what it prints, that what it times is what it says, and that it notices a wrong run.
+
+No test looks at speed.
+"""
+
+import contextlib
+import io
+import json
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gelflow.cli.commands.bench import MEASUREMENTS, conclude
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.geometry import angles_between
+from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
+from gelflow.sim.benchmark.batch import differ, measure_batch
+from gelflow.sim.benchmark.gradients import measure_gradients
+from gelflow.sim.benchmark.growth import SWEEPS, exponent
+from gelflow.sim.benchmark.markers import SHAPES, measure_markers
+from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
+from gelflow.sim.benchmark.paper_build import MODULE, why_not
+from gelflow.sim.benchmark.rolling import ROLLING_STEPS, Cell, measure_rolling, rolling_run, rolling_scene
+from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
+from gelflow.sim.benchmark.scenes import measure_scenes
+from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.validation.reference_motions import SCENES
+
+ONCE = Effort(quick=True, repeats=1)
+SIMULATED = [name for name in MEASUREMENTS if name != "tracking"]
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The file and the picture of one short run of all measurements of the simulator, and what it printed."""
+    folder = tmp_path_factory.mktemp("bench")
+    command = ["bench", *SIMULATED, "--quick", "--repeats", "1", "--json", str(folder / "speed.json")]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main([*command, "--picture", str(folder / "growth.png")]) == 0
+    return folder, out.getvalue()
+
+
+def test_everything_fits_the_terminal_and_lands_in_one_file(everything: tuple[Path, str]) -> None:
+    folder, out = everything
+    assert max(map(len, out.splitlines())) <= 80
+    record = json.loads((folder / "speed.json").read_text("utf-8"))
+    assert record["format"] == 1 and record["processor"] and record["versions"]["mujoco"]
+    assert [name for name in record if name in MEASUREMENTS] == SIMULATED
+    for name in SIMULATED:
+        assert record[name]["outside"] == []
+        assert record[name]["title"] in out
+    assert (folder / "growth.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_every_timed_run_carries_its_check(everything: tuple[Path, str]) -> None:
+    record = json.loads((everything[0] / "speed.json").read_text("utf-8"))
+    checks = [run["check"] for name in ("rolling", "scenes", "gradients", "batch") for run in record[name]["results"]]
+    checks += [size["check"] for sweep in record["growth"]["results"] for size in sweep["sizes"]]
+    for one in checks:
+        assert one["holds"] and one["position"] <= 1e-6 and one["turn"] <= 1e-6 and one["force"] <= 1e-4
+        assert one["iterations"] > 0 and one["end"] and len(one["force_sum"]) == 3
+    assert all(result["touching"] == 1 for result in record["markers"]["results"])
+
+
+def test_rolling_is_the_run_of_the_paper() -> None:
+    """Ends where a plain loop of single steps under the five forces ends, at every interval of reading."""
+    report = measure_rolling(ONCE, cells=[Cell(5, every) for every in (1, 7, 20, 350, 0)])
+    sim = simulator((scene := rolling_scene(5)).describe_to, tolerance=TIMED["viscous"])
+    sim.q[:] = scene.q0
+    largest = np.zeros(3)
+    for step in range(350):
+        x = 0.1 if 100 <= step < 150 else -0.2 if 150 <= step < 200 else 0.0
+        y = 0.1 if 200 <= step < 250 else -0.2 if step >= 250 else 0.0
+        sim.step(np.array([x, y, 0.2]))
+        if (step + 1) % 20 == 0 and sim.tactile()[0, :, 2].sum() > largest[2]:
+            largest = sim.tactile()[0].sum(0).copy()
+    for result in report.results:
+        np.testing.assert_array_equal(result["check"]["end"], sim.q[0])
+        assert result["check"]["iterations"] == sim.iterations[0] / 350
+        assert result["mujoco"]["per_second"] > 0 and result["times_as_fast_as"]["mujoco"] > 0
+    assert ROLLING_STEPS == 350
+    np.testing.assert_array_equal(report.results[2]["check"]["force_sum"], largest)
+    assert largest[2] > 0
+
+
+def test_rolling_stands_beside_the_paper_s_figures() -> None:
+    result = measure_rolling(ONCE, cells=[Cell(10, 5)]).results[0]
+    assert result["paper"] == 5200
+    assert result["times_the_paper"] == pytest.approx(result["gelflow"]["per_second"] / 5200)
+
+
+def test_mujoco_s_taxels_are_where_the_markers_are() -> None:
+    """Each gives its depth in the ball; the ball rolls as ours does, to within the softness of ours."""
+    scene = rolling_scene(40)
+    run = rolling_run(scene, 5)
+    rival, sim = MujocoRolling(scene, run), simulator(scene.describe_to)
+    rival.place()
+    rival.go()
+    run.place(sim)
+    run.go(sim)
+    np.testing.assert_allclose(rival.data.qpos[:6], sim.q[0, :6], atol=3e-3)
+
+    down = rolling_run(scene, 5)
+    pressed = MujocoRolling(scene, type(run)(run.q0, down.blocks[:20]))  # 100 steps: it lies on the ball
+    pressed.place()
+    pressed.go()
+    data = pressed.data
+    taxels = scene.pads[0].positions @ data.geom("pad").xmat.reshape(3, 3).T + data.geom("pad").xpos
+    depth = np.maximum(0.02 - np.linalg.norm(taxels - data.geom("ball").xpos, axis=1), 0)
+    assert (depth > 0).sum() > 10
+    np.testing.assert_allclose(pressed.readings[0], depth, atol=1e-7)  # its vertices are in single precision
+
+
+def test_without_the_paper_s_simulator_it_says_so() -> None:
+    reason = why_not(None)
+    assert reason is not None and MODULE in reason and "\n" not in reason
+
+
+def test_scenes_are_timed_under_both_laws() -> None:
+    report = measure_scenes(ONCE, steps=20)
+    assert [(r["scene"], r["friction"]) for r in report.results] == [
+        (scene, law) for scene in SCENES for law in ("viscous", "elastic")
+    ]
+    compared = {r["scene"]: r["paper"] for r in report.results if r["paper"]}
+    assert compared == {"pushing": 5400, "grasp": 1000, "insertion": 1940, "dclaw": 840}
+    assert report.outside == []
+
+
+def test_gradients_are_those_of_the_converged_twin() -> None:
+    report = measure_gradients(ONCE, steps=5)
+    assert report.outside == [] and all(r["gradient_off"] < 1e-4 for r in report.results)
+    assert [r["of"] for r in report.results] == ["end state"] * 3 + ["each reading"] * 2
+
+
+def test_batches_differ_but_for_the_first() -> None:
+    scene = load_scene("insertion")
+    sim = simulator(scene.describe_to, num_envs=4)
+    differ(sim)
+    stiffness = sim.param("pad_left.kn")
+    assert stiffness[0] == 8e3 and len(set(stiffness.tolist())) == 4
+    report = measure_batch(ONCE, sizes=[1, 3], steps=10)
+    assert [r["environments"] for r in report.results] == [1, 3]
+    ends = [r["check"]["end"] for r in report.results]
+    assert ends[0] == ends[1], "the first one is the scene's own, in any company"
+
+
+def test_all_markers_touch_on_every_shape() -> None:
+    report = measure_markers(ONCE, side=8)
+    assert [r["shape"] for r in report.results] == list(SHAPES)
+    for result in report.results:
+        assert result["touching"] == 1 and result["force_sum"][2] > 0 > result["force_sum"][0]
+        assert 0 < result["force_off"] < 1e-4 and 0 < result["gradient_off"] < 1e-3
+    ball, grid = (next(r for r in report.results if r["shape"] == kind) for kind in ("sphere", "grid"))
+    np.testing.assert_allclose(grid["force_sum"], ball["force_sum"], rtol=0.02, atol=1e-9)  # the grid is of that ball
+
+
+def test_single_precision_is_close_and_is_not_double(everything: tuple[Path, str]) -> None:
+    results = json.loads((everything[0] / "speed.json").read_text("utf-8"))["precision"]["results"]
+    assert len(results) == 2 * len(SCENES)
+    for result in results:
+        assert 0 < result["position"] < 1e-6 and 0 < result["turn"] < 1e-5
+        assert 0 < result["readings"] < 1e-3 and 0 < result["gradient"] < 5e-3
+
+
+@pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.name)
+def test_what_grows_is_what_is_said(sweep: Any) -> None:
+    work, checked = sweep.prepare(sweep.quick[0])
+    assert checked.holds and work.units > 0
+    assert len(sweep.sizes) >= 7 and sweep.sizes[-1] > sweep.quick[-1]
+
+
+def test_an_exponent_is_that_of_the_larger_half() -> None:
+    sizes = [1, 10, 100, 1000]
+    assert exponent(sizes, [5.0, 5.0, 1e2**1.5, 1e3**1.5]) == pytest.approx(1.5)
+
+
+def test_a_run_that_is_off_is_noticed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Newton's method stopped early: forces are off by more than 1e-4."""
+    scene = load_scene("insertion", friction="elastic")
+    run = motion_run(scene, steps=60)
+    right, loose = (simulator(scene.describe_to, tolerance=tolerance) for tolerance in (1e-7, 0.3))
+    assert check(run, right, scene.describe_to).broken("insertion") == []
+    lines = check(run, loose, scene.describe_to).broken("insertion")
+    assert len(lines) == 1 and lines[0].startswith("insertion: ")
+    report = Report("scenes", "title", (), [], "note", [], lines)
+    assert conclude([report]) == 1
+    assert capsys.readouterr().out == f"outside: {lines[0]}\n"
+    assert conclude([]) == 0
+
+
+def test_angles_between_quaternions() -> None:
+    half = np.array([[1.0, 0, 0, 0], [np.cos(5e-9), np.sin(5e-9), 0, 0], [0, 0, 1, 0]])
+    np.testing.assert_allclose(angles_between(half[0], half), [0, 1e-8, np.pi], rtol=1e-6)
+    np.testing.assert_allclose(angles_between(half[0], -half), [0, 1e-8, np.pi], rtol=1e-6)
+
+
+def test_works_are_timed_in_turn() -> None:
+    calls: list[str] = []
+
+    def noted(name: str) -> None:
+        calls.append(name)
+        sum(range(400_000))
+
+    works = [Work(lambda: noted("a"), 10, lambda: calls.append("prepared")), Work(lambda: noted("b"), 10)]
+    times = interleaved(works, Effort(repeats=3))
+    rounds = [name for name, _ in groupby(call for call in calls if call != "prepared")]
+    assert rounds == ["a", "b"] * 4, "once untimed, then three times"
+    assert calls.count("prepared") == calls.count("a")
+    assert [len(one.seconds) for one in times] == [3, 3]
+
+
+def test_ratios_are_medians_of_the_repeats_own() -> None:
+    one, other = Times((1.0, 2.0, 10.0), (1.0, 1.0, 5.0)), Times((2.0, 6.0, 10.0), (1.0, 1.0, 1.0))
+    assert times_as_fast(one, other) == 2
+    assert one.rate == 0.5 and one.cpu_share == 0.5
+    assert one.quartiles == (1 / 6, 1 / 1.5)
+
+
+def test_the_command_refuses_wrong_input_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong, message in (
+        (["rolling", "--repeats", "0"], "--repeats must be at least 1, got 0"),
+        (["roling"], "no measurement 'roling'; did you mean 'rolling'?"),
+        (["rolling", "--picture", "x.png"], "--picture draws growth or tracking: ask for one"),
+    ):
+        assert main(["bench", *wrong]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("gelflow bench: ") and error.count("\n") == 1
+        assert message.split(";")[0] in error
+    with pytest.raises(UsageError, match="at least 1"):
+        Effort(repeats=0)
+    with pytest.raises(UsageError, match="or never: 0; got -1"):
+        rolling_run(rolling_scene(5), -1)
+
+
+def test_a_busy_machine_is_mentioned() -> None:
+    assert busy([Times((1.0,), (0.99,))]) == ""
+    assert "62% of a core" in busy([Times((1.0,), (0.62,)), Times((2.0, 2.0), (1.24, 1.24))])

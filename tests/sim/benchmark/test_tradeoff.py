@@ -1,0 +1,237 @@
+"""`gelflow tradeoff`: runs that can be compared, errors that mean something, settings that are what they say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gelflow.cli.commands.tradeoff import short, show
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.sim.benchmark.tradeoff.picture import front
+from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds
+from gelflow.sim.benchmark.tradeoff.run import FRAME, WINDOW, Errors, Task, compare, drawn
+from gelflow.sim.benchmark.tradeoff.sweep import (
+    GROUPS,
+    Price,
+    Setting,
+    Tradeoff,
+    contact_density,
+    dominated,
+    reference,
+    settings,
+    simulated,
+)
+from gelflow.sim.scene.presets import NAMES
+from gelflow.sim.scene.scene import load_scene, scene_names
+
+
+def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    picture = tmp_path / "new" / "pushing.png"
+    assert main(["tradeoff", "pushing", "--quick", "--repeats", "1", "--json", "--picture", str(picture)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert picture.stat().st_size > 10_000
+    prices = {price["setting"]["name"]: price for price in found["prices"]}
+    assert set(prices) | set(found["failed"]) >= {s.name for s in settings("pushing", quick=True)}
+    assert {name for price in prices.values() for name in price["presets"]} == set(NAMES)
+    assert all(price["dominated_by"] in (None, *prices) for price in prices.values())
+    assert any(price["dominated_by"] for price in prices.values())
+    # Finer steps are closer to the reference, which moved much less than they are off.
+    errors = [prices[f"BDF2 {step} ms 1e-3"]["errors"] for step in ("10", "2.5", "0.625")]
+    for figure in ("position", "rotation", "markers", "gradient"):
+        assert errors[0][figure] > errors[1][figure] > errors[2][figure] > 3 * found["changes"]["scene"][figure]
+    # What is printed for people, from the same numbers.
+    rows = tuple(
+        Price(**{**p, "setting": Setting(**p["setting"]), "errors": Errors(**p["errors"])}) for p in found["prices"]
+    )
+    changes = {name: Errors(**change) for name, change in found["changes"].items()}
+    del found["processor"]
+    show(Tradeoff(**{**found, "prices": rows, "changes": changes}), "pushing")
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "…" not in out and all(name in out for name in prices)
+    assert "The reference changed by" in out
+
+
+def test_a_scene_without_a_motion_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "ball.xml").write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+    )
+    path = tmp_path / "ball.toml"
+    path.write_text('format = 1\nmodel = "ball.xml"\nstep = 1e-3\n')
+    assert main(["tradeoff", str(path)]) == 2
+    assert "no motion for scene 'ball'" in capsys.readouterr().err
+
+
+def test_a_step_must_fit_into_a_frame() -> None:
+    with pytest.raises(UsageError, match=r"must divide 0\.01 s"):
+        Task(load_scene("pushing", overrides={"step": 3e-3}))
+    with pytest.raises(UsageError, match=r"must divide 0\.01 s"):
+        Task(load_scene("pushing", overrides={"step": 30e-3}))
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_settings_are_of_the_scene_and_differ(name: str) -> None:
+    found = settings(name)
+    assert len({s.name for s in found}) == len(found) > 40
+    assert {s.group for s in found} <= set(GROUPS)
+    assert {"own", "step", "tolerance", "combined", "single", "reads", "contacts"} <= {s.group for s in found}
+    own = load_scene(name)
+    scenes = [load_scene(name, overrides=s.overrides) for s in found]
+    assert [s for s, scene in zip(found, scenes, strict=True) if scene.markers != own.markers] == [
+        s for s in found if s.group == "markers"
+    ]
+    for scene in scenes:
+        assert (FRAME / scene.step) % 1 == pytest.approx(0)
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_other_densities_of_points_are_as_stiff_in_all(name: str) -> None:
+    own = load_scene(name)
+    total = {p.name: p.weights.sum() for p in own.points}
+    for density in (1, 2):
+        scene = load_scene(name, overrides=contact_density(own, density))
+        for points, old in zip(scene.points, own.points, strict=True):
+            if old.radius == 0 and len(old.points) > 8:
+                assert points.per_area
+                assert len(points.points) > len(old.points) or density == 1
+        weights = {p.name: p.weights.sum() for p in scene.points}
+        for contact, before in zip(scene.contacts, own.contacts, strict=True):
+            for number in ("kn", "kt", "kd", "ks"):
+                stiffness = contact.numbers[number] * weights[contact.points]
+                assert stiffness == pytest.approx(before.numbers[number] * total[before.points])
+            assert contact.numbers["mu"] == before.numbers["mu"]
+
+
+def test_coarser_markers_stay_in_place() -> None:
+    for name in ("pushing", "rolling"):
+        own = load_scene(name).grids[0]
+        for setting in settings(name):
+            if setting.group == "markers":
+                grid = load_scene(name, overrides=setting.overrides).grids[0]
+                if name == "pushing":  # the outermost markers stay
+                    assert (grid.rows - 1) * grid.pitch == pytest.approx((own.rows - 1) * own.pitch)
+                    assert (grid.cols - 1) * grid.pitch == pytest.approx((own.cols - 1) * own.pitch)
+                else:  # the area stays
+                    assert grid.rows * grid.pitch == pytest.approx(own.rows * own.pitch)
+
+
+def test_a_run_is_a_plain_loop_of_steps_and_readings() -> None:
+    scene = load_scene("pushing", preset="balanced")
+    run, task = Task(scene).run(gradient=False), Task(scene, every=4)
+    rare = task.run(gradient=False)
+    sim = task.sim
+    sim.reset()
+    sim.q[0] = task.motion.q0
+    for frame, u in enumerate(task.motion.steps(FRAME), 1):
+        for _ in range(task.steps):
+            sim.step(u)
+        np.testing.assert_array_equal(run.poses[frame], sim.poses()[0])
+        np.testing.assert_array_equal(run.field[frame], sim.tactile()[0])
+        np.testing.assert_array_equal(rare.field[frame], run.field[frame - frame % 4])
+    assert task.seconds() > 0
+
+
+@pytest.mark.parametrize(("name", "every"), [("pushing", 1), ("insertion", 1), ("dclaw", 1), ("pushing", 4)])
+def test_the_gradient_is_that_of_the_loss(name: str, every: int) -> None:
+    """Against central differences of runs; in the middle of the motion's touch, so that no point begins to touch."""
+    task = Task(load_scene(name, overrides={"tolerance": 1e-12}), every=every)
+    gradient = task.run().gradient
+    assert gradient is not None and gradient.shape[0] == WINDOW
+    spread = task.motion.steps(FRAME).std(0)
+    chosen = np.flatnonzero(spread > 0)
+
+    def loss() -> float:
+        field = task.run(gradient=False).field[task.look - WINDOW + 1 : task.look + 1]
+        return float((field**2).sum() / (WINDOW * field.shape[1]))
+
+    original = task.controls.copy()
+    rng = np.random.default_rng(0)
+    for frame in rng.choice(WINDOW, 2, replace=False):
+        column = int(rng.integers(len(chosen)))
+        at, delta = (task.look - WINDOW + frame, 0, chosen[column]), 1e-6 * spread[chosen[column]]
+        values = []
+        for sign in (1, -1):
+            task.controls[:] = original
+            task.controls[at] += sign * delta
+            values.append(loss())
+        slope = (values[0] - values[1]) / 2e-6
+        assert gradient[frame, column] == pytest.approx(slope, rel=1e-3, abs=1e-5 * np.abs(gradient).max())
+
+
+def test_errors_of_a_run_that_is_off_by_known_amounts() -> None:
+    truth = simulated("insertion", {})
+    assert truth.gradient is not None
+    assert replace(compare(truth, truth), cosine=1) == Errors(0, 0, 0, 0, 1, 0)
+    poses = truth.poses.copy()
+    poses[5, 0, :3] += [3e-4, 0, 4e-4]
+    half = np.array([np.cos(0.05), 0, 0, np.sin(0.05)])
+    w, x, y, z = poses[7, 1, 3:].copy()
+    poses[7, 1, 3:] = -(half[0] * np.array([w, x, y, z]) + half[3] * np.array([-z, -y, x, w]))
+    other = replace(truth, poses=poses, field=1.1 * truth.field, gradient=2 * truth.gradient)
+    errors = compare(other, truth)
+    assert errors.position == pytest.approx(5e-4) and errors.rotation == pytest.approx(0.1)
+    assert errors.markers == pytest.approx(0.1)
+    assert errors.flow == pytest.approx(0, abs=1e-12)  # it is normalized
+    assert errors.cosine == pytest.approx(1) and errors.gradient == pytest.approx(1)
+
+
+def test_readings_are_compared_on_the_scene_s_own_markers() -> None:
+    own = load_scene("pushing")
+    finer = load_scene("pushing", overrides={"pads.pad.rows": 25, "pads.pad.cols": 19, "pads.pad.pitch": 0.75e-3})
+    plain, fine = Task(own).run(gradient=False), Task(finer).run(onto=own, gradient=False)
+    np.testing.assert_allclose(fine.field, plain.field, rtol=1e-9, atol=1e-12)  # every second marker is the same one
+    np.testing.assert_array_equal(fine.poses, plain.poses)
+
+
+def test_a_draw_is_the_same_for_every_step_and_changes_the_physics() -> None:
+    first, again, other = (drawn(load_scene("grasp"), np.random.default_rng(seed)) for seed in (1, 1, 2))
+    fine = drawn(load_scene("grasp", preset="accurate"), np.random.default_rng(1))
+    own = load_scene("grasp")
+    for scene in (again, fine):
+        assert [c.numbers for c in scene.contacts] == [c.numbers for c in first.contacts]
+        assert [b.mass for b in scene.bodies] == [b.mass for b in first.bodies]
+    assert first.contacts[0].numbers != other.contacts[0].numbers
+    for body, before in zip(first.bodies, own.bodies, strict=True):
+        assert body.name.startswith("finger") == (body.mass == before.mass)
+        np.testing.assert_allclose(body.inertia / before.mass, before.inertia * body.mass / before.mass**2)
+    for contact, before_contact in zip(first.contacts, own.contacts, strict=True):
+        ratio = contact.numbers["kn"] / before_contact.numbers["kn"]
+        assert 1 / 1.5 <= ratio <= 1.5
+        assert contact.numbers["ks"] == pytest.approx(ratio * before_contact.numbers["ks"])
+
+
+def test_the_bar_of_grasp_starts_at_rest() -> None:
+    """If it fell onto its tables it would rattle, and no halving of the step would settle when it is touched."""
+    own = load_scene("grasp")
+    for overrides in ({}, contact_density(own, 2)):
+        task = Task(load_scene("grasp", overrides=overrides))
+        bar, sim = own.q("bar"), task.sim
+        sim.q[0] = task.motion.q0
+        u = task.controls[0].copy()
+        u[0, [own.u("finger_left"), own.u("finger_right")]] = -0.1  # open
+        sim.step(u, 100)
+        np.testing.assert_allclose(sim.q[0, bar], task.motion.q0[bar], rtol=0, atol=1e-9)
+    errors = compare(reference("grasp", 6), reference("grasp", 7))
+    assert errors.markers < 0.02 and errors.gradient < 0.02
+
+
+def test_what_is_dominated() -> None:
+    figures = {"a": (1.0, 1.0), "b": (1.01, 2.0), "c": (0.5, 3.0), "d": (1.01, 0.99), "e": (0.4, 0.4), "f": (0.6, 3.5)}
+    groups = dict.fromkeys(figures, "step") | {"e": "single"}
+    found = dominated(figures, groups)
+    assert found == {"a": None, "b": "a", "c": None, "d": None, "e": None, "f": "c"}
+    assert front([(1, 1), (2, 0.5), (1.5, 2), (3, 0.5)]) == [(1, 1), (2, 0.5)]
+
+
+def test_bounds_are_above_and_rounded_up() -> None:
+    worst = {"fast": Errors(1.01e-4, 0.0, 0.2, 3e-3, 0.9, 0.41)}
+    found = bounds(worst, 4)["fast"]
+    assert found.bound == Errors(1.6e-4, 0.0, 0.3, 4.5e-3, 0.85, 0.62)
+    assert found.draws == 4
+
+
+def test_numbers_fit_into_their_columns() -> None:
+    assert [short(x) for x in (0, 123.4, 9.96, 0.0332, 0.00332, 1e-7)] == ["0", "123", "10", "0.033", "3e-3", "1e-7"]

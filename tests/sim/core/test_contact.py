@@ -1,0 +1,232 @@
+"""Contact and friction in the core against statics, textbook motions, and Newton's third law.
+
+A block is a free cube with its corners as contact points: 8 of them, 4 of which touch. Stiffness is per point.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.sim import _core
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+ORIGIN = (0.0, 0.0, 0.0)
+G = 9.8
+HALF = 0.02
+MASS = 0.3
+CORNERS = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+
+
+def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:
+    """A free cube; returns its body."""
+    inertia = mass * (2 * HALF) ** 2 / 6
+    body = int(spec.add_body(name, -1, pos, UPRIGHT, mass, ORIGIN, (inertia, inertia, inertia, 0, 0, 0)))
+    spec.add_joint(f"{name}_free", body, "free", ORIGIN, (0, 0, 1))
+    return body
+
+
+def block_on_plane(law: str, *, slope: float = 0.0, damping: str = "depth", **numbers: float) -> Simulator:
+    """A block on a plane with markers at its corners that follow the same law; gravity is turned by `slope` [rad]."""
+    spec = _core.ModelSpec()
+    spec.step, spec.tolerance = 2e-3, 1e-12
+    spec.gravity = (G * np.sin(slope), 0.0, -G * np.cos(slope))
+    body = block(spec, "block", (0, 0, HALF))
+    plane = spec.add_shape("plane", -1, "plane", ORIGIN, UPRIGHT, (1, 1, 1))
+    points = spec.add_points("corners", body, CORNERS, np.ones(8))
+    law_numbers = {"kn": 2e3, "kt": 20.0, "mu": 0.6, "kd": 2e4, "ks": 1e3 if law == "elastic" else 0.0} | numbers
+    spec.add_contact("contact", points, plane, law=law, damping=damping, **law_numbers)
+    axes = [np.tile(axis, (8, 1)) for axis in np.eye(3)]
+    spec.add_pad("pad", body, CORNERS, *axes, shapes=[plane], law=law, **law_numbers)
+    return Simulator(_core.Model(spec))
+
+
+def settle(sim: Simulator, seconds: float) -> None:
+    sim.step(np.zeros(0), round(seconds / sim.model.step))
+    sim.check()
+
+
+@pytest.mark.parametrize("damping", ["depth", "plain"])
+@pytest.mark.parametrize("law", LAWS)
+def test_a_block_at_rest_carries_its_weight(law: str, damping: str) -> None:
+    sim = block_on_plane(law, damping=damping, kd=20.0 if damping == "plain" else 2e4)
+    settle(sim, 2.0)
+    wrench = sim.wrenches()[0, 0]
+    np.testing.assert_allclose(wrench[3:], [0, 0, MASS * G], atol=1e-9)
+    np.testing.assert_allclose(wrench[:3], 0, atol=1e-10)  # about the origin, above which the block stands
+    assert HALF - sim.q[0, 2] == pytest.approx(MASS * G / (4 * 2e3), rel=1e-8)
+
+
+def test_a_block_that_the_viscous_law_holds_creeps() -> None:
+    """N points in contact let a load F creep at F / (N k_t)."""
+    sim = block_on_plane("viscous", slope=0.3)
+    settle(sim, 2.0)
+    speed = MASS * G * np.sin(0.3) / (4 * 20.0)
+    assert sim.v[0, 0] == pytest.approx(speed, rel=1e-6)
+    before = sim.q[0, 0]
+    settle(sim, 1.0)
+    assert sim.q[0, 0] - before == pytest.approx(speed, rel=1e-6)
+
+
+def test_a_block_that_the_elastic_law_holds_stays() -> None:
+    """It gives way by F / (N k_s) and stays there; when the load is gone, it comes back."""
+    sim = block_on_plane("elastic", mu=2.0)  # so that no corner slips while the block sways
+    settle(sim, 1.0)
+    rest = sim.q[0, 0]
+    sim.param("gravity.x")[:] = G * 0.3
+    settle(sim, 2.0)
+    held = sim.q[0].copy()
+    settle(sim, 2.0)
+    np.testing.assert_allclose(sim.q[0], held, atol=1e-10)
+    lean = 2 * held[5]  # about y, so that the lower face lags the middle
+    assert held[0] - HALF * lean - rest == pytest.approx(MASS * G * 0.3 / (4 * 1e3), rel=1e-3)
+    sim.param("gravity.x")[:] = 0
+    settle(sim, 2.0)
+    assert sim.q[0, 0] == pytest.approx(rest, abs=1e-8)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_block_that_slips_is_braked_by_mu_n(law: str) -> None:
+    slope, mu = 0.3, 0.1
+    sim = block_on_plane(law, slope=slope, mu=mu)
+    settle(sim, 0.5)
+    before = sim.v[0, 0]
+    settle(sim, 0.5)
+    rate = (sim.v[0, 0] - before) / 0.5
+    assert rate == pytest.approx(G * (np.sin(slope) - mu * np.cos(slope)), rel=1e-4)
+    friction = sim.wrenches()[0, 0, 3:]
+    assert abs(friction[0]) == pytest.approx(mu * friction[2], rel=1e-9)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("slope", [0.3, 0.9])
+def test_markers_at_the_contact_points_add_up_to_what_the_solver_applied(law: str, slope: float) -> None:
+    """With the law of the contact: holding and slipping, forces on the body by both ways."""
+    sim = block_on_plane(law, slope=slope)
+    sim.v[0, 3:] = 0.1, 0.2, 0.5
+    sim.step(np.zeros(0), 60)
+    quat = sim.poses()[0, 0, 3:]
+    force = (sim.tactile()[0] * [1, 1, -1]).sum(0) @ matrix(quat).T
+    # The wrench is that of the state now, with the anchors of now, as the markers are.
+    np.testing.assert_allclose(force, sim.wrenches()[0, 0, 3:], rtol=0, atol=1e-13)
+    assert sim.tactile()[0, :, :2].any()
+
+
+def matrix(quat: Array) -> Array:
+    w, x, y, z = quat
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def two_blocks(law: str) -> Simulator:
+    """A block against another, both afloat: the corners of the first against the faces of the second."""
+    spec = _core.ModelSpec()
+    spec.step, spec.tolerance, spec.gravity = 1e-3, 1e-13, ORIGIN
+    first = block(spec, "first")
+    second = block(spec, "second", (1.9 * HALF, 0.7 * HALF, 0.4 * HALF), mass=0.1)
+    shape = spec.add_shape("box", second, "box", ORIGIN, UPRIGHT, (HALF, HALF, HALF))
+    points = spec.add_points("corners", first, CORNERS, np.ones(8))
+    spec.add_contact("contact", points, shape, law=law, kn=300.0, kt=0.5, mu=0.7, kd=30.0, ks=100.0)
+    sim = Simulator(_core.Model(spec))
+    sim.v[0] = 0.3, 0.05, 0.0, 1.0, -2.0, 3.0, -0.2, 0.0, 0.1, 0.0, 1.0, -1.0
+    return sim
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_forces_of_a_pair_are_equal_and_opposite(law: str) -> None:
+    """What each body's momentum gains in a step is the contact's impulse, and its reverse on the other body."""
+    sim = two_blocks(law)
+    # The force of the implicit step is the one at its end, with the anchors of its start: those are put back to read.
+    gained = 0.0
+    for _ in range(40):
+        before, anchors, anchored = sim.v[0].copy(), sim.anchors.copy(), sim.anchored.copy()
+        sim.step(np.zeros(0))
+        sim.check()
+        after, set_after = sim.anchors.copy(), sim.anchored.copy()
+        sim.anchors[:], sim.anchored[:] = anchors, anchored
+        wrench = sim.wrenches()[0, 0]
+        sim.anchors[:], sim.anchored[:] = after, set_after
+        gain = (sim.v[0] - before) / sim.model.step
+        np.testing.assert_allclose(MASS * gain[:3], wrench[3:], atol=1e-9)
+        np.testing.assert_allclose(0.1 * gain[6:9], -wrench[3:], atol=1e-9)
+        for mass, joint, sign in ((MASS, 0, 1), (0.1, 1, -1)):
+            position, turn = sim.q[0, 7 * joint : 7 * joint + 3], matrix(sim.q[0, 7 * joint + 3 : 7 * joint + 7])
+            moment = wrench[:3] - np.cross(position, wrench[3:])  # about the body's centre
+            torque = mass * (2 * HALF) ** 2 / 6 * turn @ gain[6 * joint + 3 : 6 * joint + 6]
+            np.testing.assert_allclose(torque, sign * moment, atol=1e-10)
+        gained = max(gained, float(np.abs(wrench).max()))
+    assert gained > 0.1
+    momentum = MASS * sim.v[0, :3] + 0.1 * sim.v[0, 6:9]
+    np.testing.assert_allclose(momentum, MASS * np.array([0.3, 0.05, 0]) + 0.1 * np.array([-0.2, 0, 0.1]), atol=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_contact_takes_energy_and_never_gives_any(law: str) -> None:
+    sim = two_blocks(law)
+    masses = np.repeat([MASS, 0.1], 6) * np.tile([1, 1, 1, *[(2 * HALF) ** 2 / 6] * 3], 2)
+    start = 0.5 * float(masses @ sim.v[0] ** 2)
+    sim.step(np.zeros(0), 400)
+    sim.check()
+    assert 0.5 * float(masses @ sim.v[0] ** 2) < start
+    np.testing.assert_array_equal(sim.wrenches(), 0)  # they have come apart
+
+
+def ball_on_plane(step: float = 1e-3) -> Simulator:
+    spec = _core.ModelSpec()
+    spec.step, spec.tolerance = step, 1e-12
+    radius, mass = 0.03, 0.2
+    inertia = 0.4 * mass * radius**2
+    ball = spec.add_body("ball", -1, (0, 0, radius), UPRIGHT, mass, ORIGIN, (inertia, inertia, inertia, 0, 0, 0))
+    spec.add_joint("free", ball, "free", ORIGIN, (0, 0, 1))
+    plane = spec.add_shape("plane", -1, "plane", ORIGIN, UPRIGHT, (1, 1, 1))
+    points = spec.add_points("centre", ball, [ORIGIN], [1.0], radius=radius)
+    spec.add_contact("contact", points, plane, damping="plain", kn=5e4, kt=200.0, mu=0.3, kd=50.0)
+    return Simulator(_core.Model(spec))
+
+
+def test_a_sphere_on_a_plane_sinks_by_its_weight() -> None:
+    sim = ball_on_plane()
+    settle(sim, 1.0)
+    assert 0.03 - sim.q[0, 2] == pytest.approx(0.2 * G / 5e4, rel=1e-9)
+    np.testing.assert_allclose(sim.wrenches()[0, 0], [0, 0, 0, 0, 0, 0.2 * G], atol=1e-10)
+
+
+def test_a_sliding_ball_ends_rolling_at_five_sevenths() -> None:
+    """Whatever the friction: angular momentum about the ground is kept, so v = 5/7 v₀, and it rolls without slip."""
+    sim = ball_on_plane()
+    settle(sim, 0.5)
+    sim.v[0, 0] = 1.0
+    depth = 0.03 - sim.q[0, 2]
+    sliding = (2 / 7) * 1.0 / (0.3 * G)
+    sim.step(np.zeros(0), round(0.5 * sliding / sim.model.step))
+    assert 1.0 - sim.v[0, 0] == pytest.approx(0.3 * G * round(0.5 * sliding / 1e-3) * 1e-3, rel=1e-6)
+    settle(sim, sliding)
+    # The ground's reaction acts at the ground, `depth` above the sphere's lowest point.
+    assert sim.v[0, 0] == pytest.approx(5 / 7, rel=5 * depth / 0.03)
+    spin = matrix(sim.q[0, 3:]) @ sim.v[0, 3:]
+    assert spin[1] * 0.03 == pytest.approx(sim.v[0, 0], rel=1e-6)
+    before = sim.v[0, 0]
+    settle(sim, 0.5)
+    assert sim.v[0, 0] == pytest.approx(before, rel=1e-6)
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(ValueError, match="ks > 0"):
+        block_on_plane("elastic", ks=0.0)
+    with pytest.raises(ValueError, match="mu must be finite and not negative"):
+        block_on_plane("viscous", mu=-1.0)
+    with pytest.raises(ValueError, match="'sticky' is not one of viscous, elastic"):
+        block_on_plane("sticky")
+    with pytest.raises(UsageError, match=r"no parameter 'contact.kz'; there are contact\.kn"):
+        block_on_plane("viscous").param("contact.kz")

@@ -1,0 +1,145 @@
+"""Energy: BDF1 never adds any to free bodies on planes; of scenes it is told how much a step may gain.
+
+Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction, step and centre of mass. The
+tolerance is ten times Newton's, relative to the energy at work.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gelflow.sim import _core
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.energy import EnergyGauge, motor_forces
+from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.thrown_bodies import GRAVITY, KINDS, MASS, SIZE, Kind, Throw, fly
+
+TOLERANCE = 1e-8
+
+
+def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
+
+
+def throws(kind: Kind, law: str) -> st.SearchStrategy[Throw]:
+    """Every material, with and without damping, at steps of 0.1 to 20 ms, of bodies that turn and that do not."""
+    damped = st.one_of(st.just(0.0), logarithmic(0.03, 30))
+    numbers = st.fixed_dictionaries(
+        {
+            "kn": logarithmic(1e2, 1e5),
+            "kt": st.one_of(st.just(0.0), logarithmic(0.1, 50)),
+            "mu": st.sampled_from([0.0, 0.3, 0.8, 2.0]),
+            "ks": logarithmic(1e2, 1e4) if law == "elastic" else st.just(0.0),
+        }
+    )
+    centers = st.one_of(st.just((0.0, 0.0, 0.0)), st.tuples(*[st.floats(-0.5 * SIZE, 0.5 * SIZE)] * 3))
+
+    def build(
+        damping: str, kd: float, step: float, numbers: dict[str, float], turns: bool, center: tuple[float, float, float]
+    ) -> Throw:
+        scaled = kd * (1e3 if damping == "depth" else 1)
+        return Throw(kind, law, damping, step, {**numbers, "kd": scaled}, turns=turns, center=center)
+
+    turning = st.sampled_from([True, True, True, False])
+    return st.builds(
+        build, st.sampled_from(["depth", "plain"]), damped, logarithmic(1e-4, 2e-2), numbers, turning, centers
+    )
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "law"), [(kind, law) for kind in KINDS for law in LAWS if (kind, law) != ("sphere", "elastic")]
+)
+def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
+    """Not in one step, halved or not; a sphere's moving point keeps no anchor, so that its friction is viscous."""
+
+    @settings(max_examples=40)
+    @given(throw=throws(kind, law), seed=SEEDS)
+    def check(throw: Throw, seed: int) -> None:
+        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+        assert (growth.change <= TOLERANCE * growth.scale).all()
+
+    check()
+
+
+def test_what_spins_fast_over_long_steps_never_gains() -> None:
+    """Where a step's points take the longest arcs, and springs hold back nothing; the body's frame off its centre."""
+    numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
+    for kind in ("box", "cylinder"):
+        throw = Throw(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
+        growth = fly(throw, np.random.default_rng(1), bodies=24, steps=150)
+        assert (growth.change <= TOLERANCE * growth.scale).all()
+
+
+@pytest.mark.parametrize(("integrator", "step", "within"), [("bdf1", 1e-3, 1e-6), ("bdf2", 1e-5, 2e-3)])
+def test_what_the_elastic_law_stores_in_a_slip(integrator: str, step: float, within: float) -> None:
+    """A block that slides strains its springs by µ N / k_s and no more, however fast, and is braked by µ m g.
+
+    BDF2 knows the way of a step to first order."""
+    numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
+    throw = Throw("box", "elastic", "depth", step, numbers, integrator=integrator, turns=False)
+    sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
+    points = 9  # of the lower face
+    sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
+    sim.q[0, 0], sim.v[0, 0] = -10, 1.0  # far from the slope
+    sim.step(np.zeros(0), round(0.1 / step))
+    assert sim.v[0, 0] == pytest.approx(1 - 0.3 * GRAVITY * 0.1, rel=1e-6)
+    strain = 0.3 * MASS * GRAVITY / points / numbers["ks"]
+    assert gauge.read(sim).friction[0] == pytest.approx(points * 0.5 * numbers["ks"] * strain**2, rel=within)
+
+
+def test_the_parts_of_the_energy() -> None:
+    """A block that stands, and a scene's spring-like parts, against their formulas."""
+    numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
+    throw = Throw("box", "elastic", "depth", 1e-3, numbers)
+    sim, gauge = (
+        Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=2),
+        EnergyGauge(throw, num_envs=2),
+    )
+    sim.q[:, 0], sim.q[:, 2] = -10, 0.6 * SIZE - np.array([1e-4, -1.0])
+    sim.v[:, 0] = 1.0, 2.0
+    energy = gauge.read(sim)
+    np.testing.assert_allclose(energy.kinetic, 0.5 * MASS * sim.v[:, 0] ** 2)
+    np.testing.assert_allclose(energy.gravity, MASS * GRAVITY * sim.q[:, 2])
+    np.testing.assert_allclose(energy.contact, [9 * 0.5 * 2e3 * 1e-8, 0], atol=1e-15)
+    sim.v[:] = 0
+    sim.step(np.zeros(0))
+    sim.q[0, 0] += 2e-5  # a strain that all nine points share
+    np.testing.assert_allclose(gauge.read(sim).friction[0], 9 * 0.5 * 1e3 * 4e-10, rtol=1e-6)
+
+
+# What one step may gain at most beyond the motors' work, relative to all their work; BDF2 damps less than it errs.
+MOST = {
+    ("viscous", "bdf1"): TOLERANCE,
+    ("elastic", "bdf1"): TOLERANCE,
+    ("viscous", "bdf2"): 2e-3,
+    ("elastic", "bdf2"): 2e-2,
+}
+
+
+@pytest.mark.parametrize(("law", "integrator"), MOST)
+@pytest.mark.parametrize("name", scene_names())
+def test_what_scenes_gain_is_bounded(name: str, law: str, integrator: str) -> None:
+    grid = {"pads.pad.rows": 5, "pads.pad.cols": 5} if name == "rolling" else {}
+    for step in (5e-3, 2e-2):
+        scene = load_scene(name, friction=law, overrides={**grid, "step": step, "integrator": integrator})
+        sim, gauge, moves = Simulator(scene), EnergyGauge(scene), motion(scene)
+        sim.q[0] = moves.q0
+        driven = [sim.model.joint_q[a.joint] for a in scene.actuators]
+        before, gains, work = gauge.read(sim).total[0], [], 0.0
+        for u in moves.steps(step):
+            start, halved = sim.q[0, driven].copy(), sim.halved[0]
+            sim.step(u)
+            done = motor_forces(scene, sim, u)[0] @ (sim.q[0, driven] - start)
+            after = gauge.read(sim).total[0]
+            if sim.halved[0] == halved:  # else the motors' work is not told by the step's end
+                gains.append(after - before - done)
+            work += abs(done)
+            before = after
+        sim.check()
+        assert max(gains) <= MOST[law, integrator] * work

@@ -1,0 +1,121 @@
+"""Every part of the core, a few steps of each: what `make sanitize` runs, and a first look after a change of the core.
+
+Right or wrong is the other tests' business: here nothing may fail, and only finite numbers may come out.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gelflow.errors import UsageError
+from gelflow.sim import _core
+from gelflow.sim.scene.distance_grid import spline_grid
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation import gradient_check
+from gelflow.sim.validation.gradient_cases import SHAPES, pressed
+from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.stress import Draw, Extremes, Precision
+
+# Elastic friction and BDF2 are the longer ways; the others take part in single precision.
+WAYS: tuple[tuple[str, str, Precision], ...] = (("elastic", "bdf2", "double"), ("viscous", "bdf1", "single"))
+FEW: dict[str, dict[str, Any]] = {
+    "rolling": {"pads.pad.rows": 8, "pads.pad.cols": 8, "points.pad.resolution": [8, 8, 2], "pads.pad.pushes": True},
+    "pushing": {"pads.pad.rows": 8, "pads.pad.cols": 8},
+    "insertion": {"pads.*.rows": 6, "pads.*.cols": 5},
+}
+
+
+@pytest.mark.parametrize(("law", "integrator", "precision"), WAYS)
+@pytest.mark.parametrize("name", SCENES)
+def test_scene(name: str, law: str, integrator: str, precision: Precision) -> None:
+    overrides = {"integrator": integrator, **FEW.get(name, {})}
+    scene = load_scene(name, friction=law, overrides=overrides)
+    sim, run = Simulator(scene, num_envs=3, threads=2, precision=precision), motion(scene)
+    sim.q[:] = run.q0
+    controls = run.steps(scene.step)
+    for u in controls[:25]:
+        sim.step(np.tile(u, (3, 1)))
+    sim.check()
+    u = np.tile(controls[25], (3, 1))
+    for values in (
+        sim.tactile(),
+        sim.wrenches(),
+        sim.poses(),
+        sim.mass_matrix(),
+        sim.bias(),
+        sim.error_estimate(u),
+    ):
+        assert np.isfinite(values).all()
+    trajectory = sim.rollout(np.repeat(u[None], 3, axis=0), read_after=[0, 2])
+    assert sim.branches(trajectory).shape == (3, 3)
+    gradient = sim.rollout_gradient(trajectory, q=1.0, v=1.0, tactile=1.0, anchors_end=1.0, params=True)
+    for values in (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history, gradient.params):
+        assert np.isfinite(values).all()
+    sim.reset([True, False, True])
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("kind", SHAPES)
+def test_shape(kind: str, law: str) -> None:
+    rng = np.random.default_rng(1)
+    sim, u = pressed(kind, law, "bdf1" if law == "viscous" else "bdf2", rng)
+    case = gradient_check.Case.random(sim, u, "tactile", rng)
+    assert gradient_check.against_dual(case, rng, directions=1, groups=False).error < 1e-10
+
+
+def told(kind: str) -> dict[str, Any]:
+    """A rounded solid, or the grid of a sphere's distances, as the core takes it."""
+    if kind != "grid":
+        return {"kind": kind, "size": (0.02, 0.02, 0.02), "rounding": 0.004}
+    line = np.linspace(-0.04, 0.04, 17)
+    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    grid = spline_grid(np.sqrt(x**2 + y**2 + z**2) - 0.02, np.full(3, line[0]), line[1] - line[0])
+    numbers = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
+    return {"kind": kind, "size": (1, 0, 0), **numbers}
+
+
+@pytest.mark.parametrize("kind", ["grid", "box", "cylinder"])
+def test_grid_and_rounding(kind: str) -> None:
+    points = np.random.default_rng(2).uniform(-0.03, 0.03, (200, 3))
+    spec = _core.ModelSpec()
+    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
+    shape = spec.add_shape("shape", -1, pos=(0, 0, 0), quat=(1, 0, 0, 0), **told(kind))
+    axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+    spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.1, mu=0.5, kd=0.1)
+    model = _core.Model(spec)
+    for values in model.distance("shape", points):
+        assert np.isfinite(values).all()
+    sim = Simulator(model)
+    assert sim.tactile().any()
+    case = gradient_check.Case.random(sim, np.zeros((2, 0)), "tactile", np.random.default_rng(3))
+    assert gradient_check.against_dual(case, np.random.default_rng(4), directions=1, groups=False).error < 1e-10
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_extremes(precision: Precision) -> None:
+    """The ways by softer friction and through substeps, forwards and back."""
+    halved = 0
+    for name in ("rolling", "insertion"):
+        sim, u = Extremes(envs=16, steps=8, threads=2, seed=8).start(Draw(name, "elastic", "bdf2", "all", precision))
+        run = sim.rollout(u, read_after=[8])
+        assert np.isfinite(run.q).all()
+        assert np.isfinite(sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0).u).all()
+        halved += int((run.halvings > 0).sum())
+    assert halved
+
+
+def test_refusals() -> None:
+    scene = load_scene("rolling", overrides=FEW["rolling"])
+    sim = Simulator(scene)
+    with pytest.raises(UsageError, match="is not finite"):
+        sim.step([np.nan, 0, 0])
+    sim.q[0, 1] = np.inf
+    with pytest.raises(UsageError, match="is not finite"):
+        sim.step([0, 0, 0.2])
+    spec = _core.ModelSpec()
+    with pytest.raises(ValueError, match="no joint"):
+        _core.Model(spec)

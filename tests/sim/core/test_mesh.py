@@ -1,0 +1,307 @@
+"""Shapes that a distance grid describes, and rounded ones: consistent, smooth, and with exact gradients in contact."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.scene.distance_grid import DistanceGrid, spline_grid
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation import gradient_check
+from gelflow.sim.validation import reference_meshes as mesh_solids
+
+Array = NDArray[np.float64]
+
+OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
+RADIUS = 0.02
+BRACKET = (0.04, 0.012, 0.02)  # arm, thickness, depth
+ROUNDED: dict[str, tuple[float, float, float]] = {"box": (0.03, 0.02, 0.01), "cylinder": (0.02, 0.03, 0)}
+ROUNDING = 0.004
+KINDS = ("grid", "box", "cylinder")
+
+
+def sphere_grid(cells: int) -> DistanceGrid:
+    """Of the exact distances to a sphere, `cells` along its diameter."""
+    spacing = 2 * RADIUS / cells
+    line = spacing * np.arange(cells + 7) - RADIUS - 3 * spacing
+    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    return spline_grid(np.sqrt(x**2 + y**2 + z**2) - RADIUS, np.full(3, line[0]), spacing)
+
+
+def bracket_grid(cells: int) -> DistanceGrid:
+    spacing = BRACKET[0] / cells
+    low, high = np.array([0, 0, -BRACKET[2] / 2]), np.array([BRACKET[0], BRACKET[0], BRACKET[2] / 2])
+    lines = [np.arange(a - 3 * spacing, b + 3.5 * spacing, spacing) for a, b in zip(low, high, strict=True)]
+    nodes = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    distances = mesh_solids.bracket_distance(nodes.reshape(-1, 3), *BRACKET)
+    return spline_grid(distances.reshape(nodes.shape[:3]), low - 3 * spacing, spacing)
+
+
+def told(grid: DistanceGrid | None) -> dict[str, Any]:
+    """How a grid is told to the core; nothing where there is none."""
+    if grid is None:
+        return {}
+    return {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
+
+
+def model_of(kind: str, size: Any, points: Array | None = None, *, rounding: float = 0.0, **grid: Any) -> Any:
+    """A shape called "shape" that stands still, and markers of 1 N/m that don't move."""
+    spec = _core.ModelSpec()
+    spec.gravity = (0, 0, 0)
+    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
+    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), size, rounding=rounding, **grid)
+    if points is not None:
+        axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+        spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.0, mu=0.0, kd=0.0)
+    return _core.Model(spec)
+
+
+def shape_of(kind: str) -> Any:
+    """A model with one shape of the kind: a sphere's grid, or a rounded solid."""
+    if kind == "grid":
+        return model_of("grid", (1, 0, 0), **told(sphere_grid(16)))
+    return model_of(kind, ROUNDED[kind], rounding=ROUNDING)
+
+
+def inside_points(kind: str, count: int, seed: int = 0) -> Array:
+    reach = (RADIUS,) * 3 if kind == "grid" else (0.02, 0.02, 0.03) if kind == "cylinder" else ROUNDED[kind]
+    points = np.random.default_rng(seed).uniform(-1.05, 1.05, (count, 3)) * reach
+    kept: Array = points[np.linalg.norm(points, axis=1) > 2e-3]
+    return kept  # not near a sphere's centre, where all bends
+
+
+def differenced(model: Any, points: Array, step: float = 1e-7) -> tuple[Array, Array]:
+    """Gradient of d and derivative of n, by central differences."""
+    ends = [[model.distance("shape", points + s * step * axis) for s in (-1, 1)] for axis in np.eye(3)]
+    by = [[(high - low) / (2 * step) for low, high in zip(*pair, strict=True)] for pair in ends]
+    return np.stack([d for d, _, _ in by], axis=-1), np.stack([n for _, n, _ in by], axis=-1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_normal_and_curvature_are_the_derivatives(kind: str) -> None:
+    model, points = shape_of(kind), inside_points(kind, 3000)
+    _, normal, hessian = model.distance("shape", points)
+    by_d, by_n = differenced(model, points)
+    # Away from the seams of a rounded solid, where its curvature jumps, and its normal inside the smaller solid.
+    jumps = np.abs(by_n - hessian).max((1, 2)) > 1e-5 * np.abs(hessian).max()
+    assert jumps.mean() < (1e-9 if kind == "grid" else 2e-3)
+    np.testing.assert_allclose(by_d[~jumps], normal[~jumps], atol=1e-6)
+    np.testing.assert_array_equal(hessian, hessian.transpose(0, 2, 1))
+
+
+def test_second_derivatives_are_continuous_across_cells() -> None:
+    grid = sphere_grid(16)
+    model = model_of("grid", (1, 0, 0), **told(grid))
+    rng = np.random.default_rng(1)
+    border = grid.origin + grid.spacing * rng.integers(5, 18, (500, 3))  # corners of cells: all three indices change
+    way = 1e-10 * rng.normal(size=(500, 3))
+    for low, high in zip(model.distance("shape", border - way), model.distance("shape", border + way), strict=True):
+        assert np.abs(high - low).max() < 1e-6 * np.abs(high).max()
+
+
+def test_a_sphere_converges_with_the_fourth_power() -> None:
+    points = inside_points("grid", 4000)
+    length = np.linalg.norm(points, axis=1)
+    points = points[(length > RADIUS / 2) & (length < RADIUS)]
+    length = np.linalg.norm(points, axis=1)
+    errors = []
+    for cells in (8, 16, 32):
+        d, n, hessian = model_of("grid", (1, 0, 0), **told(sphere_grid(cells))).distance("shape", points)
+        outwards = points / length[:, None]
+        round_about = (np.eye(3) - outwards[:, :, None] * outwards[:, None]) / length[:, None, None]
+        errors.append(
+            [np.abs(d - length + RADIUS).max(), np.abs(n - outwards).max(), np.abs(hessian - round_about).max()]
+        )
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert (orders > [3, 2.3, 1.3]).all(), orders  # of distance, normal, curvature: 4, 3, 2 in the limit
+    assert errors[-1][0] < 1e-7
+    lengths = np.linalg.norm(n, axis=1)
+    assert np.abs(lengths - 1).max() < 1e-4
+
+
+def test_a_bracket_is_right_in_sign_everywhere() -> None:
+    grid = bracket_grid(32)
+    points = np.random.default_rng(2).uniform(-0.03, 0.07, (20_000, 3))  # far out of the grid too
+    d, _, _ = model_of("grid", (1, 0, 0), **told(grid)).distance("shape", points)
+    exact = mesh_solids.bracket_distance(points, *BRACKET)
+    clear = np.abs(exact) > 0.3 * grid.spacing  # sharp edges are rounded by a fraction of a cell
+    assert ((d < 0) == (exact < 0))[clear].all()
+    assert (exact < 0).sum() > 100
+
+
+def test_no_touching_point_is_passed_over() -> None:
+    """Markers are looked up in blocks; what the blocks rule out must not touch."""
+    points = np.random.default_rng(3).uniform(-0.03, 0.07, (30_000, 3))
+    for scale in (1.0, 0.7, 1.6):
+        model = model_of("grid", (scale, 0, 0), points, **told(bracket_grid(20)))
+        d, n, _ = model.distance("shape", points)
+        force = Simulator(model).tactile()[0] * [1, 1, -1]
+        np.testing.assert_allclose(force, np.where(d < 0, -d, 0)[:, None] * n, atol=1e-15)
+        assert (d < 0).sum() > 100
+
+
+@pytest.mark.parametrize("kind", ROUNDED)
+def test_no_point_in_a_rounded_solid_is_passed_over(kind: str) -> None:
+    points = inside_points(kind, 5000)
+    model = model_of(kind, ROUNDED[kind], points, rounding=ROUNDING)
+    d, n, _ = model.distance("shape", points)
+    force = Simulator(model).tactile()[0] * [1, 1, -1]
+    np.testing.assert_allclose(force, np.where(d < 0, -d, 0)[:, None] * n, atol=1e-15)
+
+
+def rounded_distance(kind: str, points: Array) -> Array:
+    """Exact, from the distance to the smaller solid."""
+    a, b, c = ROUNDED[kind]
+    if kind == "box":
+        beyond = np.abs(points) - (np.array([a, b, c]) - ROUNDING)
+    else:
+        across = np.column_stack([np.hypot(points[:, 0], points[:, 1]), np.abs(points[:, 2])])
+        beyond = across - (np.array([a, b]) - ROUNDING)
+    outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+    result: Array = outside + np.minimum(beyond.max(1), 0) - ROUNDING
+    return result
+
+
+@pytest.mark.parametrize("kind", ROUNDED)
+def test_a_rounded_solid_is_exact_and_smooth_at_its_seams(kind: str) -> None:
+    model, points = shape_of(kind), inside_points(kind, 5000)
+    d, n, _ = model.distance("shape", points)
+    np.testing.assert_allclose(d, rounded_distance(kind, points), atol=1e-16)
+    np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-14)
+    # Seams between face and edge, edge and corner: where one coordinate is that of the smaller solid's face.
+    seam = points[:500].copy()
+    radius, half = ROUNDED["cylinder"][0] - ROUNDING, ROUNDED["cylinder"][1] - ROUNDING
+    if kind == "box":
+        seam[:, :2] = np.sign(seam[:, :2]) * (np.array(ROUNDED["box"][:2]) - ROUNDING * np.array([0.4, 1]))
+        across = np.tile([0, 1e-9, 0], (len(seam), 1))
+    else:
+        outwards = seam[:, :2] / np.linalg.norm(seam[:, :2], axis=1)[:, None]
+        seam[:, :2] = outwards * radius
+        seam[:, 2] = np.sign(seam[:, 2]) * (half + 0.6 * ROUNDING)
+        across = np.column_stack([1e-9 * outwards, np.zeros(len(seam))])
+    low, high = (model.distance("shape", seam + s * across) for s in (-1, 1))
+    assert (low[0] < 0).sum() > 100
+    np.testing.assert_allclose(high[0], low[0], atol=3e-9)
+    np.testing.assert_allclose(high[1], low[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ROUNDED)
+def test_without_rounding_edges_are_sharp(kind: str) -> None:
+    points = inside_points(kind, 2000)
+    sharp = model_of(kind, ROUNDED[kind]).distance("shape", points)
+    none = model_of(kind, ROUNDED[kind], rounding=0.0).distance("shape", points)
+    little = model_of(kind, ROUNDED[kind], rounding=1e-9).distance("shape", points)
+    for a, b in zip(sharp, none, strict=True):
+        np.testing.assert_array_equal(a, b)
+    inside = sharp[0] < -1e-8
+    np.testing.assert_allclose(little[0][inside], sharp[0][inside], atol=1e-15)
+    np.testing.assert_array_equal(little[1][inside], sharp[1][inside])
+
+
+def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "double") -> tuple[Simulator, Array]:
+    """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge on a grid."""
+    spec = _core.ModelSpec()
+    spec.tolerance = 1e-13
+    turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
+    spec.add_joint("turn", turret, "hinge", (0, 0, 0), (0.3, 0.2, 1), damping=1e-3)
+    hand = spec.add_body("hand", -1, (0, 0, 0), (1, 0, 0, 0), 0.02, (0, 0, 1e-3), (1e-5, 2e-5, 1e-5, 0, 0, 0))
+    slides = [
+        spec.add_joint(name, hand, "slide", (0, 0, 0), axis, damping=0.5)
+        for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
+    ]
+    spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
+    if kind in ROUNDED:
+        shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=ROUNDING)
+    elif kind == "grid":
+        shape = spec.add_shape(
+            "shape", turret, "grid", (1e-3, 0, 0), (1, 0, 0, 0), (1.2, 0, 0), **told(sphere_grid(10))
+        )
+    else:
+        shape = spec.add_shape(
+            "shape", turret, "grid", (-0.01, -0.006, -0.01), (1, 0, 0, 0), (1, 0, 0), **told(bracket_grid(16))
+        )
+    cloud = rng.normal(size=(60, 3))
+    cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
+    numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.3, "kd": 20.0}
+    numbers["ks"] = 100.0 if law == "elastic" else 0.0
+    spec.add_contact("press", spec.add_points("cloud", hand, cloud, np.ones(60)), shape, **numbers)
+    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
+    spec.add_pad("skin", hand, cloud * 1.01, *axes, shapes=[shape], **{**numbers, "kn": 50.0})
+    spec.add_actuator("x", slides[0], "position", kp=100.0, kd=1.0)
+    spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0)
+    sim = Simulator(_core.Model(spec), precision=precision)
+    top = {"grid": 1.2 * RADIUS, "box": 0.01, "cylinder": 0.03, "edge": -1e-3}[kind]
+    # On a rounded solid, near the edge: over face and round at once.
+    aside = {"grid": 0.0, "box": 0.024, "cylinder": 0.015, "edge": -0.012}[kind]
+    height = top + 0.012
+    sim.q[0, sim.model.joint_q[1]], sim.q[0, sim.model.joint_q[2]] = aside, height
+    hold = np.array([aside, height - 2e-3])
+    sim.step(hold + rng.normal(size=2) * [3e-3, 2e-4], 12)
+    sim.check()
+    return sim, hold + rng.normal(size=(3, 2)) * [5e-3, 2e-4]
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("kind", [*KINDS, "edge"])
+def test_gradients_pressed_on_a_shape(kind: str, law: str) -> None:
+    """By controls, state and parameters: a grid's scale and a solid's rounding are among these."""
+    left_out = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        sim, u = pressed(kind, law, rng)
+        assert (sim.tactile() != 0).any()
+        for output in OUTPUTS:
+            case = gradient_check.Case.random(sim, u, output, rng)
+            assert gradient_check.against_dual(case, rng, directions=1).error < 1e-10
+        if kind == "edge":
+            # Where the normal is short, an elastic marker that has just slipped may be read as sticking or slipping:
+            # a kink that no signature tells. Positions and velocities have none.
+            case = gradient_check.Case.random(sim, u, OUTPUTS[seed % 2], rng)
+        agreement = gradient_check.against_differences(case)
+        left_out.append(agreement.left_out)
+        assert agreement.error < 1e-6
+    assert np.mean(left_out) <= 0.1
+
+
+@pytest.mark.parametrize("kind", ["grid", "box"])
+def test_single_precision(kind: str) -> None:
+    runs = [pressed(kind, "elastic", np.random.default_rng(0), precision)[0] for precision in ("double", "single")]
+    double, single = (sim.tactile()[0] for sim in runs)
+    assert np.abs(double).max() > 1e-3
+    np.testing.assert_allclose(single, double, atol=3e-3 * float(np.abs(double).max()))
+
+
+def test_a_grid_of_other_scale_is_a_larger_shape() -> None:
+    points = inside_points("grid", 1000)
+    grid = told(sphere_grid(12))
+    d, n, hessian = model_of("grid", (1, 0, 0), **grid).distance("shape", points)
+    larger = model_of("grid", (2, 0, 0), **grid).distance("shape", 2 * points)
+    for ours, expected in zip(larger, (2 * d, n, hessian / 2), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-13, atol=1e-15)
+
+
+GRID_FAULTS: list[tuple[dict[str, Any], str]] = [
+    ({"coefficients": np.ones((6, 6), np.float32)}, "coefficients must have shape"),
+    ({"coefficients": np.ones((6, 6, 5), np.float32)}, "at least 3 cells"),
+    ({"coefficients": -np.ones((8, 8, 8), np.float32)}, "border of cells outside"),
+    ({"coefficients": np.full((8, 8, 8), np.nan, np.float32)}, "not finite"),
+    ({"coefficients": np.ones((8, 8, 8), np.float32), "spacing": 0.0}, "positive spacing"),
+    ({}, "a grid goes with the kind grid"),
+    ({"coefficients": np.ones((8, 8, 8), np.float32), "rounding": 0.1}, "only a box or a cylinder"),
+]
+
+
+@pytest.mark.parametrize(("numbers", "says"), GRID_FAULTS, ids=[says for _, says in GRID_FAULTS])
+def test_a_wrong_grid_is_refused(numbers: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        _core.ModelSpec().add_shape("s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers})
+
+
+@pytest.mark.parametrize(("kind", "rounding"), list(itertools.product(ROUNDED, (-1e-3, 0.05, float("nan")))))
+def test_a_wrong_rounding_is_refused(kind: str, rounding: float) -> None:
+    with pytest.raises(ValueError, match="rounding must"):
+        _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=rounding)

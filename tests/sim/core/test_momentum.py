@@ -1,0 +1,189 @@
+"""Newton's third law: what two touching bodies do to each other cancels, in every scene where two moving bodies touch.
+
+The scene's bodies are cut loose: each floats where the scene's motion had carried it, without gravity, motors and
+joints, and what touched still touches, with the scene's points, shapes and numbers.
+"""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.sim import _core
+from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import motion
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 1e-11  # of Newton's method
+IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # [s] into the motion
+
+
+class Loose:
+    """A model builder that makes every body float and leaves out what is not between two of them.
+
+    `centred`: each body's frame is moved to its centre of mass.
+    """
+
+    def __init__(self, poses: Array, step: float, centred: bool) -> None:
+        self.spec = _core.ModelSpec()
+        self.spec.gravity, self.spec.step, self.spec.tolerance = (0.0, 0.0, 0.0), step, TOLERANCE
+        self.poses = poses.copy()
+        self._centred = centred
+        self._shift: list[Array] = []  # of each body's frame, in that frame
+        self._on: list[int] = []  # the body of each shape
+        self._of: list[int] = []  # the body of each point set
+
+    def add_body(self, name: str, parent: int, pos: Any, quat: Any, mass: float, com: Any, inertia: Any) -> int:
+        pose, shift = self.poses[len(self._shift)], np.asarray(com, float) * self._centred
+        pose[:3] += rotations(pose[None])[0] @ shift
+        self._shift.append(shift)
+        body = int(self.spec.add_body(name, -1, pose[:3], pose[3:], mass, np.asarray(com) - shift, inertia))
+        self.spec.add_joint(f"{name} floats", body, "free", (0, 0, 0), (0, 0, 1))
+        return body
+
+    def add_shape(self, name: str, body: int, kind: str, pos: Any, *args: Any, **more: Any) -> int:
+        self._on.append(body)
+        shift = self._shift[body] if body >= 0 else 0.0
+        return int(self.spec.add_shape(name, body, kind, np.asarray(pos) - shift, *args, **more))
+
+    def add_points(self, name: str, body: int, points: Array, *args: Any, **more: Any) -> int:
+        self._of.append(body)
+        return int(self.spec.add_points(name, body, points - self._shift[body], *args, **more))
+
+    def add_contact(self, name: str, points: int, shape: int, **numbers: Any) -> None:
+        if self._on[shape] >= 0 and self._of[points] >= 0:
+            self.spec.add_contact(name, points, shape, **numbers)
+
+    def add_joint(self, *args: Any, **more: Any) -> None:
+        pass
+
+    add_actuator = add_pad = add_joint
+
+
+def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True) -> Simulator:
+    """The scene's bodies afloat in the middle of its motion, moving as they did there."""
+    scene = load_scene(name, friction=law)
+    sim, moves = Simulator(scene), motion(scene)
+    sim.q[0] = moves.q0
+    for u in moves.steps(scene.step)[: round(IN_TOUCH[name] / scene.step)]:
+        sim.step(u)
+    sim.check()
+    loose = Loose(sim.poses()[0], step, centred)
+    scene.describe_to(loose)
+    loose.spec.integrator, loose.spec.step = integrator, step
+    loose.spec.gravity, loose.spec.tolerance = (0.0, 0.0, 0.0), TOLERANCE
+    floating = Simulator(_core.Model(loose.spec))
+    assert len(floating.model.contact_names) > 0
+    floating.q[0] = loose.poses.ravel()
+    floating.v[0] = 1e-2 * np.random.default_rng(0).normal(size=floating.model.nv)
+    return floating
+
+
+def rotations(poses: Array) -> Array:
+    w, x, y, z = poses[:, 3:].T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def in_world(sim: Simulator, of_joints: Array) -> Array:
+    """What acts on (or moves with) each floating body, as (moment about the world's origin, force), (bodies, 6)."""
+    poses, parts = sim.poses()[0], of_joints.reshape(-1, 6)
+    moment = np.einsum("bij,bj->bi", rotations(poses), parts[:, 3:]) + np.cross(poses[:, :3], parts[:, :3])
+    return np.hstack([moment, parts[:, :3]])
+
+
+def momentum(sim: Simulator) -> Array:
+    """Of each body: (angular about the world's origin, linear)."""
+    return in_world(sim, sim.mass_matrix()[0] @ sim.v[0])
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("name", scene_names())
+def test_forces_and_torques_of_touching_bodies_cancel(name: str, law: str) -> None:
+    """What each body feels, from its own equation of motion: their sum about one point is nothing, relative to them,
+    and on the first body of each contact it is the wrench that the simulator tells."""
+    sim = cut_loose(name, law, 1e-5)  # fingers weigh 0.2 g and press with 5 N: soon they are off
+    touched = 0.0
+    for _ in range(10):
+        before, anchors, anchored = sim.v[0].copy(), sim.anchors.copy(), sim.anchored.copy()
+        sim.step(np.zeros(0))
+        sim.check()
+        felt = sim.mass_matrix()[0] @ (sim.v[0] - before) / sim.model.step + sim.bias()[0]
+        on_bodies = in_world(sim, felt)
+        after, set_after = sim.anchors.copy(), sim.anchored.copy()
+        sim.anchors[:], sim.anchored[:] = anchors, anchored  # those of the step
+        told = sim.wrenches()[0].copy()
+        sim.anchors[:], sim.anchored[:] = after, set_after
+        size = np.abs(told).max(0, initial=0.0)
+        size = np.repeat([size[:3].max(), size[3:].max()], 3)
+        if size[3] < 1e-6:
+            continue
+        touched = max(touched, float(size[3]))
+        assert (np.abs(on_bodies.sum(0)) <= 1e-9 * size).all()
+        assert np.abs(on_bodies).sum(0).max() > 0
+    assert touched > 1e-3
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+@pytest.mark.parametrize("name", scene_names())
+def test_what_contacts_apply_to_the_joints_cancels_to_round_off(name: str, law: str) -> None:
+    """The generalized forces of a step's equation, as forces and moments on the floating bodies."""
+    sim = cut_loose(name, law, 1e-5)
+    touched, worst = 0.0, 0.0
+    for _ in range(10):
+        sim.step(np.zeros(0))
+        on_bodies = in_world(sim, sim.contact_forces()[0])
+        told = sim.wrenches()[0]
+        size = np.repeat(np.abs(told).reshape(-1, 2, 3).max((0, 2)), 3)
+        if size[3] < 1e-6:
+            continue
+        touched = max(touched, float(size[3]))
+        worst = max(worst, float(np.abs(on_bodies.sum(0) / size).max()))
+        if len(told) == 1:
+            np.testing.assert_allclose(np.abs(on_bodies), np.abs(told).repeat(2, 0), atol=1e-13 * size.max())
+    sim.check()
+    print(f"{name}, {law}: pairs cancel to {worst:.0e}")
+    assert touched > 1e-3
+    assert worst < 1e-13
+
+
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+@pytest.mark.parametrize("name", scene_names())
+def test_linear_momentum_is_kept_to_newton_s_tolerance(name: str, integrator: str, centred: bool) -> None:
+    """Wherever in the body its frame is."""
+    sim = cut_loose(name, "elastic", integrator=integrator, centred=centred)
+    start, mass = momentum(sim)[:, 3:].sum(0), sum(sim.param(f"{b}.mass")[0] for b in sim.model.body_names)
+    largest, steps = 0.0, 200
+    for _ in range(steps):
+        sim.step(np.zeros(0))
+        largest = max(largest, float(np.abs(sim.wrenches()).max()))
+    sim.check()
+    assert largest > 1e-3
+    drift = np.abs(momentum(sim)[:, 3:].sum(0) - start).max()
+    assert drift <= 10 * steps * TOLERANCE * sim.model.step * (9.81 * mass + largest)
+
+
+def drift_of(law: str, step: float) -> float:
+    """How far the angular momentum of the pushing scene's bodies moves in 20 ms."""
+    sim = cut_loose("pushing", law, step)
+    start = momentum(sim).sum(0)
+    sim.step(np.zeros(0), round(0.02 / step))
+    sim.check()
+    return float(np.linalg.norm((momentum(sim).sum(0) - start)[:3]))
+
+
+@pytest.mark.parametrize("law", ["viscous", "elastic"])
+def test_the_error_of_angular_momentum_falls_with_the_step(law: str) -> None:
+    """BDF1 keeps it to first order: torques are those at a step's end, the lever arms move during the step."""
+    drifts = [drift_of(law, step) for step in (2e-4, 1e-4, 5e-5, 2.5e-5)]
+    slopes = -np.diff(np.log2(drifts))
+    print(f"{law}: drifts {[f'{d:.1e}' for d in drifts]} N m s, slopes {slopes.round(2)}")
+    np.testing.assert_allclose(slopes, 1, atol=0.3)

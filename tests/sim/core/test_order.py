@@ -1,0 +1,130 @@
+"""Order of the integrators: halving the step halves BDF1's error and quarters BDF2's, where nothing switches."""
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.sim import _core
+from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+TIME = 0.08  # [s]
+
+
+def rolling(step: float, integrator: str) -> Simulator:
+    scene = load_scene("rolling", friction="viscous", overrides={"step": step, "integrator": integrator})
+    spec = scene.describe_to(_core.ModelSpec())
+    spec.tolerance = 1e-13
+    return Simulator(_core.Model(spec))
+
+
+@pytest.fixture(scope="module")
+def at_rest() -> Array:
+    sim = rolling(5e-3, "bdf1")
+    sim.step([0, 0, 0.2], 4_000)
+    assert np.abs(sim.v).max() < 1e-14
+    return sim.q.copy()
+
+
+def end(start: Array, steps: int, integrator: str) -> Array:
+    """State after a smooth push on the pad that rests on the ball."""
+    sim = rolling(TIME / steps, integrator)
+    sim.q[:] = start
+    for k in range(1, steps + 1):
+        push = (1 - np.cos(2 * np.pi * k / steps)) / 2
+        sim.step([2e-3 * push, 1e-3 * push, 0.2 + 2e-3 * push])
+    sim.check()
+    return np.concatenate([sim.q[0], sim.v[0]])
+
+
+@pytest.mark.parametrize(("integrator", "order", "within"), [("bdf1", 1, 0.2), ("bdf2", 2, 0.3)])
+def test_the_error_falls_with_the_step(at_rest: Array, integrator: str, order: int, within: float) -> None:
+    exact = end(at_rest, 2048, "bdf2")
+    errors = [np.abs(end(at_rest, steps, integrator) - exact).max() for steps in (16, 32, 64, 128, 256)]
+    slopes = -np.diff(np.log2(errors))
+    print(f"{integrator}: errors {[f'{e:.1e}' for e in errors]}, slopes {slopes.round(2)}")
+    np.testing.assert_allclose(slopes, order, atol=within)
+
+
+def test_a_free_flight_is_as_exact_as_the_integrator() -> None:
+    """Thrown, without contact: BDF1 is off by g h t / 2; BDF2, whose first step is BDF1's, by that of one step."""
+    heights = {}
+    for integrator in ("bdf1", "bdf2"):
+        sim = rolling(1e-3, integrator)
+        ball = sim.joint_q("ball")
+        sim.q[0, ball + 2] += 1.0
+        sim.v[0, sim.joint_v("ball") + 2] = 0.5
+        start = sim.q[0, ball + 2]
+        sim.step([0, 0, -9.0], 100)
+        heights[integrator] = sim.q[0, ball + 2] - (start + 0.5 * 0.1 - 9.8 * 0.1**2 / 2)
+    assert abs(heights["bdf1"]) == pytest.approx(9.8 * 1e-3 * 0.1 / 2, rel=1e-3)
+    assert abs(heights["bdf2"]) < 0.02 * abs(heights["bdf1"])
+
+
+def test_what_bdf2_remembers_belongs_to_the_state(at_rest: Array) -> None:
+    sim = rolling(5e-3, "bdf2")
+    sim.q[:] = at_rest
+    u = np.tile([1e-3, 0, 0.2], (6, 1, 1))
+    whole = sim.rollout(u)
+    again = sim.rollout(
+        u[3:],
+        q=whole.q[3],
+        v=whole.v[3],
+        anchors=whole.anchors[3],
+        anchored=whole.anchored[3],
+        history=whole.history[3],
+    )
+    np.testing.assert_array_equal(again.q[-1], whole.q[-1])
+    assert whole.history[0, 0, -1] == 0 and whole.history[1, 0, -1] == 1
+    sim.step(u[0, 0])
+    sim.forget()
+    assert not sim.history.any()
+    assert rolling(5e-3, "bdf1").history.shape == (1, 0)
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+def test_a_step_tells_its_error(at_rest: Array, integrator: str) -> None:
+    """The estimate falls with the square of the step, as BDF1's local error does; BDF2's is no smaller."""
+    estimates = []
+    for step in (4e-3, 2e-3, 1e-3):
+        sim = rolling(step, integrator)
+        sim.q[:] = at_rest
+        sim.step([0, 0, 0.2], 2)
+        before = sim.q.copy()
+        estimate = sim.error_estimate([2e-3, 1e-3, 0.202])
+        np.testing.assert_array_equal(sim.q, before)
+        assert estimate.shape == (1, sim.model.nv)
+        estimates.append(np.abs(estimate).max())
+    assert all(1.5 < np.log2(big / small) < 3 for big, small in itertools.pairwise(estimates))
+    with pytest.raises(UsageError, match="not finite"):
+        sim.error_estimate([np.nan, 0, 0])
+
+
+def test_the_elastic_law_knows_the_time_of_touch_to_a_step() -> None:
+    """An anchor is where the point is at the end of the step in which it touched: the shear lacks what was covered
+    between the touch and there. That is of first order under BDF2 too; and since the rest of a step can stay the same
+    while steps are halved, so can the error."""
+    speed, fall, height = 0.2, 0.1, 1.039e-3
+    touched, time = height / fall, 0.0256
+    lacks = {}
+    for step in (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4):
+        spec = _core.ModelSpec()
+        spec.gravity, spec.step, spec.integrator = (0.0, 0.0, 0.0), step, "bdf2"
+        body = spec.add_body("block", -1, (0, 0, height), (1, 0, 0, 0), 1e6, (0, 0, 0), (1, 1, 1, 0, 0, 0))
+        for name, axis in zip("xz", ((1, 0, 0), (0, 0, 1)), strict=True):  # so heavy that nothing stops it
+            spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+        plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (1, 1, 1))
+        axes = [[axis] for axis in np.eye(3)]
+        spec.add_pad("pad", body, [(0, 0, 0)], *axes, shapes=[plane], law="elastic", kn=1e3, kt=0, mu=1e6, kd=0, ks=1.0)
+        sim = Simulator(_core.Model(spec))
+        sim.v[0] = speed, -fall
+        sim.step([], round(time / step))
+        shear = -sim.tactile()[0, 0, 0]  # of a spring of 1 N/m: a length
+        lacks[step] = speed * (time - touched) - shear
+        assert lacks[step] == pytest.approx(speed * (np.ceil(touched / step) * step - touched), abs=1e-9)
+    assert lacks[4e-4] == pytest.approx(lacks[1e-4], abs=1e-9)  # 10.4 ms each time, after 10.39

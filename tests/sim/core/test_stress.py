@@ -1,0 +1,151 @@
+"""At the extremes nothing but numbers comes out, failures are rare, and what is at rest stays. What is drawn stands in
+gelflow.sim.validation.stress; benchmarks/extremes.py draws two million steps."""
+
+import numpy as np
+import pytest
+
+from gelflow.sim import _core
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import INTEGRATORS, load_scene
+from gelflow.sim.simulator import STATUS, Simulator
+from gelflow.sim.validation.reference_motions import SCENES
+from gelflow.sim.validation.stress import Draw, Extremes, Precision, Tally, draws
+
+BOTH: tuple[Precision, ...] = ("double", "single")
+
+
+@pytest.mark.parametrize("precision", BOTH)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision: Precision) -> None:
+    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw(scene, law, integrator, "all", precision))
+    run = sim.rollout(u, read_after=[10, 20])
+    for values in (run.q, run.v, run.anchors, run.tactile, run.history):
+        assert np.isfinite(values).all()
+    assert set(run.status.tolist()) <= set(STATUS)
+    assert (run.status == 0).any()
+    gradient = sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0)
+    for values in (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history):
+        assert np.isfinite(values).all()
+    assert not gradient.v[run.status != 0].any()
+
+
+@pytest.mark.parametrize("precision", BOTH)
+@pytest.mark.parametrize("scene", SCENES)
+def test_nothing_fails_in_the_normal_range(scene: str, precision: Precision) -> None:
+    extremes = Extremes(envs=24, steps=20, threads=1, seed=4)
+    for law in LAWS:
+        for integrator in INTEGRATORS:
+            tally = extremes.run(Draw(scene, law, integrator, "normal", precision))
+            assert tally.failed == 0 and tally.steps == 24 * 20
+
+
+def test_failures_are_rare_and_iterations_capped() -> None:
+    extremes, total = Extremes(envs=24, steps=20, threads=1, seed=5), Tally()
+    for draw in draws(3):
+        total.add(extremes.run(draw))
+    assert total.steps > 28_000 and total.failed <= 0.01 * total.steps
+    assert total.most_iterations <= _core.ModelSpec().max_step_iterations
+
+
+def test_a_step_that_must_be_halved_tells_its_error() -> None:
+    """Its parts are compared with shorter ones, which are halved in turn where they must be."""
+    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw("insertion", "elastic", "bdf1", "all"))
+    halved = 0
+    for control in u:
+        before = sim.halved.copy()
+        estimate = sim.error_estimate(control)
+        sim.step(control)
+        sim.check()
+        assert np.isfinite(estimate).all()
+        assert estimate[sim.halved > before].any(axis=1).all()
+        halved += int((sim.halved > before).sum())
+    assert halved > 5
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_what_lies_stays(law: str) -> None:
+    """A box at rest on the ground for a million steps, 83 minutes: as it lay, so it lies."""
+    sim = Simulator(load_scene("pushing", friction=law), threads=1)
+    sim.q[0] = sim.scene.q0
+    u = np.zeros(sim.model.nu)
+    sim.step(u, 2_000)
+    before = sim.q[0].copy()
+    sim.step(u, 1_000_000)
+    sim.check()
+    np.testing.assert_allclose(sim.q[0], before, atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [1e-6, 5e-2])
+def test_short_and_long_steps(step: float) -> None:
+    sim = Simulator(load_scene("insertion", friction="elastic", overrides={"step": step}))
+    sim.q[0] = sim.scene.q0
+    u = np.zeros(sim.model.nu)
+    u[[sim.scene.u("finger_left"), sim.scene.u("finger_right")]] = 5.0
+    u[[sim.scene.u("hold_left"), sim.scene.u("hold_right")]] = -0.0175
+    u[sim.scene.u("arm_z")] = 0.0585
+    sim.step(u, 50)
+    sim.check()
+    assert np.isfinite(sim.q).all()
+    part = sim.scene.q("part").start
+    np.testing.assert_allclose(sim.q[0, part : part + 2], 0, atol=1e-6)
+
+
+def free_body(spec: _core.ModelSpec, name: str, mass: float, height: float, half: float = 0.01) -> int:
+    body: int = spec.add_body(name, -1, [0, 0, height], [1, 0, 0, 0], mass, [0, 0, 0], [mass * half**2] * 3 + [0] * 3)
+    spec.add_joint(name, body, "free", [0, 0, 0], [0, 0, 1])
+    return body
+
+
+def test_a_heavy_block_on_a_light_one() -> None:
+    """100 kg on 1 mg, a ratio of 1e8, on springs that sag by 0.1 mm under it."""
+    spec, half = _core.ModelSpec(), 0.01
+    bodies = [free_body(spec, "light", 1e-6, half), free_body(spec, "heavy", 100.0, 3 * half)]
+    ground = spec.add_shape("ground", -1, "plane", [0, 0, 0], [1, 0, 0, 0], [0, 0, 0])
+    top = spec.add_shape("top", bodies[0], "plane", [0, 0, half], [1, 0, 0, 0], [0, 0, 0])
+    corners = np.array([[x, y, -half] for x in (-half, half) for y in (-half, half)])
+    for name, body, below in (("light", 0, ground), ("heavy", 1, top)):
+        points = spec.add_points(f"{name} corners", bodies[body], corners, np.ones(4))
+        spec.add_contact(f"{name} contact", points, below, law="elastic", kn=2.5e6, kt=1e3, mu=0.5, kd=1e5, ks=1e6)
+    sim = Simulator(_core.Model(spec))
+    sim.step(np.zeros(0), 2_000)
+    sim.check()
+    sag = 100.000001 * 9.8 / 1e7
+    np.testing.assert_allclose(sim.q[0, [2, 9]], [half - sag, 3 * half - 2 * sag], atol=1e-6)
+
+
+@pytest.mark.parametrize("precision", BOTH)
+def test_a_spin_through_many_turns(precision: Precision) -> None:
+    """1000 rad/s about the axis of symmetry, 8 rad in every step, for 80 000 rad."""
+    spec = _core.ModelSpec()
+    spec.gravity = (0.0, 0.0, 0.0)
+    free_body(spec, "top", 0.1, 0.0)
+    sim = Simulator(_core.Model(spec), precision=precision)
+    sim.v[0, 5] = 1000.0
+    sim.step(np.zeros(0), 16_000)
+    sim.check()
+    assert np.linalg.norm(sim.q[0, 3:]) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(sim.v[0], [0, 0, 0, 0, 0, 1000], rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("precision", BOTH)
+@pytest.mark.parametrize("size", [1e-310, 1e-40, 1e12, 1e30, 1e150, 1e300])
+def test_denormal_and_enormous_numbers(size: float, precision: Precision) -> None:
+    """As velocity, as control, as stiffness and as place: moved on, or failed with a reason; never passed on as NaN."""
+    if precision == "single" and size > 1e38:
+        pytest.skip("no number of single precision")
+    scene = load_scene("pushing", friction="elastic")
+    sim = Simulator(scene, num_envs=4, precision=precision)
+    sim.q[:] = scene.q0
+    sim.v[0, 3:] = size
+    sim.param("box_ground.kn")[1] = size
+    sim.q[2, scene.q("box_x")] = size
+    u = np.zeros((4, scene.nu))
+    u[3] = size
+    run = sim.rollout(np.repeat(u[None], 20, axis=0), read_after=[20])
+    for values in (run.q, run.v, run.anchors, run.tactile):
+        assert np.isfinite(values).all()
+    gradient = sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0)
+    for values in (gradient.u, gradient.q, gradient.v):
+        assert np.isfinite(values).all()

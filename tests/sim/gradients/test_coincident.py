@@ -1,0 +1,216 @@
+"""Where geometry coincides to the last bit: a marker on an edge, faces in one plane, a pad that hangs over its body.
+
+Lengths are powers of two, so that what coincides does so in single precision too.
+"""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.geometry import rotate
+from gelflow.sim import _core
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.gradient_check import Case, against_dual
+
+Array = NDArray[np.float64]
+
+UNIT = 2.0**-10  # [m]
+PRECISIONS = ("double", "single")
+ROUNDING = {"double": 1e-12, "single": 1e-5}
+NUMBERS: dict[str, Any] = {"kn": 1024.0, "kt": 16.0, "mu": 0.5, "kd": 1024.0}  # UNIT deep: 1 N
+SIZES = {"box": (16, 8, 8), "cylinder": (8, 16, 0)}  # [UNIT]
+ON_EDGES = {"box": [(16, 0, 8), (16, 8, 4), (16, 8, 8)], "cylinder": [(8, 0, 16), (0, 8, -16)]}
+
+
+def law_of(law: str) -> dict[str, Any]:
+    return {**NUMBERS, "law": law, "ks": 512.0 if law == "elastic" else 0.0}
+
+
+def marker(kind: str, at: tuple[float, float, float], law: str, precision: Any) -> Simulator:
+    """One marker, on three slides, at a place of a shape [UNIT]."""
+    spec = _core.ModelSpec()
+    spec.gravity = (0, 0, 0)
+    body = spec.add_body("hand", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-3, 1e-3, 1e-3, 0, 0, 0))
+    for axis, name in zip(np.eye(3), "xyz", strict=True):
+        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), [UNIT * s for s in SIZES[kind]])
+    axes = [np.array([axis]) for axis in np.eye(3)]
+    spec.add_pad("pad", body, UNIT * np.array([at]), *axes, shapes=[shape], **law_of(law))
+    return Simulator(_core.Model(spec), precision=precision)
+
+
+def reading_by_q(sim: Simulator) -> tuple[Array, Array]:
+    """What the marker reads, as a force in the world, (3,), and its derivative by the three slides, (3, 3)."""
+    run = sim.rollout(np.zeros((1, 1, 0)), read_after=[0])
+    signs = np.array([1.0, 1.0, -1.0])
+    rows = [sim.rollout_gradient(run, tactile=row).q[0] for row in np.diag(signs)]
+    return run.tactile[0, 0, 0].astype(float) * signs, np.array(rows, float)
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("kind", SIZES)
+def test_a_marker_on_an_edge_feels_nothing_yet(kind: str, law: str, precision: str) -> None:
+    """As on the outside: force and gradient vanish, and so they do a little further out."""
+    for at in ON_EDGES[kind]:
+        for out in (1.0, 1 + 2.0**-10):
+            x, y, z = (out * a for a in at)
+            force, by_q = reading_by_q(marker(kind, (x, y, z), law, precision))
+            assert not force.any() and not by_q.any()
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("kind", "at"), [("box", (12, 0, 4)), ("cylinder", (4, 0, 12))])
+def test_a_marker_equally_near_to_both_faces_of_an_edge_takes_one(
+    kind: str, at: tuple[float, float, float], law: str, precision: str
+) -> None:
+    """The box's first face, the cylinder's wall; the gradient is that towards where this face is the nearer one."""
+    sim = marker(kind, at, law, precision)
+    force, by_q = reading_by_q(sim)
+    np.testing.assert_array_equal(force, [4, 0, 0])
+    bend = 0.0 if kind == "box" else 4 / (4 * UNIT)
+    np.testing.assert_allclose(by_q, np.diag([-1024, bend, 0]), atol=1024 * ROUNDING[precision])
+    if precision == "double":
+        for direction in ((1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, -1), (1, 0, -1)):
+            sim.q[0] = 2.0**-30 * np.array(direction)
+            slope = (sim.tactile()[0, 0] * [1, 1, -1] - force) / 2.0**-30
+            np.testing.assert_allclose(by_q @ direction, slope, atol=1e-3)
+        sim.q[0] = -(2.0**-30), 0, 0  # to the other side
+        assert sim.tactile()[0, 0, 0] == 0
+
+
+def lattice(half: Array, counts: tuple[int, int, int]) -> Array:
+    """Points spread evenly over the surface of a box, edges and corners included, (points, 3)."""
+    all_points = np.array(list(product(*(np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)))))
+    surface: Array = all_points[(np.abs(all_points) == half).any(axis=1)]
+    return surface
+
+
+def fitted(
+    boxes: dict[str, tuple[Any, Any]], law: str, precision: Any, gravity: tuple[float, float, float]
+) -> Simulator:
+    """A floating cube of 16 UNIT against boxes that stand: name → centre and half sizes [UNIT]."""
+    spec = _core.ModelSpec()
+    spec.gravity, spec.step, spec.polish = gravity, 2.0**-9, 2
+    inertia = 0.25 * (16 * UNIT) ** 2 / 6
+    cube = spec.add_body("cube", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (inertia, inertia, inertia, 0, 0, 0))
+    spec.add_joint("cube", cube, "free", (0, 0, 0), (0, 0, 1))
+    surface = lattice(np.full(3, 8 * UNIT), (5, 5, 5))
+    points = spec.add_points("cube", cube, surface, np.ones(len(surface)))
+    for name, (centre, half) in boxes.items():
+        shape = spec.add_shape(name, -1, "box", UNIT * np.array(centre), (1, 0, 0, 0), UNIT * np.array(half))
+        spec.add_contact(f"on {name}", points, shape, **law_of(law))
+    sim = Simulator(_core.Model(spec), precision=precision)
+    sim.q[0, 3] = 1
+    return sim
+
+
+SAME = {"base": ((0, 0, -16), (8, 8, 8))}  # under the cube, of its size: five faces in planes of the cube's
+HOLE = {  # as wide, long and deep as the cube
+    "floor": ((0, 0, -16), (24, 24, 8)),
+    "left": ((-16, 0, 0), (8, 24, 8)),
+    "right": ((16, 0, 0), (8, 24, 8)),
+    "front": ((0, -16, 0), (24, 8, 8)),
+    "back": ((0, 16, 0), (24, 8, 8)),
+}
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
+def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precision: str) -> None:
+    """Unloaded, nothing moves by a bit; gradients are those of the free side, up and out."""
+    sim = fitted(boxes, law, precision, (0, 0, 0))
+    u, start = np.zeros((4, 1, 0)), sim.q.copy()
+    run = sim.rollout(u)
+    np.testing.assert_array_equal(run.q[-1], start)
+    lifted = np.array([[0, 0, 2.0**-12, 0, 0, 0]])
+    away = sim.rollout(u, v=lifted)
+    for part, end in (("q", run.q), ("v", run.v)):
+        weights = np.zeros_like(end)
+        weights[-1] = np.random.default_rng(0).normal(size=end.shape[1:])
+        gradient = sim.rollout_gradient(run, q=weights) if part == "q" else sim.rollout_gradient(run, v=weights)
+        assert all(np.isfinite(x).all() for x in (gradient.q, gradient.v, gradient.anchors))
+        change = ((getattr(away, part) - end) * weights).sum() / 2.0**-12
+        assert (gradient.v * lifted).sum() / 2.0**-12 == pytest.approx(change, rel=ROUNDING[precision])
+    if precision == "double":
+        rng = np.random.default_rng(1)
+        for output in ("q", "v"):
+            assert against_dual(Case.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
+def test_a_load_on_coincident_faces_is_carried_straight_down(boxes: dict[str, Any], law: str, precision: str) -> None:
+    """On the box of its size by the nine points inside its face, as those on its edges stay on its edges; in the hole
+    by all twenty-five. The walls beside it push as much from each side."""
+    sim = fitted(boxes, law, precision, (0, 0, -8))
+    sim.step(np.zeros(0), 1000)
+    sim.check()
+    carrying = 9 if boxes is SAME else 25
+    newton = 1e-10 if precision == "double" else 1e-7  # [m], of its tolerance
+    assert sim.q[0, 2] == pytest.approx(-0.25 * 8 / (1024 * carrying), abs=newton)
+    np.testing.assert_allclose(sim.q[0, :2], 0, atol=UNIT * ROUNDING[precision])
+    np.testing.assert_allclose(sim.q[0, 3:], [1, 0, 0, 0], atol=ROUNDING[precision])
+    sim.v[0] = [1e-4, 2e-4, 3e-4, 1e-2, 2e-2, 3e-2]  # at rest the gradient by dry friction would be all rounding
+    u = np.zeros((3, 1, 0))
+    run = sim.rollout(u)
+    gradient = sim.rollout_gradient(run, q=1.0, v=1.0)
+    assert all(np.isfinite(x).all() for x in (gradient.q, gradient.v, gradient.anchors))
+    if precision == "double":
+        rng = np.random.default_rng(2)
+        for output in ("q", "v"):
+            assert against_dual(Case.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+
+
+def hanging_over(law: str, precision: Any) -> Simulator:
+    """A pad of 8 × 8 markers that pushes, UNIT deep in a block that lies under four of its rows; one on its edge."""
+    spec = _core.ModelSpec()
+    spec.gravity, spec.step, spec.polish = (0, 0, 0), 2.0**-14, 2
+    hand = spec.add_body("hand", -1, (0, 0, -UNIT), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
+    spec.add_joint("hand", hand, "free", (0, 0, 0), (0, 0, 1))
+    block = spec.add_body("block", -1, (-16 * UNIT, 0, -8 * UNIT), (1, 0, 0, 0), 0.5, (0, 0, 0), (1e-4,) * 3 + (0,) * 3)
+    spec.add_joint("block", block, "free", (0, 0, 0), (0, 0, 1))
+    shape = spec.add_shape("block", block, "box", (0, 0, 0), (1, 0, 0, 0), UNIT * np.array([16, 16, 8]))
+    along = 2 * UNIT * np.arange(-4, 4)  # along x: four rows over the block, one on its edge at x = 0, three beside it
+    places = np.array([(x, y + UNIT, 0) for x in along for y in along])
+    axes = [np.tile(axis, (64, 1)) for axis in ((1, 0, 0), (0, -1, 0), (0, 0, -1))]
+    spec.add_pad("pad", hand, places, *axes, shapes=[shape], pushes=True, **law_of(law))
+    sim = Simulator(_core.Model(spec), precision=precision)
+    poses = [[0, 0, -UNIT, 1, 0, 0, 0], [-16 * UNIT, 0, -8 * UNIT, 1, 0, 0, 0]]
+    sim.q[0] = np.ravel(poses)
+    return sim
+
+
+@pytest.mark.parametrize("precision", PRECISIONS)
+@pytest.mark.parametrize("law", LAWS)
+def test_a_pad_half_off_a_body(law: str, precision: str) -> None:
+    """Only the markers over it feel it, UNIT deep, and together they feel the contact's wrench; the one on its edge
+    feels nothing."""
+    sim = hanging_over(law, precision)
+    depth = sim.tactile()[0].reshape(8, 8, 3)[..., 2]
+    np.testing.assert_array_equal(depth, np.repeat([1.0, 0.0], 4)[:, None] * np.ones(8))
+    sim.v[0, :2] = UNIT, -2 * UNIT  # drags it along
+    sim.step(np.zeros(0), 2)
+    sim.check()
+    reading, wrench = sim.tactile()[0].reshape(8, 8, 3).astype(float), sim.wrenches()[0, 0]
+    assert reading[:4].any(axis=2).all() and np.abs(reading[:4, :, :2]).max() > 1e-2
+    assert np.abs(reading[4]).max() < 1e-3 and not reading[5:].any()  # the block gives way and turns a little
+    axes = np.array([(1, 0, 0), (0, -1, 0), (0, 0, 1)])  # the pad's z is down, and the reading's normal part −f · z
+    total = rotate(sim.q[0, 3:7], (reading @ axes).sum((0, 1)))
+    size = np.linalg.norm(reading, axis=2).sum()
+    np.testing.assert_allclose(total, wrench[3:], atol=ROUNDING[precision] * size)
+    run = sim.rollout(np.zeros((3, 1, 0)), read_after=[0, 3])
+    assert not run.status.any()
+    gradient = sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0)
+    assert all(np.isfinite(x).all() for x in (gradient.q, gradient.v, gradient.anchors))
+    if precision == "double":
+        rng = np.random.default_rng(3)
+        for output in ("q", "v", "tactile"):
+            assert against_dual(Case.random(sim, np.zeros((3, 0)), output, rng), rng, directions=2).error < 1e-10

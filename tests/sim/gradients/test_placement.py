@@ -1,0 +1,170 @@
+"""Where shapes, points and markers are, how they are turned and scaled, as parameters: the same as built that way."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from gelflow.sim import _core
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.sampling import box_surface, capsule
+from gelflow.sim.scene.scene import INTEGRATORS, load_scene
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation.reference_motions import SCENES
+
+Array = NDArray[np.float64]
+
+NUMBERS = {"kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
+POS, TURN, SCALE = np.array([2e-3, -1e-3, -4e-3]), np.array([0.02, -0.01, 0.3]), np.array([1.1, 0.95, 1.2])
+FRAME = np.array([3e-3, 1e-3, 0.0]), Rotation.from_rotvec([0.1, 0.2, -0.3])  # of points and markers in their body
+
+
+def quat(rotation: Rotation) -> Array:
+    return np.roll(rotation.as_quat(), 1)
+
+
+def moved(points: Array, what: str, scale: Array) -> Array:
+    """Points of FRAME, moved as parameters would."""
+    pos, frame = FRAME
+    if what == "as built":
+        return np.asarray(pos + frame.apply(points))
+    return np.asarray(pos + POS + (frame * Rotation.from_rotvec(TURN)).apply(points * scale))
+
+
+def build(law: str, shape: str, points: str, markers: str) -> Simulator:
+    """A cloud on slides and a ball joint, over a box; each of them as built or moved."""
+    spec = _core.ModelSpec()
+    spec.tolerance = 1e-13
+    hand = spec.add_body("hand", -1, (0, 0, 0.02), (1, 0, 0, 0), 0.05, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
+        spec.add_joint(name, hand, "slide", (0, 0, 0), axis, damping=0.5)
+    spec.add_joint("ball", hand, "ball", (0, 0, 0), (0, 0, 1), damping=1e-3)
+    cloud = capsule(0.012, 0.0, count=80)[0]
+    pos, frame = FRAME
+    at = {"pos": pos, "quat": quat(frame)}
+    turned = Rotation.from_rotvec(TURN)
+    box = (POS, quat(turned)) if shape == "moved" else (np.zeros(3), (1, 0, 0, 0))
+    top = spec.add_shape("box", -1, "box", *box, (0.03, 0.02, 0.01))
+    cloud_of_contact = spec.add_points("cloud", hand, moved(cloud, points, SCALE), np.ones(80), **at)
+    numbers: dict[str, Any] = {**NUMBERS, "law": law, "ks": 100.0 if law == "elastic" else 0.0}
+    spec.add_contact("press", cloud_of_contact, top, **numbers)
+    axes = (frame * turned if markers == "moved" else frame).as_matrix()
+    columns = [np.tile(axis, (80, 1)) for axis in axes.T]
+    spec.add_pad("skin", hand, moved(cloud, markers, np.ones(3)), *columns, shapes=[top], **at, **numbers)
+    sim = Simulator(_core.Model(spec))
+    sim.q[0, 1] = 1e-3
+    return sim
+
+
+def move(sim: Simulator, owner: str, names: tuple[str, ...]) -> None:
+    for name, values in (("pos", POS), ("turn", TURN), ("scale", SCALE)):
+        for axis, value in zip("xyz" if name in names else "", values, strict=False):
+            sim.param(f"{owner}.{name}.{axis}")[:] += value - (name == "scale")
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("what", ["shape", "points", "markers"])
+def test_a_parameter_moves_as_if_built_there(what: str, law: str) -> None:
+    places = {"shape": "as built", "points": "as built", "markers": "as built"}
+    built, sim = build(law, **{**places, what: "moved"}), build(law, **places)
+    owner = {"shape": "box.shape", "points": "cloud.points", "markers": "skin.markers"}[what]
+    move(sim, owner, ("pos", "turn", "scale") if what == "points" else ("pos", "turn"))
+    felt = 0.0
+    for _ in range(20):
+        for each in (built, sim):
+            each.step(np.zeros(0))
+            each.check()
+        np.testing.assert_allclose(sim.q, built.q, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(sim.tactile(), built.tactile(), rtol=0, atol=1e-8)
+        felt += float(np.abs(built.wrenches() if what == "points" else built.tactile()).max())
+    assert felt > 0.1 and np.abs(built.v).max() > 1e-3
+
+
+def pressed_by(points: Array, areas: Array, depth: float) -> tuple[Simulator, Array]:
+    """Points with a stiffness per area, on a plane that their lowest reaches into by `depth`."""
+    spec = _core.ModelSpec()
+    body = spec.add_body("part", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    spec.add_joint("part", body, "free", (0, 0, 0), (0, 0, 1))
+    plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
+    sampled = spec.add_points("part", body, points, areas.sum(1), areas=areas)
+    spec.add_contact("stand", sampled, plane, kn=1e6, kt=1.0, mu=0.5, kd=1.0)
+    sim = Simulator(_core.Model(spec))
+    sim.q[0, 2] = -points[:, 2].min() - depth
+    return sim, sim.wrenches()[0, 0].copy()
+
+
+@pytest.mark.parametrize("scale", [(1.2, 1.2, 1.2), (1.3, 0.8, 1.1)])
+def test_scaled_points_are_those_of_a_larger_box(scale: tuple[float, float, float]) -> None:
+    half = np.array([0.02, 0.03, 0.01])
+    larger, expected = pressed_by(*box_surface(tuple(half * scale), (4, 5, 3)), 1e-3)
+    sim, before = pressed_by(*box_surface(tuple(half), (4, 5, 3)), 1e-3)
+    for axis, value in zip("xyz", scale, strict=True):
+        sim.param(f"part.points.scale.{axis}")[:] = value
+    sim.q[:] = larger.q
+    np.testing.assert_allclose(sim.wrenches()[0, 0], expected, rtol=1e-9, atol=1e-12)
+    # Of the lower face; its edges are the sides' too, and stand for half of what is next to them there.
+    assert abs(expected[5] / before[5] - scale[0] * scale[1]) < 0.3
+
+
+def test_a_sphere_s_weights_grow_with_the_square_of_its_scale() -> None:
+    larger, expected = pressed_by(*capsule(0.015, 0.0, count=200), 2e-3)
+    sim, _ = pressed_by(*capsule(0.01, 0.0, count=200), 2e-3)
+    for axis in "xyz":
+        sim.param(f"part.points.scale.{axis}")[:] = 1.5
+    sim.q[:] = larger.q
+    np.testing.assert_allclose(sim.wrenches()[0, 0], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_one_point_of_a_sphere_has_its_scale_as_size() -> None:
+    sim = Simulator(load_scene("rolling", overrides={"pads.pad.rows": 2, "pads.pad.cols": 2}), num_envs=2)
+    sim.param("ball.points.scale.x")[1] = 1.25
+    sim.q[:, sim.joint_q("pad_z")] = 1.0
+    sim.q[1, sim.joint_q("ball") + 2] = 0.025
+    sim.step(np.array([0, 0, 0.25]), 100)  # the pad's weight and damping keep it up
+    np.testing.assert_allclose(sim.q[:, sim.joint_q("ball") + 2], [0.02, 0.025], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_has_them(name: str) -> None:
+    scene = load_scene(name)
+    sim = Simulator(scene)
+    for owner, pos in [
+        *((f"{shape.name}.shape", shape.pose.pos) for shape in scene.shapes),
+        *((f"{points.name}.points", points.pose.pos) for points in scene.points),
+        *((f"{pad.name}.markers", pad.pose.pos) for pad in scene.pads),
+    ]:
+        np.testing.assert_array_equal([sim.param(f"{owner}.pos.{axis}")[0] for axis in "xyz"], pos)
+        assert not any(sim.param(f"{owner}.turn.{axis}")[0] for axis in "xyz")
+    for points in scene.points:
+        assert all(sim.param(f"{points.name}.points.scale.{axis}")[0] == 1 for axis in "xyz")
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_a_moved_wall_is_felt_there(precision: Any, integrator: str) -> None:
+    """Each environment has its own hole: where a wall comes nearer, a part that hangs in it is pushed away."""
+    scene = load_scene("insertion", overrides={"integrator": integrator})
+    sim = Simulator(scene, num_envs=3, precision=precision)
+    sim.q[:] = scene.q0
+    part = sim.joint_q("part")
+    sim.q[:, part : part + 3] = 0, 0, 0.0305  # 500 µm above the floor, in the hole
+    shift = np.array([0, 5e-3, 0])
+    sim.param("wall_left.shape.pos.x")[:] += shift
+    sim.step(np.zeros(scene.nu), 20)
+    sim.check()
+    x = sim.q[:, part]
+    np.testing.assert_array_equal(x[[0, 2]], x[0])
+    assert x[1] - x[0] > 1e-3
+
+
+@pytest.mark.parametrize("name", ["wall_left.shape.pos.x", "floor.shape.turn.y", "part.points.scale.z"])
+def test_a_place_that_is_no_number_fails(name: str) -> None:
+    scene = load_scene("insertion")
+    sim = Simulator(scene, num_envs=2)
+    sim.q[:] = scene.q0
+    sim.param(name)[1] = np.nan
+    sim.step(np.zeros(scene.nu), 2)
+    assert sim.status.tolist() == [0, 2]
+    assert np.isfinite(sim.q).all()

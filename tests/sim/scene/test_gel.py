@@ -1,0 +1,314 @@
+"""Gels: the elastic layer against closed forms and its limits, and gels in scenes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gelflow.errors import UsageError
+from gelflow.observation import Grid
+from gelflow.sim.benchmark.describe import describe
+from gelflow.sim.scene.gel import LayerGel, SpringGel, half_space_response, layer_response
+from gelflow.sim.scene.sampling import disc_lattice
+from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.torch_layer import rollout, state_of
+
+E, NU = 1e5, 0.4
+G = E / (2 + 2 * NU)
+
+
+def on_grid(rows: int, cols: int, pitch: float, thickness: float, nu: float = NU) -> LayerGel:
+    positions = Grid(rows, cols, pitch * 1e3).positions() * 1e-3
+    return LayerGel(E, nu, thickness, positions, pitch**2, (rows, cols))
+
+
+def scattered(count: int, thickness: float, nu: float = NU) -> LayerGel:
+    return LayerGel(E, nu, thickness, disc_lattice(0.01, count), np.pi * 1e-4 / count, None)
+
+
+@pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.49])
+def test_the_response_solves_the_layers_equations(nu: float) -> None:
+    """exp(±kz) (A + Bz) fitted to the rigid back and to the load, k = G = 1, against the closed forms."""
+    kappa, lame = 3 - 4 * nu, 2 * nu / (1 - 2 * nu)
+
+    def wave(z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Along, outwards, and their slopes, by A+, B+, A−, B−."""
+        up, down = np.exp(z), np.exp(-z)
+        along = np.array([up, (kappa + z) * up, -down, (kappa - z) * down])
+        out = np.array([up, z * up, down, z * down])
+        along_slope = np.array([up, (kappa + z + 1) * up, down, (z - kappa - 1) * down])
+        out_slope = np.array([up, (1 + z) * up, -down, (1 - z) * down])
+        return along, out, along_slope, out_slope
+
+    along, out, along_slope, out_slope = wave(0.0)
+    for w in (0.1, 1.0, 4.0):
+        conditions = np.stack([*wave(-w)[:2], along_slope + out, (lame + 2) * out_slope - lame * along])
+        by_shear, by_pull = np.linalg.solve(conditions, np.eye(4)[:, 2:]).T
+        expected = [np.tanh(w), along @ by_shear, -along @ by_pull, out @ by_pull]
+        np.testing.assert_allclose(layer_response(np.array(w), nu), expected, atol=1e-12)
+        assert -out @ by_shear == pytest.approx(expected[2], abs=1e-12)
+    np.testing.assert_allclose(layer_response(np.array(30.0), nu), half_space_response(nu), atol=1e-12)
+    np.testing.assert_allclose(layer_response(np.array(1e4), nu), half_space_response(nu), atol=1e-12)
+
+
+def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
+    pitch, rows = 1e-3, 25
+    matrix = on_grid(rows, 3, pitch, np.inf).matrix.reshape(rows, 3, 3, rows, 3, 3)
+    # The mean distance⁻¹ of two points of a unit square is 4 (asinh 1 − (√2 − 1)/3).
+    own = 4 * (np.arcsinh(1) - (np.sqrt(2) - 1) / 3) / (2 * np.pi * G * pitch)
+    assert matrix[0, 0, 2, 0, 0, 2] == pytest.approx((1 - NU) * own, rel=1e-12)
+    assert matrix[0, 0, 0, 0, 0, 0] == pytest.approx((1 - NU / 2) * own, rel=1e-12)
+    # Far away a point load, at distance r along x: shear along x and y, pressure; what pressure does to shear.
+    far, r = matrix[-1, 0, :, 0, 0, :], (rows - 1) * pitch
+    point = np.diag([1, 1 - NU, 1 - NU]) / (2 * np.pi * G * r)
+    point[0, 2], point[2, 0] = -(1 - 2 * NU) / (4 * np.pi * G * r), (1 - 2 * NU) / (4 * np.pi * G * r)
+    np.testing.assert_allclose(far, point, rtol=1e-3, atol=1e-18)
+    # A round cell: the mean distance⁻¹ of two points of a disc is 16 / (3 π a).
+    disc = scattered(50, np.inf)
+    own = 16 / (3 * np.pi * np.sqrt(disc.area / np.pi)) / (2 * np.pi * G)
+    assert disc.matrix[2, 2] == pytest.approx((1 - NU) * own, rel=1e-4)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.5])
+@pytest.mark.parametrize("thickness", [2e-5, 2e-4, 6e-4])
+def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -> None:
+    """u = τ h / G, and p h (1 − 2ν) / (2 G (1 − ν)) into the layer, in the middle of a wide even load."""
+    gel = on_grid(21, 21, 1e-3, thickness, nu)
+    stress, middle = 100.0, 10 * 21 + 10
+    shear_modulus = E / (2 + 2 * nu)
+    for axis, yields in ((0, 1.0), (1, 1.0), (2, (1 - 2 * nu) / (2 - 2 * nu))):
+        forces = np.zeros((21 * 21, 3))
+        forces[:, axis] = stress * gel.area
+        expected = np.zeros(3)
+        expected[axis] = stress * thickness / shear_modulus * yields
+        np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=2e-5 * stress * thickness / G)
+    if thickness < 1e-4:  # a marker alone: all of its own cell, nothing of the others but at the cells' borders
+        alone = gel.matrix[::3, 3 * middle] * shear_modulus * gel.area / thickness
+        assert alone[middle] == pytest.approx(1, abs=0.1)
+        assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 21, middle + 21])).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    "make", [lambda h: on_grid(6, 5, 1e-3, h), lambda h: scattered(30, h)], ids=["squares", "discs"]
+)
+def test_a_thick_layer_goes_over_into_the_half_space(make: Any) -> None:
+    half = make(np.inf).matrix
+    away = [np.abs(make(h).matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
+    assert away[0] < 0.05 and away[2] < 3e-4
+    np.testing.assert_allclose(np.divide(away[:2], away[1:]), 10, rtol=0.1)  # falls off as 1/h
+
+
+@pytest.mark.parametrize(("nu", "thickness"), [(0.5, 1e-4), (0.5, 3e-3), (0.0, 3e-3), (-0.9, 3e-3), (0.5, np.inf)])
+def test_reciprocity_and_energy(nu: float, thickness: float) -> None:
+    rng = np.random.default_rng(0)
+    somewhere = LayerGel(E, nu, thickness, rng.uniform(0, 0.01, (40, 2)), 1e-6, None)
+    for gel in (on_grid(8, 5, 1.5e-3, thickness, nu), scattered(60, thickness, nu), somewhere):
+        matrix = gel.matrix
+        np.testing.assert_array_equal(matrix, matrix.T)
+        energies = np.linalg.eigvalsh(matrix)
+        assert energies[0] > 1e-4 * energies[-1]
+
+
+@pytest.mark.parametrize("thickness", [3e-4, 3e-3, np.inf])
+def test_finer_cells_average_to_the_coarse_ones_exactly(thickness: float) -> None:
+    coarse, fine = on_grid(4, 3, 2e-3, thickness).matrix, on_grid(12, 9, 2e-3 / 3, thickness).matrix
+    row, col = np.divmod(np.arange(108), 9)
+    member = np.zeros((12, 108))
+    member[row // 3 * 3 + col // 3, np.arange(108)] = 1 / 9
+    spread = np.kron(member, np.eye(3))
+    np.testing.assert_allclose(spread @ fine @ spread.T, coarse, atol=1e-10 * coarse.max())
+
+
+def test_per_area_loads_converge_as_the_grid_is_refined() -> None:
+    """A bell of shear and pressure, 3 mm wide, on 15 × 15 mm: the middle marker's error falls as the pitch squared."""
+
+    def middle(cells: int) -> Any:
+        gel = on_grid(cells, cells, 0.015 / cells, 4e-3)
+        bell = np.exp(-(gel.positions**2).sum(1) / 0.003**2)[:, None] * [1000.0, 0.0, 2000.0]
+        return gel.displacement(bell * gel.area)[cells * cells // 2]
+
+    coarse, medium, fine = middle(11), middle(17), middle(27)
+    expected = (11**-2 - 17**-2) / (17**-2 - 27**-2)
+    np.testing.assert_allclose(((coarse - medium) / (medium - fine))[[0, 2]], expected, rtol=0.15)
+    np.testing.assert_allclose(medium[[0, 2]], fine[[0, 2]], rtol=0.02)
+
+
+def test_a_turned_pad_and_one_seen_from_its_side() -> None:
+    gel = scattered(40, 3e-3)
+    c, s = np.cos(0.7), np.sin(0.7)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    turned = replace(gel, positions=gel.positions @ turn[:2, :2].T)
+    every = np.kron(np.eye(40), turn)
+    np.testing.assert_allclose(turned.matrix, every @ gel.matrix @ every.T, atol=1e-9 * gel.matrix.max())
+    # A rectangle turned by a quarter: x becomes y, y becomes −x; rows become columns.
+    wide, tall = (on_grid(*n, 1e-3, 2e-3).matrix.reshape(*n, 3, *n, 3) for n in ((3, 7), (7, 3)))
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    expected = np.einsum("ax,ijxklz,bz->ijaklb", quarter, tall, quarter).transpose(1, 0, 2, 4, 3, 5)
+    np.testing.assert_allclose(wide[::-1, :, :, ::-1], expected, atol=1e-12 * wide.max())
+
+
+def test_round_cells_do_nearly_what_square_ones_do() -> None:
+    square = on_grid(6, 5, 1.5e-3, 4e-3)
+    disc = replace(square, grid=None)
+    assert np.abs(disc.matrix - square.matrix).max() < 0.015 * square.matrix.max()
+    far = np.abs(square.positions - square.positions[0]).max(1) > 4e-3
+    difference = (disc.matrix - square.matrix).reshape(30, 3, 30, 3)[far, :, 0]
+    assert np.abs(difference).max() < 2e-3 * square.matrix.max()
+
+
+MODEL = """<mujoco>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 1"/>
+    <body name="finger" pos="0 0 0.009">
+      <joint name="x" type="slide" axis="1 0 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="finger" type="sphere" size="0.01"/>
+      <site name="tip" pos="0 0 -0.0095" xyaxes="0 1 0 1 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><position joint="x" kp="10"/><position joint="z" kp="10"/></actuator>
+</mujoco>"""
+
+PAD = """[pads.NAME]
+site = "tip"
+SHAPE
+against = "ground"
+kn = 100.0
+kt = 1.0
+mu = 1.0
+kd = 1.0
+"""
+RECTANGLE = "rows = 4\ncols = 3\npitch = 1e-3\n"
+LAYER = "gel = { modulus = 1e5, poisson = 0.45, thickness = 3e-3 }"
+
+
+def scene_with(folder: Path, **pads: str) -> Scene:
+    (folder / "s.xml").write_text(MODEL)
+    tables = "".join(PAD.replace("NAME", name).replace("SHAPE", shape) for name, shape in pads.items())
+    (folder / "s.toml").write_text('format = 1\nmodel = "s.xml"\nstep = 0.005\n' + tables)
+    return load_scene(folder / "s.toml")
+
+
+def test_displacements_of_all_pads(tmp_path: Path) -> None:
+    scene = scene_with(
+        tmp_path,
+        layer=RECTANGLE + LAYER,
+        springs=RECTANGLE + "gel = { compliance = 0.01 }",
+        both='shape = "disc"\nradius = 2e-3\ncount = 9\ngel = { compliance = 0.01, normal = 0.002 }',
+    )
+    sim = Simulator(scene, num_envs=3)
+    sim.q[:, 1] = [0, 1e-4, 2e-4]
+    sim.v[:, 0] = [0.1, 0.2, 0.3]
+    forces, moved = sim.tactile().copy(), sim.displacement()
+    assert moved.shape == (3, 33, 3) and np.abs(forces).max() > 0
+    layer = scene.pads[0].gel
+    assert isinstance(layer, LayerGel) and layer.grid == (4, 3) and layer.area == pytest.approx(1e-6)
+    expected = forces[:, :12].reshape(3, 36) @ layer.matrix
+    np.testing.assert_allclose(moved[:, :12], expected.reshape(3, 12, 3), atol=1e-15)
+    np.testing.assert_allclose(moved[:, 12:24], 0.01 * forces[:, 12:24])
+    np.testing.assert_allclose(moved[:, 24:], [0.01, 0.01, 0.002] * forces[:, 24:])
+    run = sim.rollout(np.zeros((4, 3, 2)), read_after=(0, 2, 4))
+    np.testing.assert_array_equal(sim.displacement(run.tactile)[0], moved)
+    single = Simulator(scene, precision="single")
+    single.v[:, 0] = 0.1
+    assert single.displacement().dtype == np.float32
+    np.testing.assert_allclose(single.displacement()[0], moved[0], rtol=1e-4, atol=1e-5 * np.abs(moved[0]).max())
+
+
+def test_gradients_go_back_through_the_gel(tmp_path: Path) -> None:
+    """By the transposed map: ⟨M f, w⟩ = ⟨f, Mᵀ w⟩; and through a rollout to its controls."""
+    scene = scene_with(tmp_path, layer=RECTANGLE + LAYER, springs=RECTANGLE + "gel = { compliance = 0.01 }")
+    sim = Simulator(scene, num_envs=2)
+    rng = np.random.default_rng(1)
+    wanted = rng.normal(size=(5, 2, 24, 3))
+    forces = torch.tensor(rng.normal(size=(5, 2, 24, 3)), requires_grad=True)
+    moved = sim.displacement(forces)
+    np.testing.assert_allclose(moved.detach().numpy(), sim.displacement(forces.detach().numpy()), rtol=1e-13)
+    (moved * torch.from_numpy(wanted)).sum().backward()
+    assert forces.grad is not None
+    np.testing.assert_allclose(forces.grad.numpy(), sim.displacement(wanted), rtol=1e-10, atol=1e-14)
+    assert sim.displacement(forces.detach().float()).dtype == torch.float32
+
+    controls = torch.full((6, 2, 2), -1e-3, dtype=torch.float64, requires_grad=True)
+
+    def loss(u: torch.Tensor) -> torch.Tensor:
+        moved: torch.Tensor = sim.displacement(rollout(sim, state_of(sim), u, read_after=(4, 6)).tactile)
+        return 1e6 * (moved**2).sum()
+
+    assert torch.autograd.gradcheck(loss, (controls,), eps=1e-7, rtol=1e-4)
+
+
+def test_given_markers_on_any_plane(tmp_path: Path) -> None:
+    """A list that lies slanted in the site's frame is the same gel as flat; its cells come from its distances."""
+    flat = np.array([[i * 1e-3, j * 1e-3, 0] for i in range(4) for j in range(3)])
+    x, y, z = np.array([0.6, 0, -0.8]), np.array([0.0, 1, 0]), np.array([0.8, 0, 0.6])
+    slanted = flat @ np.stack([x, y, z]) + [1e-3, 0, 2e-3]
+    text = 'shape = "points"\npositions = {}\nnormals = {}\nx_axes = {}\n'
+    shape = text.format(slanted.tolist(), [z.tolist()] * 12, [x.tolist()] * 12)
+    gel = scene_with(tmp_path, pad=shape + LAYER).pads[0].gel
+    assert isinstance(gel, LayerGel) and gel.grid is None
+    assert gel.area == pytest.approx(1e-6)
+    np.testing.assert_allclose(gel.positions, flat[:, :2], atol=1e-15)
+
+
+HEMISPHERE = 'shape = "hemisphere"\nradius = 5e-3\ncount = 20\n'
+REFUSED = {
+    "gel = {}": "either compliance, or modulus, poisson and thickness",
+    "gel = { complience = 1.0 }": "unknown key 'complience'; did you mean 'compliance'",
+    "gel = { compliance = 1.0, modulus = 1.0 }": "unknown key 'modulus'",
+    "gel = { compliance = -1.0 }": "compliance must be a number ≥ 0",
+    "gel = { modulus = 1e5, thickness = 1.0 }": "poisson is missing",
+    "gel = { modulus = 1e5, poisson = 0.51, thickness = 1.0 }": "poisson must be above -1 and at most 0.5, got 0.51",
+    "gel = { modulus = 1e5, poisson = 0.4, thickness = 0 }": "thickness must be a number ≥ 1e-09, got 0",
+    "gel = { modulus = inf, poisson = 0.4, thickness = 1.0 }": "modulus must be a number",
+    "gel = 3": "gel must be a table",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        scene_with(tmp_path, pad=RECTANGLE + text)
+    assert REFUSED[text] in str(refused.value) and "pads.pad" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "why"),
+    [
+        (HEMISPHERE, "a layer needs markers on one plane"),
+        ('shape = "points"\npositions = [[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-4]]\n', "a layer needs markers on one"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\n', "there is only one"),
+        ('shape = "points"\npositions = [[0, 0, 0], [0, 0, 0], [1e-3, 0, 0]]\n', "at the same place"),
+        ("rows = 40\ncols = 30\npitch = 1e-3\n", "at most 1000 markers, got 1200"),
+    ],
+)
+def test_where_no_layer_can_be(tmp_path: Path, shape: str, why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        scene_with(tmp_path, pad=shape + LAYER)
+    assert isinstance(scene_with(tmp_path, pad=shape + "gel = { compliance = 1.0 }").pads[0].gel, SpringGel)
+
+
+def test_who_has_no_gel_has_no_displacement(tmp_path: Path) -> None:
+    scene = scene_with(tmp_path, first=RECTANGLE + LAYER, second=RECTANGLE)
+    with pytest.raises(UsageError, match=r"pad 'second' has no gel; give pads\.second\.gel in the scene"):
+        Simulator(scene).displacement()
+    with pytest.raises(UsageError, match="needs a scene with pads"):
+        Simulator(scene.build()).displacement()
+    endless = scene_with(tmp_path, pad=RECTANGLE + "gel = { modulus = 1.0, poisson = 0, thickness = inf }")
+    assert isinstance(endless.pads[0].gel, LayerGel) and endless.pads[0].gel.thickness == np.inf
+    with pytest.raises(UsageError, match=r"forces must have shape \(…, 12, 3\), got \(12, 2\)"):
+        Simulator(endless).displacement(np.zeros((12, 2)))
+
+
+def test_insertions_gel_is_told(tmp_path: Path) -> None:
+    told = describe(load_scene("insertion")).pads
+    assert [pad.gel for pad in told] == ["yields by 10 mm/N in shear, 10 mm/N into the pad"] * 2
+    layer = {"modulus": 1e5, "poisson": 0.45, "thickness": 3e-3}
+    told = describe(load_scene("insertion", overrides={"pads.*.gel": layer})).pads
+    assert told[1].gel == "layer of 3 mm, 100000 Pa, Poisson's ratio 0.45"
+    assert describe(load_scene("rolling")).pads[0].gel is None

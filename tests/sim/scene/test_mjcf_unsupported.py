@@ -1,0 +1,257 @@
+"""What model files may hold and the simulator does not model: one line that names it and says what to do."""
+
+from pathlib import Path
+
+import pytest
+
+from gelflow.errors import UsageError
+from gelflow.sim.scene.scene import load_scene
+
+MODEL = """<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="arm">
+      <joint name="swing" axis="0 1 0"/>
+      <geom type="capsule" size="0.03" fromto="0 0 0 0 0 -0.3"/>
+      <site name="tip" pos="0 0 -0.3"/>
+    </body>
+    <body name="ball" pos="1 0 0"><joint name="socket" type="ball"/><geom name="ball" size="0.1"/></body>
+    <body name="block" pos="2 0 0"><freejoint name="floating"/><geom size="0.1"/></body>
+  </worldbody>
+  <actuator><motor name="push" joint="swing"/></actuator>
+</mujoco>"""
+
+MOTOR = '<motor name="push" joint="swing"/>'
+SERVO = "use motor, position, velocity or general on joints"
+TENDON = '<tendon><fixed name="split" {}><joint joint="swing" coef="0.5"/></fixed></tendon>'
+
+
+def actuator(text: str) -> tuple[str, str]:
+    return MOTOR, text
+
+
+def section(text: str) -> tuple[str, str]:
+    return "</worldbody>", f"</worldbody>{text}"
+
+
+def swing(text: str) -> tuple[str, str]:
+    return 'axis="0 1 0"', f'axis="0 1 0" {text}'
+
+
+def option(text: str) -> tuple[str, str]:
+    return "<worldbody>", f"<option {text}<worldbody>"
+
+
+REFUSALS = [
+    (section(TENDON.format('stiffness="3"')), "tendon 'split' is not modelled: remove it or drive the joints directly"),
+    (section(TENDON.format('range="-1 1"')), "tendon 'split' is not modelled: remove it or drive the joints directly"),
+    (
+        section(TENDON.format("") + '<actuator><position tendon="split"/></actuator>'),
+        "tendon 'split' is not modelled: remove it or drive the joints directly "
+        "(also not modelled: actuator 'actuator0' on a tendon)",
+    ),
+    (
+        section('<equality><joint joint1="swing"/></equality>'),
+        "equality joint of 'swing' is not modelled: remove it, or make it inactive; drive each joint by itself",
+    ),
+    (section('<equality><weld name="glue" body1="arm"/></equality>'), "equality weld 'glue' is not modelled: remove"),
+    (
+        section('<equality><connect body1="arm" body2="ball" anchor="0 0 0"/></equality>'),
+        "equality connect of 'arm' and 'ball' is not modelled: remove it",
+    ),
+    (
+        (
+            "</worldbody>",
+            '<body name="cloth"><flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" mass="1" '
+            'radius="0.01" dim="2"><edge equality="true"/></flexcomp></body></worldbody>',
+        ),
+        "flex 'cloth' is not modelled: remove it",
+    ),
+    (
+        section(
+            '<extension><plugin plugin="mujoco.pid"><instance name="pid"/></plugin></extension>'
+            '<actuator><plugin name="servo" joint="swing" plugin="mujoco.pid" instance="pid"/></actuator>'
+        ),
+        f"actuator 'servo' with a plugin is not modelled: {SERVO}",
+    ),
+    (
+        ("</worldbody>", '<body name="target" mocap="true"/></worldbody>'),
+        "mocap body 'target' is not modelled: take mocap=\"true\" away (it then stands still), or remove the body",
+    ),
+    (
+        ('<body name="arm">', '<body name="arm" gravcomp="1">'),
+        "gravcomp of body 'arm' is not modelled: remove it, or switch gravity off for the whole model",
+    ),
+    (option('density="1"/>'), "option density is not modelled: remove it; there is no air or water"),
+    (option('viscosity="1"/>'), "option viscosity is not modelled: remove it; there is no air or water"),
+    (option('wind="1 0 0"/>'), "option wind is not modelled: remove it; there is no air or water"),
+    (
+        option('><flag actuation="disable"/></option>'),
+        'flag actuation="disable" is not modelled: remove it; controls of 0 do the same for motors',
+    ),
+    (option('actuatorgroupdisable="2"/>'), "option actuatorgroupdisable is not modelled: remove it, and the actuators"),
+    (
+        ('type="ball"', 'type="ball" range="0 60"'),
+        "range of ball joint 'socket' is not modelled: remove it, or build the joint from three hinges",
+    ),
+    (('type="ball"', 'type="ball" stiffness="2"'), "stiffness of ball joint 'socket' is not modelled: remove it"),
+    (
+        ('<freejoint name="floating"/>', '<joint name="floating" type="free" stiffness="2"/>'),
+        "stiffness of free joint 'floating' is not modelled: remove it",
+    ),
+    (swing('stiffness="1 2"'), "polynomial stiffness of joint 'swing' is not modelled: give one number"),
+    (swing('damping="1 2"'), "polynomial damping of joint 'swing' is not modelled: give one number"),
+    (
+        actuator('<motor joint="socket"/>'),
+        "actuator 'actuator0' on ball joint 'socket' is not modelled: drive slide or hinge joints",
+    ),
+    (actuator('<motor joint="floating"/>'), "actuator 'actuator0' on free joint 'floating' is not modelled: drive"),
+    (actuator('<motor name="jet" site="tip"/>'), "actuator 'jet' on a site is not modelled: drive the joints directly"),
+    (
+        actuator('<motor name="crank" cranksite="tip" slidersite="tip" cranklength="1"/>'),
+        "actuator 'crank' on a slider-crank is not modelled: drive the joints directly",
+    ),
+    (actuator('<adhesion name="cup" body="arm" ctrlrange="0 1"/>'), "actuator 'cup' on a body (adhesion) is not"),
+    (
+        actuator('<muscle name="biceps" joint="swing" lengthrange="0 1"/>'),
+        f"actuator 'biceps' with gaintype muscle is not modelled: {SERVO}",
+    ),
+    (
+        actuator('<damper name="brake" joint="swing" kv="2" ctrlrange="0 1"/>'),
+        f"actuator 'brake' with gaintype affine is not modelled: {SERVO}",
+    ),
+    (
+        actuator('<dcmotor name="dc" joint="swing" motorconst="0.1" resistance="1"/>'),
+        f"actuator 'dc' with gaintype dcmotor is not modelled: {SERVO}",
+    ),
+    (
+        actuator('<position name="slow" joint="swing" timeconst="0.1"/>'),
+        "actuator 'slow' with an activation (dyntype filterexact) is not modelled: take timeconst or dyntype away",
+    ),
+    (
+        actuator('<intvelocity name="int" joint="swing" kp="2" actrange="-1 1"/>'),
+        "actuator 'int' with an activation (dyntype integrator) is not modelled: take timeconst or dyntype away",
+    ),
+    (
+        actuator('<cylinder name="air" joint="swing" timeconst="1"/>'),
+        "actuator 'air' with an activation (dyntype filter) is not modelled: take timeconst or dyntype away",
+    ),
+    (
+        actuator('<motor name="late" joint="swing" delay="0.1" nsample="3"/>'),
+        "actuator 'late' with a delay is not modelled: remove it",
+    ),
+    (
+        actuator('<motor name="push" joint="swing" damping="1 2"/>'),
+        "polynomial damping of actuator 'push' is not modelled: give one number",
+    ),
+    (
+        section('<asset><mesh name="shell" file="meshes/gone.stl"/></asset>'),
+        "mesh 'shell': no file meshes/gone.stl (looked for ",
+    ),
+    (section('<asset><mesh file="robot.toml"/></asset>'), "mesh 'robot': robot.toml is of a kind that is not read; "),
+    (section('<asset><texture name="wood" type="2d" file="gone.png"/></asset>'), "gone.png"),
+    (section('<include file="gone.xml"/>'), "Error opening file"),
+    (('name="ball" pos', 'name="arm" pos'), "repeated name 'arm' in body"),
+    (("</mujoco>", ""), "XML"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), REFUSALS, ids=[message for _, message in REFUSALS])
+def test_what_is_not_modelled_is_refused_by_name(change: tuple[str, str], message: str, tmp_path: Path) -> None:
+    old, new = change
+    assert old in MODEL
+    (tmp_path / "robot.xml").write_text(MODEL.replace(old, new, 1))
+    check_refused(tmp_path, "robot.xml", message)
+
+
+def check_refused(folder: Path, model: str, message: str, more: str = "") -> None:
+    (folder / "robot.toml").write_text(f'format = 1\nmodel = "{model}"\nstep = 0.002\n{more}')
+    with pytest.raises(UsageError) as caught:
+        load_scene(folder / "robot.toml")
+    text = str(caught.value)
+    assert model in text or more
+    assert message in text
+    assert "\n" not in text
+
+
+def test_nothing_is_refused_without_the_changes(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(MODEL)
+    (tmp_path / "robot.toml").write_text('format = 1\nmodel = "robot.xml"\nstep = 0.002\n')
+    scene = load_scene(tmp_path / "robot.toml")
+    assert [j.type for j in scene.joints] == ["hinge", "ball", "free"]
+
+
+def test_a_joint_s_force_range_is_for_one_actuator(tmp_path: Path) -> None:
+    limited = MODEL.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="1 2"')
+    (tmp_path / "robot.xml").write_text(limited.replace(MOTOR, MOTOR + '<position joint="swing"/>'))
+    check_refused(
+        tmp_path,
+        "robot.xml",
+        "actuatorfrcrange of joint 'swing', which 2 actuators drive, is not modelled: give each a forcerange",
+    )
+    (tmp_path / "robot.xml").write_text(
+        limited.replace(MOTOR, '<motor name="push" joint="swing" forcerange="-1 0.5"/>')
+    )
+    check_refused(tmp_path, "robot.xml", "actuator 'push': its forcerange and the joint's actuatorfrcrange share no")
+
+
+HAND = """<mujoco model="hand">
+  <default><default class="finger"><joint axis="0 1 0" range="0 0.04" type="slide" armature="0.1"/></default></default>
+  <worldbody>
+    <body name="hand">
+      <geom type="box" size="0.03 0.1 0.03"/>
+      <body name="left"><joint name="finger_1" class="finger"/><geom size="0.01"/></body>
+      <body name="right" quat="0 0 0 1"><joint name="finger_2" class="finger"/><geom size="0.01"/></body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="split"><joint joint="finger_1" coef="0.5"/><joint joint="finger_2" coef="0.5"/></fixed>
+  </tendon>
+  <equality><joint joint1="finger_1" joint2="finger_2"/></equality>
+  <actuator><general name="grip" tendon="split" ctrlrange="0 255" gainprm="0.016 0 0" biasprm="0 -100 -10"/></actuator>
+</mujoco>"""
+
+
+def test_a_hand_with_coupled_fingers_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "hand.xml").write_text(HAND)
+    check_refused(
+        tmp_path,
+        "hand.xml",
+        "hand.xml: tendon 'split' is not modelled: remove it or drive the joints directly "
+        "(also not modelled: equality joint of 'finger_1' and 'finger_2', actuator 'grip' on a tendon)",
+    )
+
+
+LINK = """<link name="{}"><inertial><mass value="1"/>
+  <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>{}</link>"""
+URDF = f"""<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="base"/>
+  {LINK.format("upper", '<collision><geometry><mesh filename="FILE"/></geometry></collision>')}
+  {LINK.format("lower", "")}
+  <joint name="a" type="continuous"><parent link="base"/><child link="upper"/></joint>
+  <joint name="b" type="continuous"><parent link="upper"/><child link="lower"/></joint></robot>"""
+
+URDF_REFUSALS = [
+    (
+        ("</joint></robot>", '<mimic joint="a" multiplier="2"/></joint></robot>'),
+        "joint 'b' mimics 'a', which is not modelled: remove <mimic> and drive the joint by itself",
+    ),
+    (("<link", '<xacro:include filename="macros.xacro"/><link'), "has xacro macros, which are not expanded; run xacro"),
+    (("FILE", "package://my_arm/link.stl"), "mesh 'link': no file package://my_arm/link.stl (looked for "),
+    (("FILE", "robot.toml"), "mesh 'robot': robot.toml is of a kind that is not read; convert it to .stl or .obj"),
+    (("</robot>", ""), "XML"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), URDF_REFUSALS, ids=[message for _, message in URDF_REFUSALS])
+def test_urdf_refusals(change: tuple[str, str], message: str, tmp_path: Path) -> None:
+    old, new = change
+    assert old in URDF
+    (tmp_path / "arm.urdf").write_text(URDF.replace(old, new, 1))
+    check_refused(tmp_path, "arm.urdf", message)
+
+
+def test_a_mesh_that_is_sampled_needs_a_count(tmp_path: Path) -> None:
+    mesh = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
+    text = MODEL.replace("<worldbody>", mesh).replace('name="ball" size="0.1"', 'name="ball" type="mesh" mesh="m"')
+    (tmp_path / "robot.xml").write_text(text)
+    check_refused(tmp_path, "robot.xml", "points.p: count is missing", '[points.p]\ngeom = "ball"\n')

@@ -1,0 +1,220 @@
+"""Pads of every shape: where their markers are, how they stand, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gelflow.errors import UsageError
+from gelflow.sim.benchmark.describe import describe
+from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.simulator import Simulator
+
+MODEL = """<mujoco>
+  <worldbody>
+    <geom name="ground" type="plane" size="1 1 1"/>
+    <body name="finger" pos="0 0 0.1">
+      <joint name="slide" type="slide" axis="0 0 1"/>
+      <geom name="finger" type="sphere" size="0.01"/>
+      <site name="tip" pos="0.001 0 0" xyaxes="1 0 0 0 -1 0"/>
+    </body>
+    <body name="cap">
+      <joint name="turn" type="hinge" axis="0 0 1"/>
+      <geom name="cap" type="KIND" size="0.02 0.03 0.04" pos="0.3 0 0.1"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+SCENE = """format = 1
+model = "s.xml"
+step = 0.005
+[pads.pad]
+site = "tip"
+PAD
+against = ["cap", "ground"]
+kn = 1.0
+kt = 1.0
+mu = 1.0
+kd = 1.0
+"""
+
+
+def loaded(folder: Path, pad: str, kind: str = "cylinder", overrides: dict[str, Any] | None = None) -> Scene:
+    (folder / "s.xml").write_text(MODEL.replace("KIND", kind))
+    (folder / "s.toml").write_text(SCENE.replace("PAD", pad))
+    return load_scene(folder / "s.toml", overrides=overrides)
+
+
+def check_frames(axes: np.ndarray) -> None:
+    np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ axes, np.tile(np.eye(3), (len(axes), 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(axes), 1)
+
+
+def test_a_hemisphere(tmp_path: Path) -> None:
+    """Markers on the half beyond the site, as far apart as their area says, axes turned as little as possible."""
+    text = 'shape = "hemisphere"\nradius = 0.01\ncount = 302\nstiffness = "per area"'
+    pad = loaded(tmp_path, text).pads[0]
+    outward = (pad.positions - [0.001, 0, 0]) / 0.01
+    np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1)
+    np.testing.assert_allclose(pad.axes[..., 2], outward, atol=1e-12)
+    assert (outward[:, 2] < 0).all()  # the site's z points down
+    check_frames(pad.axes)
+    # Of all frames with this z, the nearest to the site's own: the trace of the turn between them is 1 + 2 cos(angle).
+    site = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(np.trace(site.T @ pad.axes, axis1=1, axis2=2), 1 - 2 * outward[:, 2], atol=1e-12)
+    gaps = np.linalg.norm(pad.positions[:, None] - pad.positions, axis=-1) + np.eye(302)
+    even = np.sqrt(2 * np.pi * 0.01**2 / 302)
+    assert (gaps.min(1) > 0.7 * even).all() and (gaps.min(1) < 1.2 * even).all()
+    assert pad.weights.sum() == pytest.approx(2 * np.pi * 0.01**2)
+    assert pad.grid is None and pad.shape == "hemisphere"
+
+
+def test_a_disc(tmp_path: Path) -> None:
+    text = 'shape = "disc"\nradius = 0.018\ncount = 130\ncenter = [0.002, 0.0]\nstiffness = "per area"'
+    scene = loaded(tmp_path, text)
+    pad = scene.pads[0]
+    apart = np.linalg.norm(pad.positions - [0.003, 0, 0], axis=1)
+    assert apart.max() < 0.018 and (apart < 0.009).mean() == pytest.approx(0.25, abs=0.01)
+    np.testing.assert_array_equal(pad.positions[:, 2], 0)
+    np.testing.assert_allclose(pad.axes, np.tile(np.diag([1.0, -1, -1]), (130, 1, 1)), atol=1e-12)
+    assert pad.weights.sum() == pytest.approx(np.pi * 0.018**2)
+    with pytest.raises(UsageError, match="pad 'pad' is no rectangle; its markers have no rows and columns"):
+        _ = scene.grids
+    told = describe(scene).pads[0]
+    assert (told.shape, told.markers, told.rows, told.pitch) == ("disc", 130, None, None)
+
+
+POINTS = np.array([[0.0, 0, 0.01], [0.01, 0, 0], [0, 0.01, 0], [0, 0, -0.01]])
+NORMALS = POINTS * 250  # of any length
+
+
+@pytest.mark.parametrize("source", ["toml", "csv", "npz"])
+def test_given_points(tmp_path: Path, source: str) -> None:
+    tips = np.array([[1.0, 0, 0], [0, 0, 2], [1, 1, 0], [1, 0, 1]])
+    if source == "toml":
+        text = f"positions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}\nx_axes = {tips.tolist()}"
+    else:
+        text = f'file = "markers.{source}"'
+        if source == "csv":
+            np.savetxt(tmp_path / "markers.csv", np.hstack([POINTS, NORMALS, tips]), delimiter=",", header="x, y, z")
+        else:
+            np.savez(tmp_path / "markers.npz", positions=POINTS, normals=NORMALS, x_axes=tips)
+    pad = loaded(tmp_path, f'shape = "points"\n{text}').pads[0]
+    site = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(pad.positions, POINTS @ site + [0.001, 0, 0], atol=1e-15)
+    check_frames(pad.axes)
+    inside = site @ pad.axes
+    np.testing.assert_allclose(inside[..., 2], POINTS / 0.01, atol=1e-12)
+    np.testing.assert_allclose(inside[..., 0], [[1, 0, 0], [0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-12)
+    assert (pad.weights == 1).all()
+
+
+def test_given_points_without_axes_have_those_of_the_site_or_of_their_normals(tmp_path: Path) -> None:
+    site = np.diag([1.0, -1.0, -1.0])
+    plain = loaded(tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}').pads[0]
+    np.testing.assert_allclose(site @ plain.axes, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
+    turned = loaded(tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}').pads[0]
+    check_frames(turned.axes)
+    np.testing.assert_allclose((site @ turned.axes)[..., 2], POINTS / 0.01, atol=1e-12)
+    np.testing.assert_allclose((site @ turned.axes)[3], np.diag([-1.0, 1, -1]), atol=1e-12)  # the opposite of z
+
+
+def test_every_marker_has_its_own_axes(tmp_path: Path) -> None:
+    """A fingertip pressed into the ground: the force is straight up, and each marker reads it in its own frame."""
+    scene = loaded(tmp_path, 'shape = "hemisphere"\nradius = 0.01\ncount = 40')
+    sim = Simulator(scene)
+    assert not sim.tactile().any()
+    sim.q[0, 0] = -0.1
+    reading, axes = sim.tactile()[0], scene.pads[0].axes
+    force = 1.0 * -scene.pads[0].positions[:, 2]  # k_n × depth
+    assert (force > 0).all()
+    np.testing.assert_allclose(reading[:, 2], -force * axes[:, 2, 2], atol=1e-12)
+    np.testing.assert_allclose(reading[:, :2], force[:, None] * axes[:, 2, :2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "ends"),
+    [
+        ("sphere", (0.02, 0.02, 0.02)),
+        ("box", (0.02, 0.03, 0.04)),
+        ("cylinder", (0.02, 0.02, 0.03)),
+        ("capsule", (0.02, 0.02, 0.05)),
+        ("ellipsoid", (0.02, 0.03, 0.04)),
+    ],
+)
+def test_markers_feel_every_shape(kind: str, ends: tuple[float, float, float], tmp_path: Path) -> None:
+    """One millimetre inside each end of a body's extent, and as far outside."""
+    middle = np.array([0.299, 0, 0])  # of the body, in the site's frame
+    inside = middle + np.diag(ends) - 1e-3 * np.eye(3)
+    places = np.concatenate([inside, 2 * middle - inside, inside + 2e-3 * np.eye(3)])
+    scene = loaded(tmp_path, f'shape = "points"\npositions = {places.tolist()}', kind)
+    assert next(shape for shape in scene.shapes if shape.name == "cap").kind == kind
+    force = np.linalg.norm(Simulator(scene).tactile()[0], axis=1)
+    np.testing.assert_allclose(force, [1e-3] * 6 + [0] * 3, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "message"),
+    [
+        ("sphere", "count = 20", ""),
+        ("sphere", 'faces = ["+z"]', "without a count 'cap' is one exact point, which takes geom alone"),
+        ("capsule", 'count = 20\nfaces = ["wall"]', "faces of a capsule are -z and +z, once each, got ['wall']"),
+        ("ellipsoid", "count = 20", ""),
+        ("ellipsoid", "", "count is missing"),
+        ("cylinder", 'faces = ["-z", "+z", "wall"]\nheights = 4', ""),
+        ("cylinder", "heights = 4", 'heights are those of the wall; add faces = ["-z", "+z", "wall"]'),
+    ],
+)
+def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Path) -> None:
+    loaded(tmp_path, "rows = 1\ncols = 1\npitch = 1e-3", kind)
+    contact = '[contacts.c]\npoints = "cap"\nagainst = "finger"\nkn = 1.0\nkt = 1.0\nmu = 1.0\nkd = 1.0\n'
+    path = tmp_path / "s.toml"
+    path.write_text(f'{path.read_text()}[points.cap]\ngeom = "cap"\n{text}\n{contact}')
+    if not message:
+        scene = load_scene(path, friction="viscous")
+        assert scene.points[0].radius == 0 and len(scene.points[0].points) in (20, 66 + 2 * 8)
+        assert scene.points[0].points[:, 0].mean() == pytest.approx(0.3, abs=2e-3)
+        return
+    with pytest.raises(UsageError) as caught:
+        load_scene(path)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('shape = "hexagon"\nradius = 0.01', "shape is 'hexagon'; known are disc, hemisphere, points, rectangle"),
+        ('shape = "disk"\nradius = 0.01', "shape is 'disk'; did you mean 'disc'?"),
+        ('shape = "hemisphere"\nradius = 0.01\nrows = 3', "unknown key 'rows'"),
+        ('shape = "hemisphere"\nradius = 0.01', "count is missing"),
+        ('shape = "disc"\nradius = -1\ncount = 3', "radius must be a number ≥"),
+        ('shape = "points"', "needs either positions or a file"),
+        ('shape = "points"\nfile = "no.csv"', "no.csv: no such file beside the scene"),
+        ('shape = "points"\nfile = "s.toml"', "a file of markers must be .csv or .npz"),
+        ('shape = "points"\nfile = "a.csv"\nnormals = [[0, 0, 1]]', "normals must stand in the file"),
+        ('shape = "points"\nfile = "two.csv"', "expected 3, 6 or 9 columns (position, normal, x axis), got 2"),
+        ('shape = "points"\nfile = "words.csv"', "words.csv can't be read"),
+        ('shape = "points"\nfile = "words.npz"', "words.npz can't be read"),
+        ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; known are positions, normals, x_axes"),
+        ('shape = "points"\npositions = [[0, 0]]', "positions must be a list of [x, y, z], all finite"),
+        ('shape = "points"\npositions = [[0, 0, nan]]', "positions must be a list of [x, y, z], all finite"),
+        ('shape = "points"\npositions = "tip"', "positions must be a list of [x, y, z], all finite"),
+        (
+            'shape = "points"\npositions = [[0, 0, 0]]\nnormals = [[0, 0, 1], [0, 0, 1]]',
+            "as many as positions, 1, got 2",
+        ),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nnormals = [[0, 0, 0]]', "normals[0] has no direction"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nx_axes = [[0, 0, 1]]', "x_axes[0] is along the normal"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nstiffness = "per area"', "set stiffness per point"),
+    ],
+)
+def test_a_wrong_pad_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "two.csv").write_text("1, 2\n")
+    (tmp_path / "words.csv").write_text("x, y, z\n")
+    (tmp_path / "words.npz").write_text("x, y, z\n")
+    np.savez(tmp_path / "other.npz", points=POINTS)
+    with pytest.raises(UsageError) as caught:
+        loaded(tmp_path, text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)

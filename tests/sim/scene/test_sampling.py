@@ -1,0 +1,152 @@
+"""Sampled points: they lie on the surface, and their weights add up to its area."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gelflow.errors import UsageError
+from gelflow.sim.scene.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
+
+
+def test_the_rolling_pad_has_as_many_points_as_published() -> None:
+    points, areas = box_surface((0.025, 0.025, 0.005), (20, 20, 20))
+    assert len(points) == len(areas) == 20**3 - 18**3
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    half=st.tuples(*[st.floats(0.01, 1.0)] * 3),
+    resolution=st.tuples(*[st.integers(2, 6)] * 3),
+    faces=st.lists(st.sampled_from(FACES), min_size=1, max_size=6, unique=True),
+)
+def test_box_weights_add_up_to_the_area_of_the_faces(
+    half: tuple[float, float, float], resolution: tuple[int, int, int], faces: list[str]
+) -> None:
+    points, areas = box_surface(half, resolution, faces=faces)
+    area = {"x": 4 * half[1] * half[2], "y": 4 * half[0] * half[2], "z": 4 * half[0] * half[1]}
+    assert areas.sum() == pytest.approx(sum(area[face[1]] for face in faces))
+    assert (areas.sum(1) > 0).all()
+    scaled = points / np.array(half)
+    assert np.abs(scaled).max(axis=1) == pytest.approx(1)  # on the surface
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # edges and corners once
+    for face in faces:
+        axis, sign = "xyz".index(face[1]), -1 if face[0] == "-" else 1
+        on_face = np.isclose(scaled[:, axis], sign)
+        others = [n for i, n in enumerate(resolution) if i != axis]
+        assert on_face.sum() >= others[0] * others[1]
+
+
+def test_box_points_include_the_corners() -> None:
+    points, areas = box_surface((1.0, 2.0, 3.0), (2, 2, 2))
+    assert sorted(map(tuple, points.tolist())) == sorted(
+        (x, y, z) for x in (-1.0, 1.0) for y in (-2.0, 2.0) for z in (-3.0, 3.0)
+    )
+    assert areas == pytest.approx(
+        np.tile([6.0, 3.0, 2.0], (8, 1))
+    )  # a quarter of each of the three faces that meet there
+
+
+def test_disc_has_the_published_points_and_its_area() -> None:
+    points, areas = disc(0.018, 0.0015)
+    assert len(points) == 66
+    assert areas.sum() == pytest.approx(2 * np.pi * 0.018**2)
+    assert np.linalg.norm(points[:, :2], axis=1).max() == pytest.approx(0.018)
+    assert set(points[:, 2]) == {-0.0015, 0.0015}
+
+
+def test_integrals_over_a_disc_converge() -> None:
+    """∫ x² dA over a unit disc is π/4: the error falls with the square of the spacing."""
+    errors = []
+    for radii in (4, 8, 16):
+        points, areas = disc(1.0, 0.1, angles=16, radii=radii, faces=["+z"])
+        errors.append(abs((areas[:, 2] * points[:, 0] ** 2).sum() - np.pi / 4))
+    assert errors[0] > 1.7 * errors[1] > 1.7**2 * errors[2]
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    angles=st.integers(3, 12),
+    radii=st.integers(1, 4),
+    heights=st.integers(2, 6),
+    faces=st.lists(st.sampled_from(("-z", "+z", "wall")), min_size=1, max_size=3, unique=True),
+)
+def test_cylinder_weights_add_up_to_the_area_of_the_faces(
+    angles: int, radii: int, heights: int, faces: list[str]
+) -> None:
+    radius, half = 0.3, 0.5
+    points, areas = cylinder(radius, half, angles=angles, radii=radii, heights=heights, faces=faces)
+    area = {"-z": np.pi * radius**2, "+z": np.pi * radius**2, "wall": 4 * np.pi * radius * half}
+    assert areas.sum() == pytest.approx(sum(area[face] for face in faces))
+    assert (areas.sum(1) > 0).all()
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # the rims once
+    around = np.linalg.norm(points[:, :2], axis=1)
+    assert np.maximum(around / radius, np.abs(points[:, 2]) / half) == pytest.approx(1)  # on the surface
+    flat = sum(area[face] for face in faces if face != "wall")
+    assert areas.sum(0) == pytest.approx([area["wall"] / 2 * ("wall" in faces)] * 2 + [flat])
+    # What each face integrates to on its own: moments of the height.
+    expected = sum(area[face] * {"-z": -half, "+z": half, "wall": 0}[face] for face in faces)
+    assert (areas.sum(1) * points[:, 2]).sum() == pytest.approx(expected, abs=1e-12)
+
+
+HALVES = [("-z", "+z"), ("-z",), ("+z",)]
+
+
+@pytest.mark.parametrize("faces", HALVES)
+@pytest.mark.parametrize("half", [0.0, 0.4])
+def test_spheres_and_capsules(half: float, faces: tuple[str, ...]) -> None:
+    points, areas = capsule(0.2, half, count=200, faces=faces)
+    assert len(points) == 200
+    axis = np.clip(points[:, 2], -half, half)
+    assert np.linalg.norm(points - np.stack([0 * axis, 0 * axis, axis], -1), axis=1) == pytest.approx(0.2)
+    assert areas.sum() == pytest.approx(len(faces) / 2 * (4 * np.pi * 0.2**2 + 4 * np.pi * 0.2 * half))
+    assert ((points[:, 2] < 0) == (len(faces) == 2) | (faces == ("-z",)))[points[:, 2] < 0].all()
+    # Equal areas, near-uniform: nobody's neighbour is much nearer than the area says.
+    gaps = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(200)
+    assert gaps.min() > 0.6 * np.sqrt(areas[0].sum())
+
+
+@pytest.mark.parametrize("faces", HALVES)
+@pytest.mark.parametrize("axes", [(0.1, 0.1, 0.1), (0.1, 0.2, 0.3), (0.3, 0.1, 0.1)])
+def test_ellipsoids(axes: tuple[float, float, float], faces: tuple[str, ...]) -> None:
+    """Area by the mean of a dense grid over both angles; ∫ z² over the whole surface converges."""
+    u, v = np.meshgrid((np.arange(400) + 0.5) / 400 * np.pi, np.arange(400) / 400 * 2 * np.pi)
+    direction = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
+    cell = np.prod(axes) * np.linalg.norm(direction / axes, axis=-1) * np.sin(u) * np.pi / 400 * 2 * np.pi / 400
+    points, areas = ellipsoid(axes, count=500, faces=faces)
+    assert np.linalg.norm(points / axes, axis=1) == pytest.approx(1)
+    assert areas.sum() == pytest.approx(cell.sum() * len(faces) / 2, rel=1e-4)
+    z = (cell * (axes[2] * direction[..., 2]) ** 2).sum() * len(faces) / 2
+    assert (areas.sum(1) * points[:, 2] ** 2).sum() == pytest.approx(z, rel=2e-3)
+    assert (points[:, 2] < 0).any() == ("-z" in faces) and (points[:, 2] > 0).any() == ("+z" in faces)
+
+
+@pytest.mark.parametrize("axes", [(0.1, 0.1, 0.1), (0.1, 0.2, 0.3)])
+def test_parts_of_an_area_say_how_it_grows(axes: tuple[float, float, float]) -> None:
+    """Stretched by a little along one axis, the area grows by the parts across the other two."""
+    _, areas = ellipsoid(axes, count=400)
+    for axis in range(3):
+        stretch = np.ones(3)
+        stretch[axis] = 1 + 1e-6
+        larger = ellipsoid(tuple(np.array(axes) * stretch), count=400)[1].sum()
+        others = areas.sum() - areas[:, axis].sum()
+        assert (larger - areas.sum()) / 1e-6 == pytest.approx(others, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: box_surface((1, 1, 1), (1, 2, 2)), "at least 2 points"),
+        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["z"]), "unknown face 'z'"),
+        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["-z", "-z"]), "once each"),
+        (lambda: disc(1, 1, angles=2), "at least 3 angles"),
+        (lambda: disc(1, 1, faces=["-x"]), "faces of a disc"),
+        (lambda: cylinder(1, 1, faces=["-x"]), "faces of a cylinder are -z, .z and wall, once each"),
+        (lambda: cylinder(1, 1, heights=1), "at least 3 angles and 2 heights, got 16 and 1"),
+        (lambda: capsule(1, 1, count=0), "a capsule needs a count of at least 1, got 0"),
+        (lambda: ellipsoid((1, 1, 1), count=9, faces=["wall"]), "faces of an ellipsoid are -z and .z"),
+    ],
+)
+def test_wrong_sampling_is_refused(call: object, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        call()  # type: ignore[operator]

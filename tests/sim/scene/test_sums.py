@@ -1,0 +1,119 @@
+"""Readings that add up: a pad whose markers are contact points reads exactly what pushes its body."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.sim import _core
+from gelflow.sim.benchmark.describe import describe
+from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.validation import gradient_check
+from gelflow.sim.validation.energy import EnergyGauge
+from gelflow.sim.validation.reference_motions import motion
+
+PUSHING: dict[str, dict[str, Any]] = {
+    "rolling": {"pads.pad.pushes": True, "pads.pad.rows": 20, "pads.pad.cols": 20, "pads.pad.size": [0.04, 0.04]},
+    "insertion": {"pads.*.pushes": True},
+    "dclaw": {"pads.*.pushes": True},
+}
+
+
+def pushed(name: str, law: str, **more: Any) -> Scene:
+    return load_scene(name, friction=law, overrides={**PUSHING[name], **more})
+
+
+def in_world(sim: Simulator, scene: Scene, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Forces of a pad's markers [N] and where they are [m], in the world, each (markers, 3)."""
+    pad = scene.pads[index]
+    start = sum(len(p.positions) for p in scene.pads[:index])
+    axes, places = pad.axes, pad.positions
+    body = sim.poses()[0, pad.body]
+    w, v = body[3], body[4:]
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    readings = sim.tactile()[0, start : start + len(places)] * [1, 1, -1]
+    return np.einsum("mij,mj->mi", axes, readings) @ turn.T, places @ turn.T + body[:3]
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", PUSHING)
+def test_markers_add_up_to_the_wrench(name: str, law: str) -> None:
+    """After every step of a motion that touches, sticks, slips and lets go."""
+    scene = pushed(name, law)
+    sim, run = Simulator(scene), motion(scene)
+    sim.q[:] = run.q0
+    felt, names = 0, list(sim.model.contact_names)
+    for u in run.steps(scene.step):
+        sim.step(u)
+        wrenches = sim.wrenches()[0]
+        for i, pad in enumerate(scene.pads):
+            forces, places = in_world(sim, scene, i)
+            size = np.linalg.norm(forces, axis=1).sum()
+            own = sum(wrenches[n] for n, c in enumerate(names) if c == pad.name or c.startswith(pad.name + "/"))
+            np.testing.assert_allclose(forces.sum(0), own[3:], atol=1e-12 * size, rtol=0)
+            np.testing.assert_allclose(np.cross(places, forces).sum(0), own[:3], atol=1e-12 * size, rtol=0)
+            felt += bool(size)
+    sim.check()
+    assert felt > 50
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+@pytest.mark.parametrize("law", LAWS)
+def test_gradients(law: str, integrator: str) -> None:
+    scene = pushed("rolling", law, integrator=integrator)
+    spec = scene.describe_to(_core.ModelSpec())
+    spec.polish = 2
+    sim = Simulator(_core.Model(spec))
+    sim.step([0, 0, 0.2], 120)
+    sim.step([0.1, 0.03, 0.2], 10)
+    rng = np.random.default_rng(1)
+    outputs: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
+    for output in outputs:
+        case = gradient_check.Case.random(sim, np.tile([0.12, 0.0, 0.2], (3, 1)), output, rng)
+        assert gradient_check.against_dual(case, rng).error < 1e-10
+
+
+def test_separate_grids_converge_to_one_total() -> None:
+    """Per area, the markers' sum and the contact's differ less and less as both grids get denser."""
+    differences = []
+    for fine in (1, 2, 4, 8):
+        numbers = {"kn": 1e5, "kt": 1e2, "mu": 0.5, "kd": 1e3}
+        pad = {f"pads.pad.{key}": value for key, value in numbers.items()}
+        contact = {f"contacts.pad_ball.{key}": value for key, value in numbers.items()}
+        size = {"pads.pad.rows": 10 * fine, "pads.pad.cols": 10 * fine, "pads.pad.stiffness": "per area"}
+        points = {"points.pad.stiffness": "per area", "points.pad.resolution": [12 * fine + 1, 12 * fine + 1, 2]}
+        scene = load_scene("rolling", friction="viscous", overrides={**pad, **contact, **size, **points})
+        sim = Simulator(scene)
+        sim.step([0, 0, 0.2], 100)
+        sim.check()
+        normal = sim.tactile()[0, :, 2].sum()
+        pushed_with = abs(sim.wrenches()[0, list(sim.model.contact_names).index("pad_ball"), 5])
+        differences.append(abs(normal / pushed_with - 1))
+    print("difference of the totals:", [f"{d:.1e}" for d in differences])
+    assert differences[-1] < 2e-3 and differences[-1] < differences[0] / 8
+
+
+def test_one_set_of_numbers_and_anchors() -> None:
+    scene = pushed("insertion", "elastic")
+    plain = load_scene("insertion", friction="elastic")
+    assert scene.build().na == plain.build().na
+    sim = Simulator(scene, num_envs=2)
+    sim.q[:] = motion(scene).q0
+    sim.param(f"{scene.pads[0].name}.kn")[1] *= 2
+    sim.step(np.tile(motion(scene).steps(scene.step)[0], (2, 1)))
+    assert not np.array_equal(sim.v[0], sim.v[1]), "the number pushes"
+    gauge = EnergyGauge(scene, num_envs=2)
+    assert np.isfinite(gauge.read(sim).total).all()
+
+
+def test_describe_and_refusal() -> None:
+    described = describe(pushed("insertion", "viscous"))
+    assert all(pad.pushes for pad in described.pads)
+    assert described.size.contact_pairs > describe(load_scene("insertion")).size.contact_pairs
+    with pytest.raises(UsageError, match="pushes must be true or false"):
+        load_scene("insertion", overrides={"pads.*.pushes": 1})
