@@ -1,7 +1,7 @@
 """Two million random steps at the extremes: `python benchmarks/extremes.py`, a little over 3 minutes on 2 cores.
 
-What is drawn stands in `sim/validation/stress.py`. Prints how many steps failed, needed substeps, and what they cost;
-the figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
+What is drawn stands in `gelflow.sim`. Prints how many steps failed, needed substeps, and what they cost; the
+figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
 """
 
 import argparse
