@@ -4,11 +4,11 @@ import re
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tomllib
 import zipfile
 from pathlib import Path
 
+import importlinter
 import pytest
 
 import gelflow
@@ -100,7 +100,7 @@ def lint_imports(skeleton: Path, edges: list[tuple[str, str]]) -> subprocess.Com
         (skeleton / folder / "edge.py").write_text("".join(lines))
     # -S: without the editable install's own import hook, which would lead back to this tree.
     code = (
-        f"import sys; sys.path[:0] = ['src', {sysconfig.get_path('purelib')!r}]; "
+        f"import sys; sys.path[:0] = ['src', {str(Path(importlinter.__file__).parents[1])!r}]; "
         "from importlinter.cli import lint_imports; "
         "sys.exit(lint_imports(config_filename='pyproject.toml', no_cache=True))"
     )
