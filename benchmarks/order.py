@@ -260,7 +260,7 @@ def main() -> int:
     slopes = {q: min(r.slope(q) for r in found) for q in QUANTITIES}
     console.print(f"Smallest slope over the finest steps: {', '.join(f'{q} {s:.2f}' for q, s in slopes.items())}")
     if min(slopes.values()) < REQUIRED:
-        console.print(f"Some are below {REQUIRED}: docs/accuracy.md says why.")
+        console.print(f"Some are below {REQUIRED}: docs/reference/accuracy.md says why.")
     record = {
         "format": 1,
         "processor": processor(),

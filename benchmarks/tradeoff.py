@@ -1,8 +1,8 @@
-"""Everything that docs/tradeoff.md shows: `python benchmarks/tradeoff.py [SCENE …]`.
+"""Everything that docs/guide/tradeoff.md shows: `python benchmarks/tradeoff.py [SCENE …]`.
 
 For each scene: all settings (`gelflow.sim.benchmark.tradeoff.sweep`) to benchmarks/results/tradeoff_SCENE.json and
 docs/pictures/tradeoff_SCENE.png, and the errors of its presets over draws of its physics, whose bounds go into the
-table of docs/tradeoff.md. Errors do not depend on the machine; run it where nothing else runs, for the times.
+table of docs/guide/tradeoff.md. Errors do not depend on the machine; run it where nothing else runs, for the times.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff, measure
 from gelflow.sim.scene.scene import load_scene, scene_names
 
 ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "tradeoff.md"
+PAGE = ROOT / "docs" / "guide" / "tradeoff.md"
 DRAWS = 48
 HALVINGS = 8  # of a frame, for the references of the draws
 BEGIN, END = "<!-- written by benchmarks/tradeoff.py -->", "<!-- end -->"
@@ -86,7 +86,7 @@ def one(scene: str, draws: int, repeats: int, progress: Progress) -> tuple[Trade
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Measure what accuracy costs, and write what docs/tradeoff.md shows.")
+    parser = argparse.ArgumentParser(description="Measure cost against accuracy; writes docs/guide/tradeoff.md.")
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all that come along, when none is named")
     parser.add_argument("--repeats", type=int, default=21, metavar="N", help="timed runs of each setting (%(default)s)")
     parser.add_argument("--draws", type=int, default=DRAWS, metavar="N", help="of the physics (%(default)s)")

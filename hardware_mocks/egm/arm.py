@@ -1,6 +1,6 @@
 """The robot's side of EGM: an IRB 120 that sends its feedback over UDP every 4 ms and follows what it is answered.
 
-It plays the controller together with its RAPID program (docs/arm.md has the real one): EGM waits for the first answer,
+It plays the controller together with its RAPID program (docs/guide/arm.md): EGM waits for the first answer,
 runs until answers stay out for CommTimeout, and is started again by the program a second later, with a new message
 count. Motion goes through the joints (lag, then the speed limit of MaxSpeedDeviation) to an `ArmPlant`.
 

@@ -3,7 +3,7 @@
 A contact is felt at points. Where stiffness is given per area, a point's weight is the part of the surface nearest to
 it, clipped to the face, so that the weights add up to the area exactly and results converge as points get denser.
 A point's area comes in three parts, whose sum it is: those across x, y and z. An area with normal n has the shares n²;
-where faces meet, each gives its own. When points are scaled the parts grow with it (docs/physics.md).
+where faces meet, each gives its own. When points are scaled the parts grow with it (docs/reference/physics.md).
 
 Round surfaces carry a Fibonacci lattice: points at equal steps of height, each turned by the golden angle from the one
 below. On spheres and cylinders alike equal steps of height are equal areas (Archimedes).

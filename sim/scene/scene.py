@@ -2,7 +2,7 @@
 
 `load_scene` reads both, checks every key and name, and returns a `Scene`: plain data, frozen, from which `build`
 makes the core's model. Only what the scene requires is passed on: geometry that is in no contact and under no pad is
-left out, and `Scene.left_out` says so. The format is described in docs/scenes.md.
+left out, and `Scene.left_out` says so. The format is described in docs/guide/scenes.md.
 """
 
 import copy
@@ -53,7 +53,7 @@ class Scene:
     path: Path
     step: float  # [s]
     integrator: str  # "bdf1" or "bdf2"
-    tolerance: float  # of Newton's method, see docs/physics.md
+    tolerance: float  # of Newton's method, see docs/reference/physics.md
     precision: Precision  # in which a `Simulator` steps it unless told otherwise
     friction: str  # the law that contacts and pads follow unless they fix their own
     gravity: Array  # [m/s²]

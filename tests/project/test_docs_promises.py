@@ -8,7 +8,7 @@ import pytest
 from gelflow.cli.main import COMMANDS, main
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCUMENTS = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
+DOCUMENTS = ("README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")))
 
 
 @pytest.mark.parametrize("command", COMMANDS)

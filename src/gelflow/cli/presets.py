@@ -1,3 +1,3 @@
 """The option `--preset`, the same everywhere. No command."""
 
-PRESET_HELP = "how exactly to simulate: fast, balanced, accurate (default: the scene's own numbers; docs/tradeoff.md)"
+PRESET_HELP = "fast, balanced or accurate simulation (default: the values of the scene file; docs/guide/tradeoff.md)"

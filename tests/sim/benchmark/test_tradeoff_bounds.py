@@ -1,4 +1,4 @@
-"""The errors that docs/tradeoff.md promises of every preset, on physics that was not used to choose the bounds."""
+"""The error bounds in docs/guide/tradeoff.md hold for physics that did not choose them."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.scene.presets import NAMES
 from gelflow.sim.scene.scene import load_scene, scene_names
 
-PAGE = Path(__file__).parents[3] / "docs" / "tradeoff.md"
+PAGE = Path(__file__).parents[3] / "docs" / "guide" / "tradeoff.md"
 SEEDS = (1001, 1002, 1003)  # the page's draws have seeds from 0 on
 HALVINGS = 8
 

@@ -176,7 +176,7 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
 
 
 def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_by_depth: bool) -> str:
-    """A force law in words; units as in docs/conventions.md, plain damping has that of k_t."""
+    """A force law in words; units as in docs/reference/conventions.md, plain damping has that of k_t."""
     stiffness, friction, by_depth = ("N/m³", "N s/m³", "N s/m⁴") if unit == "per area" else ("N/m", "N s/m", "N s/m²")
     words = [f"k_n {numbers['kn']:g} {stiffness}"]
     if law == "elastic":

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("job", choices=("insertion",), help="what to run")
-    parser.add_argument("--lab", type=Path, required=True, metavar="FILE", help="the lab file (docs/robot.md)")
+    parser.add_argument("--lab", type=Path, required=True, metavar="FILE", help="the lab file (docs/guide/robot.md)")
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="the policy; default: gelflow's own")
     parser.add_argument("--insertions", type=int, default=1, metavar="N", help="how many parts (default 1)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the recording (default sessions/DATE-TIME)")
