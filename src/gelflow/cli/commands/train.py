@@ -14,7 +14,7 @@ from gelflow.errors import UsageError
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=["insertion"], help="what to learn")
-    parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: see docs/guide/training.md)")
+    parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: docs/guide/training.md)")
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="simulated robots side by side (default 64)")
     parser.add_argument("--seed", type=int, default=0, help="decides every random number (default 0)")
