@@ -27,8 +27,8 @@ from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.energy import EnergyGauge, motor_forces
-from gelflow.sim.validation.reference_motions import SCENES, motion
-from gelflow.sim.validation.thrown_bodies import Kind, Throw, fly
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
+from gelflow.sim.validation.thrown_bodies import Kind, ThrownBody, throw_bodies
 
 STEPS = (1e-4, 1e-3, 5e-3, 2e-2)  # [s], of free bodies
 SCENE_STEPS = (1e-3, 5e-3, 2e-2)  # [s]
@@ -69,8 +69,8 @@ def throw(body: Kind, law: str, kt: float, integrator: str, step: float) -> Thro
         numbers = {"kn": 2e3, "kt": kt, "mu": 0.6, "kd": kd, "ks": 1e3 if law == "elastic" else 0.0}
         rng = np.random.default_rng(1)
         for center in CENTERS:
-            thrown = Throw(body, law, damping, step, numbers, integrator=integrator, center=center)
-            growth = fly(thrown, rng, bodies=BODIES, steps=STEPS_TAKEN)
+            thrown = ThrownBody(body, law, damping, step, numbers, integrator=integrator, center=center)
+            growth = throw_bodies(thrown, rng, bodies=BODIES, steps=STEPS_TAKEN)
             relative = growth.change / growth.scale
             above = (growth.total.max(0) - growth.total[0]) / growth.scale[0]
             rows.append(((relative > ALLOWED).mean(), relative.max(), above.max(), growth.halved.mean()))
@@ -97,12 +97,12 @@ class Moved:
 def move(name: str, law: str, integrator: str, step: float) -> Moved:
     overrides = {**GRID.get(name, {}), "step": step, "integrator": integrator}
     scene = load_scene(name, friction=law, overrides=overrides)
-    sim, gauge, moves = Simulator(scene), EnergyGauge(scene), motion(scene)
+    sim, gauge, moves = Simulator(scene), EnergyGauge(scene), reference_motion(scene)
     sim.q[0] = moves.q0
     at = [sim.model.joint_q[a.joint] for a in scene.actuators]
     excess, work = [], []
     before = gauge.read(sim).total[0]
-    for u in moves.steps(step):
+    for u in moves.step_controls(step):
         start = sim.q[0, at].copy()
         sim.step(u)
         after = gauge.read(sim).total[0]

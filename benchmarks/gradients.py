@@ -28,8 +28,8 @@ from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS
-from gelflow.sim.validation.gradient_cases import FREE, SHAPES, exact_simulator, in_contact, on_shape
-from gelflow.sim.validation.gradient_check import Case, Output, against_differences, against_dual
+from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
+from gelflow.sim.validation.gradient_check import Output, RolloutLoss, compare_to_differences, compare_to_dual_numbers
 from gelflow.sim.validation.reference_motions import SCENES
 
 FILE = Path(__file__).parent / "results" / "gradients.json"
@@ -62,14 +62,14 @@ class Row:
 def check(row: Row, seed: int) -> None:
     """One more state of a combination."""
     rng = np.random.default_rng(seed)
-    sim, u = (in_contact if row.name in SCENES else on_shape)(row.name, row.law, row.integrator, rng)
-    case = Case.random(sim, u, OUTPUTS[seed % len(OUTPUTS)], rng)
-    exact, right = against_dual(case, rng, directions=2), against_differences(case)
+    sim, u = (scene_in_contact if row.name in SCENES else cloud_on_shape)(row.name, row.law, row.integrator, rng)
+    case = RolloutLoss.random(sim, u, OUTPUTS[seed % len(OUTPUTS)], rng)
+    exact, right = compare_to_dual_numbers(case, rng, directions=2), compare_to_differences(case)
     if exact.error >= row.dual:
         row.dual, row.dual_worst = exact.error, exact.worst
     if row.difference is None or right.error >= row.difference:
         row.difference, row.difference_worst = right.error, right.worst
-    left = (row.left_out or 0.0) * row.entries + right.left_out * right.entries
+    left = (row.left_out or 0.0) * row.entries + right.skipped * right.entries
     row.states, row.entries = row.states + 1, row.entries + right.entries
     row.left_out = left / row.entries
 
@@ -77,11 +77,11 @@ def check(row: Row, seed: int) -> None:
 def check_rolling_run(row: Row) -> None:
     """The published run's first 110 steps, with a loss of all marker readings at the end, and positions there."""
     (down, push), (_, roll) = ROLLING_FORCES[:2]
-    sim, rng = exact_simulator("rolling", row.law, row.integrator), np.random.default_rng(0)
+    sim, rng = converged_simulator("rolling", row.law, row.integrator), np.random.default_rng(0)
     u = np.array([push] * down + [roll] * (110 - down))
     reading = sim.rollout(u[:, None], read_after=(len(u),)).tactile[0, 0]
-    for case in (Case(sim, u, "tactile", reading), Case.random(sim, u, "q", rng)):
-        exact = against_dual(case, rng, directions=1)
+    for case in (RolloutLoss(sim, u, "tactile", reading), RolloutLoss.random(sim, u, "q", rng)):
+        exact = compare_to_dual_numbers(case, rng, directions=1)
         row.states += 1
         if exact.error >= row.dual:
             row.dual, row.dual_worst = exact.error, exact.worst

@@ -46,7 +46,7 @@ from gelflow.sim import _core
 from gelflow.sim.benchmark import versions
 from gelflow.sim.scene.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import Motion, motion
+from gelflow.sim.validation.reference_motions import ReferenceMotion, reference_motion
 
 Array = NDArray[np.float64]
 Case = tuple[str, str]  # scene, law
@@ -72,7 +72,7 @@ QUANTITIES = ("q", "v", "tactile")
 GRID = {"rolling": {"pads.pad.rows": 20, "pads.pad.cols": 20}}
 
 
-def variants(moves: Motion, count: int) -> list[Motion]:
+def variants(moves: ReferenceMotion, count: int) -> list[ReferenceMotion]:
     """The motion itself, then others near it, spread evenly over sizes and paces (an R2 sequence)."""
     steps = np.array([0.7548776662466927, 0.5698402909980532])
     points = (0.5 + np.arange(count)[:, None] * steps) % 1
@@ -97,7 +97,7 @@ class Course:
 def run(scene: Scene, integrator: str, halvings: int, count: int) -> Course:
     """A scene's motions with steps of LONGEST / 2^halvings. Raises SimulationError where a step can't be taken."""
     step, between = LONGEST / 2**halvings, 2**halvings
-    moves = motion(scene)
+    moves = reference_motion(scene)
     sim, chosen = simulator(scene, step, integrator, TOLERANCE, count), variants(moves, count)
     sim.q[:] = moves.q0
     seen: dict[str, list[Array]] = {quantity: [] for quantity in QUANTITIES}
@@ -181,7 +181,7 @@ def converge(less: int, threads: int, done: Callable[[float], None]) -> tuple[li
         return result
 
     def errors(job: tuple[Case, str, int]) -> Errors:
-        return judge(course(*job), references[job[0]], motion(scenes[job[0]]).q0)
+        return judge(course(*job), references[job[0]], reference_motion(scenes[job[0]]).q0)
 
     jobs = sorted(((*kind, k) for kind, ks in taken.items() for k in ks), key=lambda job: -job[2])  # the longest first
     with ThreadPoolExecutor(threads) as pool:
@@ -301,7 +301,7 @@ def scene_schemes(
             if (r.scene, r.law) == (name, law)
         ]
         scene = load_scene(name, friction=law, overrides=GRID.get(name))
-        moves, end = motion(scene), ends[name, law]
+        moves, end = reference_motion(scene), ends[name, law]
         size = float(np.linalg.norm(end - moves.q0))
         steps = [LONGEST / 2**k for k in range(8)]
         errors, iterations = [], []

@@ -24,7 +24,7 @@ from gelflow.sim.benchmark import versions
 from gelflow.sim.benchmark.runs import HOLD
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
 STEPS = 100
 # Groups by the names of functions, looked for in this order; small ones are inlined into those that call them.
@@ -54,9 +54,9 @@ GROUPS = {
 def run(name: str, steps: int) -> float:
     """Some steps from the start of the scene's motion, `HOLD` a call [s per step]."""
     scene = load_scene(name, friction="viscous")
-    sim, moves = Simulator(scene, threads=1), motion(scene)
+    sim, moves = Simulator(scene, threads=1), reference_motion(scene)
     sim.q[:] = moves.q0
-    controls = moves.steps(scene.step)[:steps]
+    controls = moves.step_controls(scene.step)[:steps]
     start = time.process_time()
     for u in controls[HOLD - 1 :: HOLD]:
         sim.step(u, HOLD)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.gradient_check import difference, retract
-from gelflow.sim.validation.reference_motions import Motion
+from gelflow.sim.validation.reference_motions import ReferenceMotion
 
 Array = NDArray[np.float64]
 
@@ -174,14 +174,14 @@ def ball_errors(done: Callable[[float], None]) -> list[Scheme]:
     return result
 
 
-def extrapolated_scene(whole: Simulator, halves: Simulator, moves: Motion) -> tuple[Array, int]:
+def extrapolated_scene(whole: Simulator, halves: Simulator, moves: ReferenceMotion) -> tuple[Array, int]:
     """A scene's motion by BDF1 extrapolated in every step: final q and Newton iterations.
 
     `whole` has steps of h, `halves` of h / 2, both BDF1. Anchors are those of the half steps. Raises SimulationError
     where a step can't be taken.
     """
     model = whole.model
-    u = moves.steps(whole.model.step)
+    u = moves.step_controls(whole.model.step)
     middles = moves.controls(whole.model.step * (np.arange(len(u)) + 0.5))
     halves.q[0] = moves.q0
     for middle, end in zip(middles, u, strict=True):

@@ -20,7 +20,7 @@ from gelflow.errors import GelflowError
 from gelflow.measurement.machine import processor
 from gelflow.sim.benchmark import versions
 from gelflow.sim.benchmark.tradeoff.picture import draw
-from gelflow.sim.benchmark.tradeoff.preset_bounds import OWN, Bounds, bounds, preset_errors
+from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, Bounds, bounds, preset_errors
 from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff, measure
 from gelflow.sim.scene.scene import load_scene, scene_names
@@ -34,7 +34,7 @@ BEGIN, END = "<!-- written by benchmarks/tradeoff.py -->", "<!-- end -->"
 
 def row(scene: str, name: str, bound: Errors, speed: float) -> str:
     """One line of the page's table. Units as in its heading."""
-    way = load_scene(scene, preset=None if name == OWN else name)
+    way = load_scene(scene, preset=None if name == SCENE_DEFAULT else name)
     how = f"{way.integrator.upper()}, {1e3 * way.step:g} ms, {way.tolerance:.0e}".replace("e-0", "e-")
     figures = (1e3 * bound.position, 1e3 * bound.rotation, 100 * bound.markers, bound.flow)
     cells = [scene, name, how, f"{speed:.0f}", *(f"{x:.3g}" for x in figures), f"{bound.cosine:.4f}"]
@@ -43,8 +43,12 @@ def row(scene: str, name: str, bound: Errors, speed: float) -> str:
 
 def speeds(found: Tradeoff) -> dict[str, float]:
     """Times faster than real time, by preset."""
-    result = {name: price.speed for price in found.prices for name in price.presets}
-    return result | {OWN: next(price.speed for price in found.prices if price.setting.group == "own")}
+    result = {name: measurement.speed for measurement in found.measurements for name in measurement.presets}
+    return result | {
+        SCENE_DEFAULT: next(
+            measurement.speed for measurement in found.measurements if measurement.setting.group == "default"
+        )
+    }
 
 
 def write_page(rows: dict[str, list[str]]) -> None:

@@ -1,7 +1,7 @@
 """The simulated insertion as training and evaluation use it: which environment, which noise."""
 
 from gelflow.policies.evaluation import Attempts, Noise
-from gelflow.sim.tasks.gym import InsertionVectorEnv
+from gelflow.sim.tasks.environments import InsertionVectorEnv
 from gelflow.task import INSERTION, InsertionTask
 
 

@@ -126,7 +126,7 @@ class Simulator:
         """
         self._batch.reset(None if which is None else np.ascontiguousarray(which, dtype=np.uint8))
 
-    def forget(self, which: ArrayLike | None = None) -> None:
+    def clear_history(self, which: ArrayLike | None = None) -> None:
         """Clear what the state remembers of its past, after it was written by hand: anchors, and BDF2's history."""
         chosen = slice(None) if which is None else np.asarray(which, dtype=bool)
         self.anchored[chosen] = 0
@@ -328,7 +328,7 @@ class Simulator:
             raise UsageError(str(error)) from None
         return result
 
-    def branches(self, trajectory: Trajectory) -> NDArray[np.uint64]:
+    def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:
         """Signature of the branches that each step took (touching, sliding, clipped), (steps, N).
 
         Two runs with equal signatures lie on one smooth piece of the dynamics; markers count where they were read.

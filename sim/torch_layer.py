@@ -43,13 +43,13 @@ class TorchRollout:
     ok: torch.Tensor
 
 
-def state_of(sim: Simulator) -> TorchState:
+def torch_state(sim: Simulator) -> TorchState:
     """The simulator's present state as tensors (copies)."""
     arrays = (sim.q, sim.v, sim.anchors, sim.anchored, sim.history)
     return TorchState(*(torch.from_numpy(np.array(array)) for array in arrays))
 
 
-def rollout(
+def torch_rollout(
     sim: Simulator,
     state: TorchState,
     u: torch.Tensor,
@@ -89,11 +89,11 @@ def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Ten
     return numbers
 
 
-def step(
+def torch_step(
     sim: Simulator, state: TorchState, u: torch.Tensor, *, params: Mapping[str, torch.Tensor] | None = None
 ) -> tuple[TorchState, torch.Tensor]:
     """One step under controls u (N, nu): the state after it, and what the markers then feel (N, markers, 3) [N]."""
-    result = rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else (), params=params)
+    result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else (), params=params)
     tactile = result.tactile[0] if sim.model.markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
 

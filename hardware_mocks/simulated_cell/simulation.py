@@ -274,7 +274,7 @@ class World:
         z = gz - self.config.grasp_height + _HALF_HEIGHT + rng.uniform(-1, 1) * self.config.height_error
         self._hand = np.array([gx, gy, z, *yaw_quaternion(turn)])
         self._hold_part()
-        self._sim.forget()
+        self._sim.clear_history()
         self._current = PartTruth(self._next_seed, (float(x), float(y), float(yaw)))
         self.parts.append(self._current)
         self._next_seed += 1

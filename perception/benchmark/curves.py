@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.measurement.timing import Effort, Report
+from gelflow.measurement.timing import BenchmarkOptions, Report
 from gelflow.perception.benchmark.baselines import FOLLOWERS
 from gelflow.perception.benchmark.metrics import Figures
 from gelflow.perception.benchmark.speed import measure_speed
@@ -38,14 +38,14 @@ ERRORS = (
 WIDTHS = (240, 320, 480, 640, 960, 1280)  # of images of 4:3 [px]
 
 
-def measure_curves(effort: Effort) -> Report:
-    """Errors and times along every curve; with a quick effort at their ends alone."""
+def measure_curves(options: BenchmarkOptions) -> Report:
+    """Errors and times along every curve; with `options.quick` at their ends alone."""
     rows: list[tuple[str, ...]] = []
     results: list[dict[str, Any]] = []
-    fields, sequence = (FIELDS[:1], {"frames": 6, "period": 4}) if effort.quick else (FIELDS[::2], _SEQUENCE)
+    fields, sequence = (FIELDS[:1], {"frames": 6, "period": 4}) if options.quick else (FIELDS[::2], _SEQUENCE)
     for curve in ERRORS:
-        values = curve.values[:: len(curve.values) - 1] if effort.quick else curve.values
-        effort.watch.begin(f"tracking: {curve.name}", len(values))
+        values = curve.values[:: len(curve.values) - 1] if options.quick else curve.values
+        options.progress.begin(f"tracking: {curve.name}", len(values))
         for value in values:
             changed, motion = curve.at(value)
             courses = Case(curve.name, "typical", changed).follow(FOLLOWERS, fields, **(sequence | motion))
@@ -53,18 +53,18 @@ def measure_curves(effort: Effort) -> Report:
             medians = ("gave up" if one.failed else f"{one.median:.3f}" for one in figures.values())
             rows.append((f"{curve.name} {value:g}", *medians))
             results.append({"curve": curve.name, "at": value} | {name: one.plain() for name, one in figures.items()})
-            effort.watch.advance()
+            options.progress.advance()
     timed = [("markers", markers, markers, LARGE) for markers in SIZES]
     timed += [("width", width, 130, (width, width * 3 // 4)) for width in WIDTHS]
-    for name, value, markers, size in [timed[0], timed[len(SIZES)]] if effort.quick else timed:
+    for name, value, markers, size in [timed[0], timed[len(SIZES)]] if options.quick else timed:
         look = look_of("typical", markers=markers, width=size[0], height=size[1])
         frames = list(GelSequence(look, frames=_TIMED))
         images, first, grid = [frame.image for frame in frames], frames[0], look.grid
-        taken = measure_speed(
-            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=effort.repeats
+        timings = measure_speed(
+            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=options.repeats
         )
-        rows.append((f"ms: {name} {value}", *(f"{one.frame:.2f}" for one in taken.values())))
-        results.append({"curve": name, "at": value} | {who: asdict(one) for who, one in taken.items()})
+        rows.append((f"ms: {name} {value}", *(f"{one.frame:.2f}" for one in timings.values())))
+        results.append({"curve": name, "at": value} | {who: asdict(one) for who, one in timings.items()})
     return Report(
         name="tracking_curves",
         title="Tracking: the curves",
@@ -73,7 +73,7 @@ def measure_curves(effort: Effort) -> Report:
         note="Median error in px on press and twist, 130 markers on 320 × 240 px; ms an image: markers on "
         f"{LARGE[0]} × {LARGE[1]} px, 130 markers on images of any width.",
         results=results,
-        outside=[],
+        violations=[],
     )
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gelflow.measurement.timing import Effort, Report
+from gelflow.measurement.timing import BenchmarkOptions, Report
 from gelflow.perception.benchmark.baselines import FOLLOWERS
 from gelflow.perception.benchmark.metrics import Course, Figures, follow
 from gelflow.perception.benchmark.speed import measure_speed
@@ -73,30 +73,30 @@ SIZED = tuple(
 FACTORED = tuple(Case(name, "typical", changed) for name, changed in FACTORS.items())
 
 
-def measure_tracking(effort: Effort) -> list[Report]:
-    """All of it; with a quick effort the three classes only, on two fields, and motion on the typical class alone."""
-    cases = CLASSES if effort.quick else (*CLASSES, *SIZED, *FACTORED)
-    moved = CLASSES[1:2] if effort.quick else (*CLASSES, *FACTORED)
-    effort.watch.begin("tracking: errors", len(cases))
-    errors = _errors(cases, effort)
-    effort.watch.begin("tracking: motion", len(moved))
-    motion = _motion(moved, effort)
-    return [errors, motion, _speed(effort)]
+def measure_tracking(options: BenchmarkOptions) -> list[Report]:
+    """All of it; with `options.quick` the three classes only, on two fields, and motion on the typical class alone."""
+    cases = CLASSES if options.quick else (*CLASSES, *SIZED, *FACTORED)
+    moved = CLASSES[1:2] if options.quick else (*CLASSES, *FACTORED)
+    options.progress.begin("tracking: errors", len(cases))
+    errors = _errors(cases, options)
+    options.progress.begin("tracking: motion", len(moved))
+    motion = _motion(moved, options)
+    return [errors, motion, _speed(options)]
 
 
-def _fields(effort: Effort) -> Sequence[Field]:
-    return FIELDS[::2] if effort.quick else FIELDS
+def _fields(options: BenchmarkOptions) -> Sequence[Field]:
+    return FIELDS[::2] if options.quick else FIELDS
 
 
-def _errors(cases: Sequence[Case], effort: Effort) -> Report:
+def _errors(cases: Sequence[Case], options: BenchmarkOptions) -> Report:
     rows, results = [], []
-    outside: list[str] = []
+    violations: list[str] = []
     for case in cases:
         # The other trackers are measured on the images of the usual size.
         names = tuple(FOLLOWERS) if case.size == SMALL else (OWN,)
-        frames = QUICK_FRAMES if effort.quick else FRAMES
-        figures = {n: Figures.of(c) for n, c in case.follow(names, _fields(effort), frames=frames).items()}
-        looks = [(case.look(FIELDS.index(field)), field) for field in _fields(effort)]
+        frames = QUICK_FRAMES if options.quick else FRAMES
+        figures = {n: Figures.of(c) for n, c in case.follow(names, _fields(options), frames=frames).items()}
+        looks = [(case.look(FIELDS.index(field)), field) for field in _fields(options)]
         floor = np.concatenate([floor_errors(GelSequence(look, field, frames=frames)) for look, field in looks])
         own, least = figures[OWN], float(np.median(floor))
         rows.append(
@@ -107,8 +107,8 @@ def _errors(cases: Sequence[Case], effort: Effort) -> Report:
             )
         )
         results.append({"images": case.name, "floor": least} | {name: one.plain() for name, one in figures.items()})
-        outside += [f"tracking, {case.name}: {line}" for line in (*own.failed, *_errors_missed(case, own))]
-        effort.watch.advance()
+        violations += [f"tracking, {case.name}: {line}" for line in (*own.failed, *_errors_missed(case, own))]
+        options.progress.advance()
     return Report(
         name="tracking",
         title="Tracking: endpoint errors on images with known truth, in px",
@@ -121,7 +121,7 @@ def _errors(cases: Sequence[Case], effort: Effort) -> Report:
         "told where the markers are at rest. near: of the visible markers, within 0.1 spacing of the truth; meas: "
         "measured, not guessed; end: both, in the last image.",
         results=results,
-        outside=outside,
+        violations=violations,
     )
 
 
@@ -170,26 +170,26 @@ def _pixels(found: float | None) -> str:
     return "none" if found is None else f"{found:.3f}"
 
 
-def _moved(case: Case, effort: Effort) -> Motion:
-    rest_frames = QUICK_REST_FRAMES if effort.quick else REST_FRAMES
-    period, after = (QUICK_DRIFT, QUICK_DRIFT) if effort.quick else (DRIFT_PERIOD, DRIFT)
+def _moved(case: Case, options: BenchmarkOptions) -> Motion:
+    rest_frames = QUICK_REST_FRAMES if options.quick else REST_FRAMES
+    period, after = (QUICK_DRIFT, QUICK_DRIFT) if options.quick else (DRIFT_PERIOD, DRIFT)
     still = case.follow((OWN,), ("press",), motion="rest", frames=rest_frames)[OWN][0]
     back = case.follow((OWN,), ("shear",), frames=after + REST + 1, period=period)[OWN][0]
-    large = case.follow(tuple(FOLLOWERS), _fields(effort), peak=IDENTITY, frames=16, period=12)
+    large = case.follow(tuple(FOLLOWERS), _fields(options), peak=IDENTITY, frames=16, period=12)
     return Motion(
         images=case.name,
         jitter=still.jitter(),
         drift=back.drift(),
         exchanged={name: sum(course.exchanged() for course in courses) for name, courses in large.items()},
-        largest_jump=_largest_jumps(case, effort),
+        largest_jump=_largest_jumps(case, options),
     )
 
 
-def _motion(cases: Sequence[Case], effort: Effort) -> Report:
+def _motion(cases: Sequence[Case], options: BenchmarkOptions) -> Report:
     found = []
     for case in cases:
-        found.append(_moved(case, effort))
-        effort.watch.advance()
+        found.append(_moved(case, options))
+        options.progress.advance()
     rows = [
         (
             *(one.images, _pixels(one.jitter), _pixels(one.drift)),
@@ -210,15 +210,15 @@ def _motion(cases: Sequence[Case], effort: Effort) -> Report:
         "next, in spacings, that every field survives with no marker exchanged, and "
         f"{SURVIVED:.0%} of the visible ones in place two images later.",
         results=[asdict(one) for one in found],
-        outside=[f"tracking, {one.images}: {line}" for one in found for line in one.missed()],
+        violations=[f"tracking, {one.images}: {line}" for one in found for line in one.missed()],
     )
 
 
-def _largest_jumps(case: Case, effort: Effort) -> dict[str, dict[str, float]]:
+def _largest_jumps(case: Case, options: BenchmarkOptions) -> dict[str, dict[str, float]]:
     """For each tracker and field the largest of the jumps that it and all smaller ones survived; 0 if none."""
-    jumps = QUICK_JUMPS if effort.quick else JUMPS
-    best: dict[str, dict[str, float]] = {name: dict.fromkeys(_fields(effort), 0.0) for name in FOLLOWERS}
-    for field in _fields(effort):
+    jumps = QUICK_JUMPS if options.quick else JUMPS
+    best: dict[str, dict[str, float]] = {name: dict.fromkeys(_fields(options), 0.0) for name in FOLLOWERS}
+    for field in _fields(options):
         alive = list(FOLLOWERS)
         for jump in jumps:
             courses = case.follow(alive, (field,), motion="jump", peak=jump, frames=6)
@@ -230,37 +230,37 @@ def _largest_jumps(case: Case, effort: Effort) -> dict[str, dict[str, float]]:
     return best
 
 
-def _speed(effort: Effort) -> Report:
-    sizes = [(130, SMALL), (130, LARGE)] if effort.quick else [(n, size) for size in (SMALL, LARGE) for n in MARKERS]
-    effort.watch.begin("tracking: speed", len(sizes))
+def _speed(options: BenchmarkOptions) -> Report:
+    sizes = [(130, SMALL), (130, LARGE)] if options.quick else [(n, size) for size in (SMALL, LARGE) for n in MARKERS]
+    options.progress.begin("tracking: speed", len(sizes))
     rows, results = [], []
     for markers, (width, height) in sizes:
         look = look_of("typical", markers=markers, width=width, height=height)
-        frames = list(GelSequence(look, "press", frames=QUICK_FRAMES if effort.quick else FRAMES))
+        frames = list(GelSequence(look, "press", frames=QUICK_FRAMES if options.quick else FRAMES))
         images = [frame.image for frame in frames]
         first, grid = frames[0], look.grid
-        taken = measure_speed(
-            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=effort.repeats
+        timings = measure_speed(
+            FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=options.repeats
         )
-        own = taken[OWN]
+        own = timings[OWN]
         rows.append(
             (
                 *(f"{width} × {height}, {markers} markers", f"{own.start:.1f}", f"{own.frame:.2f}"),
-                *(f"{taken[name].frame:.2f}" for name in (FLOW, DENSE)),
-                *(f"{taken[name].frame / own.frame:.1f}" for name in (FLOW, DENSE)),
+                *(f"{timings[name].frame:.2f}" for name in (FLOW, DENSE)),
+                *(f"{timings[name].frame / own.frame:.1f}" for name in (FLOW, DENSE)),
             )
         )
         results.append(
-            {"markers": markers, "width": width, "height": height} | {n: asdict(t) for n, t in taken.items()}
+            {"markers": markers, "width": width, "height": height} | {n: asdict(t) for n, t in timings.items()}
         )
-        effort.watch.advance()
+        options.progress.advance()
     return Report(
         name="tracking_speed",
         title="Tracking: milliseconds an image, after decoding",
         columns=("typical images", "start", "image", "LK", "DIS", "LK ×", "DIS ×"),
         rows=rows,
-        note=f"Processor time on one thread, best of {effort.repeats}. start: the first image, in which the grid is "
+        note=f"Processor time on one thread, best of {options.repeats}. start: the first image, in which the grid is "
         "found; Lucas-Kanade and dense flow are told where it is.",
         results=results,
-        outside=[],
+        violations=[],
     )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import UsageError
-from gelflow.sim.benchmark.step_times import start_controls
+from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene.mjcf import WORLD, JointDef, Mechanics, read_mechanics
 from gelflow.sim.scene.mjcf_file import compile_model, names
 from gelflow.sim.scene.scene import Scene
@@ -303,7 +303,7 @@ def _size(scene: Scene) -> Size:
     built = _allocated()
     sim = Simulator(model, threads=1)
     sim.q[:] = scene.q0
-    sim.step(start_controls(scene))
+    sim.step(holding_controls(scene))
     sim.tactile()
     after = _allocated()
     state = (sim.q, sim.v, sim.anchors, sim.anchored, sim.status, sim.iterations, sim.halved)

@@ -7,16 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.measurement.timing import Effort, Report, Work, busy, interleaved, times_as_fast
+from gelflow.measurement.timing import BenchmarkOptions, Report, Workload, load_note, speedup, time_interleaved
 from gelflow.sim.benchmark.rolling import rolling_scene
-from gelflow.sim.benchmark.runs import Check, Run, check, motion_run, simulator, twin_of
+from gelflow.sim.benchmark.runs import (
+    AccuracyCheck,
+    TimedRun,
+    check_accuracy,
+    converged_reference,
+    motion_run,
+    simulator,
+)
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]
 
 START = 30  # steps of the motion before the ones that count: in the middle of contact
-GRADIENT = 1e-4  # how far the gradient may be from its converged twin's, relative
+GRADIENT = 1e-4  # how far the gradient may be from its converged reference's, relative
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class _Subject:
 
     def __init__(self, case: Case, steps: int) -> None:
         self.scene: Scene = rolling_scene(case.side) if case.side else load_scene(case.scene, friction="viscous")
-        self.run: Run = motion_run(self.scene, steps=START + steps)
+        self.run: TimedRun = motion_run(self.scene, steps=START + steps)
         self.sim = simulator(self.scene.describe_to)
         rows = [u for count, u, _ in self.run.blocks for _ in range(count)]
         self._before, self._u = rows[:START], np.array(rows[START:])[:, np.newaxis]
@@ -66,7 +73,7 @@ class _Subject:
         return len(self._u)
 
     def start(self, sim: Simulator) -> None:
-        self.run.place(sim)
+        self.run.start(sim)
         for u in self._before:
             sim.step(u)
 
@@ -79,31 +86,31 @@ class _Subject:
     def both(self) -> TrajectoryGradient:
         return self.backward(self.sim, self.forward(self.sim, self.trajectory))
 
-    def works(self) -> list[Work]:
+    def workloads(self) -> list[Workload]:
         """Forwards, and forwards and backwards."""
-        return [Work(partial(self.forward, self.sim, self.trajectory), self.steps), Work(self.both, self.steps)]
+        return [Workload(partial(self.forward, self.sim, self.trajectory), self.steps), Workload(self.both, self.steps)]
 
-    def checks(self) -> tuple[Check, float]:
-        """The run's, and how far the gradient is from the converged twin's, relative."""
-        twin = twin_of(self.sim, self.scene.describe_to)
-        checked = check(self.run, simulator(self.scene.describe_to), self.scene.describe_to)
-        self.start(twin)
-        right = self.backward(twin, self.forward(twin))
+    def checks(self) -> tuple[AccuracyCheck, float]:
+        """The run's, and how far the gradient is from the converged reference's, relative."""
+        reference = converged_reference(self.sim, self.scene.describe_to)
+        accuracy = check_accuracy(self.run, simulator(self.scene.describe_to), self.scene.describe_to)
+        self.start(reference)
+        right = self.backward(reference, self.forward(reference))
         found = self.both()
         apart, size = np.linalg.norm(found.u - right.u), np.linalg.norm(right.u)
-        return checked, float(apart / size)
+        return accuracy, float(apart / size)
 
 
-def measure_gradients(effort: Effort, *, steps: int | None = None) -> Report:
+def measure_gradients(options: BenchmarkOptions, *, steps: int | None = None) -> Report:
     """Time recorded steps in the middle of contact, and those with the reverse pass."""
-    steps = steps or (10 if effort.quick else 50)
+    steps = steps or (10 if options.quick else 50)
     subjects = [_Subject(case, steps) for case in CASES]
     checks = [subject.checks() for subject in subjects]
-    effort.watch.begin("gradients", 2 * len(subjects) * (effort.repeats + 1))
-    taken = interleaved([work for subject in subjects for work in subject.works()], effort)
-    rows, results, outside = [], [], []
-    for case, forward, both, (checked, off) in zip(CASES, taken[::2], taken[1::2], checks, strict=True):
-        ratio = times_as_fast(forward, both)
+    options.progress.begin("gradients", 2 * len(subjects) * (options.repeats + 1))
+    timings = time_interleaved([work for subject in subjects for work in subject.workloads()], options)
+    rows, results, violations = [], [], []
+    for case, forward, both, (accuracy, off) in zip(CASES, timings[::2], timings[1::2], checks, strict=True):
+        ratio = speedup(forward, both)
         what = "each reading" if case.read else "end state"
         paper = sum(case.paper) if case.paper else None
         rows.append(
@@ -122,13 +129,15 @@ def measure_gradients(effort: Effort, *, steps: int | None = None) -> Report:
                 "forward_and_backward": both.plain(),
                 "ratio": ratio,
                 "paper_us": case.paper,
-                "check": checked.plain(),
+                "check": accuracy.plain(),
                 "gradient_off": off,
             }
         )
-        outside += checked.broken(f"gradients, {case.name}")
+        violations += accuracy.violations(f"gradients, {case.name}")
         if not off <= GRADIENT:
-            outside.append(f"gradients, {case.name}: {off:.1e} from the converged twin's; allowed is {GRADIENT:g}")
+            violations.append(
+                f"gradients, {case.name}: {off:.1e} from the converged reference's; allowed is {GRADIENT:g}"
+            )
     return Report(
         name="gradients",
         title="Gradients: µs per step of one thread",
@@ -136,7 +145,7 @@ def measure_gradients(effort: Effort, *, steps: int | None = None) -> Report:
         rows=rows,
         note=f"of: what is differentiated, by all controls and the start. {steps} recorded steps in the middle of "
         "contact, viscous friction. + back: forward and backward; ratio: that to forward. paper: its simulator, "
-        "forward + backward; pushing has 130 markers." + busy(taken),
+        "forward + backward; pushing has 130 markers." + load_note(timings),
         results=results,
-        outside=outside,
+        violations=violations,
     )

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved
-from gelflow.sim.benchmark.batch import differ
+from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
+from gelflow.sim.benchmark.batch import perturb_stiffness
 from gelflow.sim.benchmark.rolling import rolling_run, rolling_scene
-from gelflow.sim.benchmark.runs import Check, Describe, Run, check, motion_run, simulator
+from gelflow.sim.benchmark.runs import AccuracyCheck, Describe, TimedRun, check_accuracy, motion_run, simulator
 from gelflow.sim.scene.scene import load_scene
 
 Array = NDArray[np.float64]
@@ -29,18 +29,18 @@ class Sweep:
     unit: str  # of the horizontal axis
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
-    prepare: Callable[[int], tuple[Work, Check]]
+    prepare: Callable[[int], tuple[Workload, AccuracyCheck]]
     threads: str = ONE_THREAD
 
 
 @dataclass(frozen=True)
-class Grown:
+class SweepResult:
     """What a sweep came to."""
 
     sweep: Sweep
     sizes: tuple[int, ...]
-    times: list[Times]  # of a step of everything
-    checks: list[Check]
+    times: list[Timing]  # of a step of everything
+    checks: list[AccuracyCheck]
     exponent: float
 
     @property
@@ -111,40 +111,42 @@ def _body(spec: Any, name: str, parent: int, pos: tuple[float, float, float]) ->
     return int(spec.add_body(name, parent, pos, (1, 0, 0, 0), 0.01, (0, 0, 0), (inertia,) * 3 + (0, 0, 0)))
 
 
-def _own(describe: Describe, push: float) -> tuple[Work, Check]:
+def _own(describe: Describe, push: float) -> tuple[Workload, AccuracyCheck]:
     """A model of ours, all of its actuators pushing, so many newtons."""
     sim = simulator(describe)
     q0 = sim.q[0].copy()
     q0[0] += 0.02 if sim.model.joint_names[0] == "hinge0" else 0.0
-    run = Run(q0, ((STEPS, np.full(sim.model.nu, push), False),))
-    return run.work(sim), check(run, sim, describe)
+    run = TimedRun(q0, ((STEPS, np.full(sim.model.nu, push), False),))
+    return run.workload(sim), check_accuracy(run, sim, describe)
 
 
-def _bodies(count: int) -> tuple[Work, Check]:
+def _bodies(count: int) -> tuple[Workload, AccuracyCheck]:
     return _own(balls(count), 0.0)
 
 
-def _links(count: int) -> tuple[Work, Check]:
+def _links(count: int) -> tuple[Workload, AccuracyCheck]:
     return _own(chain(count), 0.0)
 
 
-def _points(count: int) -> tuple[Work, Check]:
+def _points(count: int) -> tuple[Workload, AccuracyCheck]:
     return _own(plate(count), 0.02)
 
 
-def _markers(count: int) -> tuple[Work, Check]:
+def _markers(count: int) -> tuple[Workload, AccuracyCheck]:
     """The ball rolling run; markers are read every 5 steps."""
     scene = rolling_scene(round(count**0.5))
     run, sim = rolling_run(scene, 5), simulator(scene.describe_to)
-    return run.work(sim), check(run, sim, scene.describe_to)
+    return run.workload(sim), check_accuracy(run, sim, scene.describe_to)
 
 
-def _environments(count: int) -> tuple[Work, Check]:
+def _environments(count: int) -> tuple[Workload, AccuracyCheck]:
     """The first steps of pushing, on all cores."""
     scene = load_scene("pushing")
     run, sim = motion_run(scene, steps=STEPS), simulator(scene.describe_to, num_envs=count, threads=None)
-    differ(sim)
-    return Work(lambda: run.go(sim), run.steps, lambda: run.place(sim)), check(run, sim, scene.describe_to)
+    perturb_stiffness(sim)
+    return Workload(lambda: run.execute(sim), run.steps, lambda: run.start(sim)), check_accuracy(
+        run, sim, scene.describe_to
+    )
 
 
 SWEEPS = (
@@ -156,24 +158,24 @@ SWEEPS = (
 )
 
 
-def grow(sweep: Sweep, effort: Effort) -> Grown:
+def grow(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
     """Time one sweep."""
-    sizes = sweep.quick if effort.quick else sweep.sizes
-    effort.watch.begin(f"growth: {sweep.unit}", len(sizes) * (effort.repeats + 2))
-    works, checks = [], []
+    sizes = sweep.quick if options.quick else sweep.sizes
+    options.progress.begin(f"growth: {sweep.unit}", len(sizes) * (options.repeats + 2))
+    workloads, checks = [], []
     for size in sizes:
-        work, checked = sweep.prepare(size)
-        works.append(work)
-        checks.append(checked)
-        effort.watch.advance()
-    times = interleaved(works, effort)
-    return Grown(sweep, sizes, times, checks, exponent(sizes, [t.median for t in times]))
+        work, accuracy = sweep.prepare(size)
+        workloads.append(work)
+        checks.append(accuracy)
+        options.progress.advance()
+    times = time_interleaved(workloads, options)
+    return SweepResult(sweep, sizes, times, checks, exponent(sizes, [t.median for t in times]))
 
 
-def measure_growth(effort: Effort) -> tuple[Report, list[Grown]]:
+def measure_growth(options: BenchmarkOptions) -> tuple[Report, list[SweepResult]]:
     """Time all sweeps; the report, and what `growth_picture.draw` draws."""
-    found = [grow(sweep, effort) for sweep in SWEEPS]
-    rows, results, outside = [], [], []
+    found = [grow(sweep, options) for sweep in SWEEPS]
+    rows, results, violations = [], [], []
     for grown in found:
         name, sizes = grown.sweep.name, grown.sizes
         rows.append(
@@ -189,13 +191,13 @@ def measure_growth(effort: Effort) -> tuple[Report, list[Grown]]:
                 "exponent": grown.exponent,
                 "threads": grown.sweep.threads,
                 "sizes": [
-                    {"size": size, **times.plain(), "check": checked.plain()}
-                    for size, times, checked in zip(sizes, grown.times, grown.checks, strict=True)
+                    {"size": size, **times.plain(), "check": accuracy.plain()}
+                    for size, times, accuracy in zip(sizes, grown.times, grown.checks, strict=True)
                 ],
             }
         )
-        for size, checked in zip(sizes, grown.checks, strict=True):
-            outside += checked.broken(f"growth, {size} {name}")
+        for size, accuracy in zip(sizes, grown.checks, strict=True):
+            violations += accuracy.violations(f"growth, {size} {name}")
     report = Report(
         name="growth",
         title="Growth: steps per second",
@@ -203,8 +205,8 @@ def measure_growth(effort: Effort) -> tuple[Report, list[Grown]]:
         rows=rows,
         note="One thread; environments: all cores, and a step is one of all of them. The exponent of time is fitted "
         "over the larger half of the sizes. For one chain a dense matrix is solved: up to n³."
-        + busy([times for grown in found for times in grown.times if grown.sweep.threads == ONE_THREAD]),
+        + load_note([times for grown in found for times in grown.times if grown.sweep.threads == ONE_THREAD]),
         results=results,
-        outside=outside,
+        violations=violations,
     )
     return report, found

@@ -7,12 +7,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gelflow.sim.benchmark.growth import UPPER, Grown
+from gelflow.sim.benchmark.growth import UPPER, SweepResult
 
 PANELS = (("bodies", "chain"), ("contacts",), ("markers",), ("environments",))
 
 
-def draw(found: Sequence[Grown], file: Path) -> None:
+def draw(found: Sequence[SweepResult], file: Path) -> None:
     """Steps per second over size, one panel for each thing that grows, with the fitted lines."""
     by_name = {grown.sweep.name: grown for grown in found}
     figure = Figure(figsize=(10, 7.4), layout="constrained")

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved
+from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
 from gelflow.sim import _core
 from gelflow.sim.benchmark.runs import FORCE
 from gelflow.sim.scene.distance_grid import spline_grid
@@ -83,33 +83,33 @@ class _Reading:
         found = self.sim.rollout_gradient(self._still, tactile=self._by)
         return np.concatenate([found.q[0], found.v[0]]).astype(float)
 
-    def works(self) -> Iterator[Work]:
+    def workloads(self) -> Iterator[Workload]:
         markers = int(self.sim.model.markers)
-        yield Work(self.sim.tactile, markers)
-        yield Work(self.gradient, markers)
+        yield Workload(self.sim.tactile, markers)
+        yield Workload(self.gradient, markers)
 
 
-def measure_markers(effort: Effort, *, side: int | None = None) -> Report:
+def measure_markers(options: BenchmarkOptions, *, side: int | None = None) -> Report:
     """Time readings with all of side × side markers in the shape, for every shape in both precisions."""
-    side = side or (QUICK_SIDE if effort.quick else SIDE)
+    side = side or (QUICK_SIDE if options.quick else SIDE)
     models = {kind: pressed_pad(kind, side) for kind in SHAPES}
     readings = [
         _Reading(kind, precision, Simulator(model, threads=1, precision=precision))
         for kind, model in models.items()
         for precision in PRECISIONS
     ]
-    works = [work for reading in readings for work in reading.works()]
-    effort.watch.begin("markers", len(works) * (effort.repeats + 1))
-    taken = interleaved(works, effort)
-    rows, results, outside = [], [], []
+    workloads = [work for reading in readings for work in reading.workloads()]
+    options.progress.begin("markers", len(workloads) * (options.repeats + 1))
+    timings = time_interleaved(workloads, options)
+    rows, results, violations = [], [], []
     for i, kind in enumerate(SHAPES):
         double, single = readings[2 * i : 2 * i + 2]
-        times = dict(zip(("double", "double_gradient", "single", "single_gradient"), taken[4 * i :], strict=False))
+        times = dict(zip(("double", "double_gradient", "single", "single_gradient"), timings[4 * i :], strict=False))
         result = _compared(double, single) | {name: time.plain() for name, time in times.items()}
         results.append({"shape": kind, "markers": side**2} | result)
         rows.append((kind, *_nanoseconds(times), f"{result['touching']:.0%}"))
         if result["touching"] < 1 or not result["force_off"] <= FORCE or not result["gradient_off"] <= GRADIENT:
-            outside.append(
+            violations.append(
                 f"markers, {kind}: {result['touching']:.1%} touch, single precision is {result['force_off']:.1e} off "
                 f"double in the forces and {result['gradient_off']:.1e} in the gradient; allowed are 100 %, {FORCE:g} "
                 f"and {GRADIENT:g}"
@@ -120,13 +120,13 @@ def measure_markers(effort: Effort, *, side: int | None = None) -> Report:
         columns=("shape", "double", "+ gradient", "ratio", "single", "+ gradient", "ratio", "touch"),
         rows=rows,
         note="One thread, viscous friction. + gradient: the reading and its reverse pass. ratio: of the two."
-        + busy(taken),
+        + load_note(timings),
         results=results,
-        outside=outside,
+        violations=violations,
     )
 
 
-def _nanoseconds(times: dict[str, Times]) -> Iterator[str]:
+def _nanoseconds(times: dict[str, Timing]) -> Iterator[str]:
     for precision in PRECISIONS:
         value, gradient = times[precision].median, times[f"{precision}_gradient"].median
         yield from (f"{value * 1e9:.2f}", f"{(value + gradient) * 1e9:.2f}", f"{(value + gradient) / value:.1f}")

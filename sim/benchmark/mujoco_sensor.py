@@ -10,8 +10,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gelflow.measurement.timing import Work
-from gelflow.sim.benchmark.runs import Run
+from gelflow.measurement.timing import Workload
+from gelflow.sim.benchmark.runs import TimedRun
 from gelflow.sim.scene.scene import Scene
 
 # With MuJoCo's usual contact the heavy pad sinks 16 mm into the light ball; so it is half a millimetre, as with ours.
@@ -24,7 +24,7 @@ class MujocoRolling:
     `readings` (3, markers), MuJoCo's own memory, are what the taxels gave at the last reading.
     """
 
-    def __init__(self, scene: Scene, run: Run) -> None:
+    def __init__(self, scene: Scene, run: TimedRun) -> None:
         taxels = scene.pads[0].positions
         self.model = _model(scene, taxels)
         self.data = mujoco.MjData(self.model)
@@ -48,9 +48,9 @@ class MujocoRolling:
                 mujoco.mj_sensorVel(model, data)
                 model.opt.disableflags |= off
 
-    def work(self) -> Work:
+    def work(self) -> Workload:
         """To time it."""
-        return Work(self.go, self._run.steps, self.place)
+        return Workload(self.go, self._run.steps, self.place)
 
 
 def _model(scene: Scene, taxels: Any) -> Any:

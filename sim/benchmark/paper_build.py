@@ -7,13 +7,13 @@ import tempfile
 from pathlib import Path
 
 from gelflow.errors import UsageError
-from gelflow.measurement.timing import Work
-from gelflow.sim.benchmark.runs import Run
+from gelflow.measurement.timing import Workload
+from gelflow.sim.benchmark.runs import TimedRun
 
 MODULE = "redmax_py"
 
 
-def why_not(model: Path | None) -> str | None:
+def unavailable_reason(model: Path | None) -> str | None:
     """Why it is not timed, in one line; None where it is. Raises UsageError where the model file can't be read."""
     if importlib.util.find_spec(MODULE) is None:
         return f"The paper's simulator is not timed: no Python module {MODULE} here."
@@ -29,7 +29,7 @@ def why_not(model: Path | None) -> str | None:
 class PaperRolling:
     """The run on the paper's `tactile_pad.xml`, with side × side markers."""
 
-    def __init__(self, model: Path, side: int, run: Run) -> None:
+    def __init__(self, model: Path, side: int, run: TimedRun) -> None:
         text, changed = re.subn(r'(<tactile [^>]*resolution=)"[^"]*"', rf'\1"{side} {side}"', model.read_text("utf-8"))
         if changed != 1:
             raise UsageError(f'{model}: expected one <tactile … resolution="…"/>, found {changed}')
@@ -47,6 +47,6 @@ class PaperRolling:
             if read:
                 self._sim.get_tactile_force_vector()
 
-    def work(self) -> Work:
+    def work(self) -> Workload:
         """To time it."""
-        return Work(self.go, self._run.steps, lambda: self._sim.reset(backward_flag=False))
+        return Workload(self.go, self._run.steps, lambda: self._sim.reset(backward_flag=False))

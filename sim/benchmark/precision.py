@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import angles_between
-from gelflow.measurement.timing import Effort, Report, busy, interleaved, times_as_fast
+from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, speedup, time_interleaved
 from gelflow.sim.benchmark.runs import HOLD, motion_run, simulator
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
 Array = NDArray[np.float64]
 
@@ -28,23 +28,23 @@ class _Course:
     gradient: Array  # of all readings with random weights, by the controls (steps, nu)
 
 
-def measure_precision(effort: Effort) -> Report:
+def measure_precision(options: BenchmarkOptions) -> Report:
     """The five scenes under both laws, forward and backward."""
     cases = [(name, law) for name in SCENES for law in LAWS]
-    steps = 4 * READ_EVERY if effort.quick else None
-    works, found = [], []
+    steps = 4 * READ_EVERY if options.quick else None
+    workloads, found = [], []
     for name, law in cases:
         scene = load_scene(name, friction=law)
         run = motion_run(scene, steps=steps)
         double, single = (_course(scene, precision, steps) for precision in ("double", "single"))
         found.append(_apart(single, double))
         for precision in ("double", "single"):
-            works.append(run.work(simulator(scene.describe_to, precision=precision)))
-    effort.watch.begin("precision", len(works) * (effort.repeats + 1))
-    taken = interleaved(works, effort)
+            workloads.append(run.workload(simulator(scene.describe_to, precision=precision)))
+    options.progress.begin("precision", len(workloads) * (options.repeats + 1))
+    timings = time_interleaved(workloads, options)
     rows, results = [], []
-    for (name, law), apart, double_times, single_times in zip(cases, found, taken[::2], taken[1::2], strict=True):
-        ratio = times_as_fast(single_times, double_times)
+    for (name, law), apart, double_times, single_times in zip(cases, found, timings[::2], timings[1::2], strict=True):
+        ratio = speedup(single_times, double_times)
         errors = (f"{value:.0e}" for value in apart.values())
         rows.append((name, law, *errors, f"{single_times.rate:.0f}", f"{ratio:.2f}"))
         results.append({"scene": name, "friction": law, **apart, "single": single_times.plain(), "times_double": ratio})
@@ -56,15 +56,15 @@ def measure_precision(effort: Effort) -> Report:
         note="m, rad: largest difference of a body's place and turn. readings: largest norm of a difference over the "
         f"largest norm. gradient: of readings every {READ_EVERY} steps with random weights, by all controls, relative. "
         "Gradients are computed in double, at the states of single precision, but for viscous readings' share."
-        + busy(taken),
+        + load_note(timings),
         results=results,
-        outside=[],
+        violations=[],
     )
 
 
 def _course(scene: Scene, precision: Any, steps: int | None) -> _Course:
-    moves, sim = motion(scene), Simulator(scene, threads=1, precision=precision)
-    u = moves.steps(scene.step)[:steps]
+    moves, sim = reference_motion(scene), Simulator(scene, threads=1, precision=precision)
+    u = moves.step_controls(scene.step)[:steps]
     sim.q[:] = moves.q0
     run = sim.rollout(u[:, None], read_after=tuple(range(READ_EVERY, len(u) + 1, READ_EVERY)))
     weights = np.random.default_rng(0).normal(size=run.tactile.shape)

@@ -1,4 +1,4 @@
-"""Runs to time, and how each checks itself: against its fully converged twin, step by step."""
+"""Runs to time, and how each checks itself: against its fully converged reference, step by step."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -8,24 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import angles_between
-from gelflow.measurement.timing import Work
+from gelflow.measurement.timing import Workload
 from gelflow.sim import _core
 from gelflow.sim.scene.scene import Scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
 Describe = Callable[[Any], Any]  # tells a model builder what there is, such as `Scene.describe_to`
 
-CONVERGED = 1e-12  # tolerance of a twin's Newton iterations
+CONVERGED = 1e-12  # tolerance of a reference's Newton iterations
 # And of runs that are timed beside other simulators, by law of friction: what they may be off by asks for no more.
 TIMED = {"viscous": 2e-4, "elastic": 2e-5}
-POSITION, TURN, FORCE = 1e-6, 1e-6, 1e-4  # how far from its twin a run may be: [m], [rad], relative
+POSITION, ROTATION, FORCE = 1e-6, 1e-6, 1e-4  # how far from its reference a run may be: [m], [rad], relative
 HOLD = 5  # steps that a motion's controls are held for, and after which markers are read
 
 
 @dataclass(frozen=True)
-class Run:
+class TimedRun:
     """Steps from a start, in blocks of the same controls."""
 
     q0: Array  # (nq,)
@@ -35,39 +35,39 @@ class Run:
     def steps(self) -> int:
         return sum(block[0] for block in self.blocks)
 
-    def place(self, sim: Simulator) -> None:
+    def start(self, sim: Simulator) -> None:
         """Put all environments at the start."""
         sim.reset()
         sim.q[:] = self.q0
 
-    def go(self, sim: Simulator) -> None:
+    def execute(self, sim: Simulator) -> None:
         """As a user would: readings land in the simulator's own array."""
         for steps, u, read in self.blocks:
             sim.step(u, steps)
             if read:
                 sim.tactile()
 
-    def work(self, sim: Simulator) -> Work:
+    def workload(self, sim: Simulator) -> Workload:
         """To time it; a unit is a step of one environment."""
-        return Work(lambda: self.go(sim), self.steps * sim.num_envs, lambda: self.place(sim))
+        return Workload(lambda: self.execute(sim), self.steps * sim.num_envs, lambda: self.start(sim))
 
-    def rollout_work(self, sim: Simulator) -> Work:
+    def rollout_workload(self, sim: Simulator) -> Workload:
         """To time it in one call, without Python between steps; readings land in the arrays of a first one."""
         controls = np.concatenate([np.tile(u, (steps, 1)) for steps, u, _ in self.blocks])
         u = np.repeat(controls[:, None], sim.num_envs, axis=1)
         ends = np.cumsum([steps for steps, _, _ in self.blocks])
         reads = [int(end) for end, (_, _, read) in zip(ends, self.blocks, strict=True) if read]
-        self.place(sim)
+        self.start(sim)
         kept = sim.rollout(u, read_after=reads)
-        return Work(lambda: sim.rollout(u, read_after=reads, out=kept), self.steps * sim.num_envs)
+        return Workload(lambda: sim.rollout(u, read_after=reads, out=kept), self.steps * sim.num_envs)
 
 
-def motion_run(scene: Scene, *, steps: int | None = None) -> Run:
+def motion_run(scene: Scene, *, steps: int | None = None) -> TimedRun:
     """The scene's own motion, or its first steps, controls held and markers read every `HOLD` steps."""
-    moves = motion(scene)
-    u = moves.steps(scene.step)[:steps]
+    moves = reference_motion(scene)
+    u = moves.step_controls(scene.step)[:steps]
     ends = range(HOLD, len(u) + 1, HOLD)
-    return Run(moves.q0, tuple((HOLD, u[end - 1], True) for end in ends))
+    return TimedRun(moves.q0, tuple((HOLD, u[end - 1], True) for end in ends))
 
 
 def simulator(
@@ -85,20 +85,20 @@ def simulator(
     return Simulator(_core.Model(spec), num_envs=num_envs, threads=threads, precision=precision)
 
 
-def twin_of(sim: Simulator, describe: Describe) -> Simulator:
+def converged_reference(sim: Simulator, describe: Describe) -> Simulator:
     """A fully converged copy, with the same parameters."""
-    twin = simulator(describe, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
-    twin.params[:] = sim.params
-    return twin
+    reference = simulator(describe, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
+    reference.params[:] = sim.params
+    return reference
 
 
 @dataclass(frozen=True)
-class Check:
-    """What a run came to, and how far it was from its twin."""
+class AccuracyCheck:
+    """What a run came to, and how far it was from its reference."""
 
-    position: float  # largest distance of a body from the twin's, at any reading or change of controls [m]
+    position: float  # largest distance of a body from the reference's, at any reading or change of controls [m]
     turn: float  # largest angle between the two [rad]
-    force: float  # largest norm of the difference of readings over the largest norm of the twin's reading
+    force: float  # largest norm of the difference of readings over the largest norm of the reference's reading
     iterations: float  # of Newton's method, per step
     halved: int  # steps that were taken as substeps
     end: tuple[float, ...]  # q of the first environment at the end
@@ -106,44 +106,44 @@ class Check:
 
     @property
     def holds(self) -> bool:
-        return self.position <= POSITION and self.turn <= TURN and self.force <= FORCE
+        return self.position <= POSITION and self.turn <= ROTATION and self.force <= FORCE
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
         return asdict(self) | {"holds": self.holds}
 
-    def broken(self, name: str) -> list[str]:
+    def violations(self, name: str) -> list[str]:
         """A line where it does not hold."""
         if self.holds:
             return []
         return [
             f"{name}: {self.position:.1e} m, {self.turn:.1e} rad, {self.force:.1e} of the marker forces away from "
-            f"its converged twin; allowed are {POSITION:g} m, {TURN:g} rad, {FORCE:g}"
+            f"its converged reference; allowed are {POSITION:g} m, {ROTATION:g} rad, {FORCE:g}"
         ]
 
 
-def check(run: Run, sim: Simulator, describe: Describe) -> Check:
-    """Take the run with its twin beside it. Raises SimulationError where a step can't be taken."""
-    twin = twin_of(sim, describe)
+def check_accuracy(run: TimedRun, sim: Simulator, describe: Describe) -> AccuracyCheck:
+    """Take the run with its reference beside it. Raises SimulationError where a step cannot be taken."""
+    reference = converged_reference(sim, describe)
     position = turn = difference = largest = 0.0
     force_sum: Array = np.zeros(3)
-    for one in (sim, twin):
-        run.place(one)
+    for one in (sim, reference):
+        run.start(one)
     for steps, u, read in run.blocks:
-        for one in (sim, twin):
+        for one in (sim, reference):
             one.step(u, steps)
-        here, there = sim.poses(), twin.poses()
+        here, there = sim.poses(), reference.poses()
         position = max(position, float(np.linalg.norm(here[..., :3] - there[..., :3], axis=-1).max()))
         turn = max(turn, float(angles_between(here[..., 3:], there[..., 3:]).max()))
         if read:
-            felt, right = sim.tactile(), twin.tactile()
+            felt, right = sim.tactile(), reference.tactile()
             difference = max(difference, float(np.linalg.norm(felt - right, axis=(1, 2)).max()))
             largest = max(largest, float(np.linalg.norm(right, axis=(1, 2)).max()))
             total = felt[0].sum(0)
             force_sum = max(force_sum, total, key=lambda forces: float(forces[2]))
-    for one in (sim, twin):
+    for one in (sim, reference):
         one.check()
-    return Check(
+    return AccuracyCheck(
         position=position,
         turn=turn,
         force=difference / largest if largest > 0 else 0.0,

@@ -1,8 +1,8 @@
 """The five scenes that come along, each on its own motion, under both friction laws."""
 
-from gelflow.measurement.timing import Effort, Report, busy, interleaved
+from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, time_interleaved
 from gelflow.sim.benchmark.rolling import rolling_scene
-from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
+from gelflow.sim.benchmark.runs import TIMED, check_accuracy, motion_run, simulator
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.validation.reference_motions import SCENES
@@ -13,26 +13,26 @@ SIDE = 50  # of the rolling pad's grid
 PAPER = {"pushing": 5400.0, "grasp": 1000.0, "insertion": 1940.0, "dclaw": 840.0}
 
 
-def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
+def measure_scenes(options: BenchmarkOptions, *, steps: int | None = None) -> Report:
     """Time each scene's motion, or its first steps."""
     cases = [(name, law) for name in SCENES for law in LAWS]
-    works, checks = [], []
+    workloads, checks = [], []
     for name, law in cases:
         scene = rolling_scene(SIDE, law) if name == "rolling" else load_scene(name, friction=law)
         run, sim = motion_run(scene, steps=steps), simulator(scene.describe_to, tolerance=TIMED[law])
-        checks.append(check(run, sim, scene.describe_to))
-        works.append(run.work(sim))
-    effort.watch.begin("scenes", len(works) * (effort.repeats + 1))
-    taken = interleaved(works, effort)
-    rows, results, outside = [], [], []
-    for (name, law), times, checked in zip(cases, taken, checks, strict=True):
+        checks.append(check_accuracy(run, sim, scene.describe_to))
+        workloads.append(run.workload(sim))
+    options.progress.begin("scenes", len(workloads) * (options.repeats + 1))
+    timings = time_interleaved(workloads, options)
+    rows, results, violations = [], [], []
+    for (name, law), times, accuracy in zip(cases, timings, checks, strict=True):
         published = PAPER.get(name) if law == "viscous" else None
         ratio = times.rate / published if published else None
         rows.append(
             (
                 *(name, law, f"{times.rate:.0f}", times.spread, f"{times.median * 1e6:.1f}"),
                 *(
-                    f"{checked.iterations:.2f}",
+                    f"{accuracy.iterations:.2f}",
                     f"{published:.0f}" if published else "",
                     f"{ratio:.1f}" if ratio else "",
                 ),
@@ -45,10 +45,10 @@ def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
                 "gelflow": times.plain(),
                 "paper": published,
                 "times_the_paper": ratio,
-                "check": checked.plain(),
+                "check": accuracy.plain(),
             }
         )
-        outside += checked.broken(f"{name}, {law}")
+        violations += accuracy.violations(f"{name}, {law}")
     return Report(
         name="scenes",
         title="Scenes on their motions: steps per second of one thread",
@@ -57,7 +57,7 @@ def measure_scenes(effort: Effort, *, steps: int | None = None) -> Report:
         note="Steps of 5 ms; controls change and markers are read every 5. ±: half of what lies between the "
         f"quartiles. µs: per step, readings included. Newton: iterations per step, to {TIMED['viscous']:g} (viscous) "
         f"or {TIMED['elastic']:g} of the forces. paper: its simulator's best build on a comparable core, "
-        "whose friction is viscous." + busy(taken),
+        "whose friction is viscous." + load_note(timings),
         results=results,
-        outside=outside,
+        violations=violations,
     )

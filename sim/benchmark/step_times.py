@@ -57,14 +57,14 @@ class StepTimes:
     reading: float | None  # one reading of all markers, which is no part of a step; None without pads
 
 
-def start_controls(scene: Scene) -> Array:
+def holding_controls(scene: Scene) -> Array:
     """Controls that ask for nothing: servos hold where the scene starts, all else is 0. Shape (nu,)."""
     lengths = [a.gear * scene.q0[scene.joints[a.joint].q] for a in scene.actuators]
     servo = [a.kind == "position" for a in scene.actuators]
     return np.where(servo, lengths, 0.0)
 
 
-def with_twice(scene: Scene) -> list[tuple[str, Simulator]]:
+def with_duplicates(scene: Scene) -> list[tuple[str, Simulator]]:
     """For each contact and each pad, its name and a simulator of the scene that has it twice, the second without force.
 
     All of them move exactly like the scene.
@@ -95,8 +95,8 @@ def with_twice(scene: Scene) -> list[tuple[str, Simulator]]:
 def measure(scene: Scene, *, repeats: int = 60, done: Callable[[], None] = lambda: None) -> StepTimes:
     """Time a step and its parts.
 
-    The scene runs for `RUN_STEPS` steps from its start under `start_controls`. Then single steps are taken from every
-    `EVERY`th of the states it went through, by the scene and by those of `with_twice`, in turn, again and again. A
+    The scene runs for `RUN_STEPS` steps from its start under `holding_controls`. Then single steps are taken from every
+    `EVERY`th of the states it went through, by the scene and by those of `with_duplicates`, in turn, again and again. A
     step's time and the differences from it are medians over the repeats for each state, then means over the states.
 
     Parameters
@@ -108,8 +108,8 @@ def measure(scene: Scene, *, repeats: int = 60, done: Callable[[], None] = lambd
     """
     if repeats < 1:
         raise UsageError(f"repeats must be at least 1, got {repeats}")
-    u = start_controls(scene)
-    twice = with_twice(scene)
+    u = holding_controls(scene)
+    twice = with_duplicates(scene)
     sims = [Simulator(scene, threads=1), *(sim for _, sim in twice)]
     runs = [_recorded(sim, scene.q0, u) for sim in sims]
     free = Simulator(replace(scene, contacts=(), pads=()), threads=1)

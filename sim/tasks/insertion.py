@@ -17,7 +17,7 @@ from gelflow.errors import UsageError
 from gelflow.observation import DEFAULT_FLOORS, normalize
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.randomization import TABLE_7, Randomization
+from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
 from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class InsertionAttempts:
         *,
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
-        randomization: Randomization = TABLE_7,
+        randomization: Randomization = DEFAULT_RANDOMIZATION,
         threads: int | None = None,
         steps: int | None = None,
     ) -> None:
@@ -128,7 +128,7 @@ class InsertionAttempts:
 
     def draw(self, rng: np.random.Generator, *, misalignment: Array | None = None) -> None:
         """New parts everywhere: physics and grasp from the randomization, start from the task (or as given, (N, 3))."""
-        drawn = self.randomization.draw(rng, self.num_envs, elastic=self.scene.friction == "elastic")
+        drawn = self.randomization.sample(rng, self.num_envs, elastic=self.scene.friction == "elastic")
         for name, values in drawn.params.items():
             self.sim.param(name)[:] = values
         self._noise, self._stop_shear = drawn.noise, drawn.stop_shear
@@ -236,7 +236,7 @@ class InsertionAttempts:
         """−1e4 ‖position error‖² − 20 (yaw error)² of the present poses: eq. 27 as a penalty, shape (N,)."""
         return np.asarray(-1e4 * (self.pose[:, :2] ** 2).sum(1) - 20 * self.pose[:, 2] ** 2)
 
-    def take(self, rows: NDArray[np.int64], other: "InsertionAttempts", other_rows: NDArray[np.int64]) -> None:
+    def copy_parts(self, rows: NDArray[np.int64], other: "InsertionAttempts", other_rows: NDArray[np.int64]) -> None:
         """Replace the parts of `rows` by parts of another batch: physics, grasp and pose."""
         self.sim.params[rows] = other.sim.params[other_rows]
         self.pose[rows] = other.pose[other_rows]

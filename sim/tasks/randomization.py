@@ -21,7 +21,7 @@ MARKER_RELAXATION = 5e-3  # [s]
 
 
 @dataclass(frozen=True)
-class Drawn:
+class SampledPhysics:
     """The physics of N parts."""
 
     params: dict[str, Array]  # simulator parameter → values, shape (N,)
@@ -60,7 +60,7 @@ class Randomization:
             if isinstance(value, tuple) and not 0 <= value[1] - value[0] < np.inf:
                 raise UsageError(f"randomization: {name} must be (low, high) with low ≤ high, got {value}")
 
-    def draw(self, rng: np.random.Generator, count: int, *, elastic: bool) -> Drawn:
+    def sample(self, rng: np.random.Generator, count: int, *, elastic: bool) -> SampledPhysics:
         """The physics of `count` parts, under the elastic or the viscous law."""
 
         def uniform(limits: Range) -> Array:
@@ -86,12 +86,12 @@ class Randomization:
         for arm, scale in (("arm_x", 1.0), ("arm_y", 1.0), ("arm_z", 1.0), ("arm_yaw", 0.05)):
             params[f"{arm}.kp"] = stiffness * scale
             params[f"{arm}.kd"] = stiffness * scale / 200
-        return Drawn(
+        return SampledPhysics(
             params, uniform(self.grasp_force), uniform(self.grasp_height), log(self.stop_shear), log(self.noise)
         )
 
 
-TABLE_7 = Randomization()
+DEFAULT_RANDOMIZATION = Randomization()
 
 # One fixed physics, as in the scene file, with an arm as stiff as a robot's: for tests and pictures.
 NOMINAL = Randomization(

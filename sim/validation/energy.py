@@ -16,7 +16,7 @@ from gelflow.sim import _core
 from gelflow.sim.scene.parts import NUMBERS
 from gelflow.sim.scene.scene import Scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.gradient_check import turning_joints
+from gelflow.sim.validation.gradient_check import quaternion_joints
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ def _gravity(sim: Simulator) -> Array:
 
 def _joints(sim: Simulator) -> tuple[Array, Array]:
     springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
-    turning = {v for _, v in turning_joints(sim.model)}
+    turning = {v for _, v in quaternion_joints(sim.model)}
     for name, q, v in zip(sim.model.joint_names, sim.model.joint_q, sim.model.joint_v, strict=True):
         if v in turning or v + 3 in turning:  # a ball; a free joint, whose turning part comes after three numbers
             continue

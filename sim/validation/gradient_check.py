@@ -27,12 +27,12 @@ class Agreement:
     """How well two ways to a gradient agree."""
 
     error: float  # norm of the difference over norm of the gradient
-    left_out: float  # share of entries left out, as every stencil crossed a branch (0 for dual numbers)
+    skipped: float  # share of entries left out, as every stencil crossed a branch (0 for dual numbers)
     worst: str = ""  # where the error is: "u", "q", "v", or a group of parameters
     entries: int = 0  # that were to be compared
 
 
-def turning_joints(model: Any) -> list[tuple[int, int]]:
+def quaternion_joints(model: Any) -> list[tuple[int, int]]:
     """(first number of the quaternion, first angular velocity) of each ball and free joint."""
     ends = [*list(model.joint_q)[1:], model.nq]
     widths = [end - q for q, end in zip(model.joint_q, ends, strict=True)]
@@ -46,7 +46,7 @@ def turning_joints(model: Any) -> list[tuple[int, int]]:
 def _straight(model: Any) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which positions and which velocities are plain numbers: all but the quaternions and their angular velocities."""
     straight_q, straight_v = np.ones(model.nq, bool), np.ones(model.nv, bool)
-    for at_q, at_v in turning_joints(model):
+    for at_q, at_v in quaternion_joints(model):
         straight_q[at_q : at_q + 4] = False
         straight_v[at_v : at_v + 3] = False
     return straight_q, straight_v
@@ -72,7 +72,7 @@ def retract(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float64]) ->
     """Positions q (…, nq) displaced by tangent vectors (…, nv)."""
     q, tangent = np.broadcast_to(q, (*tangent.shape[:-1], model.nq)).copy(), np.asarray(tangent)
     straight_q, straight_v = _straight(model)
-    for at_q, at_v in turning_joints(model):
+    for at_q, at_v in quaternion_joints(model):
         q[..., at_q : at_q + 4] = _turn(q[..., at_q : at_q + 4], tangent[..., at_v : at_v + 3])
     q[..., straight_q] += tangent[..., straight_v]
     return q
@@ -82,14 +82,14 @@ def to_tangent(model: Any, q: NDArray[np.float64], gradient: NDArray[np.float64]
     """Gradient with respect to q (nq,) as a gradient with respect to its tangent (nv,)."""
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nv)
-    for at_q, at_v in turning_joints(model):
+    for at_q, at_v in quaternion_joints(model):
         result[at_v : at_v + 3] = 0.5 * _columns(q[at_q : at_q + 4]).T @ gradient[at_q : at_q + 4]
     result[straight_v] = gradient[straight_q]
     return result
 
 
 @dataclass(frozen=True)
-class Case:
+class RolloutLoss:
     """A rollout of one environment from its simulator's state, and a random scalar of its end."""
 
     sim: Simulator  # one environment, double precision
@@ -98,7 +98,7 @@ class Case:
     weights: NDArray[np.float64]  # of the scalar: (nv,) on the tangent of q, (nv,), or (markers, 3)
 
     @classmethod
-    def random(cls, sim: Simulator, u: NDArray[np.float64], output: Output, rng: np.random.Generator) -> "Case":
+    def random(cls, sim: Simulator, u: NDArray[np.float64], output: Output, rng: np.random.Generator) -> "RolloutLoss":
         shape = (sim.model.markers, 3) if output == "tactile" else (sim.model.nv,)
         return cls(sim, u, output, rng.normal(size=shape))
 
@@ -107,7 +107,7 @@ class Case:
         return (len(self.u),) if self.output == "tactile" else ()
 
 
-def analytic(case: Case, *, params: bool = False) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
+def reverse_gradient(case: RolloutLoss, *, params: bool = False) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
     """The rollout, and the gradient by the reverse pass: "u" (steps, nu), "q" (nv,) as a tangent, "v" (nv,),
     "anchors" (na, 3), "history" (nh,), and with `params` "params" (parameters,)."""
     sim, model = case.sim, case.sim.model
@@ -132,24 +132,26 @@ def analytic(case: Case, *, params: bool = False) -> tuple[Trajectory, dict[str,
 def _from_tangent(model: Any, q: NDArray[np.float64], tangent: NDArray[np.float64]) -> NDArray[np.float64]:
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nq)
-    for at_q, at_v in turning_joints(model):
+    for at_q, at_v in quaternion_joints(model):
         result[at_q : at_q + 4] = 2 * _columns(q[at_q : at_q + 4]) @ tangent[at_v : at_v + 3]
     result[straight_q] = tangent[straight_v]
     return result
 
 
-def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3, groups: bool = True) -> Agreement:
+def compare_to_dual_numbers(
+    case: RolloutLoss, rng: np.random.Generator, *, directions: int = 3, groups: bool = True
+) -> Agreement:
     """Worst relative difference along random directions in u, q, v, anchors, history, params: each alone, and all;
-    with `groups` also in each group of parameters (`groups_of`) alone, once.
+    with `groups` also in each group of parameters (`parameter_groups`) alone, once.
 
     The adjoint identity ⟨w, J d⟩ = ⟨Jᵀ w, d⟩ is what is compared: J d by dual numbers, Jᵀ w by the reverse pass.
     """
     sim, model = case.sim, case.sim.model
-    trajectory, gradient = analytic(case, params=True)
+    trajectory, gradient = reverse_gradient(case, params=True)
     set_now = sim.anchored[0].astype(bool)
     parts = ["u", "q", "v", "params"]
     parts += ["anchors"] * bool(set_now.any()) + ["history"] * bool(sim.history[0].any())
-    scale, group = param_scale(model, sim.params[0]), groups_of(model)
+    scale, group = parameter_scales(model, sim.params[0]), parameter_groups(model)
     found: list[tuple[str, float, float]] = []  # of what, difference, size
     tries = [(only, group == only) for only in np.unique(group)] if groups else []
     tries += [(only, np.ones(len(scale), bool)) for only in [*parts, "all"]] * directions
@@ -175,7 +177,7 @@ def against_dual(case: Case, rng: np.random.Generator, *, directions: int = 3, g
     return Agreement(float(error), 0.0, most)
 
 
-def groups_of(model: Any) -> NDArray[np.str_]:
+def parameter_groups(model: Any) -> NDArray[np.str_]:
     """What each parameter is, whatever its owner: "kn", "pos", "inertia", "gravity", …; (parameters,)."""
     return np.array(
         [next(part for part in reversed(name.split(".")) if part not in _COMPONENTS) for name in model.param_names]
@@ -185,10 +187,10 @@ def groups_of(model: Any) -> NDArray[np.str_]:
 _COMPONENTS = ("x", "y", "z", "xx", "yy", "zz", "xy", "xz", "yz")
 
 
-def param_scale(model: Any, params: NDArray[np.float64]) -> NDArray[np.float64]:
+def parameter_scales(model: Any, params: NDArray[np.float64]) -> NDArray[np.float64]:
     """By how much each parameter is displaced: by its own size, or one that fits what it is. 0 where it may not be:
     an infinite bound, a size that a shape does not have."""
-    groups = groups_of(model)
+    groups = parameter_groups(model)
     scale = np.where(np.isfinite(params), np.abs(params), 0.0)
     zero = params == 0
     inertia = np.flatnonzero(groups == "inertia").reshape(-1, 6)
@@ -208,7 +210,7 @@ AGREE = 1e-8  # of two estimates, relative to the gradient: good enough
 CHUNK = 128  # environments at a time
 
 
-def against_differences(case: Case, *, params: bool = True) -> Agreement:
+def compare_to_differences(case: RolloutLoss, *, params: bool = True) -> Agreement:
     """Gradient with respect to (u, q, v, params) by five-point central differences, entry by entry.
 
     A five-point difference is made of two of three points, of sizes s and s/4. Each entry is differenced with several
@@ -219,22 +221,24 @@ def against_differences(case: Case, *, params: bool = True) -> Agreement:
     such stencils is left out.
 
     The error is the largest over u, q, v and the groups of parameters, as their units differ, of norm of the difference
-    over norm. Parameters count in multiples of `param_scale`; a group whose gradient is below a thousandth of that by
-    all parameters counts as if it were one.
+    over norm. Parameters count in multiples of `parameter_scales`; a group whose gradient is below a thousandth of that
+    by all parameters counts as if it were one.
     """
     model = case.sim.model
-    middle, gradient = analytic(case, params=params)
+    middle, gradient = reverse_gradient(case, params=params)
     kinds = ["u", "q", "v"] + ["params"] * params
     scale = {k: np.ones(gradient[k].size) for k in kinds}
     if params:
-        scale["params"] = param_scale(model, case.sim.params[0])
-        scale["params"][(groups_of(model) == "frictionloss") & (case.sim.params[0] == 0)] = 0  # never negative
+        scale["params"] = parameter_scales(model, case.sim.params[0])
+        scale["params"][(parameter_groups(model) == "frictionloss") & (case.sim.params[0] == 0)] = 0  # never negative
     which = np.concatenate([np.flatnonzero(scale[k]) for k in kinds])
     kind = np.concatenate([np.full(int((scale[k] != 0).sum()), k) for k in kinds])
     unit = np.concatenate([scale[k][scale[k] != 0] for k in kinds])
     ours = np.concatenate([gradient[k].ravel()[scale[k] != 0] for k in kinds]) * unit
     label = (
-        kind.copy() if not params else np.where(kind == "params", groups_of(model)[which * (kind == "params")], kind)
+        kind.copy()
+        if not params
+        else np.where(kind == "params", parameter_groups(model)[which * (kind == "params")], kind)
     )
     first = np.array([STENCIL[k] for k in kind])
 
@@ -275,7 +279,7 @@ def against_differences(case: Case, *, params: bool = True) -> Agreement:
 
 
 def _slopes(
-    case: Case,
+    case: RolloutLoss,
     middle: Trajectory,
     kind: NDArray[np.str_],
     which: NDArray[np.intp],
@@ -291,7 +295,7 @@ def _slopes(
     entry = np.repeat(np.arange(len(kind)), 2 * sizes.shape[1])
     ends, same = np.zeros(len(amounts)), np.zeros(len(amounts), bool)
     many = Simulator(model, num_envs=CHUNK)
-    reference = sim.branches(middle)
+    reference = sim.contact_modes(middle)
     for start in range(0, len(amounts), CHUNK):
         chunk = np.arange(start, min(start + CHUNK, len(amounts)))
         moves = {
@@ -318,7 +322,7 @@ def _slopes(
             value = (run.v[-1] - middle.v[-1]) @ case.weights
         else:
             value = ((run.tactile[0] - middle.tactile[0]) * case.weights).sum((1, 2))
-        unmoved = (many.branches(run) == reference).all(0) & (run.status == 0)
+        unmoved = (many.contact_modes(run) == reference).all(0) & (run.status == 0)
         ends[chunk], same[chunk] = value[: len(chunk)], unmoved[: len(chunk)]
     pairs = np.where(same, ends, np.nan).reshape(*sizes.shape, 2)
     return np.asarray((pairs[..., 1] - pairs[..., 0]) / (2 * sizes))
@@ -328,7 +332,7 @@ def difference(model: Any, q: NDArray[np.float64], base: NDArray[np.float64]) ->
     """q ⊖ base: the tangent (nv,) from positions `base` (nq,) to positions close to them."""
     straight_q, straight_v = _straight(model)
     result = np.zeros(model.nv)
-    for at_q, at_v in turning_joints(model):
+    for at_q, at_v in quaternion_joints(model):
         vector = _columns(base[at_q : at_q + 4]).T @ q[at_q : at_q + 4]  # sin(angle/2) axis
         length = float(np.linalg.norm(vector))
         result[at_v : at_v + 3] = 2 * vector * (np.arcsin(min(length, 1.0)) / length if length > 1e-12 else 1.0)

@@ -18,32 +18,32 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Motion:
+class ReferenceMotion:
     """Where a scene starts, at rest, and what its actuators are told."""
 
     q0: Array  # (nq,)
     duration: float  # [s]
-    look: float  # when what is felt is worth a look: touch is made and held [s]
+    evaluation_time: float  # when what is felt is worth a look: touch is made and held [s]
     controls: Callable[[ArrayLike], Array]  # times (K,) [s] → u (K, nu)
 
-    def steps(self, step: float) -> Array:
+    def step_controls(self, step: float) -> Array:
         """Controls of all steps of this length [s], (steps, nu). Raises UsageError where none fits in."""
         count = round(self.duration / step)
         if count < 1:
             raise UsageError(f"a step of {step} s is longer than the motion, {self.duration} s")
         return self.controls(step * np.arange(1, count + 1))
 
-    def varied(self, size: float, pace: float) -> "Motion":
+    def varied(self, size: float, pace: float) -> "ReferenceMotion":
         """The same motion, its controls' changes `size` times as large and `pace` times as fast, for as long."""
         rest = self.controls(0.0)
 
         def controls(times: ArrayLike) -> Array:
             return rest + size * (self.controls(pace * np.asarray(times, float)) - rest)
 
-        return Motion(self.q0, self.duration, min(self.look / pace, self.duration), controls)
+        return ReferenceMotion(self.q0, self.duration, min(self.evaluation_time / pace, self.duration), controls)
 
 
-def motion(scene: Scene) -> Motion:
+def reference_motion(scene: Scene) -> ReferenceMotion:
     """The motion of a scene that comes along. Raises UsageError for another scene."""
     if scene.name not in _MOTIONS:
         raise UsageError(f"no motion for scene {scene.name!r}; there are {', '.join(_MOTIONS)}")
@@ -72,7 +72,7 @@ def _follow(scene: Scene, tracks: dict[str, list[tuple[float, float]]]) -> Calla
     return controls
 
 
-def _rolling(scene: Scene) -> Motion:
+def _rolling(scene: Scene) -> ReferenceMotion:
     """The pad comes down on the ball, rolls it, lifts off while the ball rolls on, and catches it."""
     q0 = scene.q0.copy()
     q0[scene.q("pad_z")] = -0.0145  # half a millimetre above the ball
@@ -84,20 +84,20 @@ def _rolling(scene: Scene) -> Motion:
         "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
         "pad_y": [(0.15, 0.0), (0.25, 0.05), (0.35, 0.0)],
     }
-    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
+    return ReferenceMotion(q0, 0.64, 0.64, _follow(scene, tracks))
 
 
-def _pushing(scene: Scene) -> Motion:
+def _pushing(scene: Scene) -> ReferenceMotion:
     """The finger runs into the box, pushes it away and round over the ground, draws back, and pushes again."""
     tracks = {
         "gripper_x": [(0.0, 0.3), (0.1, 1.0), (0.3, 0.9), (0.34, -0.6), (0.4, -0.6), (0.44, 0.9)],
         "gripper_y": [(0.1, 0.0), (0.2, 0.3), (0.3, 0.0)],
         "gripper_yaw": [(0.12, 0.0), (0.2, 0.1), (0.3, -0.05), (0.4, 0.0)],
     }
-    return Motion(scene.q0.copy(), 0.64, 0.28, _follow(scene, tracks))
+    return ReferenceMotion(scene.q0.copy(), 0.64, 0.28, _follow(scene, tracks))
 
 
-def _insertion(scene: Scene) -> Motion:
+def _insertion(scene: Scene) -> ReferenceMotion:
     """A held part comes down on the rim beside its hole, slides over it, is lifted off, goes in and leans on a wall."""
     q0, force, lift, shift = scene.q0.copy(), 5.0, 0.5e-3, 4.5e-3
     q0[scene.q("arm_z")] += lift
@@ -128,10 +128,10 @@ def _insertion(scene: Scene) -> Motion:
         "arm_yaw": [(0.3, 0.0), (0.35, 0.01), (0.42, 0.0)],
         "arm_z": [(0.0, top), (0.2, top - 1.6e-3), (0.36, top - 1.6e-3), (0.44, top), (0.48, top), (0.66, top - 3e-3)],
     }
-    return Motion(q0, 0.8, 0.8, _follow(scene, tracks))
+    return ReferenceMotion(q0, 0.8, 0.8, _follow(scene, tracks))
 
 
-def _grasp(scene: Scene) -> Motion:
+def _grasp(scene: Scene) -> ReferenceMotion:
     """The fingers close on the bar off its middle, lift it, set it down, and open."""
     q0 = scene.q0.copy()
     q0[scene.q("arm_y")] = 0.02
@@ -146,7 +146,7 @@ def _grasp(scene: Scene) -> Motion:
         "finger_left": close,
         "finger_right": close,
     }
-    return Motion(q0, 0.64, 0.34, _follow(scene, tracks))
+    return ReferenceMotion(q0, 0.64, 0.34, _follow(scene, tracks))
 
 
 def _sag(scene: Scene) -> float:
@@ -159,7 +159,7 @@ def _sag(scene: Scene) -> float:
     return float(-scene.gravity[2] * scene.bodies[scene.body("bar")].mass / (kn * resting))
 
 
-def _dclaw(scene: Scene) -> Motion:
+def _dclaw(scene: Scene) -> ReferenceMotion:
     """Three fingers close on the cap, turn it, open and swing back, and close again."""
     q0 = scene.q0.copy()
     start = dict(zip((a.name for a in scene.actuators), q0, strict=False))
@@ -171,10 +171,10 @@ def _dclaw(scene: Scene) -> Motion:
             f"bend{finger}": [(0.0, bend), (0.15, bend + 0.12), (0.37, bend + 0.12), (0.43, bend), (0.5, bend + 0.1)],
             f"curl{finger}": [(0.0, start[f"curl{finger}"])],
         }
-    return Motion(q0, 0.64, 0.64, _follow(scene, tracks))
+    return ReferenceMotion(q0, 0.64, 0.64, _follow(scene, tracks))
 
 
-_MOTIONS: dict[str, Callable[[Scene], Motion]] = {
+_MOTIONS: dict[str, Callable[[Scene], ReferenceMotion]] = {
     "rolling": _rolling,
     "pushing": _pushing,
     "insertion": _insertion,

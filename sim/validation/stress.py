@@ -34,7 +34,7 @@ from gelflow.sim import _core
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
@@ -45,7 +45,7 @@ _FEW_MARKERS = {"rolling": {"pads.pad.rows": 10, "pads.pad.cols": 10}}
 
 
 @dataclass
-class Tally:
+class StepStatistics:
     """What a number of steps came to."""
 
     steps: int = 0
@@ -55,7 +55,7 @@ class Tally:
     most_iterations: int = 0  # of one step
     reasons: dict[int, int] = field(default_factory=dict)  # status: how many
 
-    def add(self, other: "Tally") -> None:
+    def add(self, other: "StepStatistics") -> None:
         for name in ("steps", "failed", "halved", "iterations"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.most_iterations = max(self.most_iterations, other.most_iterations)
@@ -64,7 +64,7 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Draw:
+class StressBatch:
     """One batch: everything that is the same for its environments."""
 
     scene: str
@@ -74,7 +74,7 @@ class Draw:
     precision: Precision = "double"
 
 
-def draws(rounds: int) -> list[Draw]:
+def stress_batches(rounds: int) -> list[StressBatch]:
     """Every scene × law × integrator `rounds` times: 2 of 10 normal, 4 with one extreme quantity, 4 with all; every
     fifth in single precision."""
     kinds = [k for i in range(len(QUANTITIES)) for k in ("all", QUANTITIES[i], "normal", QUANTITIES[i - 1], "all")]
@@ -83,11 +83,11 @@ def draws(rounds: int) -> list[Draw]:
     for i in range(rounds):
         for j, (scene, law, integrator) in enumerate(combinations):
             precision: Precision = "single" if (i + j) % 5 == 0 else "double"
-            result.append(Draw(scene, law, integrator, kinds[(i + 7 * j) % len(kinds)], precision))
+            result.append(StressBatch(scene, law, integrator, kinds[(i + 7 * j) % len(kinds)], precision))
     return result
 
 
-class Extremes:
+class StressTest:
     """Draws and runs batches; scenes are loaded once."""
 
     def __init__(self, *, envs: int = 100, steps: int = 20, threads: int | None = None, seed: int = 0) -> None:
@@ -95,7 +95,7 @@ class Extremes:
         self._rng = np.random.default_rng(seed)
         self._scenes: dict[tuple[str, str, str], Scene] = {}
 
-    def start(self, draw: Draw) -> tuple[Simulator, Array]:
+    def start(self, draw: StressBatch) -> tuple[Simulator, Array]:
         """A batch at its start, and its controls (steps, envs, nu)."""
         rng, n = self._rng, self.envs
         scene = self._scene(draw)
@@ -105,7 +105,7 @@ class Extremes:
         sim = Simulator(_core.Model(spec), num_envs=n, precision=draw.precision, threads=self.threads)
         for i, name in enumerate(sim.model.param_names):
             self._draw_parameter(name.rsplit(".", 1)[-1], sim.params[:, i], extreme)
-        run = motion(scene)
+        run = reference_motion(scene)
         sim.q[:] = run.q0
         u = np.repeat(run.controls(spec.step * np.arange(1, self.steps + 1))[:, None], n, axis=1)
         if "speed" in extreme:
@@ -115,27 +115,27 @@ class Extremes:
             sim.v[:] = rng.uniform(-0.1, 0.1, sim.v.shape)
         return sim, u
 
-    def run(self, draw: Draw) -> Tally:
+    def run(self, draw: StressBatch) -> StepStatistics:
         """Take the steps of a batch. Raises SimulationError where anything but finite numbers comes out."""
         sim, u = self.start(draw)
-        tally = Tally()
+        statistics = StepStatistics()
         for control in u:
             alive = sim.status == 0
             before = sim.iterations[alive].copy()
             sim.step(control)
             used = sim.iterations[alive] - before
-            tally.steps += int(alive.sum())
-            tally.iterations += int(used.sum())
-            tally.most_iterations = max(tally.most_iterations, int(used.max(initial=0)))
+            statistics.steps += int(alive.sum())
+            statistics.iterations += int(used.sum())
+            statistics.most_iterations = max(statistics.most_iterations, int(used.max(initial=0)))
         for values in (sim.q, sim.v, sim.anchors, sim.history, sim.tactile()):
             if not np.isfinite(values).all():
                 raise SimulationError(f"numbers that are not finite came out of {draw}")
-        tally.failed = int((sim.status != 0).sum())
-        tally.halved = int(sim.halved.sum())
-        tally.reasons = {int(s): int((sim.status == s).sum()) for s in np.unique(sim.status) if s}
-        return tally
+        statistics.failed = int((sim.status != 0).sum())
+        statistics.halved = int(sim.halved.sum())
+        statistics.reasons = {int(s): int((sim.status == s).sum()) for s in np.unique(sim.status) if s}
+        return statistics
 
-    def _scene(self, draw: Draw) -> Scene:
+    def _scene(self, draw: StressBatch) -> Scene:
         key = (draw.scene, draw.law, draw.integrator)
         if key not in self._scenes:
             overrides: dict[str, Any] = {"integrator": draw.integrator, **_FEW_MARKERS.get(draw.scene, {})}

@@ -36,7 +36,7 @@ def _body(kind: Kind) -> tuple[Array, Array, float]:
 
 
 @dataclass(frozen=True)
-class Throw:
+class ThrownBody:
     """A free body over a ground, and a plane that leans at 45° beside it."""
 
     kind: Kind
@@ -45,7 +45,7 @@ class Throw:
     step: float  # [s]
     numbers: Mapping[str, float]  # kn, kt, mu, kd, ks per point
     integrator: str = "bdf1"
-    turns: bool = True  # else it is carried by three slides
+    has_rotation: bool = True  # else it is carried by three slides
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in the body's frame [m]
     tolerance: float = 1e-9  # of Newton's method
 
@@ -62,7 +62,7 @@ class Throw:
         spec.integrator = self.integrator
         still, upright = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
         body = spec.add_body("body", -1, still, upright, MASS, self.center, (*(MASS * moments), 0.0, 0.0, 0.0))
-        if self.turns:
+        if self.has_rotation:
             spec.add_joint("free", body, "free", still, (0.0, 0.0, 1.0))
         else:
             for name, axis in zip("xyz", np.eye(3), strict=True):
@@ -77,7 +77,7 @@ class Throw:
 
 
 @dataclass(frozen=True)
-class Growth:
+class EnergyChange:
     """What each step did; arrays (steps, N) [J] but for `halved`, of all steps but those that failed."""
 
     change: Array  # of the energy
@@ -86,13 +86,13 @@ class Growth:
     total: Array  # (steps + 1, N): the energy itself
 
 
-def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> Growth:
-    """Throw bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
+def throw_bodies(throw: ThrownBody, rng: np.random.Generator, *, bodies: int, steps: int) -> EnergyChange:
+    """ThrownBody bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
     sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
     gauge = EnergyGauge(throw, num_envs=bodies)
     speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)
     sim.v[:, :3] = speed * rng.normal(size=(bodies, 3))
-    if throw.turns:
+    if throw.has_rotation:
         turn = rng.normal(size=(bodies, 4))
         turn[: bodies // 3] = 1, 0, 0, 0
         sim.q[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
@@ -114,4 +114,4 @@ def fly(throw: Throw, rng: np.random.Generator, *, bodies: int, steps: int) -> G
         before = after
     sim.check()
     change, scale, halved = (np.array(column) for column in zip(*rows, strict=True))
-    return Growth(change, scale, halved, np.array(total))
+    return EnergyChange(change, scale, halved, np.array(total))

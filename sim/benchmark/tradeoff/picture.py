@@ -16,7 +16,7 @@ _PANELS = {
     "gradient": "error of the gradient, relative",
 }
 _GROUPS = {  # group: what the legend says, colour, marker
-    "own": ("the scene's own numbers", "black", "D"),
+    "default": ("the scene's own numbers", "black", "D"),
     "step": ("step and integrator", "tab:blue", "o"),
     "tolerance": ("Newton's tolerance", "tab:purple", "v"),
     "combined": ("the same, tolerance 1e-3", "tab:cyan", "s"),
@@ -49,8 +49,10 @@ def draw(found: "Tradeoff", path: Path) -> None:
 
 
 def _panel(axis: Any, found: "Tradeoff", name: str) -> None:
-    points = [(price.seconds, max(getattr(price.errors, name), _LEAST)) for price in found.prices]
-    groups = [price.setting.group for price in found.prices]
+    points = [
+        (measurement.seconds, max(getattr(measurement.errors, name), _LEAST)) for measurement in found.measurements
+    ]
+    groups = [measurement.setting.group for measurement in found.measurements]
     for group, (label, color, marker) in _GROUPS.items():
         chosen = [point for point, of in zip(points, groups, strict=True) if of == group]
         if chosen:
@@ -59,7 +61,9 @@ def _panel(axis: Any, found: "Tradeoff", name: str) -> None:
     same_world = [p for p, of in zip(points, groups, strict=True) if of not in ("single", "markers", "contacts")]
     axis.plot(*zip(*front(same_world), strict=True), "k-", lw=0.8, alpha=0.6, label="front")
     axis.margins(0.1)
-    named = [(n, point) for price, point in zip(found.prices, points, strict=True) for n in price.presets]
+    named = [
+        (n, point) for measurement, point in zip(found.measurements, points, strict=True) for n in measurement.presets
+    ]
     for at, (preset, point) in enumerate(named):
         axis.plot(*point, "o", mfc="none", mec="tab:red", ms=11, label="preset" if at == 0 else None)
         axis.annotate(preset, point, xytext=(0, 8), textcoords="offset points", ha="center", color="tab:red")

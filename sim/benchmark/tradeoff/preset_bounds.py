@@ -11,7 +11,7 @@ from gelflow.sim.benchmark.tradeoff.sweep import reference, simulated
 from gelflow.sim.scene.scene import load_scene
 
 MARGIN = 1.5  # a bound is this many times the worst that was measured
-OWN = "own"  # the scene's own numbers, measured beside its presets
+SCENE_DEFAULT = "default"  # the scene's own numbers, measured beside its presets
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def preset_errors(
     presets: these only
     done: told the share that is done
     """
-    ways: Mapping[str, Mapping[str, Any]] = {OWN: {}, **load_scene(scene).presets}
+    ways: Mapping[str, Mapping[str, Any]] = {SCENE_DEFAULT: {}, **load_scene(scene).presets}
     chosen = list(ways) if presets is None else presets
     worst: dict[str, Errors] = {}
     for at, seed in enumerate(seeds):

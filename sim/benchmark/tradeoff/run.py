@@ -20,7 +20,7 @@ from gelflow.observation import DEFAULT_FLOORS, normalize
 from gelflow.sim.scene.parts import PadDef
 from gelflow.sim.scene.scene import Scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
 
@@ -77,9 +77,9 @@ class Task:
         if self.steps < 1 or abs(self.steps * scene.step - FRAME) > 1e-9 * FRAME:
             raise UsageError(f"{scene.path}: a step of {scene.step} s must divide {FRAME} s, the time between controls")
         self.sim = Simulator(scene, threads=1)
-        self.motion = motion(scene)
-        self.look = round(self.motion.look / FRAME)
-        self.controls: NDArray[Any] = self.motion.steps(FRAME).astype(self.sim.dtype)[:, None]
+        self.motion = reference_motion(scene)
+        self.look = round(self.motion.evaluation_time / FRAME)
+        self.controls: NDArray[Any] = self.motion.step_controls(FRAME).astype(self.sim.dtype)[:, None]
         weights = np.concatenate([np.broadcast_to(p.weights, len(p.positions)) for p in scene.pads])
         self._weights = weights[:, None]
 
@@ -160,7 +160,7 @@ class Task:
             )
             rows.insert(0, back.u.sum((0, 1)))
             later = {name: getattr(back, name) for name in ("q", "v", "anchors", "history")}
-        spread = self.motion.steps(FRAME).std(0)
+        spread = self.motion.step_controls(FRAME).std(0)
         return np.asarray(np.array(rows)[:, spread > 0] * spread[spread > 0], float)
 
 

@@ -17,7 +17,7 @@ from gelflow.errors import SimulationError
 from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, Run, Task, compare, drawn
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.scene.toml_tables import read_toml
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 STEPS = (1, 2, 4, 8, 16, 32)  # that a frame of 10 ms is cut into: 10 to 0.3125 ms
 TOLERANCES = (1e-2, 1e-3, 1e-5, 1e-9)
@@ -31,7 +31,7 @@ _CORNERS = 8  # points that are the corners of a box stay: they are no sample of
 _APART = ("single", "markers", "contacts")  # other arrays, readings or physics: they make no other setting needless
 _EQUAL, _BETTER = 1.02, 0.9  # figures within 2 % are the same; one by 10 % lower is better
 
-GROUPS = ("own", "step", "tolerance", "combined", "single", "reads", "markers", "contacts", "preset")
+GROUPS = ("default", "step", "tolerance", "combined", "single", "reads", "markers", "contacts", "preset")
 
 Overrides = dict[str, Any]
 
@@ -47,7 +47,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Price:
+class Measurement:
     """A setting, what it costs and how far it is off."""
 
     setting: Setting
@@ -68,7 +68,7 @@ class Tradeoff:
     """All settings of a scene, in the order in which they were varied."""
 
     scene: str
-    prices: tuple[Price, ...]
+    measurements: tuple[Measurement, ...]
     failed: Mapping[str, str]  # setting → why it could not be run
     reference_step: float  # [s]
     changes: Mapping[str, Errors]  # reference → what it changed by when its step was halved for the last time
@@ -81,7 +81,7 @@ def settings(scene: str | Path, *, quick: bool = False) -> list[Setting]:
     cuts = STEPS[::2] if quick else STEPS
     timed = [_timed(integrator, cut, {}) for integrator in ("bdf1", "bdf2") for cut in cuts]
     mine = {"step": own.step, "integrator": own.integrator}
-    found = [Setting(f"{_words(mine)} (own)", "own", {}), *(s for s in timed if s.overrides != mine)]
+    found = [Setting(f"{_words(mine)} (default)", "default", {}), *(s for s in timed if s.overrides != mine)]
     for tolerance in TOLERANCES:
         found.append(Setting(f"tolerance {_power(tolerance)}", "tolerance", {"tolerance": tolerance}))
     for precision in ("double", "single"):
@@ -199,7 +199,7 @@ def measure(
     Raises UsageError for a scene without a motion.
     """
     own = load_scene(scene)
-    motion(own)  # raises where there is none
+    reference_motion(own)  # raises where there is none
     halvings = COARSE if quick else FINE
     truths, changes = _references(own, scene, halvings, lambda share: done("reference", 0.3 * share))
     tried, presets = _with_presets(own, settings(scene, quick=quick))
@@ -220,12 +220,12 @@ def measure(
     seconds = _seconds(tasks, repeats, lambda share: done("timing", 0.6 + 0.4 * share))
     groups = {s.name: s.group for s in tried}
     beaten = dominated({name: (seconds[name], *_figures(errors[name])) for name in tasks}, groups)
-    prices = tuple(
-        Price(s, presets[s.name], seconds[s.name], errors[s.name], iterations[s.name], beaten[s.name])
+    measurements = tuple(
+        Measurement(s, presets[s.name], seconds[s.name], errors[s.name], iterations[s.name], beaten[s.name])
         for s in tried
         if s.name in tasks
     )
-    return Tradeoff(own.name, prices, failed, FRAME / 2 ** halvings[0], changes, repeats)
+    return Tradeoff(own.name, measurements, failed, FRAME / 2 ** halvings[0], changes, repeats)
 
 
 def _references(

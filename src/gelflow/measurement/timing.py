@@ -15,12 +15,12 @@ import numpy as np
 
 from gelflow.errors import UsageError
 
-LEAST = 5e-3  # what takes less [s] is run several times in one repeat: clocks and interrupts are coarse
+MIN_RUN_SECONDS = 5e-3  # what takes less [s] is run several times in one repeat: clocks and interrupts are coarse
 QUICK_REPEATS, REPEATS = 5, 15
-FREE = 0.95  # share of a core that a thread gets on a machine that does nothing else, at least
+IDLE_CPU_SHARE = 0.95  # share of a core that a thread gets on a machine that does nothing else, at least
 
 
-class Watch(Protocol):
+class ProgressReporter(Protocol):
     """Is told how far a measurement is."""
 
     def begin(self, what: str, total: int) -> None:
@@ -30,7 +30,7 @@ class Watch(Protocol):
         """One part of it is done."""
 
 
-class Unwatched:
+class SilentProgress:
     """A watch that nobody looks at."""
 
     def begin(self, what: str, total: int) -> None: ...
@@ -39,12 +39,12 @@ class Unwatched:
 
 
 @dataclass(frozen=True)
-class Effort:
+class BenchmarkOptions:
     """How long a measurement may take."""
 
     quick: bool = False  # fewer sizes and shorter runs
     repeats: int = REPEATS
-    watch: Watch = field(default_factory=Unwatched)
+    progress: ProgressReporter = field(default_factory=SilentProgress)
 
     def __post_init__(self) -> None:
         if self.repeats < 1:
@@ -61,14 +61,14 @@ class Report:
     rows: Sequence[tuple[str, ...]]
     note: str
     results: list[dict[str, Any]]  # what JSON can hold
-    outside: list[str]  # runs that were off by more than allowed, a line each
+    violations: list[str]  # runs that were off by more than allowed, a line each
 
     def plain(self) -> dict[str, Any]:
-        return {"title": self.title, "note": self.note, "outside": self.outside, "results": self.results}
+        return {"title": self.title, "note": self.note, "outside": self.violations, "results": self.results}
 
 
 @dataclass(frozen=True)
-class Work:
+class Workload:
     """Something to time."""
 
     run: Callable[[], object]
@@ -77,11 +77,11 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Times:
+class Timing:
     """What a unit of a work took in each repeat [s]."""
 
     seconds: tuple[float, ...]  # by the clock on the wall
-    cpu_seconds: tuple[float, ...]  # of all threads: tells a busy machine from a slow one
+    cpu_seconds: tuple[float, ...]  # of all threads: tells a load_note machine from a slow one
 
     @property
     def median(self) -> float:
@@ -120,33 +120,34 @@ class Times:
         }
 
 
-def busy(taken: Sequence[Times]) -> str:
-    """What to add to the note under works of one thread, where others used the machine; usually nothing."""
-    share = statistics.median(times.cpu_share for times in taken)
-    return "" if share > FREE else f" The machine was busy, runs had {share:.0%} of a core: rough figures."
+def load_note(timings: Sequence[Timing]) -> str:
+    """What to add to the note under workloads of one thread, where others used the machine; usually nothing."""
+    share = statistics.median(times.cpu_share for times in timings)
+    return "" if share > IDLE_CPU_SHARE else f" The machine was busy, runs had {share:.0%} of a core: rough figures."
 
 
-def times_as_fast(one: Times, other: Times) -> float:
-    """How many times as fast `one` was as `other`, of the same `interleaved` run."""
+def speedup(one: Timing, other: Timing) -> float:
+    """How many times as fast `one` was as `other`, of the same `time_interleaved` run."""
     return statistics.median(b / a for a, b in zip(one.seconds, other.seconds, strict=True))
 
 
-def interleaved(works: Sequence[Work], effort: Effort) -> list[Times]:
-    """Time works in turn, each `effort.repeats` times after once untimed; advances the watch (repeats + 1) × works."""
+def time_interleaved(workloads: Sequence[Workload], options: BenchmarkOptions) -> list[Timing]:
+    """Time workloads in turn, each `options.repeats` times after once untimed; advances
+    `options.progress` (repeats + 1) × workloads times."""
     loops = []
-    for work in works:
-        loops.append(math.ceil(LEAST / max(_once(work)[0], 1e-9)))
-        effort.watch.advance()
-    taken: list[list[tuple[float, float]]] = [[] for _ in works]
-    for _ in range(effort.repeats):
-        for work, count, own in zip(works, loops, taken, strict=True):
+    for work in workloads:
+        loops.append(math.ceil(MIN_RUN_SECONDS / max(_once(work)[0], 1e-9)))
+        options.progress.advance()
+    timings: list[list[tuple[float, float]]] = [[] for _ in workloads]
+    for _ in range(options.repeats):
+        for work, count, own in zip(workloads, loops, timings, strict=True):
             wall, cpu = np.sum([_once(work) for _ in range(count)], axis=0) / (count * work.units)
             own.append((float(wall), float(cpu)))
-            effort.watch.advance()
-    return [Times(*(tuple(values) for values in zip(*own, strict=True))) for own in taken]
+            options.progress.advance()
+    return [Timing(*(tuple(values) for values in zip(*own, strict=True))) for own in timings]
 
 
-def _once(work: Work) -> tuple[float, float]:
+def _once(work: Workload) -> tuple[float, float]:
     work.prepare()
     wall, cpu = time.perf_counter(), time.process_time()
     work.run()

@@ -17,20 +17,20 @@ from gelflow.cli.commands.bench import MEASUREMENTS, conclude
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.geometry import angles_between
-from gelflow.measurement.timing import Effort, Report, Times, Work, busy, interleaved, times_as_fast
-from gelflow.sim.benchmark.batch import differ, measure_batch
+from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, speedup, time_interleaved
+from gelflow.sim.benchmark.batch import measure_batch, perturb_stiffness
 from gelflow.sim.benchmark.gradients import measure_gradients
 from gelflow.sim.benchmark.growth import SWEEPS, exponent
 from gelflow.sim.benchmark.markers import SHAPES, measure_markers
 from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
-from gelflow.sim.benchmark.paper_build import MODULE, why_not
-from gelflow.sim.benchmark.rolling import ROLLING_STEPS, Cell, measure_rolling, rolling_run, rolling_scene
-from gelflow.sim.benchmark.runs import TIMED, check, motion_run, simulator
+from gelflow.sim.benchmark.paper_build import MODULE, unavailable_reason
+from gelflow.sim.benchmark.rolling import ROLLING_STEPS, RollingConfig, measure_rolling, rolling_run, rolling_scene
+from gelflow.sim.benchmark.runs import TIMED, check_accuracy, motion_run, simulator
 from gelflow.sim.benchmark.scenes import measure_scenes
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.validation.reference_motions import SCENES
 
-ONCE = Effort(quick=True, repeats=1)
+ONCE = BenchmarkOptions(quick=True, repeats=1)
 SIMULATED = [name for name in MEASUREMENTS if name != "tracking"]
 
 
@@ -68,7 +68,7 @@ def test_every_timed_run_carries_its_check(everything: tuple[Path, str]) -> None
 
 def test_rolling_is_the_run_of_the_paper() -> None:
     """Ends where a plain loop of single steps under the five forces ends, at every interval of reading."""
-    report = measure_rolling(ONCE, cells=[Cell(5, every) for every in (1, 7, 20, 350, 0)])
+    report = measure_rolling(ONCE, configs=[RollingConfig(5, every) for every in (1, 7, 20, 350, 0)])
     sim = simulator((scene := rolling_scene(5)).describe_to, tolerance=TIMED["viscous"])
     sim.q[:] = scene.q0
     largest = np.zeros(3)
@@ -88,7 +88,7 @@ def test_rolling_is_the_run_of_the_paper() -> None:
 
 
 def test_rolling_stands_beside_the_paper_s_figures() -> None:
-    result = measure_rolling(ONCE, cells=[Cell(10, 5)]).results[0]
+    result = measure_rolling(ONCE, configs=[RollingConfig(10, 5)]).results[0]
     assert result["paper"] == 5200
     assert result["times_the_paper"] == pytest.approx(result["gelflow"]["per_second"] / 5200)
 
@@ -100,8 +100,8 @@ def test_mujoco_s_taxels_are_where_the_markers_are() -> None:
     rival, sim = MujocoRolling(scene, run), simulator(scene.describe_to)
     rival.place()
     rival.go()
-    run.place(sim)
-    run.go(sim)
+    run.start(sim)
+    run.execute(sim)
     np.testing.assert_allclose(rival.data.qpos[:6], sim.q[0, :6], atol=3e-3)
 
     down = rolling_run(scene, 5)
@@ -116,7 +116,7 @@ def test_mujoco_s_taxels_are_where_the_markers_are() -> None:
 
 
 def test_without_the_paper_s_simulator_it_says_so() -> None:
-    reason = why_not(None)
+    reason = unavailable_reason(None)
     assert reason is not None and MODULE in reason and "\n" not in reason
 
 
@@ -127,19 +127,19 @@ def test_scenes_are_timed_under_both_laws() -> None:
     ]
     compared = {r["scene"]: r["paper"] for r in report.results if r["paper"]}
     assert compared == {"pushing": 5400, "grasp": 1000, "insertion": 1940, "dclaw": 840}
-    assert report.outside == []
+    assert report.violations == []
 
 
 def test_gradients_are_those_of_the_converged_twin() -> None:
     report = measure_gradients(ONCE, steps=5)
-    assert report.outside == [] and all(r["gradient_off"] < 1e-4 for r in report.results)
+    assert report.violations == [] and all(r["gradient_off"] < 1e-4 for r in report.results)
     assert [r["of"] for r in report.results] == ["end state"] * 3 + ["each reading"] * 2
 
 
 def test_batches_differ_but_for_the_first() -> None:
     scene = load_scene("insertion")
     sim = simulator(scene.describe_to, num_envs=4)
-    differ(sim)
+    perturb_stiffness(sim)
     stiffness = sim.param("pad_left.kn")
     assert stiffness[0] == 8e3 and len(set(stiffness.tolist())) == 4
     report = measure_batch(ONCE, sizes=[1, 3], steps=10)
@@ -168,8 +168,8 @@ def test_single_precision_is_close_and_is_not_double(everything: tuple[Path, str
 
 @pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.name)
 def test_what_grows_is_what_is_said(sweep: Any) -> None:
-    work, checked = sweep.prepare(sweep.quick[0])
-    assert checked.holds and work.units > 0
+    work, accuracy = sweep.prepare(sweep.quick[0])
+    assert accuracy.holds and work.units > 0
     assert len(sweep.sizes) >= 7 and sweep.sizes[-1] > sweep.quick[-1]
 
 
@@ -183,8 +183,8 @@ def test_a_run_that_is_off_is_noticed(capsys: pytest.CaptureFixture[str]) -> Non
     scene = load_scene("insertion", friction="elastic")
     run = motion_run(scene, steps=60)
     right, loose = (simulator(scene.describe_to, tolerance=tolerance) for tolerance in (1e-7, 0.3))
-    assert check(run, right, scene.describe_to).broken("insertion") == []
-    lines = check(run, loose, scene.describe_to).broken("insertion")
+    assert check_accuracy(run, right, scene.describe_to).violations("insertion") == []
+    lines = check_accuracy(run, loose, scene.describe_to).violations("insertion")
     assert len(lines) == 1 and lines[0].startswith("insertion: ")
     report = Report("scenes", "title", (), [], "note", [], lines)
     assert conclude([report]) == 1
@@ -205,8 +205,8 @@ def test_works_are_timed_in_turn() -> None:
         calls.append(name)
         sum(range(400_000))
 
-    works = [Work(lambda: noted("a"), 10, lambda: calls.append("prepared")), Work(lambda: noted("b"), 10)]
-    times = interleaved(works, Effort(repeats=3))
+    workloads = [Workload(lambda: noted("a"), 10, lambda: calls.append("prepared")), Workload(lambda: noted("b"), 10)]
+    times = time_interleaved(workloads, BenchmarkOptions(repeats=3))
     rounds = [name for name, _ in groupby(call for call in calls if call != "prepared")]
     assert rounds == ["a", "b"] * 4, "once untimed, then three times"
     assert calls.count("prepared") == calls.count("a")
@@ -214,8 +214,8 @@ def test_works_are_timed_in_turn() -> None:
 
 
 def test_ratios_are_medians_of_the_repeats_own() -> None:
-    one, other = Times((1.0, 2.0, 10.0), (1.0, 1.0, 5.0)), Times((2.0, 6.0, 10.0), (1.0, 1.0, 1.0))
-    assert times_as_fast(one, other) == 2
+    one, other = Timing((1.0, 2.0, 10.0), (1.0, 1.0, 5.0)), Timing((2.0, 6.0, 10.0), (1.0, 1.0, 1.0))
+    assert speedup(one, other) == 2
     assert one.rate == 0.5 and one.cpu_share == 0.5
     assert one.quartiles == (1 / 6, 1 / 1.5)
 
@@ -231,11 +231,11 @@ def test_the_command_refuses_wrong_input_in_one_line(capsys: pytest.CaptureFixtu
         assert error.startswith("gelflow bench: ") and error.count("\n") == 1
         assert message.split(";")[0] in error
     with pytest.raises(UsageError, match="at least 1"):
-        Effort(repeats=0)
+        BenchmarkOptions(repeats=0)
     with pytest.raises(UsageError, match="or never: 0; got -1"):
         rolling_run(rolling_scene(5), -1)
 
 
 def test_a_busy_machine_is_mentioned() -> None:
-    assert busy([Times((1.0,), (0.99,))]) == ""
-    assert "62% of a core" in busy([Times((1.0,), (0.62,)), Times((2.0, 2.0), (1.24, 1.24))])
+    assert load_note([Timing((1.0,), (0.99,))]) == ""
+    assert "62% of a core" in load_note([Timing((1.0,), (0.62,)), Timing((2.0, 2.0), (1.24, 1.24))])

@@ -11,7 +11,7 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
-from gelflow.sim.benchmark.step_times import measure, start_controls, with_twice
+from gelflow.sim.benchmark.step_times import holding_controls, measure, with_duplicates
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
@@ -177,7 +177,7 @@ def test_an_elastic_pad_is_not_left_out(own: Path) -> None:
     told = describe(scene)
     assert not any(line.startswith("pad pad") for line in told.left_out)
     assert told.size.anchors == 12
-    assert [name for name, _ in with_twice(scene)] == ["contact stand", "pad pad: memory of its markers"]
+    assert [name for name, _ in with_duplicates(scene)] == ["contact stand", "pad pad: memory of its markers"]
 
 
 def test_viscous_markers_are_free_until_they_are_read() -> None:
@@ -191,7 +191,7 @@ def test_viscous_markers_are_free_until_they_are_read() -> None:
 def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
     """What is timed with a part twice takes the very steps and Newton iterations that the scene takes."""
     scene = load_scene(name, friction=law, overrides={"pads.*.rows": 8, "pads.*.cols": 8} if name == "rolling" else {})
-    u = start_controls(scene)
+    u = holding_controls(scene)
 
     def run(sim: Simulator) -> tuple[Any, ...]:
         sim.q[:] = scene.q0
@@ -201,7 +201,7 @@ def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
 
     alone = Simulator(scene)
     expected = run(alone)
-    twice = with_twice(scene)
+    twice = with_duplicates(scene)
     assert len(twice) == len({c.group for c in scene.contacts}) + len(scene.pads)
     for part, sim in twice:
         assert run(sim) == expected
@@ -214,7 +214,7 @@ def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
 
 def test_start_controls_hold_the_scene_where_it_starts() -> None:
     scene = load_scene("insertion")
-    u = start_controls(scene)
+    u = holding_controls(scene)
     assert u[scene.u("arm_z")] == scene.q0[2] == 0.0555
     assert u[scene.u("hold_left")] == -0.0175
     assert u[scene.u("finger_left")] == 0

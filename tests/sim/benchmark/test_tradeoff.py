@@ -15,7 +15,7 @@ from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds
 from gelflow.sim.benchmark.tradeoff.run import FRAME, WINDOW, Errors, Task, compare, drawn
 from gelflow.sim.benchmark.tradeoff.sweep import (
     GROUPS,
-    Price,
+    Measurement,
     Setting,
     Tradeoff,
     contact_density,
@@ -33,25 +33,26 @@ def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str],
     assert main(["tradeoff", "pushing", "--quick", "--repeats", "1", "--json", "--picture", str(picture)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert picture.stat().st_size > 10_000
-    prices = {price["setting"]["name"]: price for price in found["prices"]}
-    assert set(prices) | set(found["failed"]) >= {s.name for s in settings("pushing", quick=True)}
-    assert {name for price in prices.values() for name in price["presets"]} == set(NAMES)
-    assert all(price["dominated_by"] in (None, *prices) for price in prices.values())
-    assert any(price["dominated_by"] for price in prices.values())
+    measurements = {measurement["setting"]["name"]: measurement for measurement in found["measurements"]}
+    assert set(measurements) | set(found["failed"]) >= {s.name for s in settings("pushing", quick=True)}
+    assert {name for measurement in measurements.values() for name in measurement["presets"]} == set(NAMES)
+    assert all(measurement["dominated_by"] in (None, *measurements) for measurement in measurements.values())
+    assert any(measurement["dominated_by"] for measurement in measurements.values())
     # Finer steps are closer to the reference, which moved much less than they are off.
-    errors = [prices[f"BDF2 {step} ms 1e-3"]["errors"] for step in ("10", "2.5", "0.625")]
+    errors = [measurements[f"BDF2 {step} ms 1e-3"]["errors"] for step in ("10", "2.5", "0.625")]
     for figure in ("position", "rotation", "markers", "gradient"):
         assert errors[0][figure] > errors[1][figure] > errors[2][figure] > 3 * found["changes"]["scene"][figure]
     # What is printed for people, from the same numbers.
     rows = tuple(
-        Price(**{**p, "setting": Setting(**p["setting"]), "errors": Errors(**p["errors"])}) for p in found["prices"]
+        Measurement(**{**p, "setting": Setting(**p["setting"]), "errors": Errors(**p["errors"])})
+        for p in found["measurements"]
     )
     changes = {name: Errors(**change) for name, change in found["changes"].items()}
     del found["processor"]
-    show(Tradeoff(**{**found, "prices": rows, "changes": changes}), "pushing")
+    show(Tradeoff(**{**found, "measurements": rows, "changes": changes}), "pushing")
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
-    assert "…" not in out and all(name in out for name in prices)
+    assert "…" not in out and all(name in out for name in measurements)
     assert "The reference changed by" in out
 
 
@@ -77,7 +78,7 @@ def test_settings_are_of_the_scene_and_differ(name: str) -> None:
     found = settings(name)
     assert len({s.name for s in found}) == len(found) > 40
     assert {s.group for s in found} <= set(GROUPS)
-    assert {"own", "step", "tolerance", "combined", "single", "reads", "contacts"} <= {s.group for s in found}
+    assert {"default", "step", "tolerance", "combined", "single", "reads", "contacts"} <= {s.group for s in found}
     own = load_scene(name)
     scenes = [load_scene(name, overrides=s.overrides) for s in found]
     assert [s for s, scene in zip(found, scenes, strict=True) if scene.markers != own.markers] == [
@@ -125,7 +126,7 @@ def test_a_run_is_a_plain_loop_of_steps_and_readings() -> None:
     sim = task.sim
     sim.reset()
     sim.q[0] = task.motion.q0
-    for frame, u in enumerate(task.motion.steps(FRAME), 1):
+    for frame, u in enumerate(task.motion.step_controls(FRAME), 1):
         for _ in range(task.steps):
             sim.step(u)
         np.testing.assert_array_equal(run.poses[frame], sim.poses()[0])
@@ -140,7 +141,7 @@ def test_the_gradient_is_that_of_the_loss(name: str, every: int) -> None:
     task = Task(load_scene(name, overrides={"tolerance": 1e-12}), every=every)
     gradient = task.run().gradient
     assert gradient is not None and gradient.shape[0] == WINDOW
-    spread = task.motion.steps(FRAME).std(0)
+    spread = task.motion.step_controls(FRAME).std(0)
     chosen = np.flatnonzero(spread > 0)
 
     def loss() -> float:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gelflow.sim.benchmark.tradeoff.preset_bounds import OWN, preset_errors
+from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, preset_errors
 from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.scene.presets import NAMES
 from gelflow.sim.scene.scene import load_scene, scene_names
@@ -28,9 +28,9 @@ def promised() -> dict[tuple[str, str], tuple[str, Errors]]:
 
 def test_the_page_has_every_preset_as_it_is() -> None:
     found = promised()
-    assert set(found) == {(scene, name) for scene in scene_names() for name in (*NAMES, OWN)}
+    assert set(found) == {(scene, name) for scene in scene_names() for name in (*NAMES, SCENE_DEFAULT)}
     for (scene, name), (how, _) in found.items():
-        way = load_scene(scene, preset=None if name == OWN else name)
+        way = load_scene(scene, preset=None if name == SCENE_DEFAULT else name)
         integrator, step, tolerance = how.split(", ")
         assert integrator.lower() == way.integrator
         assert float(step.removesuffix(" ms")) == pytest.approx(1e3 * way.step)

@@ -15,7 +15,7 @@ from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import STATUS, Simulator
-from gelflow.sim.validation.reference_motions import SCENES, motion
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
 Array = NDArray[np.float64]
 
@@ -78,8 +78,8 @@ def test_a_neighbour_with_other_parameters_leaves_no_trace(name: str) -> None:
     """Both run on one thread, in its memory: what the first one needs of that and the second does not, such as a centre
     of mass that is off the frame's origin."""
     scene = load_scene(name)
-    moves = motion(scene)
-    u = moves.steps(scene.step)[:3, None]
+    moves = reference_motion(scene)
+    u = moves.step_controls(scene.step)[:3, None]
     runs = []
     for envs in (1, 2):
         sim = Simulator(scene, num_envs=envs, threads=1)
@@ -299,8 +299,8 @@ def test_small_steps_add_up_in_single_precision() -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_gradients_of_single_precision_are_those_of_double(name: str, friction: str) -> None:
     scene = load_scene(name, friction=friction)
-    moves = motion(scene)
-    u = moves.steps(scene.step)[:40, None]
+    moves = reference_motion(scene)
+    u = moves.step_controls(scene.step)[:40, None]
     found = []
     for precision in ("double", "single"):
         sim = Simulator(scene, precision=precision)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gelflow.sim.scene.scene import Scene, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def rolled(sim: Simulator, u: Array) -> list[NDArray[Any]]:
         run.history,
         run.tactile,
         run.halvings,
-        sim.branches(run),
+        sim.contact_modes(run),
     )
     return [np.moveaxis(part, 1, 0) for part in parts]
 
@@ -83,8 +83,8 @@ def case(request: pytest.FixtureRequest) -> tuple[Scene, Array, dict[str, Array]
     """A scene, controls (STEPS, nu) in the middle of its motion, and the state there; by BDF2, for its history."""
     name, law = request.param
     scene = load_scene(name, friction=law, overrides={**OVERRIDES.get(name, {}), "integrator": "bdf2"})
-    moves = motion(scene)
-    u, middle = moves.steps(scene.step), round(IN_TOUCH[name] / scene.step)
+    moves = reference_motion(scene)
+    u, middle = moves.step_controls(scene.step), round(IN_TOUCH[name] / scene.step)
     sim = Simulator(scene)
     sim.q[0] = moves.q0
     for now in u[:middle]:

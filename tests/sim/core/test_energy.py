@@ -14,8 +14,8 @@ from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.energy import EnergyGauge, motor_forces
-from gelflow.sim.validation.reference_motions import motion
-from gelflow.sim.validation.thrown_bodies import GRAVITY, KINDS, MASS, SIZE, Kind, Throw, fly
+from gelflow.sim.validation.reference_motions import reference_motion
+from gelflow.sim.validation.thrown_bodies import GRAVITY, KINDS, MASS, SIZE, Kind, ThrownBody, throw_bodies
 
 TOLERANCE = 1e-8
 
@@ -24,7 +24,7 @@ def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
     return st.floats(np.log(low), np.log(high)).map(lambda x: float(np.exp(x)))
 
 
-def throws(kind: Kind, law: str) -> st.SearchStrategy[Throw]:
+def throws(kind: Kind, law: str) -> st.SearchStrategy[ThrownBody]:
     """Every material, with and without damping, at steps of 0.1 to 20 ms, of bodies that turn and that do not."""
     damped = st.one_of(st.just(0.0), logarithmic(0.03, 30))
     numbers = st.fixed_dictionaries(
@@ -39,9 +39,9 @@ def throws(kind: Kind, law: str) -> st.SearchStrategy[Throw]:
 
     def build(
         damping: str, kd: float, step: float, numbers: dict[str, float], turns: bool, center: tuple[float, float, float]
-    ) -> Throw:
+    ) -> ThrownBody:
         scaled = kd * (1e3 if damping == "depth" else 1)
-        return Throw(kind, law, damping, step, {**numbers, "kd": scaled}, turns=turns, center=center)
+        return ThrownBody(kind, law, damping, step, {**numbers, "kd": scaled}, has_rotation=turns, center=center)
 
     turning = st.sampled_from([True, True, True, False])
     return st.builds(
@@ -60,8 +60,8 @@ def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
 
     @settings(max_examples=40)
     @given(throw=throws(kind, law), seed=SEEDS)
-    def check(throw: Throw, seed: int) -> None:
-        growth = fly(throw, np.random.default_rng(seed), bodies=8, steps=40)
+    def check(throw: ThrownBody, seed: int) -> None:
+        growth = throw_bodies(throw, np.random.default_rng(seed), bodies=8, steps=40)
         assert (growth.change <= TOLERANCE * growth.scale).all()
 
     check()
@@ -71,8 +71,8 @@ def test_what_spins_fast_over_long_steps_never_gains() -> None:
     """Where a step's points take the longest arcs, and springs hold back nothing; the body's frame off its centre."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
     for kind in ("box", "cylinder"):
-        throw = Throw(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
-        growth = fly(throw, np.random.default_rng(1), bodies=24, steps=150)
+        throw = ThrownBody(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
+        growth = throw_bodies(throw, np.random.default_rng(1), bodies=24, steps=150)
         assert (growth.change <= TOLERANCE * growth.scale).all()
 
 
@@ -82,7 +82,7 @@ def test_what_the_elastic_law_stores_in_a_slip(integrator: str, step: float, wit
 
     BDF2 knows the way of a step to first order."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
-    throw = Throw("box", "elastic", "depth", step, numbers, integrator=integrator, turns=False)
+    throw = ThrownBody("box", "elastic", "depth", step, numbers, integrator=integrator, has_rotation=False)
     sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
     points = 9  # of the lower face
     sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
@@ -96,7 +96,7 @@ def test_what_the_elastic_law_stores_in_a_slip(integrator: str, step: float, wit
 def test_the_parts_of_the_energy() -> None:
     """A block that stands, and a scene's spring-like parts, against their formulas."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
-    throw = Throw("box", "elastic", "depth", 1e-3, numbers)
+    throw = ThrownBody("box", "elastic", "depth", 1e-3, numbers)
     sim, gauge = (
         Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=2),
         EnergyGauge(throw, num_envs=2),
@@ -128,11 +128,11 @@ def test_what_scenes_gain_is_bounded(name: str, law: str, integrator: str) -> No
     grid = {"pads.pad.rows": 5, "pads.pad.cols": 5} if name == "rolling" else {}
     for step in (5e-3, 2e-2):
         scene = load_scene(name, friction=law, overrides={**grid, "step": step, "integrator": integrator})
-        sim, gauge, moves = Simulator(scene), EnergyGauge(scene), motion(scene)
+        sim, gauge, moves = Simulator(scene), EnergyGauge(scene), reference_motion(scene)
         sim.q[0] = moves.q0
         driven = [sim.model.joint_q[a.joint] for a in scene.actuators]
         before, gains, work = gauge.read(sim).total[0], [], 0.0
-        for u in moves.steps(step):
+        for u in moves.step_controls(step):
             start, halved = sim.q[0, driven].copy(), sim.halved[0]
             sim.step(u)
             done = motor_forces(scene, sim, u)[0] @ (sim.q[0, driven] - start)

@@ -15,9 +15,9 @@ from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
-from gelflow.sim.validation.gradient_cases import SHAPES, pressed
-from gelflow.sim.validation.reference_motions import SCENES, motion
-from gelflow.sim.validation.stress import Draw, Extremes, Precision
+from gelflow.sim.validation.contact_states import SHAPES, pressed_cloud
+from gelflow.sim.validation.reference_motions import SCENES, reference_motion
+from gelflow.sim.validation.stress import Precision, StressBatch, StressTest
 
 # Elastic friction and BDF2 are the longer ways; the others take part in single precision.
 WAYS: tuple[tuple[str, str, Precision], ...] = (("elastic", "bdf2", "double"), ("viscous", "bdf1", "single"))
@@ -33,9 +33,9 @@ FEW: dict[str, dict[str, Any]] = {
 def test_scene(name: str, law: str, integrator: str, precision: Precision) -> None:
     overrides = {"integrator": integrator, **FEW.get(name, {})}
     scene = load_scene(name, friction=law, overrides=overrides)
-    sim, run = Simulator(scene, num_envs=3, threads=2, precision=precision), motion(scene)
+    sim, run = Simulator(scene, num_envs=3, threads=2, precision=precision), reference_motion(scene)
     sim.q[:] = run.q0
-    controls = run.steps(scene.step)
+    controls = run.step_controls(scene.step)
     for u in controls[:25]:
         sim.step(np.tile(u, (3, 1)))
     sim.check()
@@ -50,7 +50,7 @@ def test_scene(name: str, law: str, integrator: str, precision: Precision) -> No
     ):
         assert np.isfinite(values).all()
     trajectory = sim.rollout(np.repeat(u[None], 3, axis=0), read_after=[0, 2])
-    assert sim.branches(trajectory).shape == (3, 3)
+    assert sim.contact_modes(trajectory).shape == (3, 3)
     gradient = sim.rollout_gradient(trajectory, q=1.0, v=1.0, tactile=1.0, anchors_end=1.0, params=True)
     for values in (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history, gradient.params):
         assert np.isfinite(values).all()
@@ -61,9 +61,9 @@ def test_scene(name: str, law: str, integrator: str, precision: Precision) -> No
 @pytest.mark.parametrize("kind", SHAPES)
 def test_shape(kind: str, law: str) -> None:
     rng = np.random.default_rng(1)
-    sim, u = pressed(kind, law, "bdf1" if law == "viscous" else "bdf2", rng)
-    case = gradient_check.Case.random(sim, u, "tactile", rng)
-    assert gradient_check.against_dual(case, rng, directions=1, groups=False).error < 1e-10
+    sim, u = pressed_cloud(kind, law, "bdf1" if law == "viscous" else "bdf2", rng)
+    case = gradient_check.RolloutLoss.random(sim, u, "tactile", rng)
+    assert gradient_check.compare_to_dual_numbers(case, rng, directions=1, groups=False).error < 1e-10
 
 
 def told(kind: str) -> dict[str, Any]:
@@ -91,8 +91,10 @@ def test_grid_and_rounding(kind: str) -> None:
         assert np.isfinite(values).all()
     sim = Simulator(model)
     assert sim.tactile().any()
-    case = gradient_check.Case.random(sim, np.zeros((2, 0)), "tactile", np.random.default_rng(3))
-    assert gradient_check.against_dual(case, np.random.default_rng(4), directions=1, groups=False).error < 1e-10
+    case = gradient_check.RolloutLoss.random(sim, np.zeros((2, 0)), "tactile", np.random.default_rng(3))
+    assert (
+        gradient_check.compare_to_dual_numbers(case, np.random.default_rng(4), directions=1, groups=False).error < 1e-10
+    )
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -100,7 +102,9 @@ def test_extremes(precision: Precision) -> None:
     """The ways by softer friction and through substeps, forwards and back."""
     halved = 0
     for name in ("rolling", "insertion"):
-        sim, u = Extremes(envs=16, steps=8, threads=2, seed=8).start(Draw(name, "elastic", "bdf2", "all", precision))
+        sim, u = StressTest(envs=16, steps=8, threads=2, seed=8).start(
+            StressBatch(name, "elastic", "bdf2", "all", precision)
+        )
         run = sim.rollout(u, read_after=[8])
         assert np.isfinite(run.q).all()
         assert np.isfinite(sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0).u).all()

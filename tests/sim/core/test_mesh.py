@@ -255,14 +255,14 @@ def test_gradients_pressed_on_a_shape(kind: str, law: str) -> None:
         sim, u = pressed(kind, law, rng)
         assert (sim.tactile() != 0).any()
         for output in OUTPUTS:
-            case = gradient_check.Case.random(sim, u, output, rng)
-            assert gradient_check.against_dual(case, rng, directions=1).error < 1e-10
+            case = gradient_check.RolloutLoss.random(sim, u, output, rng)
+            assert gradient_check.compare_to_dual_numbers(case, rng, directions=1).error < 1e-10
         if kind == "edge":
             # Where the normal is short, an elastic marker that has just slipped may be read as sticking or slipping:
             # a kink that no signature tells. Positions and velocities have none.
-            case = gradient_check.Case.random(sim, u, OUTPUTS[seed % 2], rng)
-        agreement = gradient_check.against_differences(case)
-        left_out.append(agreement.left_out)
+            case = gradient_check.RolloutLoss.random(sim, u, OUTPUTS[seed % 2], rng)
+        agreement = gradient_check.compare_to_differences(case)
+        left_out.append(agreement.skipped)
         assert agreement.error < 1e-6
     assert np.mean(left_out) <= 0.1
 

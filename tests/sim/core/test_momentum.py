@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gelflow.sim import _core
 from gelflow.sim.scene.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
 
@@ -66,9 +66,9 @@ class Loose:
 def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True) -> Simulator:
     """The scene's bodies afloat in the middle of its motion, moving as they did there."""
     scene = load_scene(name, friction=law)
-    sim, moves = Simulator(scene), motion(scene)
+    sim, moves = Simulator(scene), reference_motion(scene)
     sim.q[0] = moves.q0
-    for u in moves.steps(scene.step)[: round(IN_TOUCH[name] / scene.step)]:
+    for u in moves.step_controls(scene.step)[: round(IN_TOUCH[name] / scene.step)]:
         sim.step(u)
     sim.check()
     loose = Loose(sim.poses()[0], step, centred)

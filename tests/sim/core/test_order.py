@@ -82,7 +82,7 @@ def test_what_bdf2_remembers_belongs_to_the_state(at_rest: Array) -> None:
     np.testing.assert_array_equal(again.q[-1], whole.q[-1])
     assert whole.history[0, 0, -1] == 0 and whole.history[1, 0, -1] == 1
     sim.step(u[0, 0])
-    sim.forget()
+    sim.clear_history()
     assert not sim.history.any()
     assert rolling(5e-3, "bdf1").history.shape == (1, 0)
 

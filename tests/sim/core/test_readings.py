@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gelflow.sim import _core
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[Any]
 RADIUS, KN, KT, MU, KD = 0.02, 30.0, 0.4, 0.05, 2.0
@@ -83,11 +83,11 @@ def test_readings_are_those_of_their_markers(
 def test_own_readings_are_those_of_a_fresh_array(side: int) -> None:
     """The simulator's own array is written where markers touch or did; few, many and none of them here."""
     scene = load_scene("rolling", overrides={"pads.pad.rows": side, "pads.pad.cols": side})
-    moves = motion(scene)
+    moves = reference_motion(scene)
     sim = Simulator(scene, num_envs=2, threads=1)
     sim.q[:] = moves.q0
     counts: set[int] = set()
-    for block in np.array_split(moves.steps(scene.step), 40):
+    for block in np.array_split(moves.step_controls(scene.step), 40):
         for u in block:
             sim.step(u)
         sim.q[1] = moves.q0 + 1e-3 * len(counts)  # this one jumps

@@ -11,7 +11,7 @@ from gelflow.sim import _core
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import NOMINAL
-from gelflow.sim.validation.thrown_bodies import GRAVITY, MASS, Throw
+from gelflow.sim.validation.thrown_bodies import GRAVITY, MASS, ThrownBody
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ def test_a_sliding_block_stops_after_v_squared_over_2_mu_g(law: str, integrator:
     thousandth: creep below µ m g / (n k_t) = 0.5 mm/s, or give of µ m g / (n k_s) = 0.01 mm."""
     mu, speed, step = 0.3, 0.8, 1e-3
     numbers = {"kn": 2e3, "kt": 200.0 if law == "viscous" else 5.0, "mu": mu, "kd": 1e4, "ks": 1e4 * (law == "elastic")}
-    throw = Throw("box", law, "depth", step, numbers, integrator=integrator, turns=False)
+    throw = ThrownBody("box", law, "depth", step, numbers, integrator=integrator, has_rotation=False)
     sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())))
     sim.q[0, 0], sim.q[0, 2] = (
         -10,

@@ -9,7 +9,7 @@ from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS, load_scene
 from gelflow.sim.simulator import STATUS, Simulator
 from gelflow.sim.validation.reference_motions import SCENES
-from gelflow.sim.validation.stress import Draw, Extremes, Precision, Tally, draws
+from gelflow.sim.validation.stress import Precision, StepStatistics, StressBatch, StressTest, stress_batches
 
 BOTH: tuple[Precision, ...] = ("double", "single")
 
@@ -19,7 +19,9 @@ BOTH: tuple[Precision, ...] = ("double", "single")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision: Precision) -> None:
-    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw(scene, law, integrator, "all", precision))
+    sim, u = StressTest(envs=24, steps=20, threads=1, seed=3).start(
+        StressBatch(scene, law, integrator, "all", precision)
+    )
     run = sim.rollout(u, read_after=[10, 20])
     for values in (run.q, run.v, run.anchors, run.tactile, run.history):
         assert np.isfinite(values).all()
@@ -34,16 +36,16 @@ def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision:
 @pytest.mark.parametrize("precision", BOTH)
 @pytest.mark.parametrize("scene", SCENES)
 def test_nothing_fails_in_the_normal_range(scene: str, precision: Precision) -> None:
-    extremes = Extremes(envs=24, steps=20, threads=1, seed=4)
+    extremes = StressTest(envs=24, steps=20, threads=1, seed=4)
     for law in LAWS:
         for integrator in INTEGRATORS:
-            tally = extremes.run(Draw(scene, law, integrator, "normal", precision))
-            assert tally.failed == 0 and tally.steps == 24 * 20
+            statistics = extremes.run(StressBatch(scene, law, integrator, "normal", precision))
+            assert statistics.failed == 0 and statistics.steps == 24 * 20
 
 
 def test_failures_are_rare_and_iterations_capped() -> None:
-    extremes, total = Extremes(envs=24, steps=20, threads=1, seed=5), Tally()
-    for draw in draws(3):
+    extremes, total = StressTest(envs=24, steps=20, threads=1, seed=5), StepStatistics()
+    for draw in stress_batches(3):
         total.add(extremes.run(draw))
     assert total.steps > 28_000 and total.failed <= 0.01 * total.steps
     assert total.most_iterations <= _core.ModelSpec().max_step_iterations
@@ -51,7 +53,7 @@ def test_failures_are_rare_and_iterations_capped() -> None:
 
 def test_a_step_that_must_be_halved_tells_its_error() -> None:
     """Its parts are compared with shorter ones, which are halved in turn where they must be."""
-    sim, u = Extremes(envs=24, steps=20, threads=1, seed=3).start(Draw("insertion", "elastic", "bdf1", "all"))
+    sim, u = StressTest(envs=24, steps=20, threads=1, seed=3).start(StressBatch("insertion", "elastic", "bdf1", "all"))
     halved = 0
     for control in u:
         before = sim.halved.copy()

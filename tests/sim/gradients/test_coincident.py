@@ -14,7 +14,7 @@ from gelflow.geometry import rotate
 from gelflow.sim import _core
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.gradient_check import Case, against_dual
+from gelflow.sim.validation.gradient_check import RolloutLoss, compare_to_dual_numbers
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,9 @@ def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precisi
     if precision == "double":
         rng = np.random.default_rng(1)
         for output in ("q", "v"):
-            assert against_dual(Case.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+            assert (
+                compare_to_dual_numbers(RolloutLoss.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+            )
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
@@ -166,7 +168,9 @@ def test_a_load_on_coincident_faces_is_carried_straight_down(boxes: dict[str, An
     if precision == "double":
         rng = np.random.default_rng(2)
         for output in ("q", "v"):
-            assert against_dual(Case.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+            assert (
+                compare_to_dual_numbers(RolloutLoss.random(sim, u[:, 0], output, rng), rng, directions=2).error < 1e-10
+            )
 
 
 def hanging_over(law: str, precision: Any) -> Simulator:
@@ -213,4 +217,7 @@ def test_a_pad_half_off_a_body(law: str, precision: str) -> None:
     if precision == "double":
         rng = np.random.default_rng(3)
         for output in ("q", "v", "tactile"):
-            assert against_dual(Case.random(sim, np.zeros((3, 0)), output, rng), rng, directions=2).error < 1e-10
+            assert (
+                compare_to_dual_numbers(RolloutLoss.random(sim, np.zeros((3, 0)), output, rng), rng, directions=2).error
+                < 1e-10
+            )

@@ -8,7 +8,7 @@ from gelflow.sim.benchmark.rolling import ROLLING_FORCES
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS
 from gelflow.sim.validation import gradient_check
-from gelflow.sim.validation.gradient_cases import FREE, SHAPES, exact_simulator, in_contact, on_shape
+from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
 from gelflow.sim.validation.reference_motions import SCENES
 
 OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
@@ -20,11 +20,11 @@ OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        sim, u = in_contact(name, law, integrator, rng)
+        sim, u = scene_in_contact(name, law, integrator, rng)
         assert sim.tactile().any(), "the markers must feel something for the check to mean anything"
         for output in OUTPUTS:
-            case = gradient_check.Case.random(sim, u, output, rng)
-            assert gradient_check.against_dual(case, rng, directions=2).error < 1e-10
+            case = gradient_check.RolloutLoss.random(sim, u, output, rng)
+            assert gradient_check.compare_to_dual_numbers(case, rng, directions=2).error < 1e-10
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -35,10 +35,10 @@ def test_right_against_central_differences(name: str, law: str, integrator: str)
     agreements, with_params = [], (LAWS.index(law) + 2 * INTEGRATORS.index(integrator)) % len(OUTPUTS)
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(100 + seed)
-        sim, u = in_contact(name, law, integrator, rng)
-        case = gradient_check.Case.random(sim, u, output, rng)
-        agreements.append(gradient_check.against_differences(case, params=seed == with_params))
-    worst, left_out = max(a.error for a in agreements), np.mean([a.left_out for a in agreements])
+        sim, u = scene_in_contact(name, law, integrator, rng)
+        case = gradient_check.RolloutLoss.random(sim, u, output, rng)
+        agreements.append(gradient_check.compare_to_differences(case, params=seed == with_params))
+    worst, left_out = max(a.error for a in agreements), np.mean([a.skipped for a in agreements])
     print(f"{name} {law} {integrator}: error {worst:.1e}, left out {left_out:.1%}")
     assert worst < 1e-6
     assert left_out <= 0.05
@@ -52,13 +52,13 @@ def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
     left_out = []
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(seed)
-        sim, u = on_shape(kind, law, integrator, rng)
+        sim, u = cloud_on_shape(kind, law, integrator, rng)
         assert sim.tactile().any()
-        case = gradient_check.Case.random(sim, u, output, rng)
-        assert gradient_check.against_dual(case, rng, directions=1).error < 1e-10
-        agreement = gradient_check.against_differences(case)
+        case = gradient_check.RolloutLoss.random(sim, u, output, rng)
+        assert gradient_check.compare_to_dual_numbers(case, rng, directions=1).error < 1e-10
+        agreement = gradient_check.compare_to_differences(case)
         assert agreement.error < 1e-6
-        left_out.append(agreement.left_out)
+        left_out.append(agreement.skipped)
     assert np.mean(left_out) <= 0.05
 
 
@@ -67,21 +67,21 @@ def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
 def test_the_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> None:
     """Down onto the ball for 100 steps, then rolling: the end's positions, and a loss of all its marker readings."""
     (down, push), (_, roll) = ROLLING_FORCES[:2]
-    sim = exact_simulator("rolling", law, integrator)
+    sim = converged_simulator("rolling", law, integrator)
     u = np.array([push] * down + [roll] * (110 - down))
     reading = sim.rollout(u[:, None], read_after=(len(u),)).tactile[0, 0]
     assert (reading[:, 2] > 0).sum() > 20
     rng = np.random.default_rng(0)
-    loss = gradient_check.Case(sim, u, "tactile", reading)  # the gradient of ½ ‖reading‖²
-    for case in (loss, gradient_check.Case.random(sim, u, "q", rng)):
-        error = gradient_check.against_dual(case, rng, directions=1).error
+    loss = gradient_check.RolloutLoss(sim, u, "tactile", reading)  # the gradient of ½ ‖reading‖²
+    for case in (loss, gradient_check.RolloutLoss.random(sim, u, "q", rng)):
+        error = gradient_check.compare_to_dual_numbers(case, rng, directions=1).error
         print(f"{law} {integrator} {case.output}: {error:.1e}")
         assert error < 1e-10
 
 
 def test_the_checker_notices_a_wrong_gradient() -> None:
-    sim, u = in_contact("rolling", "viscous", "bdf1", np.random.default_rng(0))
-    case = gradient_check.Case.random(sim, u, "v", np.random.default_rng(1))
-    wrong = gradient_check.Case(sim, u * (1 + 1e-3), case.output, case.weights)
-    _, right, other = *gradient_check.analytic(case), gradient_check.analytic(wrong)[1]
+    sim, u = scene_in_contact("rolling", "viscous", "bdf1", np.random.default_rng(0))
+    case = gradient_check.RolloutLoss.random(sim, u, "v", np.random.default_rng(1))
+    wrong = gradient_check.RolloutLoss(sim, u * (1 + 1e-3), case.output, case.weights)
+    _, right, other = *gradient_check.reverse_gradient(case), gradient_check.reverse_gradient(wrong)[1]
     assert np.linalg.norm(right["q"] - other["q"]) / np.linalg.norm(right["q"]) > 1e-6

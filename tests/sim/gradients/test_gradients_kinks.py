@@ -16,7 +16,7 @@ from gelflow.sim import _core
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
-from gelflow.sim.validation.gradient_check import Case, against_dual
+from gelflow.sim.validation.gradient_check import RolloutLoss, compare_to_dual_numbers
 
 Array = NDArray[np.float64]
 
@@ -160,9 +160,9 @@ def test_of_the_side_that_the_step_takes(name: str, integrator: str) -> None:
     sim, rng = KINKS[name](integrator), np.random.default_rng(1)
     u = np.full((2, 1), 0.5 if name in DRIVEN else 0.0)
     for output in ("q", "v", "tactile"):
-        case = Case.random(sim, u, output, rng)
+        case = RolloutLoss.random(sim, u, output, rng)
         for steps in (u, u[:1]):
-            assert against_dual(replace(case, u=steps), rng, directions=2).error < 1e-10
+            assert compare_to_dual_numbers(replace(case, u=steps), rng, directions=2).error < 1e-10
 
 
 def test_they_are_on_the_border() -> None:
@@ -186,7 +186,7 @@ def test_they_are_on_the_border() -> None:
                 reading = sim.tactile()[0, 0]
                 signatures.append(int(np.hypot(*reading[:2]) < LAW["mu"] * abs(reading[2])))
             else:
-                signatures.append(int(sim.branches(sim.rollout(u))[0, 0]))
+                signatures.append(int(sim.contact_modes(sim.rollout(u))[0, 0]))
         assert len(set(signatures)) == 2, (name, signatures)
     for name in (
         "sphere, centre, viscous",

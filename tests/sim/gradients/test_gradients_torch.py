@@ -9,15 +9,15 @@ from gelflow.sim import torch_layer
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
-from gelflow.sim.validation.gradient_cases import exact_simulator, in_contact
+from gelflow.sim.validation.contact_states import converged_simulator, scene_in_contact
 
 OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 
 
 def rollout_loss(sim: Simulator, u: torch.Tensor, q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    state = torch_layer.state_of(sim)
+    state = torch_layer.torch_state(sim)
     state = torch_layer.TorchState(q, v, state.anchors, state.anchored, state.history)
-    run = torch_layer.rollout(sim, state, u, read_after=(len(u) // 2, len(u)))
+    run = torch_layer.torch_rollout(sim, state, u, read_after=(len(u) // 2, len(u)))
     return (run.q[-1] ** 2).sum() + (run.v**2).mean() + 10 * (run.tactile**2).sum()
 
 
@@ -29,16 +29,16 @@ def test_hundred_steps_through_torch(name: str, law: str) -> None:
     Stencils that leave the branches of the middle run at any of the 100 steps are left out, and counted.
     """
     rng = np.random.default_rng(7)
-    sim, u = in_contact(name, law, "bdf1", rng)
+    sim, u = scene_in_contact(name, law, "bdf1", rng)
     controls = torch.tensor(np.repeat(u.mean(0)[None, None], 100, axis=0), requires_grad=True)
     q = torch.tensor(sim.q.copy(), requires_grad=True)
     v = torch.tensor(sim.v.copy(), requires_grad=True)
     before = sim.q.copy()
     rollout_loss(sim, controls, q, v).backward()
     assert np.array_equal(sim.q, before), "a layer must not change the simulator's own state"
-    signature = sim.branches(sim.rollout(controls.detach().numpy(), read_after=(50, 100)))
+    signature = sim.contact_modes(sim.rollout(controls.detach().numpy(), read_after=(50, 100)))
     straight = torch.ones_like(q)
-    for at_q, _ in gradient_check.turning_joints(sim.model):
+    for at_q, _ in gradient_check.quaternion_joints(sim.model):
         straight[:, at_q : at_q + 4] = 0  # a quaternion's entries can not be moved one by one
     kept = 0
     for tensor, size, mask in ((controls, 1e-6, 1.0), (q, 1e-8, straight), (v, 1e-6, 1.0)):
@@ -50,7 +50,7 @@ def test_hundred_steps_through_torch(name: str, law: str) -> None:
                     for sign in (-1, 1)
                 ]
                 ends = [sim.rollout(a.numpy(), q=b.numpy(), v=c.numpy(), read_after=(50, 100)) for a, b, c in moved]
-                if all((sim.branches(end) == signature).all() for end in ends):
+                if all((sim.contact_modes(end) == signature).all() for end in ends):
                     low, high = (float(rollout_loss(sim, *x)) for x in moved)
                     assert tensor.grad is not None
                     ours = float((tensor.grad * d).sum())
@@ -62,43 +62,43 @@ def test_hundred_steps_through_torch(name: str, law: str) -> None:
     # left of 15, dual numbers all of it.
     assert kept >= 8
     for output in OUTPUTS:
-        case = gradient_check.Case.random(sim, controls.detach().numpy()[:, 0], output, rng)
-        assert gradient_check.against_dual(case, rng, directions=1, groups=False).error < 1e-6
+        case = gradient_check.RolloutLoss.random(sim, controls.detach().numpy()[:, 0], output, rng)
+        assert gradient_check.compare_to_dual_numbers(case, rng, directions=1, groups=False).error < 1e-6
 
 
 def test_steps_one_by_one_are_the_rollout() -> None:
-    sim, u = in_contact("insertion", "elastic", "bdf1", np.random.default_rng(3))
+    sim, u = scene_in_contact("insertion", "elastic", "bdf1", np.random.default_rng(3))
     controls = torch.tensor(np.repeat(u[:, None], 4, axis=0), requires_grad=True)
-    state = torch_layer.state_of(sim)
-    whole = torch_layer.rollout(sim, state, controls, read_after=(len(controls),))
+    state = torch_layer.torch_state(sim)
+    whole = torch_layer.torch_rollout(sim, state, controls, read_after=(len(controls),))
     gradient_whole = torch.autograd.grad((whole.tactile**2).sum(), controls)[0]
     for row in controls:
-        state, tactile = torch_layer.step(sim, state, row)
+        state, tactile = torch_layer.torch_step(sim, state, row)
     gradient_steps = torch.autograd.grad((tactile**2).sum(), controls)[0]
     assert torch.equal(whole.tactile[0], tactile)
     assert torch.allclose(gradient_whole, gradient_steps, rtol=1e-9, atol=1e-9)
 
 
 def test_wrong_tensors_are_refused() -> None:
-    sim = exact_simulator("rolling", "viscous", "bdf1")
-    state = torch_layer.state_of(sim)
+    sim = converged_simulator("rolling", "viscous", "bdf1")
+    state = torch_layer.torch_state(sim)
     with pytest.raises(UsageError, match=r"u must be a CPU tensor of torch\.float64"):
-        torch_layer.rollout(sim, state, torch.zeros((1, 1, 3), dtype=torch.float32))
+        torch_layer.torch_rollout(sim, state, torch.zeros((1, 1, 3), dtype=torch.float32))
     with pytest.raises(UsageError, match="u must have shape"):
-        torch_layer.rollout(sim, state, torch.zeros((1, 1, 5), dtype=torch.float64))
+        torch_layer.torch_rollout(sim, state, torch.zeros((1, 1, 5), dtype=torch.float64))
     with pytest.raises(UsageError, match="not finite"):
-        torch_layer.rollout(sim, state, torch.full((1, 1, 3), float("nan"), dtype=torch.float64))
+        torch_layer.torch_rollout(sim, state, torch.full((1, 1, 3), float("nan"), dtype=torch.float64))
 
 
 def test_stiffness_and_place_are_found_again() -> None:
     """The markers' stiffness and the pad's place on its finger, from marker readings of a run that had others."""
-    sim, u = in_contact("rolling", "viscous", "bdf1", np.random.default_rng(5))
-    controls, state = torch.from_numpy(np.repeat(u[:, None], 2, axis=0)), torch_layer.state_of(sim)
+    sim, u = scene_in_contact("rolling", "viscous", "bdf1", np.random.default_rng(5))
+    controls, state = torch.from_numpy(np.repeat(u[:, None], 2, axis=0)), torch_layer.torch_state(sim)
     kept = sim.params.copy()
 
     def readings(stiffness: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
         params = {"pad.kn": stiffness, "pad.markers.pos.x": place}
-        return torch_layer.rollout(sim, state, controls, read_after=(2, 4, 6), params=params).tactile
+        return torch_layer.torch_rollout(sim, state, controls, read_after=(2, 4, 6), params=params).tactile
 
     with torch.no_grad():
         recorded = readings(torch.tensor(1.3, dtype=torch.float64), torch.tensor(0.7e-3, dtype=torch.float64))
@@ -119,7 +119,7 @@ def test_stiffness_and_place_are_found_again() -> None:
 
 
 def test_parameters_of_each_environment_have_their_own_gradient() -> None:
-    one, u = in_contact("pushing", "viscous", "bdf1", np.random.default_rng(2))
+    one, u = scene_in_contact("pushing", "viscous", "bdf1", np.random.default_rng(2))
     sim = Simulator(one.model, num_envs=3)
     for name in ("q", "v", "params"):
         getattr(sim, name)[:] = getattr(one, name)
@@ -127,7 +127,7 @@ def test_parameters_of_each_environment_have_their_own_gradient() -> None:
     kn = torch.tensor([90.0, 100.0, 110.0], dtype=torch.float64, requires_grad=True)
     common = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)
     params = {"pad_box.kn": kn, "box_ground.mu": common}
-    run = torch_layer.rollout(sim, torch_layer.state_of(sim), controls, params=params)
+    run = torch_layer.torch_rollout(sim, torch_layer.torch_state(sim), controls, params=params)
     (run.v[-1] ** 2).sum().backward()
     assert kn.grad is not None and common.grad is not None and common.grad.shape == ()
     sim.params[:, sim.param_index["pad_box.kn"]] = kn.detach()
@@ -140,8 +140,8 @@ def test_parameters_of_each_environment_have_their_own_gradient() -> None:
 
 
 def test_wrong_parameters_are_refused() -> None:
-    sim = exact_simulator("rolling", "viscous", "bdf1")
-    state, u = torch_layer.state_of(sim), torch.zeros((1, 1, 3), dtype=torch.float64)
+    sim = converged_simulator("rolling", "viscous", "bdf1")
+    state, u = torch_layer.torch_state(sim), torch.zeros((1, 1, 3), dtype=torch.float64)
     for name, value, message in (
         ("pad.stiffness", torch.ones((), dtype=torch.float64), "no parameter 'pad.stiffness'"),
         ("pad.kn", torch.ones(2, dtype=torch.float64), r"pad\.kn must have shape \(1,\) or \(\), got \(2,\)"),
@@ -149,4 +149,4 @@ def test_wrong_parameters_are_refused() -> None:
         ("pad.kn", torch.full((1,), torch.nan, dtype=torch.float64), r"pad\.kn is not finite"),
     ):
         with pytest.raises(UsageError, match=message):
-            torch_layer.rollout(sim, state, u, params={name: value})
+            torch_layer.torch_rollout(sim, state, u, params={name: value})

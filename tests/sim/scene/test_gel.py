@@ -15,7 +15,7 @@ from gelflow.sim.scene.gel import LayerGel, SpringGel, half_space_response, laye
 from gelflow.sim.scene.sampling import disc_lattice
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.torch_layer import rollout, state_of
+from gelflow.sim.torch_layer import torch_rollout, torch_state
 
 E, NU = 1e5, 0.4
 G = E / (2 + 2 * NU)
@@ -236,7 +236,7 @@ def test_gradients_go_back_through_the_gel(tmp_path: Path) -> None:
     controls = torch.full((6, 2, 2), -1e-3, dtype=torch.float64, requires_grad=True)
 
     def loss(u: torch.Tensor) -> torch.Tensor:
-        moved: torch.Tensor = sim.displacement(rollout(sim, state_of(sim), u, read_after=(4, 6)).tactile)
+        moved: torch.Tensor = sim.displacement(torch_rollout(sim, torch_state(sim), u, read_after=(4, 6)).tactile)
         return 1e6 * (moved**2).sum()
 
     assert torch.autograd.gradcheck(loss, (controls,), eps=1e-7, rtol=1e-4)

@@ -13,7 +13,7 @@ from gelflow.hardware_mocks.simulated_cell.simulation import World, preset_confi
 from gelflow.sim.scene.presets import NAMES
 from gelflow.sim.scene.scene import TOLERANCE, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.gym import InsertionEnv, InsertionVectorEnv
+from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import NOMINAL
 from gelflow.task import INSERTION

@@ -14,7 +14,7 @@ from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.energy import EnergyGauge
-from gelflow.sim.validation.reference_motions import motion
+from gelflow.sim.validation.reference_motions import reference_motion
 
 PUSHING: dict[str, dict[str, Any]] = {
     "rolling": {"pads.pad.pushes": True, "pads.pad.rows": 20, "pads.pad.cols": 20, "pads.pad.size": [0.04, 0.04]},
@@ -45,10 +45,10 @@ def in_world(sim: Simulator, scene: Scene, index: int) -> tuple[NDArray[Any], ND
 def test_markers_add_up_to_the_wrench(name: str, law: str) -> None:
     """After every step of a motion that touches, sticks, slips and lets go."""
     scene = pushed(name, law)
-    sim, run = Simulator(scene), motion(scene)
+    sim, run = Simulator(scene), reference_motion(scene)
     sim.q[:] = run.q0
     felt, names = 0, list(sim.model.contact_names)
-    for u in run.steps(scene.step):
+    for u in run.step_controls(scene.step):
         sim.step(u)
         wrenches = sim.wrenches()[0]
         for i, pad in enumerate(scene.pads):
@@ -74,8 +74,8 @@ def test_gradients(law: str, integrator: str) -> None:
     rng = np.random.default_rng(1)
     outputs: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
     for output in outputs:
-        case = gradient_check.Case.random(sim, np.tile([0.12, 0.0, 0.2], (3, 1)), output, rng)
-        assert gradient_check.against_dual(case, rng).error < 1e-10
+        case = gradient_check.RolloutLoss.random(sim, np.tile([0.12, 0.0, 0.2], (3, 1)), output, rng)
+        assert gradient_check.compare_to_dual_numbers(case, rng).error < 1e-10
 
 
 def test_separate_grids_converge_to_one_total() -> None:
@@ -103,9 +103,9 @@ def test_one_set_of_numbers_and_anchors() -> None:
     plain = load_scene("insertion", friction="elastic")
     assert scene.build().na == plain.build().na
     sim = Simulator(scene, num_envs=2)
-    sim.q[:] = motion(scene).q0
+    sim.q[:] = reference_motion(scene).q0
     sim.param(f"{scene.pads[0].name}.kn")[1] *= 2
-    sim.step(np.tile(motion(scene).steps(scene.step)[0], (2, 1)))
+    sim.step(np.tile(reference_motion(scene).step_controls(scene.step)[0], (2, 1)))
     assert not np.array_equal(sim.v[0], sim.v[1]), "the number pushes"
     gauge = EnergyGauge(scene, num_envs=2)
     assert np.isfinite(gauge.read(sim).total).all()

@@ -11,7 +11,7 @@ from gelflow.errors import UsageError
 from gelflow.observation import DEFAULT_FLOORS, TactileFrame, flow_map
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.randomization import NOMINAL, TABLE_7, Randomization
+from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, NOMINAL, Randomization
 from gelflow.task import INSERTION
 
 WEIGHT = 0.063 * 9.8  # of the part [N]
@@ -195,10 +195,10 @@ def test_a_part_can_move_to_another_batch() -> None:
     source.draw(rng)
     target.draw(rng)
     source._noise[:] = 0
-    source.randomization = dataclasses.replace(TABLE_7, start_height=0.0)
+    source.randomization = dataclasses.replace(DEFAULT_RANDOMIZATION, start_height=0.0)
     target.randomization = source.randomization
     expected = source.attempt(rng)
-    target.take(np.array([1]), source, np.array([2]))
+    target.copy_parts(np.array([1]), source, np.array([2]))
     moved = target.attempt(rng)
     np.testing.assert_array_equal(moved.image[1], expected.image[2])
     assert moved.height[1] == expected.height[2]
@@ -206,7 +206,7 @@ def test_a_part_can_move_to_another_batch() -> None:
 
 @pytest.mark.parametrize("elastic", [True, False])
 def test_drawn_physics_lies_in_its_ranges(elastic: bool) -> None:
-    drawn = TABLE_7.draw(np.random.default_rng(0), 500, elastic=elastic)
+    drawn = DEFAULT_RANDOMIZATION.sample(np.random.default_rng(0), 500, elastic=elastic)
     for name, limits in {
         "pad_left.kn": (2e3, 1.4e4),
         "right.kd": (0, 100),

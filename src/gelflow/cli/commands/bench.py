@@ -14,7 +14,7 @@ from rich.table import Table
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
-    from gelflow.measurement.timing import Effort, Report
+    from gelflow.measurement.timing import BenchmarkOptions, Report
 
 WIDTH = 80
 MEASUREMENTS = {
@@ -54,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure; prints tables. 1 when a timed run was too far from its converged twin."""
     from gelflow.measurement.machine import processor
-    from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, Effort
+    from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, BenchmarkOptions
     from gelflow.sim.scene.toml_tables import nearest
 
     quick = args.quick or not args.what
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     reports: list[Report] = []
     for name in wanted:
         with _Bar() as bar:
-            found = _measure(name, Effort(quick=quick, repeats=repeats, watch=bar), args)
+            found = _measure(name, BenchmarkOptions(quick=quick, repeats=repeats, progress=bar), args)
         for report in found:
             _show(console, report, markdown=args.markdown)
         reports += found
@@ -84,42 +84,42 @@ def run(args: argparse.Namespace) -> int:
 
 def conclude(reports: "Sequence[Report]") -> int:
     """Say which timed runs were wrong; 1 when there was one."""
-    outside = [line for report in reports for line in report.outside]
+    outside = [line for report in reports for line in report.violations]
     for line in outside:
         print(f"outside: {line}")
     return 1 if outside else 0
 
 
-def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "list[Report]":
+def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -> "list[Report]":
     if name == "rolling":
         from gelflow.sim.benchmark.rolling import measure_rolling
 
-        return [measure_rolling(effort, paper_model=args.paper_model)]
+        return [measure_rolling(options, paper_model=args.paper_model)]
     if name == "scenes":
         from gelflow.sim.benchmark.scenes import measure_scenes
 
-        return [measure_scenes(effort)]
+        return [measure_scenes(options)]
     if name == "gradients":
         from gelflow.sim.benchmark.gradients import measure_gradients
 
-        return [measure_gradients(effort)]
+        return [measure_gradients(options)]
     if name == "batch":
         from gelflow.sim.benchmark.batch import measure_batch
 
-        return [measure_batch(effort)]
+        return [measure_batch(options)]
     if name == "markers":
         from gelflow.sim.benchmark.markers import measure_markers
 
-        return [measure_markers(effort)]
+        return [measure_markers(options)]
     if name == "precision":
         from gelflow.sim.benchmark.precision import measure_precision
 
-        return [measure_precision(effort)]
+        return [measure_precision(options)]
     if name == "tracking":
-        return _measure_tracking(effort, args.picture)
+        return _measure_tracking(options, args.picture)
     from gelflow.sim.benchmark.growth import measure_growth
 
-    report, found = measure_growth(effort)
+    report, found = measure_growth(options)
     if args.picture is not None:
         from gelflow.sim.benchmark.growth_picture import draw
 
@@ -127,14 +127,14 @@ def _measure(name: str, effort: "Effort", args: argparse.Namespace) -> "list[Rep
     return [report]
 
 
-def _measure_tracking(effort: "Effort", picture: Path | None) -> "list[Report]":
+def _measure_tracking(options: "BenchmarkOptions", picture: Path | None) -> "list[Report]":
     from gelflow.perception.benchmark.tracking import measure_tracking
 
-    reports = measure_tracking(effort)
+    reports = measure_tracking(options)
     if picture is not None:
         from gelflow.perception.benchmark.curves import draw, measure_curves
 
-        curves = measure_curves(effort)
+        curves = measure_curves(options)
         draw(curves, picture)
         reports.append(curves)
     return reports

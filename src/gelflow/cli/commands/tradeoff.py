@@ -14,7 +14,7 @@ from rich.table import Table
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
-    from gelflow.sim.benchmark.tradeoff.sweep import Price, Tradeoff
+    from gelflow.sim.benchmark.tradeoff.sweep import Measurement, Tradeoff
 
 _FIGURES = ("ms/s", "×", "mm", "mrad", "mark%", "flow", "cosine", "grad%")
 _EXPLAINED = (
@@ -88,29 +88,33 @@ def table(found: "Tradeoff", title: str) -> Table:
     for heading in _FIGURES:
         view.add_column(heading, justify="right", no_wrap=True)
     group = None
-    for price in found.prices:
-        if group not in (None, price.setting.group):
+    for measurement in found.measurements:
+        if group not in (None, measurement.setting.group):
             view.add_section()
-        group = price.setting.group
-        mark = " " if price.dominated_by else "●"
-        view.add_row(f"{mark} {price.setting.name}", *_cells(price), style="dim" if price.dominated_by else None)
+        group = measurement.setting.group
+        mark = " " if measurement.dominated_by else "●"
+        view.add_row(
+            f"{mark} {measurement.setting.name}",
+            *_cells(measurement),
+            style="dim" if measurement.dominated_by else None,
+        )
     view.add_section()
-    for name, price in _presets(found).items():
-        view.add_row(f"  {name}", *_cells(price), style="bold")
+    for name, measurement in _presets(found).items():
+        view.add_row(f"  {name}", *_cells(measurement), style="bold")
     return view
 
 
-def _presets(found: "Tradeoff") -> "dict[str, Price]":
-    """The preset's name → its price, cheapest first."""
-    pairs = [(name, price) for price in found.prices for name in price.presets]
+def _presets(found: "Tradeoff") -> "dict[str, Measurement]":
+    """The preset's name → its measurement, cheapest first."""
+    pairs = [(name, measurement) for measurement in found.measurements for name in measurement.presets]
     return dict(sorted(pairs, key=lambda pair: pair[1].seconds))
 
 
-def _cells(price: "Price") -> tuple[str, ...]:
-    e = price.errors
+def _cells(measurement: "Measurement") -> tuple[str, ...]:
+    e = measurement.errors
     return (
-        f"{1e3 * price.seconds:.3g}",
-        f"{price.speed:.0f}",
+        f"{1e3 * measurement.seconds:.3g}",
+        f"{measurement.speed:.0f}",
         short(1e3 * e.position),
         short(1e3 * e.rotation),
         short(100 * e.markers),
@@ -132,9 +136,9 @@ def dominated(found: "Tradeoff") -> Table:
     view = Table(title="Dominated", title_justify="left", box=SIMPLE_HEAD, padding=0)
     view.add_column("setting", no_wrap=True)
     view.add_column("by", no_wrap=True)
-    for price in found.prices:
-        if price.dominated_by:
-            view.add_row(price.setting.name, price.dominated_by)
+    for measurement in found.measurements:
+        if measurement.dominated_by:
+            view.add_row(measurement.setting.name, measurement.dominated_by)
     return view
 
 

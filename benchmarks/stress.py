@@ -1,7 +1,7 @@
 """Two million random steps at the extremes: `python benchmarks/extremes.py`, a little over 3 minutes on 2 cores.
 
 What is drawn stands in `gelflow.sim`. Prints how many steps failed, needed substeps, and what they cost; the
-figures go to benchmarks/results/extremes.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
+figures go to benchmarks/results/stress.json. Exit status 1: a step of the normal range failed, or over 1 % of all.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from gelflow.measurement.machine import processor
 from gelflow.sim import _core
 from gelflow.sim.simulator import STATUS
 from gelflow.sim.validation.reference_motions import SCENES
-from gelflow.sim.validation.stress import KINDS, Extremes, Tally, draws
+from gelflow.sim.validation.stress import KINDS, StepStatistics, StressTest, stress_batches
 
 RESULTS = Path(__file__).parent / "results"
 ENVS, STEPS = 250, 20
@@ -27,18 +27,18 @@ ENVS, STEPS = 250, 20
 def main() -> int:
     parser = argparse.ArgumentParser(description="Count what fails among random steps at the extremes.")
     parser.add_argument("--rounds", type=int, default=21, metavar="N", help="100 000 steps each (%(default)s)")
-    parser.add_argument("--out", type=Path, default=RESULTS / "extremes.json", help="file to write (%(default)s)")
+    parser.add_argument("--out", type=Path, default=RESULTS / "stress.json", help="file to write (%(default)s)")
     args = parser.parse_args()
-    rows: dict[tuple[str, str], Tally] = {}
+    rows: dict[tuple[str, str], StepStatistics] = {}
     seconds: dict[tuple[str, str], float] = {}
-    extremes = Extremes(envs=ENVS, steps=STEPS)
+    test = StressTest(envs=ENVS, steps=STEPS)
     begin = time.perf_counter()
-    for draw in track(draws(args.rounds), "batches", console=Console(stderr=True, width=80)):
+    for draw in track(stress_batches(args.rounds), "batches", console=Console(stderr=True, width=80)):
         started = time.perf_counter()
-        tally = extremes.run(draw)
+        statistics = test.run(draw)
         took = time.perf_counter() - started
         for key in (("kind", draw.kind), ("scene", draw.scene), ("precision", draw.precision), ("", "everything")):
-            rows.setdefault(key, Tally()).add(tally)
+            rows.setdefault(key, StepStatistics()).add(statistics)
             seconds[key] = seconds.get(key, 0.0) + took
     wall = time.perf_counter() - begin
     order = [("kind", k) for k in KINDS] + [("scene", s) for s in SCENES]

@@ -41,7 +41,7 @@ POLISH = 2  # iterations after convergence, as the runs with dual numbers have t
 STEPS = 3  # that are checked
 
 
-def exact_simulator(name: str, law: str, integrator: str) -> Simulator:
+def converged_simulator(name: str, law: str, integrator: str) -> Simulator:
     """A scene solved down to rounding errors; the rolling pad with 24 × 24 markers."""
     overrides = {"pads.pad.rows": 24, "pads.pad.cols": 24} if name == "rolling" else {}
     scene = load_scene(name, friction=law, overrides={**overrides, "integrator": integrator})
@@ -52,9 +52,9 @@ def exact_simulator(name: str, law: str, integrator: str) -> Simulator:
     return sim
 
 
-def in_contact(name: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+def scene_in_contact(name: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
     """A simulator in the middle of a scene's contact, and controls (steps, nu) to go on with, drawn at random."""
-    sim = exact_simulator(name, law, integrator)
+    sim = converged_simulator(name, law, integrator)
     hold, spread = _BEGIN[name](sim, sim.scene, rng)
     sim.check()
     return sim, hold + rng.normal(size=(STEPS, sim.model.nu)) * spread
@@ -144,12 +144,12 @@ def bracket_grid() -> DistanceGrid:
 _BEGIN = {"rolling": _rolling, "insertion": _insertion, "pushing": _pushing, "grasp": _grasp, "dclaw": _dclaw}
 
 
-def on_shape(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+def cloud_on_shape(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
     """Points pressed onto one of SHAPES, or those of a FREE body; and controls to go on with, drawn at random."""
-    return tumbling(law, integrator, rng) if kind == FREE else pressed(kind, law, integrator, rng)
+    return free_cloud(law, integrator, rng) if kind == FREE else pressed_cloud(kind, law, integrator, rng)
 
 
-def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
     """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge.
 
     And controls (steps, 3) to go on with, drawn at random.
@@ -185,7 +185,7 @@ def pressed(kind: str, law: str, integrator: str, rng: np.random.Generator) -> t
     return sim, hold + rng.normal(size=(STEPS, 3)) * spread
 
 
-def tumbling(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
+def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
     """A free cloud of points, its centre of mass off its frame, that spins on the ground and against a pusher.
 
     And controls (steps, 1) to go on with, drawn at random.

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from gelflow.errors import UsageError
-from gelflow.sim.tasks.gym import InsertionEnv, InsertionVectorEnv
+from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion import InsertionAttempts
 from gelflow.sim.tasks.randomization import NOMINAL
 from gelflow.task import INSERTION

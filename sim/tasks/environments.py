@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim.scene.scene import Scene
 from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.randomization import TABLE_7, Randomization
+from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
 from gelflow.task import INSERTION, InsertionTask
 
 Observation = NDArray[np.float32]
 
-_MOST_DRAWS = 100  # rounds of drawing until a start does not go in at once; one nearly always does
+_MAX_RESET_ROUNDS = 100  # rounds of drawing until a start does not go in at once; one nearly always does
 
 
 def _spaces(task: InsertionTask) -> tuple[Any, Any]:
@@ -83,7 +83,7 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
         preset: str | None = None,
-        randomization: Randomization = TABLE_7,
+        randomization: Randomization = DEFAULT_RANDOMIZATION,
         threads: int | None = 1,
     ) -> None:
         self.task = task
@@ -98,13 +98,13 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A new part; returns the flow map of its first attempt."""
         super().reset(seed=seed)
         given = _misalignment(options, 1)
-        for _ in range(_MOST_DRAWS):
+        for _ in range(_MAX_RESET_ROUNDS):
             self._attempts.draw(self.np_random, misalignment=given)
             result = self._attempts.attempt(self.np_random)
             if given is not None or not (result.inserted | result.failed)[0]:
                 break
         else:
-            raise SimulationError(f"{_MOST_DRAWS} starts in a row went in at once, or failed")
+            raise SimulationError(f"{_MAX_RESET_ROUNDS} starts in a row went in at once, or failed")
         self._tries[:] = 1
         return result.image[0], self._first(result)
 
@@ -138,7 +138,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
         preset: str | None = None,
-        randomization: Randomization = TABLE_7,
+        randomization: Randomization = DEFAULT_RANDOMIZATION,
         threads: int | None = None,
     ) -> None:
         self.task = task
@@ -151,11 +151,11 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._attempts = InsertionAttempts(
             num_envs, task=task, scene=scene, randomization=randomization, threads=threads
         )
-        self._nursery = InsertionAttempts(
+        self._reset_pool = InsertionAttempts(
             num_envs, task=task, scene=self._attempts.scene, randomization=randomization, threads=threads
         )
-        self._newborn: AttemptResult | None = None
-        self._ready: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._pool_result: AttemptResult | None = None
+        self._pool_rows: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._tries = np.zeros(num_envs, dtype=np.int64)
 
     def reset(
@@ -175,7 +175,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             self._attempts.draw(self.np_random, misalignment=given)
             result = self._attempts.attempt(self.np_random)
             return result.image, self._masked(_info(result, self._attempts, self._tries))
-        self._ready = self._ready[:0]  # what a former seed drew is forgotten
+        self._pool_rows = self._pool_rows[:0]  # what a former seed drew is forgotten
         images = np.empty(self.observation_space.shape or (), np.float32)
         info = self._replace(np.ones(self.num_envs, dtype=bool), images, {})
         return images, self._masked(info)
@@ -215,35 +215,35 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     ) -> dict[str, NDArray[Any]]:
         """Put new parts where `rows`, their flow maps into `images`; returns `info` with their entries."""
         wanted = np.flatnonzero(rows)
-        for _ in range(_MOST_DRAWS):
+        for _ in range(_MAX_RESET_ROUNDS):
             if not len(wanted):
                 return info
-            if not len(self._ready):
+            if not len(self._pool_rows):
                 self._prepare()
-            assert self._newborn is not None
-            count = min(len(wanted), len(self._ready))
-            into, these = wanted[:count], self._ready[:count]
-            wanted, self._ready = wanted[count:], self._ready[count:]
-            self._attempts.take(into, self._nursery, these)
+            assert self._pool_result is not None
+            count = min(len(wanted), len(self._pool_rows))
+            into, these = wanted[:count], self._pool_rows[:count]
+            wanted, self._pool_rows = wanted[count:], self._pool_rows[count:]
+            self._attempts.copy_parts(into, self._reset_pool, these)
             self._tries[into] = 1
-            images[into] = self._newborn.image[these]
-            newborn = _info(self._newborn, self._nursery, np.ones(self.num_envs, dtype=np.int64))
-            info = {key: info.get(key, values.copy()) for key, values in newborn.items()}
-            for key, values in newborn.items():
+            images[into] = self._pool_result.image[these]
+            pool_info = _info(self._pool_result, self._reset_pool, np.ones(self.num_envs, dtype=np.int64))
+            info = {key: info.get(key, values.copy()) for key, values in pool_info.items()}
+            for key, values in pool_info.items():
                 info[key][into] = values[these]
         if len(wanted):
-            raise SimulationError(f"{_MOST_DRAWS} rounds of starts went in at once, or failed")
+            raise SimulationError(f"{_MAX_RESET_ROUNDS} rounds of starts went in at once, or failed")
         return info
 
     def _prepare(self) -> None:
         """Draw parts in the nursery and make their first attempts; those that are not in at once are ready."""
-        self._nursery.draw(self.np_random)
-        self._newborn = self._nursery.attempt(self.np_random)
-        self._ready = np.flatnonzero(~self._newborn.inserted & ~self._newborn.failed)
+        self._reset_pool.draw(self.np_random)
+        self._pool_result = self._reset_pool.attempt(self.np_random)
+        self._pool_rows = np.flatnonzero(~self._pool_result.inserted & ~self._pool_result.failed)
 
 
 gymnasium.register(
     id="gelflow/Insertion-v0",
-    entry_point="gelflow.sim.tasks.gym:InsertionEnv",
-    vector_entry_point="gelflow.sim.tasks.gym:InsertionVectorEnv",
+    entry_point="gelflow.sim.tasks.environments:InsertionEnv",
+    vector_entry_point="gelflow.sim.tasks.environments:InsertionVectorEnv",
 )
