@@ -13,11 +13,11 @@ from urllib.parse import parse_qs, urlsplit
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.hardware_mocks.camera.mjpeg_server import MjpegServer
-from gelflow.hardware_mocks.egm.arm import MockEgm, MockEgmConfig
-from gelflow.hardware_mocks.simulated_cell.process import RemoteWorld
-from gelflow.hardware_mocks.simulated_cell.simulation import WorldConfig
-from gelflow.hardware_mocks.wsg.gripper import MockWsg
+from gelflow.hardware_mocks.camera.device import MockMjpegCamera
+from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
+from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
+from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
 from gelflow.real.kinematics import Joints
 from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, Pace
@@ -29,10 +29,10 @@ _NEAR: Joints = (0.0, 0.3, 0.1, 0.0, 1.2, 0.0)
 
 
 @dataclass(frozen=True)
-class RobotConfig:
+class MockRobotConfig:
     """Where the mock robot is served, and what it looks like. Times in robot time."""
 
-    world: WorldConfig = field(default_factory=WorldConfig)
+    cell: SimulatedCellConfig = field(default_factory=SimulatedCellConfig)
     host: str = "127.0.0.1"
     egm_port: int = 6510  # where the arm sends its feedback
     tcp_port: int = 0  # of the gripper, beside its pty; 0 takes a free one
@@ -48,21 +48,21 @@ class MockRobot:
     Its `clock` runs at most `factor` times as fast as the wall clock: as fast as this computer can simulate.
     """
 
-    def __init__(self, factor: float = 1.0, config: RobotConfig | None = None) -> None:
-        self.config = config = config or RobotConfig()
+    def __init__(self, factor: float = 1.0, config: MockRobotConfig | None = None) -> None:
+        self.config = config = config or MockRobotConfig()
         self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-")
         pace = f"{self._folder.name}/pace"
         Pace.create(pace)
         self.clock = clock = ScaledClock(factor, pace)
-        self.world = RemoteWorld(clock, config.world)
+        self.cell = SimulatedCellProcess(clock, config.cell)
         # CommTimeout is 0.4 s in wall time: this computer's jitter does not shrink when the clock is scaled.
         timeout = 0.4 * max(1.0, clock.factor)
         controller = MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR, comm_timeout=timeout)
-        self.arm = MockEgm(self.world, clock=clock, config=controller)
-        self.gripper = MockWsg(self.world, clock=clock, tcp_port=config.tcp_port, host=config.host)
+        self.arm = MockEgmArm(self.cell, clock=clock, config=controller)
+        self.gripper = MockWsgGripper(self.cell, clock=clock, tcp_port=config.tcp_port, host=config.host)
         self.cameras = tuple(
-            MjpegServer(
-                _Gel(self.world, finger, _look(config, finger)),
+            MockMjpegCamera(
+                _Gel(self.cell, finger, _look(config, finger)),
                 clock,
                 rate=config.camera_rate,
                 host=config.host,
@@ -70,7 +70,7 @@ class MockRobot:
             )
             for finger, slot in enumerate((LEFT_CAMERA, RIGHT_CAMERA))
         )
-        self._truth = _TruthServer((config.host, config.truth_port), self.world)
+        self._truth = _TruthServer((config.host, config.truth_port), self.cell)
         self._stack = contextlib.ExitStack()
 
     @property
@@ -83,8 +83,8 @@ class MockRobot:
         """Start the world, then the devices. Raises UsageError when a port is taken."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._folder.cleanup)
-            self.world.start()
-            stack.callback(self.world.stop)
+            self.cell.start()
+            stack.callback(self.cell.stop)
             self.arm.start()
             stack.callback(self.arm.stop)
             stack.enter_context(self.gripper)
@@ -106,25 +106,25 @@ class MockRobot:
         self.stop()
 
 
-def _look(config: RobotConfig, finger: int) -> GelLook:
+def _look(config: MockRobotConfig, finger: int) -> GelLook:
     rotation = config.rotations[finger]
     width, height = config.look.width, config.look.height
     turned = (height, width) if rotation in (90, 270) else (width, height)
-    look = replace(config.look, grid=config.world.grid, seed=config.look.seed + finger)
+    look = replace(config.look, grid=config.cell.grid, seed=config.look.seed + finger)
     return replace(look, rotation=rotation, width=turned[0], height=turned[1])
 
 
 class _Gel:
     """The picture source of one camera."""
 
-    def __init__(self, world: RemoteWorld, finger: int, look: GelLook) -> None:
-        self._world, self._finger = world, finger
+    def __init__(self, cell: SimulatedCellProcess, finger: int, look: GelLook) -> None:
+        self._cell, self._finger = cell, finger
         self._renderer = GelRenderer(look)
         self._count = 0
 
     def __call__(self) -> bytes:
         self._count += 1
-        image = self._renderer.render(self._world.marker_displacement(self._finger), sequence=self._count)
+        image = self._renderer.render(self._cell.marker_displacement(self._finger), sequence=self._count)
         return self._renderer.encode(image)
 
 
@@ -134,8 +134,8 @@ class _TruthServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, where: tuple[str, int], world: RemoteWorld) -> None:
-        self.world = world
+    def __init__(self, where: tuple[str, int], cell: SimulatedCellProcess) -> None:
+        self.cell = cell
         try:
             super().__init__(where, _TruthHandler)
         except OSError as error:
@@ -153,14 +153,14 @@ class _TruthHandler(BaseHTTPRequestHandler):
     server: _TruthServer
 
     def do_GET(self) -> None:
-        self._answer(self.server.world.truth())
+        self._answer(self.server.cell.truth())
 
     def do_POST(self) -> None:
         text = parse_qs(urlsplit(self.path).query).get("seed", [""])[0]
         if not text.isdecimal():
             self.send_error(400, "expected ?seed=N with a whole number")
             return
-        self.server.world.next_seed(int(text))
+        self.server.cell.next_seed(int(text))
         self._answer({"next_seed": int(text)})
 
     def log_message(self, format: str, *args: object) -> None:

@@ -8,12 +8,9 @@ import math
 from collections.abc import Sequence
 
 from gelflow.errors import SafetyError
+from gelflow.geometry import Columns, PoseTuple, Quaternion, Vector, columns_quaternion, rotation_columns
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Joints = tuple[float, float, float, float, float, float]
-Frame = tuple[Vector, Quaternion]
-Columns = tuple[Vector, Vector, Vector]  # a rotation matrix by its columns: where x, y and z point
+Joints = tuple[float, float, float, float, float, float]  # [rad]
 
 # Standard DH: offset of θ [rad], d [m], a [m], α [rad].
 DH = (
@@ -45,74 +42,6 @@ _BRANCHES = tuple((behind, elbow, flip) for behind in (False, True) for elbow in
 _RANGE_SLACK = 1e-9  # rounding at the end of a range is not out of range [rad]
 
 
-def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product of two quaternions w x y z."""
-    aw, ax, ay, az = a
-    bw, bx, by, bz = b
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-def rotate(q: Quaternion, v: Vector) -> Vector:
-    """The vector `v` turned by the unit quaternion `q`."""
-    w, x, y, z = q
-    vx, vy, vz = v
-    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx)
-
-
-def compose(a: Frame, b: Frame) -> Frame:
-    """The frame `b`, given in frame `a`, in the parent of `a`."""
-    (px, py, pz), q = a
-    x, y, z = rotate(q, b[0])
-    return (px + x, py + y, pz + z), multiply(q, b[1])
-
-
-def invert(a: Frame) -> Frame:
-    """The parent of frame `a`, given in `a`."""
-    (px, py, pz), (w, x, y, z) = a
-    back = (w, -x, -y, -z)
-    return rotate(back, (-px, -py, -pz)), back
-
-
-def angle_between(a: Quaternion, b: Quaternion) -> float:
-    """The angle of the turn from one unit quaternion to another [rad], 0 to π."""
-    aw, ax, ay, az = a
-    w, x, y, z = multiply((aw, -ax, -ay, -az), b)
-    return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
-
-
-def columns(q: Quaternion) -> Columns:
-    """The rotation matrix of a unit quaternion, by columns."""
-    w, x, y, z = q
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-def quaternion(matrix: Columns) -> Quaternion:
-    """The unit quaternion of a rotation matrix, with w ≥ 0; the largest component is found first, so none is lost."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
-    w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
-    largest = max(w, x, y, z)
-    scale = 0.5 / math.sqrt(largest)
-    if largest == w:
-        q = (w * scale, (yz - zy) * scale, (zx - xz) * scale, (xy - yx) * scale)
-    elif largest == x:
-        q = ((yz - zy) * scale, x * scale, (xy + yx) * scale, (zx + xz) * scale)
-    elif largest == y:
-        q = ((zx - xz) * scale, (xy + yx) * scale, y * scale, (yz + zy) * scale)
-    else:
-        q = ((xy - yx) * scale, (zx + xz) * scale, (yz + zy) * scale, z * scale)
-    return q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
-
-
 def _chain(joints: Sequence[float], count: int) -> tuple[Vector, Columns]:
     """Origin and axes of the frame behind the first `count` joints."""
     px = py = pz = 0.0
@@ -131,10 +60,10 @@ def _chain(joints: Sequence[float], count: int) -> tuple[Vector, Columns]:
     return (px, py, pz), ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
 
 
-def forward(joints: Sequence[float]) -> Frame:
+def forward(joints: Sequence[float]) -> PoseTuple:
     """The flange in the base frame: position [m] and quaternion w x y z, of six joint angles [rad]."""
     position, matrix = _chain(joints, 6)
-    return position, quaternion(matrix)
+    return position, columns_quaternion(matrix)
 
 
 def outside(joints: Sequence[float]) -> str:
@@ -154,7 +83,7 @@ def inverse(position: Sequence[float], orientation: Quaternion, *, near: Sequenc
 
     Raises SafetyError when the pose is out of reach, or when every solution has a joint out of its range.
     """
-    matrix = columns(orientation)
+    matrix = rotation_columns(orientation)
     zx, zy, zz = matrix[2]
     px, py, pz = position
     wrist = (px - _FLANGE * zx, py - _FLANGE * zy, pz - _FLANGE * zz)

@@ -1,4 +1,4 @@
-"""The robot's side of EGM in a process of its own: started by `gelflow.hardware_mocks.egm.arm`, which see."""
+"""The robot's side of EGM in a process of its own: started by `gelflow.hardware_mocks.egm.device`, which see."""
 
 import gc
 import math
@@ -14,12 +14,13 @@ from typing import Any
 
 from gelflow.clock import Clock, ScaledClock, raise_priority
 from gelflow.errors import PeerError, SafetyError, UsageError
+from gelflow.geometry import PoseTuple, angle_between, compose, invert
 from gelflow.helper_process import Messages, adopted
 from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
-from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, compose, forward, inverse, invert
+from gelflow.real.kinematics import HOME, Joints, forward, inverse
 from gelflow.time_sync import CONTROLLER, LAG, SHORTEST_WAIT
 
-_IDENTITY: Frame = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+_IDENTITY: PoseTuple = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class MockEgmConfig:
     joint_speed: float = math.radians(1.0)  # MaxSpeedDeviation [rad/s]
     comm_timeout: float = 0.2  # without an answer EGM ends [s]
     restart_after: float = 1.0  # the RAPID program starts EGM again [s]
-    tool: Frame = _IDENTITY  # the plant's tool in the flange: position [m], quaternion w x y z
+    tool: PoseTuple = _IDENTITY  # the plant's tool in the flange: position [m], quaternion w x y z
     near: Joints = HOME  # of the joint solutions for the first pose, the one closest to this is taken [rad]
     convergence: tuple[float, float, float] = (1e-3, math.radians(0.5), 1.0)  # within [m], [rad], for [s]
 
@@ -62,7 +63,7 @@ class MockEgmReport:
     last_sequence: int = -1  # the last answer's count
 
 
-def joints_of(config: MockEgmConfig, pose: Frame, near: Joints) -> Joints:
+def joints_of(config: MockEgmConfig, pose: PoseTuple, near: Joints) -> Joints:
     """Joint angles [rad] of the plant's tool at `pose`. Raises SafetyError when there are none in range."""
     position, quaternion = compose(pose, invert(config.tool))
     return inverse(position, quaternion, near=near)
@@ -71,7 +72,7 @@ def joints_of(config: MockEgmConfig, pose: Frame, near: Joints) -> Joints:
 class Controller:
     """The controller itself, without I/O: answers go in, messages come out, cycle by cycle."""
 
-    def __init__(self, config: MockEgmConfig, clock: Clock, pose: Frame) -> None:
+    def __init__(self, config: MockEgmConfig, clock: Clock, pose: PoseTuple) -> None:
         self._config = config
         self._clock = clock
         self.report = MockEgmReport()
@@ -79,7 +80,7 @@ class Controller:
         self._joints = joints_of(config, pose, config.near)  # of the controller's own motion
         self._wanted = self._joints  # of the newest reference
         self._shown, self._shown_at = self._joints, pose  # of the plant's pose
-        self._way: deque[tuple[Frame, Joints]] = deque(maxlen=4)  # where the plant was sent last
+        self._way: deque[tuple[PoseTuple, Joints]] = deque(maxlen=4)  # where the plant was sent last
         self._reference: EgmReference | None = None
         self._motors = self._rapid = True
         self._random = random.Random(0)
@@ -135,7 +136,7 @@ class Controller:
             except SafetyError as error:
                 self._end(f"a reference is out of range: {error}")
 
-    def cycle(self, periods: int) -> tuple[bytes | None, Frame | None]:
+    def cycle(self, periods: int) -> tuple[bytes | None, PoseTuple | None]:
         """One message, after `periods` periods of motion: what to send, and where the plant is to go."""
         elapsed = periods * self._config.period
         report = self.report
@@ -180,7 +181,7 @@ class Controller:
             self._wanted = self._joints
             self._reference = None
 
-    def _move(self, elapsed: float) -> Frame | None:
+    def _move(self, elapsed: float) -> PoseTuple | None:
         share = 1 - math.exp(-elapsed / self._config.lag)
         change = [(w - q) * share for w, q in zip(self._wanted, self._joints, strict=True)]
         largest = max(map(abs, change))
@@ -241,7 +242,7 @@ class _Loop:
         self._clock = clock
         self._parent = parent
         self._asked: float | None = None  # when the parent was asked what it has not answered yet [s, robot time]
-        self._move: Frame | None = None
+        self._move: PoseTuple | None = None
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind(("", 0))
         self._udp.setblocking(False)
@@ -300,7 +301,7 @@ class _Loop:
 
 
 def main(arguments: list[str]) -> int:
-    """Started by `MockEgm`."""
+    """Started by `MockEgmArm`."""
     settings, parent, _ = adopted(arguments)
     clock = ScaledClock(*settings["clock"])
     config = MockEgmConfig(**{name: _tuple(value) for name, value in settings["config"].items()})

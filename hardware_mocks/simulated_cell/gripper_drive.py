@@ -14,7 +14,7 @@ _FINGERS = ("finger_left", "finger_right")
 _HOLDS = ("hold_left", "hold_right")
 
 
-class Grip:
+class GripperDrive:
     """Drives the two fingers of the insertion scene. The caller holds the world's lock.
 
     Moving, both fingers follow a servo whose force is limited. Once both press on a part the left jaw keeps its place

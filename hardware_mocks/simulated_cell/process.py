@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import gelflow
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError
-from gelflow.hardware_mocks.simulated_cell.simulation import World, WorldConfig
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.observation import Grid
 
 Array = NDArray[np.float64]
@@ -73,11 +73,11 @@ class _Shared:
         return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols)
 
 
-class RemoteWorld:
+class SimulatedCellProcess:
     """The plants of the mock robot, simulated in another process; `with` or `start` and `stop`."""
 
-    def __init__(self, clock: ScaledClock, config: WorldConfig | None = None) -> None:
-        self.config = WorldConfig() if config is None else config
+    def __init__(self, clock: ScaledClock, config: SimulatedCellConfig | None = None) -> None:
+        self.config = SimulatedCellConfig() if config is None else config
         self._clock = clock
         self._shared: _Shared | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -139,7 +139,7 @@ class RemoteWorld:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.stop()
 
-    # ArmPlant, GripperPlant, GelPlant: see `World`
+    # ArmPlant, GripperPlant, GelPlant: see `SimulatedCell`
 
     def arm_pose(self) -> tuple[Array, Array]:
         with self._lock:
@@ -167,11 +167,11 @@ class RemoteWorld:
     # What the devices can not know
 
     def truth(self) -> dict[str, Any]:
-        """`World.truth`. Raises SimulationError when the world has failed."""
+        """`SimulatedCell.truth`. Raises SimulationError when the world has failed."""
         return dict(self._ask({"ask": "truth"}))
 
     def next_seed(self, seed: int) -> None:
-        """`World.next_seed`."""
+        """`SimulatedCell.next_seed`."""
         self._ask({"ask": "next_seed", "seed": seed})
 
     def _running(self) -> _Shared:
@@ -217,7 +217,7 @@ class RemoteWorld:
 class _Service:
     """The process's side."""
 
-    def __init__(self, world: World, link: socket.socket, shared: _Shared) -> None:
+    def __init__(self, world: SimulatedCell, link: socket.socket, shared: _Shared) -> None:
         self._world, self._link, self._shared = world, link, shared
         self._commands = shared.command.read()[0]
         self._poses = -1
@@ -264,7 +264,7 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     config, settings = pickle.load(sys.stdin.buffer)  # from our own parent
     link = socket.socket(fileno=int(arguments[0]))
-    world = World(ScaledClock(*settings), config)
+    world = SimulatedCell(ScaledClock(*settings), config)
     service = _Service(world, link, _Shared(int(arguments[1]), config.grid))
     threading.Thread(target=service.answer, daemon=True).start()
     service.pass_on()

@@ -1,298 +1,211 @@
-"""The WSG-50's side of its binary protocol, without I/O: bytes of a client in, replies and updates out.
+"""The mock WSG-50 on the wire: the same device behind a pty, a TCP port, or both."""
 
-One device has any number of sessions (a serial line, a TCP client); each has its own decoder and its own updates,
-and a motion's result goes to the session that asked for it.
-"""
-
-import struct
+import contextlib
+import os
+import selectors
+import socket
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+import tty
 
 from gelflow.clock import Clock
+from gelflow.errors import UsageError
 from gelflow.hardware_mocks.plant import GripperPlant
-from gelflow.hardware_mocks.wsg.fingers import Fingers, WsgDeviceConfig
-from gelflow.real.wsg.codec import (
-    ACKNOWLEDGE_KEY,
-    MM,
-    Corrupt,
-    Decoder,
-    Frame,
-    Reply,
-    plausible_request,
-    reply,
-)
-from gelflow.real.wsg.tables import (
-    LONGEST_PERIOD,
-    MOTIONS,
-    SHORTEST_PERIOD,
-    STATE_COMMANDS,
-    Command,
-    Status,
-    UpdateMode,
-)
+from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
+from gelflow.hardware_mocks.wsg.protocol import WsgDevice, WsgSession
 
-_HALF_FRAME = 0.5  # a frame whose rest does not come in this time is given up [s]
-_UNHURRIED = (Command.STOP, Command.FAST_STOP, Command.DISCONNECT)  # taken at any rate
-
-_WSG_50, _FIRMWARE = 1, 0x0400  # device type, and a version of the firmware that speaks this protocol
-
-# Formats of the requests' payloads; commands that are not named here take none.
-_REQUEST_LAYOUT = {
-    Command.HOME: "<B",
-    Command.PRE_POSITION: "<Bff",
-    Command.ACKNOWLEDGE: "<3s",
-    Command.GRASP: "<ff",
-    Command.RELEASE: "<ff",
-    Command.SET_ACCELERATION: "<f",
-    Command.SET_FORCE_LIMIT: "<f",
-    Command.SET_SOFT_LIMITS: "<ff",
-    Command.SYSTEM_STATE: "<BH",
-    Command.GRASP_STATE: "<BH",
-    Command.WIDTH: "<BH",
-    Command.SPEED: "<BH",
-    Command.FORCE: "<BH",
-    Command.TEMPERATURE: "<BH",
-}
+_TICK = 0.005  # how often the device looks at its fingers [s]; half the shortest period of updates
+_SHORTEST_WAIT = 0.0005  # however fast the clock [s, wall]
+_READ_SIZE = 4096  # bytes
+_BACKLOG = 65536  # a TCP client that leaves more than this unread is dropped [bytes]
 
 
-@dataclass
-class _Update:
-    mode: UpdateMode
-    period: float  # [s]
-    due: float
-    last: bytes
+class MockWsgGripper:
+    """Serves one device. Nothing is opened before `open` (or `with`).
 
+    `serial` offers a pty, whose path is `serial_path`; `tcp_port` a TCP port on `host` (0: any free one), which is
+    `tcp_address` then. One TCP client at a time; a second one is turned away.
+    """
 
-class WsgDevice:
-    """The device itself. Thread-safe."""
+    def __init__(
+        self,
+        plant: GripperPlant,
+        *,
+        clock: Clock,
+        config: MockWsgConfig | None = None,
+        serial: bool = True,
+        tcp_port: int | None = None,
+        host: str = "127.0.0.1",
+    ) -> None:
+        if not serial and tcp_port is None:
+            raise UsageError("the mock gripper needs a pty (serial=True), a tcp_port, or both")
+        self._device = WsgDevice(plant, clock=clock, config=config)
+        self._clock = clock
+        self._serial = serial
+        self._wanted = None if tcp_port is None else (host, tcp_port)
+        self._selector: selectors.BaseSelector | None = None
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
+        self._client_session: WsgSession | None = None
+        self._unsent = b""
+        self._master = self._slave = -1
+        self._line_session: WsgSession | None = None
+        self._thread: threading.Thread | None = None
+        self._ending = threading.Event()
+        self.serial_path = ""
+        self.tcp_address = ("", 0)
 
-    def __init__(self, plant: GripperPlant, *, clock: Clock, config: WsgDeviceConfig | None = None) -> None:
-        self.clock = clock
-        self.config = config or WsgDeviceConfig()
-        self.fingers = Fingers(plant, self.config)
-        self.lock = threading.RLock()
-        self._owner: WsgSession | None = None
+    def __enter__(self) -> "MockWsgGripper":
+        self.open()
+        return self
 
-    def poll(self) -> None:
-        """Let the motion under way go on; its result goes to the session that started it."""
-        with self.lock:
-            if ended := self.fingers.poll(self.clock.now()):
-                self._finish(*ended)
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def start(self, session: "WsgSession", command: Command, values: tuple[float, ...]) -> Status:
-        """Start a motion for a session; PENDING, or why not."""
-        now = self.clock.now()
-        if command == Command.HOME:
-            status = self.fingers.home(int(values[0]), now)
-        elif command == Command.PRE_POSITION and values[0] != 0:
-            status = Status.INVALID_PARAMETER  # drivers disagree on what the flags mean
-        else:
-            width, speed = values[-2:]
-            status = self.fingers.travel(command, width / MM, speed / MM, now)
-        if status == Status.CMD_PENDING:
-            self._owner = session
-        return status
+    def open(self) -> None:
+        """Open pty and port and serve them from a thread. Raises UsageError when the port is taken."""
+        if self._thread is not None:
+            raise UsageError("the mock gripper is already open")
+        self._selector = selectors.DefaultSelector()
+        try:
+            if self._wanted is not None:
+                self._listen(self._wanted)
+            if self._serial:
+                self._open_line()
+        except BaseException:
+            self._close_files()
+            raise
+        self._ending.clear()
+        self._thread = threading.Thread(target=self._serve, name="mock wsg", daemon=True)
+        self._thread.start()
 
-    def stop(self, *, fast: bool = False) -> None:
-        """Stop the fingers; `fast` locks them as well."""
-        with self.lock:
-            ended = self.fingers.fast_stop() if fast else self.fingers.stop()
-            if ended is not None:
-                self._finish(*ended)
+    def close(self) -> None:
+        """Close everything; may be called twice."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self._close_files()
 
-    def state_reply(self, command: Command) -> Reply:
-        """The answer to a question after a state value."""
-        width, speed, force = self.fingers.measured
-        values: dict[Command, float] = {
-            Command.SYSTEM_STATE: int(self.fingers.flags()),
-            Command.GRASP_STATE: int(self.fingers.grasp),
-            Command.WIDTH: width * MM,
-            Command.SPEED: speed * MM,
-            Command.FORCE: force,
-            Command.TEMPERATURE: 312,
-        }
-        return reply(command, Status.SUCCESS, values[command])
-
-    def _finish(self, command: Command, status: Status) -> None:
-        if self._owner is not None:
-            self._owner.send(reply(command, status))
-        self._owner = None
-
-
-class WsgSession:
-    """One client's conversation with the device."""
-
-    def __init__(self, device: WsgDevice) -> None:
-        self._device = device
-        self._decoder = Decoder(plausible=plausible_request, check_crc=device.config.crc)
-        self._updates: dict[Command, _Update] = {}
-        self._outbox: list[bytes] = []
-        self._last_bytes = 0.0
-        self._last_command = -float("inf")
-        self.announced = False  # the client said that it will disconnect
-        self._handlers = self._table()
-
-    def _table(self) -> dict[Command, Callable[[Command, tuple[Any, ...]], Reply]]:
-        groups: dict[tuple[Command, ...], Callable[[Command, tuple[Any, ...]], Reply]] = {
-            (Command.DISCONNECT,): self._disconnect,
-            MOTIONS: self._motion,
-            (Command.STOP, Command.FAST_STOP): self._stop,
-            (Command.ACKNOWLEDGE,): self._acknowledge,
-            (Command.SET_ACCELERATION, Command.GET_ACCELERATION): self._acceleration,
-            (Command.SET_FORCE_LIMIT, Command.GET_FORCE_LIMIT): self._force_limit,
-            (Command.SET_SOFT_LIMITS, Command.GET_SOFT_LIMITS, Command.CLEAR_SOFT_LIMITS): self._soft_limits,
-            (Command.TARE_FORCE,): self._tare,
-            (*STATE_COMMANDS, Command.TEMPERATURE): self._state,
-            (Command.DEVICE_INFO, Command.LIMITS): self._description,
-        }
-        return {command: handler for commands, handler in groups.items() for command in commands}
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the client, in any portions."""
+    def lose_part(self) -> None:
+        """A fault to order: the device reports that the held part is lost."""
         with self._device.lock:
-            self._last_bytes = self._device.clock.now()
-            self._handle(self._decoder.feed(data))
+            self._device.fingers.lose_part()
 
-    def tick(self) -> list[bytes]:
-        """What the client gets now: replies and due updates, one frame each."""
-        with self._device.lock:
-            now = self._device.clock.now()
-            if self._decoder.waiting and now - self._last_bytes > _HALF_FRAME:
-                self._last_bytes = now
-                self._handle(self._decoder.expire())
-            for command, update in self._updates.items():
-                if now >= update.due:
-                    self._update(command, update, now)
-            frames, self._outbox = self._outbox, []
-            return frames
+    def raise_fast_stop(self) -> None:
+        """A fault to order: FAST STOP."""
+        self._device.stop(fast=True)
 
-    def send(self, answer: Reply) -> None:
-        """Put a reply into the outbox."""
-        self._outbox.append(answer.encode(crc=self._device.config.crc))
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """Where it is served, as a driver takes it: `serial:PATH`, `tcp:HOST:PORT`, or both."""
+        line = (f"serial:{self.serial_path}",) if self._serial else ()
+        port = ("tcp:{}:{}".format(*self.tcp_address),) if self._wanted else ()
+        return line + port
 
-    def lost(self) -> None:
-        """The connection ended: unannounced, that is a fault."""
-        if not self.announced and self._device.config.fast_stop_on_disconnect:
-            self._device.stop(fast=True)
+    @property
+    def fast_stopped(self) -> bool:
+        """Whether the device is in FAST STOP."""
+        return self._device.fingers.fast_stopped
 
-    def _handle(self, events: list[Frame | Corrupt]) -> None:
-        for event in events:
+    def _listen(self, address: tuple[str, int]) -> None:
+        assert self._selector is not None
+        try:
+            self._listener = socket.create_server(address)
+        except (OSError, OverflowError) as error:
+            raise UsageError(f"the mock gripper can't listen on {address[0]}:{address[1]} ({error})") from None
+        self._listener.setblocking(False)
+        self.tcp_address = self._listener.getsockname()[:2]
+        self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def _open_line(self) -> None:
+        assert self._selector is not None
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)  # kept open, so that the line outlives its clients
+        os.set_blocking(self._master, False)
+        self.serial_path = os.ttyname(self._slave)
+        self._line_session = WsgSession(self._device)
+        self._selector.register(self._master, selectors.EVENT_READ, self._read_line)
+
+    def _close_files(self) -> None:
+        for open_socket in (self._client, self._listener):
+            if open_socket is not None:
+                open_socket.close()
+        for descriptor in (self._master, self._slave):
+            if descriptor >= 0:
+                os.close(descriptor)
+        if self._selector is not None:
+            self._selector.close()
+        self._client = self._listener = self._selector = None
+        self._client_session = self._line_session = None
+        self._master = self._slave = -1
+
+    def _serve(self) -> None:
+        assert self._selector is not None
+        wait = max(self._clock.wall(_TICK), _SHORTEST_WAIT)
+        while not self._ending.wait(0):
+            for key, _ in self._selector.select(wait):
+                key.data()
+            self._device.poll()
+            if self._line_session is not None:
+                for frame in self._line_session.tick():
+                    # A line has no flow control: what nobody reads is lost.
+                    with contextlib.suppress(BlockingIOError):
+                        os.write(self._master, frame)
+            if self._client_session is not None:
+                self._unsent += b"".join(self._client_session.tick())
+                self._flush()
+
+    def _read_line(self) -> None:
+        assert self._line_session is not None
+        with contextlib.suppress(BlockingIOError):
+            self._line_session.receive(os.read(self._master, _READ_SIZE))
+
+    def _accept(self) -> None:
+        assert self._listener is not None and self._selector is not None
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return  # it went away before it was accepted
+        self._read_client()  # the end of the client before may wait to be read
+        if self._client is not None:
+            client.close()
+            return
+        client.setblocking(False)
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client, self._client_session, self._unsent = client, WsgSession(self._device), b""
+        self._selector.register(client, selectors.EVENT_READ, self._read_client)
+
+    def _read_client(self) -> None:
+        while self._client is not None and self._client_session is not None:
             try:
-                command = Command(event.id)
-            except ValueError:
-                payload = struct.pack("<H", Status.CMD_UNKNOWN)
-                self._outbox.append(Frame(event.id, payload).encode(crc=self._device.config.crc))
-                continue
-            if isinstance(event, Corrupt):
-                self.send(reply(command, Status.CHECKSUM_ERROR))
-            else:
-                self.send(self._answer(command, event.payload))
-
-    def _answer(self, command: Command, payload: bytes) -> Reply:
-        now = self._device.clock.now()
-        since, self._last_command = now - self._last_command, now
-        if since < self._device.config.shortest_command_interval and command not in _UNHURRIED:
-            return reply(command, Status.OVERRUN)
-        self.announced = command == Command.DISCONNECT
-        if command == Command.LOOP:
-            return Reply(command, Status.SUCCESS, payload)
-        if command == Command.TEMPERATURE and not payload:
-            return self._device.state_reply(command)
-        layout = _REQUEST_LAYOUT.get(command, "<")
-        expected = struct.calcsize(layout)
-        if len(payload) != expected:
-            if not expected:
-                return reply(command, Status.NO_PARAM_EXPECTED)
-            short = len(payload) < expected
-            return reply(command, Status.NOT_ENOUGH_PARAMS if short else Status.CMD_FORMAT_ERROR)
-        return self._handlers[command](command, struct.unpack(layout, payload))
-
-    def _update(self, command: Command, update: _Update, now: float) -> None:
-        frame = self._device.state_reply(command)
-        if update.mode == UpdateMode.ON_CHANGE:
-            if frame.data == update.last:
+                data = self._client.recv(_READ_SIZE)
+            except BlockingIOError:
                 return
-            update.due = now + update.period
-        else:
-            # A late tick does not shift the beat, but it makes up for no more than one update.
-            update.due = max(update.due + update.period, now)
-        update.last = frame.data
-        self.send(frame)
+            except OSError:
+                data = b""
+            if data:
+                self._client_session.receive(data)
+            else:
+                self._drop_client()
 
-    def _state(self, command: Command, values: tuple[float, ...]) -> Reply:
-        mode, period = int(values[0]), values[1] / MM
-        answer = self._device.state_reply(command)
-        if mode == UpdateMode.ONCE:
-            self._updates.pop(command, None)
-            return answer
-        if mode not in list(UpdateMode):
-            return reply(command, Status.INVALID_PARAMETER)
-        if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
-            return reply(command, Status.RANGE_ERROR)
-        due = self._device.clock.now() + period
-        self._updates[command] = _Update(UpdateMode(mode), period, due, answer.data)
-        return answer
+    def _flush(self) -> None:
+        assert self._client is not None
+        if not self._unsent:
+            return
+        try:
+            sent = self._client.send(self._unsent)
+            self._unsent = self._unsent[sent:]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._drop_client()
+            return
+        if len(self._unsent) > _BACKLOG:
+            self._drop_client()
 
-    def _disconnect(self, command: Command, _: tuple[float, ...]) -> Reply:
-        self._updates.clear()
-        return reply(command, Status.SUCCESS)
-
-    def _motion(self, command: Command, values: tuple[float, ...]) -> Reply:
-        return reply(command, self._device.start(self, command, values))
-
-    def _stop(self, command: Command, _: tuple[float, ...]) -> Reply:
-        self._device.stop(fast=command == Command.FAST_STOP)
-        return reply(command, Status.SUCCESS)
-
-    def _acknowledge(self, command: Command, values: tuple[Any, ...]) -> Reply:
-        (key,) = values
-        if key != ACKNOWLEDGE_KEY:
-            return reply(command, Status.INVALID_PARAMETER)
-        self._device.fingers.acknowledge()
-        return reply(command, Status.SUCCESS)
-
-    def _acceleration(self, command: Command, values: tuple[float, ...]) -> Reply:
-        fingers = self._device.fingers
-        if command == Command.GET_ACCELERATION:
-            return reply(command, Status.SUCCESS, fingers.acceleration * MM)
-        lowest, highest = self._device.config.acceleration
-        if not lowest <= values[0] / MM <= highest:
-            return reply(command, Status.RANGE_ERROR)
-        fingers.acceleration = values[0] / MM
-        return reply(command, Status.SUCCESS)
-
-    def _force_limit(self, command: Command, values: tuple[float, ...]) -> Reply:
-        fingers = self._device.fingers
-        if command == Command.GET_FORCE_LIMIT:
-            return reply(command, Status.SUCCESS, fingers.force_limit)
-        lowest, nominal, _ = self._device.config.force
-        if not lowest <= values[0] <= nominal:
-            return reply(command, Status.RANGE_ERROR)
-        fingers.force_limit = values[0]
-        return reply(command, Status.SUCCESS)
-
-    def _soft_limits(self, command: Command, values: tuple[float, ...]) -> Reply:
-        fingers = self._device.fingers
-        if command == Command.GET_SOFT_LIMITS:
-            low, high = fingers.soft_limits or (0.0, self._device.config.stroke)
-            return reply(command, Status.SUCCESS, low * MM, high * MM)
-        if command == Command.CLEAR_SOFT_LIMITS:
-            fingers.soft_limits = None
-            return reply(command, Status.SUCCESS)
-        low, high = (value / MM for value in values)
-        if not 0 <= low < high <= self._device.config.stroke + 1e-7:
-            return reply(command, Status.RANGE_ERROR)
-        fingers.soft_limits = low, high
-        return reply(command, Status.SUCCESS)
-
-    def _tare(self, command: Command, _: tuple[float, ...]) -> Reply:
-        return reply(command, Status.NOT_AVAILABLE)  # needs fingers that measure force
-
-    def _description(self, command: Command, _: tuple[float, ...]) -> Reply:
-        config = self._device.config
-        if command == Command.DEVICE_INFO:
-            return reply(command, Status.SUCCESS, _WSG_50, 1, _FIRMWARE, config.serial_number)
-        lengths = (config.stroke, *config.speed, *config.acceleration)
-        return reply(command, Status.SUCCESS, *(value * MM for value in lengths), *config.force)
+    def _drop_client(self) -> None:
+        assert self._client is not None and self._client_session is not None and self._selector is not None
+        self._selector.unregister(self._client)
+        self._client.close()
+        self._client_session.lost()
+        self._client = self._client_session = None

@@ -11,6 +11,8 @@ from typing import Any
 from google.protobuf.message import DecodeError
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.geometry import Quaternion, Vector
+from gelflow.real.kinematics import Joints
 
 try:
     from ABBRobotEGM._egm_protobuf import egm_pb2
@@ -19,10 +21,6 @@ except TypeError as error:  # what protobuf raises for a second schema
         "expected to be the only EGM schema in this process, got another one; "
         f"do not import another EGM package (such as abb_robot_client) beside gelflow ({error})"
     ) from None
-
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Joints = tuple[float, float, float, float, float, float]
 
 _DATA = egm_pb2.EgmHeader.MSGTYPE_DATA
 _CORRECTION = egm_pb2.EgmHeader.MSGTYPE_CORRECTION

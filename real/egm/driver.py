@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
+from gelflow.geometry import PoseTuple
 from gelflow.helper_process import Child
 from gelflow.protocols import ArmState
 from gelflow.real.egm.codec import EgmFeedback
-from gelflow.real.egm.follower import EgmEvent, EgmFlag
-from gelflow.real.egm.limits import EgmConfig, Target, check_target, tool_frame
-from gelflow.real.egm.ring import Counts, EgmRecord, EgmRing
-from gelflow.real.kinematics import Frame
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog, MessageCounts
+from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag
+from gelflow.real.egm.target import Target, check_target, tool_frame
 
-__all__ = ["EgmArm", "EgmConfig", "EgmEvent", "EgmFlag", "EgmRecord"]
+__all__ = ["EgmArm", "EgmConfig", "EgmCycle", "EgmEvent", "EgmFlag"]
 
 # Wall-clock limits on our own process, which owes nothing to the robot's clock [s].
 _START_LIMIT = 30.0
@@ -48,11 +49,11 @@ class EgmArm:
         self._clock = clock
         self._lock = threading.RLock()
         self._child: Child | None = None
-        self._ring: EgmRing | None = None
+        self._ring: EgmCycleLog | None = None
         self._events: list[EgmEvent] = []
         self._latched = ""
         self._resets = 0
-        self._tool: Frame | None = None
+        self._tool: PoseTuple | None = None
         self.port = config.port  # the UDP port in use: with port 0 known after `connect`
 
     def connect(self, timeout: float | None = None) -> None:
@@ -209,7 +210,7 @@ class EgmArm:
             self._send("reset")
             self._wait(lambda: self._resets > before, _OBEY_LIMIT, "the EGM process did not confirm the reset")
 
-    def drain_log(self) -> list[EgmRecord]:
+    def drain_log(self) -> list[EgmCycle]:
         """Every cycle since the last call: commanded, applied, measured, and what the cycle was like."""
         with self._lock:
             return self._opened().drain()
@@ -222,7 +223,7 @@ class EgmArm:
             return events
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> MessageCounts:
         """Messages that came in and were not followed."""
         return self._opened().counts
 
@@ -261,21 +262,21 @@ class EgmArm:
             ) from None
         self.port = udp.getsockname()[1]
         self._events = []
-        descriptor = EgmRing.create(self._config.log_records)
+        descriptor = EgmCycleLog.create(self._config.log_records)
         try:
-            self._ring = EgmRing(descriptor, self._config.log_records)
+            self._ring = EgmCycleLog(descriptor, self._config.log_records)
             settings = dataclasses.asdict(self._config) | {"clock": self._clock.settings}
             self._child = Child.start("gelflow.real.egm.process", settings, descriptors=(udp.fileno(), descriptor))
         finally:
             udp.close()
             os.close(descriptor)
 
-    def _opened(self) -> EgmRing:
+    def _opened(self) -> EgmCycleLog:
         if self._ring is None:
             raise UsageError("the EGM arm is not connected; call connect() first")
         return self._ring
 
-    def _latest(self) -> EgmRecord:
+    def _latest(self) -> EgmCycle:
         record = self._opened().latest()
         if record is None:
             raise PeerTimeout(f"no EGM packet on UDP port {self.port} yet")

@@ -14,12 +14,13 @@ from typing import Any
 
 from gelflow.clock import ScaledClock, raise_priority
 from gelflow.errors import PeerError
+from gelflow.geometry import PoseTuple
 from gelflow.helper_process import Messages, adopted
 from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_robot, encode_sensor
-from gelflow.real.egm.follower import EgmEvent, EgmFlag, Follower
-from gelflow.real.egm.limits import EgmConfig, Target
-from gelflow.real.egm.ring import EgmRecord, EgmRing
-from gelflow.real.kinematics import Frame
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog
+from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag, ReferenceGenerator
+from gelflow.real.egm.target import Target
 
 _LARGEST_MESSAGE = 4096
 _PARENT_CHECK = 0.1  # [s, wall]: the closed link says it at once, except where another child holds the parent's end
@@ -28,13 +29,13 @@ _PARENT_CHECK = 0.1  # [s, wall]: the closed link says it at once, except where 
 class EgmLoop:
     """Waits for the robot's messages and the parent's commands, and answers each message once."""
 
-    def __init__(self, config: EgmConfig, clock: ScaledClock, udp: socket.socket, parent: Messages, ring: EgmRing):
+    def __init__(self, config: EgmConfig, clock: ScaledClock, udp: socket.socket, parent: Messages, ring: EgmCycleLog):
         self._config = config
         self._clock = clock
         self._udp = udp
         self._parent = parent
         self._ring = ring
-        self._follower = Follower(config)
+        self._follower = ReferenceGenerator(config)
         self._robot: tuple[str, int] | None = None
         self._sent = 0
 
@@ -128,9 +129,11 @@ class EgmLoop:
         self._sent += 1
         return self._clock.now()
 
-    def _log(self, feedback: EgmFeedback, stamp: float, applied: Frame | None, flags: EgmFlag, answered: float) -> None:
+    def _log(
+        self, feedback: EgmFeedback, stamp: float, applied: PoseTuple | None, flags: EgmFlag, answered: float
+    ) -> None:
         target = self._follower.target
-        record = EgmRecord(
+        record = EgmCycle(
             stamp=stamp,
             commanded=(target.position, target.quaternion) if target else None,
             applied=applied,
@@ -162,7 +165,7 @@ def main(arguments: list[str]) -> int:
     config = EgmConfig(**settings)
     udp = socket.socket(fileno=udp_number)
     udp.setblocking(False)
-    ring = EgmRing(ring_number, config.log_records)
+    ring = EgmCycleLog(ring_number, config.log_records)
     # Nothing here makes cycles of references; a collection would only delay an answer.
     gc.disable()
     with suppress(ConnectionError):

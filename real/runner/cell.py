@@ -13,7 +13,7 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.protocols import CameraImage
-from gelflow.real.camera.drivers import open_camera
+from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.driver import EgmArm, EgmConfig
 from gelflow.real.runner.lab import Lab

@@ -15,7 +15,7 @@ _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
 
 
 @dataclass(frozen=True)
-class Item:
+class PreflightItem:
     """One thing that was checked."""
 
     name: str
@@ -23,7 +23,7 @@ class Item:
     text: str  # what was found, or what is wrong
 
 
-def preflight(cell: Cell, supervisor: Supervisor) -> list[Item]:
+def preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
     """Check cameras, gripper and arm; homes the gripper outwards where the lab allows it, otherwise nothing moves.
 
     Returns all items. Raises SafetyError, naming each that failed.
@@ -44,11 +44,11 @@ def preflight(cell: Cell, supervisor: Supervisor) -> list[Item]:
     return items
 
 
-def _look(name: str, check: Callable[[], str]) -> Item:
+def _look(name: str, check: Callable[[], str]) -> PreflightItem:
     try:
-        return Item(name, True, check())
+        return PreflightItem(name, True, check())
     except GelflowError as error:
-        return Item(name, False, str(error))
+        return PreflightItem(name, False, str(error))
 
 
 def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
@@ -80,7 +80,7 @@ def _arm(cell: Cell) -> str:
 def _pose(cell: Cell, supervisor: Supervisor) -> str:
     state = cell.arm.state()
     pose = cell.lab.gripper_pose(state.position, state.quaternion)
-    x, y, yaw, height = supervisor.place(pose)
+    x, y, yaw, height = supervisor.hole_coordinates(pose)
     try:
         supervisor.check(pose, pose, speed=1e-6, turn_speed=1e-6)
     except SafetyError as error:

@@ -63,7 +63,7 @@ class Supervisor:
         self._check_change(target, previous, speed, turn_speed)
         return self._lab.tool_pose(target)
 
-    def place(self, target: Pose) -> tuple[float, float, float, float]:
+    def hole_coordinates(self, target: Pose) -> tuple[float, float, float, float]:
         """Where a gripper pose is about the taught hole: x, y [m], yaw [rad], height of the lower face [m]."""
         local = self._base_to_hole @ target
         x, y, z = (float(c) for c in local.position)
@@ -79,7 +79,7 @@ class Supervisor:
 
     def _check_place(self, target: Pose) -> None:
         space = self._lab.workspace
-        x, y, yaw, height = self.place(target)
+        x, y, yaw, height = self.hole_coordinates(target)
         local = self._base_to_hole @ target
         bounds = (
             ("x", 1e3 * abs(x), 1e3 * space.x, "mm"),

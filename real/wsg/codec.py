@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.real.wsg.tables import LONGEST_PERIOD, SHORTEST_PERIOD, Command, Status, UpdateMode
+from gelflow.real.wsg.constants import LONGEST_PERIOD, SHORTEST_PERIOD, Command, Status, UpdateMode
 
 PREAMBLE = b"\xaa\xaa\xaa"
 HEADER = 6  # bytes before the payload
@@ -58,7 +58,7 @@ def crc16(data: bytes, crc: int = 0xFFFF) -> int:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Packet:
     """One message in either direction."""
 
     id: int
@@ -106,15 +106,15 @@ class Decoder:
         """Bytes held back because they may become a frame."""
         return len(self._buffer)
 
-    def feed(self, data: bytes) -> list[Frame | Corrupt]:
+    def feed(self, data: bytes) -> list[Packet | Corrupt]:
         """Take bytes as they came, return what they completed."""
         self._buffer += data
-        found: list[Frame | Corrupt] = []
+        found: list[Packet | Corrupt] = []
         while self._step(found):
             pass
         return found
 
-    def expire(self) -> list[Frame | Corrupt]:
+    def expire(self) -> list[Packet | Corrupt]:
         """Give up the frame that is awaited (its rest did not come in time) and search what came after its start."""
         if not self._buffer:
             return []
@@ -129,7 +129,7 @@ class Decoder:
         del self._buffer[:count]
         self.discarded += count
 
-    def _step(self, found: list[Frame | Corrupt]) -> bool:
+    def _step(self, found: list[Packet | Corrupt]) -> bool:
         """Decide on the head of the buffer; False when more bytes are needed."""
         buffer = self._buffer
         start = buffer.find(PREAMBLE)
@@ -157,7 +157,7 @@ class Decoder:
             found.append(Corrupt(command))
             self._drop(1)
             return True
-        found.append(Frame(command, raw[HEADER:-2]))
+        found.append(Packet(command, raw[HEADER:-2]))
         del buffer[:total]
         return True
 
@@ -201,7 +201,7 @@ class Reply:
 
     def encode(self, *, crc: bool = True) -> bytes:
         """The bytes on the wire (the device's side)."""
-        return Frame(self.command, struct.pack("<H", self.status) + self.data).encode(crc=crc)
+        return Packet(self.command, struct.pack("<H", self.status) + self.data).encode(crc=crc)
 
 
 def reply(command: Command, status: Status, *values: float) -> Reply:
@@ -209,7 +209,7 @@ def reply(command: Command, status: Status, *values: float) -> Reply:
     return Reply(command, status, struct.pack(_REPLY_LAYOUT.get(command, "<"), *values) if values else b"")
 
 
-def parse_reply(frame: Frame) -> Reply:
+def parse_reply(frame: Packet) -> Reply:
     """A received frame as a reply. Raises PeerError when id or status is not in the tables."""
     try:
         command = Command(frame.id)
@@ -224,41 +224,41 @@ def parse_reply(frame: Frame) -> Reply:
         raise PeerError(f"the gripper answered {command.name} with status {code}, expected 0 to 30") from None
 
 
-def home(direction: int) -> Frame:
+def home(direction: int) -> Packet:
     """Reference the fingers: 0 as the device is set up, 1 outwards, 2 inwards."""
-    return Frame(Command.HOME, struct.pack("<B", direction))
+    return Packet(Command.HOME, struct.pack("<B", direction))
 
 
-def pre_position(width: float, speed: float) -> Frame:
+def pre_position(width: float, speed: float) -> Packet:
     """Move to `width` [m] at `speed` [m/s]. The flags are always 0: their bits are read in opposite ways."""
-    return Frame(Command.PRE_POSITION, struct.pack("<Bff", 0, width * MM, speed * MM))
+    return Packet(Command.PRE_POSITION, struct.pack("<Bff", 0, width * MM, speed * MM))
 
 
-def grasp(width: float, speed: float) -> Frame:
+def grasp(width: float, speed: float) -> Packet:
     """Grasp a part of nominal `width` [m] at `speed` [m/s]."""
-    return Frame(Command.GRASP, struct.pack("<ff", width * MM, speed * MM))
+    return Packet(Command.GRASP, struct.pack("<ff", width * MM, speed * MM))
 
 
-def release(width: float, speed: float) -> Frame:
+def release(width: float, speed: float) -> Packet:
     """Let a part go: move to `width` [m] at `speed` [m/s]."""
-    return Frame(Command.RELEASE, struct.pack("<ff", width * MM, speed * MM))
+    return Packet(Command.RELEASE, struct.pack("<ff", width * MM, speed * MM))
 
 
-def acknowledge() -> Frame:
+def acknowledge() -> Packet:
     """Leave FAST STOP."""
-    return Frame(Command.ACKNOWLEDGE, ACKNOWLEDGE_KEY)
+    return Packet(Command.ACKNOWLEDGE, ACKNOWLEDGE_KEY)
 
 
-def set_force_limit(force: float) -> Frame:
+def set_force_limit(force: float) -> Packet:
     """Limit the grasping force [N]."""
-    return Frame(Command.SET_FORCE_LIMIT, struct.pack("<f", force))
+    return Packet(Command.SET_FORCE_LIMIT, struct.pack("<f", force))
 
 
-def request_updates(command: Command, mode: UpdateMode, period: float) -> Frame:
+def request_updates(command: Command, mode: UpdateMode, period: float) -> Packet:
     """Ask for a state value; `period` [s] is the interval, or the shortest one for ON_CHANGE.
 
     Raises UsageError outside 0.010 to 9.999 s.
     """
     if not SHORTEST_PERIOD <= period <= LONGEST_PERIOD:
         raise UsageError(f"the period of updates must be {SHORTEST_PERIOD} to {LONGEST_PERIOD} s, got {period}")
-    return Frame(command, struct.pack("<BH", mode, round(period * MM)))
+    return Packet(command, struct.pack("<BH", mode, round(period * MM)))

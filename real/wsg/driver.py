@@ -17,11 +17,11 @@ from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout, Sa
 from gelflow.protocols import GripperState
 from gelflow.real.transport import SHORTEST_WALL_TIMEOUT, Transport
 from gelflow.real.wsg import codec
-from gelflow.real.wsg.codec import MM, Frame, Reply
+from gelflow.real.wsg.codec import MM, Packet, Reply
 from gelflow.real.wsg.config import WsgConfig, WsgLimits, narrowed
+from gelflow.real.wsg.constants import HOME_OUTWARDS, STATE_COMMANDS, Command, Status, UpdateMode
 from gelflow.real.wsg.link import WsgLink, WsgRefused
 from gelflow.real.wsg.state import StateAssembler
-from gelflow.real.wsg.tables import HOME_OUTWARDS, STATE_COMMANDS, Command, Status, UpdateMode
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # a driver prints nothing unless its program asks for it
@@ -108,16 +108,16 @@ class WsgGripper:
         self._link = link
         try:
             link.open()
-            kind, _, firmware, serial = link.request(Frame(Command.DEVICE_INFO)).values()
+            kind, _, firmware, serial = link.request(Packet(Command.DEVICE_INFO)).values()
             if kind != _WSG_50:
                 raise PeerError(f"{link.address} is a device of type {kind}, expected {_WSG_50} (WSG-50)")
-            self._limits = narrowed(config.limits, link.request(Frame(Command.LIMITS)).values())
+            self._limits = narrowed(config.limits, link.request(Packet(Command.LIMITS)).values())
             for command in STATE_COMMANDS:
                 link.request(codec.request_updates(command, UpdateMode.PERIODIC, config.update_period))
             self._await(lambda: self._values.complete, "send its state")
         except BaseException:
             with contextlib.suppress(GelflowError):
-                link.send(Frame(Command.DISCONNECT))  # closing unannounced would raise FAST STOP
+                link.send(Packet(Command.DISCONNECT))  # closing unannounced would raise FAST STOP
             link.close()
             self._link = None
             raise
@@ -141,7 +141,7 @@ class WsgGripper:
                 farewell.insert(0, ("stop", Command.STOP))
             for name, command in farewell:
                 try:
-                    link.request(Frame(command), urgent=True)
+                    link.request(Packet(command), urgent=True)
                     self._record(name, {})
                 except GelflowError as error:
                     _log.error("%s while disconnecting from the gripper: %s", name, error)
@@ -347,7 +347,7 @@ class WsgGripper:
             )
 
     def _move(
-        self, name: str, values: Mapping[str, float], frame: Frame, timeout: float, *, force: float | None = None
+        self, name: str, values: Mapping[str, float], frame: Packet, timeout: float, *, force: float | None = None
     ) -> None:
         """Send a motion and wait for its result. Raises PeerRefused naming the status; stops the fingers on trouble."""
         link = self._connected()
@@ -380,7 +380,7 @@ class WsgGripper:
 
     def _limit_force(self, link: WsgLink, force: float) -> None:
         link.request(codec.set_force_limit(force))
-        (confirmed,) = link.request(Frame(Command.GET_FORCE_LIMIT)).values()
+        (confirmed,) = link.request(Packet(Command.GET_FORCE_LIMIT)).values()
         if abs(confirmed - force) > _FORCE_MATCH:
             raise PeerRefused(
                 f"the gripper limits its force to {confirmed:.1f} N, expected {force:.1f} N: not grasping"
@@ -390,7 +390,7 @@ class WsgGripper:
         link = self._connected()
         try:
             if not self._config.dry_run:
-                link.request(Frame(command), urgent=True)
+                link.request(Packet(command), urgent=True)
         finally:
             self._record(name, {})  # after the command: a stop does not wait for the record
 

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterator
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout
 from gelflow.real.transport import SHORTEST_WALL_TIMEOUT, Transport
-from gelflow.real.wsg.codec import Corrupt, Decoder, Frame, Reply, parse_reply, plausible_reply
-from gelflow.real.wsg.tables import STATE_COMMANDS, Command, Status
+from gelflow.real.wsg.codec import Corrupt, Decoder, Packet, Reply, parse_reply, plausible_reply
+from gelflow.real.wsg.constants import STATE_COMMANDS, Command, Status
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # a driver prints nothing unless its program asks for it
@@ -92,7 +92,7 @@ class WsgLink:
         self._transport.close()
         self._fail(PeerError(f"the link to the gripper at {self.address} is closed"))
 
-    def request(self, frame: Frame, *, urgent: bool = False) -> Reply:
+    def request(self, frame: Packet, *, urgent: bool = False) -> Reply:
         """Send a command that is answered once; returns its successful reply.
 
         `urgent` does not keep the pause between commands. Raises PeerTimeout, PeerRefused or PeerError.
@@ -105,11 +105,11 @@ class WsgLink:
             raise WsgRefused(text, status=reply.status)
         return reply
 
-    def send(self, frame: Frame) -> None:
+    def send(self, frame: Packet) -> None:
         """Send a command at once and wait for no answer. Raises PeerError when the transport is broken."""
         self._write(frame)
 
-    def run(self, frame: Frame, *, timeout: float) -> tuple[Reply, bool]:
+    def run(self, frame: Packet, *, timeout: float) -> tuple[Reply, bool]:
         """Send a motion and wait for its result: the final reply, and whether it was pending before.
 
         Raises PeerTimeout when no first answer comes in the reply time-out or no result in `timeout` [s].
@@ -126,7 +126,7 @@ class WsgLink:
                     return reply, pending
                 # A success before the motion was pending repeats an earlier command's result.
 
-    def _send(self, frame: Frame, *, urgent: bool) -> None:
+    def _send(self, frame: Packet, *, urgent: bool) -> None:
         if urgent:
             self.send(frame)
             return
@@ -134,7 +134,7 @@ class WsgLink:
             self._clock.sleep(self._last_write + self._interval - self._clock.now())
             self._write(frame)
 
-    def _write(self, frame: Frame) -> None:
+    def _write(self, frame: Packet) -> None:
         with self._writing:
             if self._dead:
                 raise self._broken()
@@ -157,7 +157,7 @@ class WsgLink:
             with self._condition:
                 self._boxes = [other for other in self._boxes if other is not entry]
 
-    def _take(self, box: deque[Reply], frame: Frame, timeout: float) -> Reply:
+    def _take(self, box: deque[Reply], frame: Packet, timeout: float) -> Reply:
         end = time.monotonic() + max(self._clock.wall(timeout), SHORTEST_WALL_TIMEOUT)
         with self._condition:
             while not box:
@@ -211,7 +211,7 @@ class WsgLink:
             self._dead = True
             raise
 
-    def _sort(self, event: Frame | Corrupt, stamp: float) -> None:
+    def _sort(self, event: Packet | Corrupt, stamp: float) -> None:
         if isinstance(event, Corrupt):
             self.corrupt += 1
             _log.error("a frame with id %#04x came with a wrong checksum", event.id)

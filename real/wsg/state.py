@@ -3,7 +3,7 @@
 from gelflow.errors import PeerError
 from gelflow.protocols import GripperState
 from gelflow.real.wsg.codec import MM, Reply
-from gelflow.real.wsg.tables import STATE_COMMANDS, Command, GraspState, SystemFlag
+from gelflow.real.wsg.constants import STATE_COMMANDS, Command, GraspState, SystemFlag
 
 # Flags that forbid motion until an operator has looked.
 FAULTS = (

@@ -1,90 +1,139 @@
-"""Rigid poses: position [m] and unit quaternion w x y z.
+"""Rigid transforms: quaternions w x y z and poses.
 
-The arithmetic is in plain floats: these run hundreds of times a second, where arrays of four numbers cost much more.
+The functions take quaternions and vectors as sequences or arrays and return tuples of plain floats: the EGM process
+calls them in every 4 ms cycle, where arrays of four numbers cost much more. `Pose` holds arrays.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # w x y z, unit length
+PoseTuple = tuple[Vector, Quaternion]  # position [m] and orientation, for loops of real-time threads
+Columns = tuple[Vector, Vector, Vector]  # a rotation matrix by its columns: the directions of x, y and z
 
 
-def multiply(a: Array, b: Array) -> Array:
+def multiply(a: Sequence[float] | Array, b: Sequence[float] | Array) -> Quaternion:
     """Hamilton product of two quaternions w x y z."""
-    aw, ax, ay, az = a.tolist()
-    bw, bx, by, bz = b.tolist()
-    return np.array(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
-def conjugate(q: Array) -> Array:
-    conjugated: Array = q * np.array([1.0, -1.0, -1.0, -1.0])
-    return conjugated
+def conjugate(q: Sequence[float] | Array) -> Quaternion:
+    """Conjugate of a quaternion w x y z: the inverse rotation of a unit quaternion."""
+    w, x, y, z = q
+    return (w, -x, -y, -z)
 
 
-def rotate(q: Array, v: Array) -> Array:
-    """The vector `v` [any unit], shape (3,), turned by the unit quaternion `q`."""
-    w, x, y, z = q.tolist()
-    vx, vy, vz = v.tolist()
+def rotate(q: Sequence[float] | Array, v: Sequence[float] | Array) -> Vector:
+    """The vector `v` [any unit] rotated by the unit quaternion `q`."""
+    w, x, y, z = q
+    vx, vy, vz = v
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return np.array([vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx])
+    return (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx)
 
 
 def yaw_quaternion(yaw: float) -> Array:
-    """A turn by `yaw` [rad] about z."""
+    """Rotation by `yaw` [rad] about z, shape (4,)."""
     return np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)])
 
 
-def angle_between(a: Array, b: Array) -> float:
-    """The angle of the turn from one unit quaternion to another [rad], 0 to π."""
-    difference = multiply(conjugate(a), b)
-    w, x, y, z = difference.tolist()
+def rotation_columns(q: Sequence[float] | Array) -> Columns:
+    """The rotation matrix of a unit quaternion, by columns."""
+    w, x, y, z = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def columns_quaternion(columns: Columns) -> Quaternion:
+    """The unit quaternion with w ≥ 0 of a rotation matrix, given by columns.
+
+    Divides by the largest component, so that no accuracy is lost near half turns (Shepperd 1978).
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = columns
+    w, x, y, z = 1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    largest = max(w, x, y, z)
+    scale = 0.5 / math.sqrt(largest)
+    if largest == w:
+        q = (w * scale, (yz - zy) * scale, (zx - xz) * scale, (xy - yx) * scale)
+    elif largest == x:
+        q = ((yz - zy) * scale, x * scale, (xy + yx) * scale, (zx + xz) * scale)
+    elif largest == y:
+        q = ((zx - xz) * scale, (xy + yx) * scale, y * scale, (yz + zy) * scale)
+    else:
+        q = ((xy - yx) * scale, (zx + xz) * scale, (yz + zy) * scale, z * scale)
+    return q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
+
+
+def angle_between(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
+    """Angle of the rotation between two unit quaternions [rad], 0 to π."""
+    w, x, y, z = multiply(conjugate(a), b)
     return 2 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
 
 
 def angles_between(a: Array, b: Array) -> Array:
-    """The same for arrays of unit quaternions (…, 4), whatever their signs; exact for tiny angles too."""
+    """Angles between unit quaternions [rad], shapes (…, 4) → (…); independent of sign, accurate for tiny angles."""
     apart = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return np.asarray(4 * np.arcsin(np.minimum(apart / 2, 1)))
 
 
+def compose(a: PoseTuple, b: PoseTuple) -> PoseTuple:
+    """The pose `b`, given relative to the pose `a`, in the parent frame of `a`."""
+    (px, py, pz), q = a
+    x, y, z = rotate(q, b[0])
+    return (px + x, py + y, pz + z), multiply(q, b[1])
+
+
+def invert(a: PoseTuple) -> PoseTuple:
+    """The inverse of a pose: the parent frame relative to `a`."""
+    (px, py, pz), q = a
+    back = conjugate(q)
+    return rotate(back, (-px, -py, -pz)), back
+
+
 @dataclass(frozen=True)
 class Pose:
-    """A frame in another frame."""
+    """Position and orientation of a frame relative to its parent frame."""
 
     position: Array  # [m], shape (3,)
     quaternion: Array  # w x y z, shape (4,), unit length
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        q = multiply(self.quaternion, other.quaternion)
-        return Pose(self.position + rotate(self.quaternion, other.position), q / math.sqrt(q @ q))
+        q = np.array(multiply(self.quaternion.tolist(), other.quaternion.tolist()))
+        return Pose(self.position + rotate(self.quaternion.tolist(), other.position.tolist()), q / math.sqrt(q @ q))
 
     def inverse(self) -> "Pose":
-        back = conjugate(self.quaternion)
-        return Pose(-rotate(back, self.position), back)
+        """The parent frame relative to this one."""
+        back = conjugate(self.quaternion.tolist())
+        return Pose(-np.array(rotate(back, self.position.tolist())), np.array(back))
 
     def near(self, other: "Pose", distance: float, angle: float) -> bool:
         """Whether another pose is within a distance [m] and an angle [rad]."""
         apart = math.dist(self.position.tolist(), other.position.tolist())
-        return apart < distance and angle_between(self.quaternion, other.quaternion) < angle
+        return apart < distance and angle_between(self.quaternion.tolist(), other.quaternion.tolist()) < angle
 
     @property
     def yaw(self) -> float:
-        """The turn about z [rad], −π to π, of a frame whose z is near the parent's z."""
+        """Rotation about z [rad], −π to π, of a frame whose z is near the parent's z."""
         w, x, y, z = self.quaternion.tolist()
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
     @property
     def tilt(self) -> float:
-        """The angle between the two frames' z axes [rad]."""
+        """Angle between the z axes of this frame and its parent [rad]."""
         _, x, y, _ = self.quaternion.tolist()
         return 2 * math.atan2(math.hypot(x, y), math.sqrt(max(0.0, 1 - x * x - y * y)))

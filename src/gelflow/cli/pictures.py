@@ -10,7 +10,7 @@ from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.perception.frames import CameraMount
-    from gelflow.real.runner.runner import Attempt, Insertion
+    from gelflow.real.runner.insertion_runner import Attempt, Insertion
     from gelflow.task import InsertionTask
 
 _MOST = 6  # attempts in one picture
@@ -83,7 +83,7 @@ def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> Non
 
 
 def _words(made: "Attempt") -> str:
-    x, y, yaw = made.place
+    x, y, yaw = made.planar_pose
     lines = [
         f"at x {1e3 * x:+.1f} mm, y {1e3 * y:+.1f} mm, yaw {np.degrees(yaw):+.1f}°",
         f"depth {1e3 * made.depth:.2f} mm, shear {made.shear:.3f} mm",
@@ -93,7 +93,7 @@ def _words(made: "Attempt") -> str:
     elif made.action is not None and made.observation is not None:
         dx, dy, turn = made.action * (1e3, 1e3, 180 / np.pi)
         lines += [
-            "stopped by touch" if made.stopped else "not in the hole",
+            "stopped by touch" if made.stopped_by_contact else "not in the hole",
             f"longest arrow {made.observation.divisor:.3f} {made.observation.unit}",
             "",
             "the policy's correction:",

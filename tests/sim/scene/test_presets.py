@@ -9,7 +9,7 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.hardware_mocks.simulated_cell.simulation import World, preset_config
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, preset_config
 from gelflow.sim.scene.presets import NAMES
 from gelflow.sim.scene.scene import TOLERANCE, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
@@ -150,7 +150,7 @@ def test_the_mock_s_world_steps_in_parts_of_4_ms(preset: str) -> None:
     config = preset_config(preset, seed=3)
     assert config.step <= load_scene("insertion", preset=preset).step
     assert round(4e-3 / config.step) * config.step == pytest.approx(4e-3)
-    world = World(ScaledClock(), config)
+    world = SimulatedCell(ScaledClock(), config)
     world.command_gripper(width=0.03, speed=0.05, force=12.0)
     world.advance(round(0.7 / config.step))
     part = world.truth()["part"]

@@ -26,7 +26,7 @@ from gelflow.task import INSERTION
 if TYPE_CHECKING:
     from gelflow.policies.networks import NetworkPolicy
     from gelflow.protocols import Policy
-    from gelflow.real.runner.runner import Attempt, Insertion
+    from gelflow.real.runner.insertion_runner import Attempt, Insertion
 
 _START_LIMIT = 60.0  # for the mock robot to be up [s, wall]
 _TELL_WAIT = 0.1  # of the wall time, in which the simulation did not keep up
@@ -96,7 +96,7 @@ class Shown:
     """One insertion, as the robot saw it and as it was."""
 
     result: "Insertion"
-    truth: dict[str, Any]  # of its part: see hardware_mocks/simulated_cell/simulation.py
+    truth: dict[str, Any]  # of its part: see hardware_mocks/simulated_cell/cell.py
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def demonstrate(
     from gelflow.cli.commands.run import ATTEMPT_HEADER, attempt_line
     from gelflow.cli.pictures import draw_insertion
     from gelflow.real.runner.lab_file import load_lab
-    from gelflow.real.runner.run import RunPlan, run_insertions
+    from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
     begun = time.monotonic()
     shown: list[Shown] = []

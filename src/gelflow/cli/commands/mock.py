@@ -34,12 +34,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from gelflow.hardware_mocks.robot import MockRobot, RobotConfig
-    from gelflow.hardware_mocks.simulated_cell.simulation import preset_config
+    from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
+    from gelflow.hardware_mocks.simulated_cell.cell import preset_config
     from gelflow.real.runner.lab_file import save_lab
 
-    config = RobotConfig(
-        world=preset_config(args.preset, seed=args.seed),
+    config = MockRobotConfig(
+        cell=preset_config(args.preset, seed=args.seed),
         egm_port=args.egm_port,
         tcp_port=args.tcp_port,
         truth_port=args.truth_port,
@@ -73,7 +73,7 @@ def lab_for(robot: "MockRobot") -> "Lab":
     """The lab file's content for a running mock robot."""
     from gelflow.real.runner import lab
 
-    world, look = robot.config.world, robot.config.look
+    cell, look = robot.config.cell, robot.config.look
     factor, pace = robot.clock.settings
     # One computer plays robot and runner at once, and its jitter does not shrink when the clock is scaled: in wall time
     # the limits are twelve times those for a robot.
@@ -82,11 +82,11 @@ def lab_for(robot: "MockRobot") -> "Lab":
     def camera(finger: int) -> lab.CameraLab:
         return lab.CameraLab(
             source=robot.cameras[finger].url,
-            rows=world.grid.rows,
-            cols=world.grid.cols,
-            pitch_mm=world.grid.pitch,
+            rows=cell.grid.rows,
+            cols=cell.grid.cols,
+            pitch_mm=cell.grid.pitch,
             pixels_per_mm=look.pixels_per_mm,
-            center_mm=world.grid.center,
+            center_mm=cell.grid.center,
             rotation_deg=robot.config.rotations[finger],
             mirrored=look.mirrored,
         )
@@ -103,12 +103,12 @@ def lab_for(robot: "MockRobot") -> "Lab":
         arm=lab.ArmLab(egm_port=robot.config.egm_port, host=robot.config.host, max_speed=5e-3, max_turn_speed_deg=0.9),
         cameras=lab.CamerasLab(camera(0), camera(1)),
         tool=lab.ToolLab(
-            cast("lab.Vector", numbers(world.tool.position)),
-            cast("tuple[float, float, float, float]", numbers(world.tool.quaternion)),
+            cast("lab.Vector", numbers(cell.tool.position)),
+            cast("tuple[float, float, float, float]", numbers(cell.tool.quaternion)),
         ),
-        hole=lab.HoleLab(cast("lab.Vector", numbers(world.hole.position)), math.degrees(world.hole.yaw)),
+        hole=lab.HoleLab(cast("lab.Vector", numbers(cell.hole.position)), math.degrees(cell.hole.yaw)),
         part=lab.PartLab(
-            grasp_height=world.grasp_height, load_height=world.load_height, presentation="wait", load_wait=1.0
+            grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
         limits=lab.LimitsLab(
             stale_pose=0.020 * scale,

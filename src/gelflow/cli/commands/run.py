@@ -14,10 +14,10 @@ from gelflow.errors import UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
-    from gelflow.real.runner.motion import Mover
-    from gelflow.real.runner.preflight import Item
-    from gelflow.real.runner.run import RunPlan
-    from gelflow.real.runner.runner import Attempt, Insertion
+    from gelflow.real.runner.insertion_runner import Attempt, Insertion
+    from gelflow.real.runner.motion_executor import MotionExecutor
+    from gelflow.real.runner.preflight import PreflightItem
+    from gelflow.real.runner.run_plan import RunPlan
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from gelflow.policies.checkpoint import default_checkpoint, load_policy
     from gelflow.real.runner.lab_file import load_lab
-    from gelflow.real.runner.run import RunPlan, run_insertions
+    from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
     if args.insertions < 1:
         raise UsageError(f"--insertions must be at least 1, got {args.insertions}")
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         session=session,
         checkpoint=checkpoint,
         insertions=args.insertions,
-        operator=(lambda mover: _Prompt(console, mover)) if lab.part.presentation == "prompt" else None,
+        operator=(lambda motion: _Prompt(console, motion)) if lab.part.presentation == "prompt" else None,
         on_preflight=lambda items: console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n"),
         on_attempt=lambda number, attempt: console.print(attempt_line(number, attempt), markup=False),
     )
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(result.inserted for result in results) else 1
 
 
-def preflight_table(items: "list[Item]") -> Table:
+def preflight_table(items: "list[PreflightItem]") -> Table:
     """What was checked before anything moved."""
     table = Table(title="Preflight", show_header=False, box=None)
     for item in items:
@@ -76,10 +76,12 @@ ATTEMPT_HEADER = "  part  try   x [mm]   y [mm]  yaw [°]  depth [mm]  shear [mm
 
 def attempt_line(number: int, attempt: "Attempt") -> str:
     """One attempt in one line, under `ATTEMPT_HEADER`."""
-    x, y, yaw = attempt.place
+    x, y, yaw = attempt.planar_pose
     where = f"{1e3 * x:+9.1f}{1e3 * y:+9.1f}{math.degrees(yaw):+9.1f}"
     felt = f"{1e3 * attempt.depth:12.2f}{attempt.shear:12.3f}"
-    outcome = "in the hole" if attempt.inserted else "stopped by touch" if attempt.stopped else "not in the hole"
+    outcome = (
+        "in the hole" if attempt.inserted else "stopped by touch" if attempt.stopped_by_contact else "not in the hole"
+    )
     return f"{number + 1:6d}{attempt.number + 1:5d}{where}{felt}  {outcome}"
 
 
@@ -94,7 +96,7 @@ def _table(results: "list[Insertion]") -> Table:
 
 
 def _dry_run(console: Console, plan: "RunPlan") -> int:
-    from gelflow.real.runner.run import dry_run
+    from gelflow.real.runner.run_plan import dry_run
 
     found = dry_run(plan)
     console.print(preflight_table(found.items))
@@ -108,8 +110,8 @@ def _dry_run(console: Console, plan: "RunPlan") -> int:
 class _Prompt:
     """A person at the terminal hands the parts over."""
 
-    def __init__(self, console: Console, mover: "Mover") -> None:
-        self._console, self._mover = console, mover
+    def __init__(self, console: Console, motion: "MotionExecutor") -> None:
+        self._console, self._motion = console, motion
 
     def present(self, number: int) -> None:
         self._ask(f"Hold part {number + 1} between the fingers, then press Enter.")
@@ -122,4 +124,4 @@ class _Prompt:
             self._console.input(f"[bold]{text}[/] ")
         except EOFError:
             raise UsageError('the lab file says presentation = "prompt", but nobody can press Enter here') from None
-        self._mover.wait(0.0)
+        self._motion.wait(0.0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, rotate, yaw_quaternion
-from gelflow.hardware_mocks.simulated_cell.gripper_drive import Grip
+from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
 from gelflow.observation import Grid, resampling
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -34,7 +34,7 @@ _STILL = (2e-5, math.radians(0.02))  # a tool that stays within this of where it
 
 
 @dataclass(frozen=True)
-class WorldConfig:
+class SimulatedCellConfig:
     """How the mock cell is built. Lengths in metres, angles in radians, times in robot time."""
 
     hole: Pose = field(default_factory=lambda: Pose(np.array([0.374, 0.05, 0.05]), yaw_quaternion(0.0)))
@@ -61,15 +61,15 @@ class WorldConfig:
         return pose.position, pose.quaternion
 
 
-def preset_config(preset: str | None, *, seed: int) -> WorldConfig:
+def preset_config(preset: str | None, *, seed: int) -> SimulatedCellConfig:
     """The cell simulated as a preset of the insertion scene says, in steps that divide 4 ms and are no longer.
 
     Raises UsageError when there is no such preset.
     """
     if preset is None:
-        return WorldConfig(seed=seed)
+        return SimulatedCellConfig(seed=seed)
     step = load_scene("insertion", preset=preset).step
-    return WorldConfig(seed=seed, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
+    return SimulatedCellConfig(seed=seed, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
 
 
 @dataclass
@@ -87,13 +87,13 @@ class PartTruth:
     inserted: bool = False  # in the hole when last held
 
 
-class World:
+class SimulatedCell:
     """The simulated cell. All plant methods may be called from any thread."""
 
     def __init__(
-        self, clock: ScaledClock, config: WorldConfig | None = None, *, task: InsertionTask = INSERTION
+        self, clock: ScaledClock, config: SimulatedCellConfig | None = None, *, task: InsertionTask = INSERTION
     ) -> None:
-        self.config = config = config or WorldConfig()
+        self.config = config = config or SimulatedCellConfig()
         self._clock, self._task = clock, task
         scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
         self._sim = sim = Simulator(scene, threads=1)
@@ -109,7 +109,7 @@ class World:
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         sim.reset()
         sim.q[0] = scene.q0
-        self._grip = Grip(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
+        self._grip = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
         self._lock = threading.Lock()
         self._time = clock.now()
         self._still_since = self._time

@@ -13,19 +13,19 @@ import pytest
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError, UsageError
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.hardware_mocks.simulated_cell.process import RemoteWorld
-from gelflow.hardware_mocks.simulated_cell.simulation import World, WorldConfig
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
+from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.task import INSERTION
 from gelflow.time_sync import Pace
 
-Place = tuple[float, float, float]
+PlanarPose = tuple[float, float, float]
 
 
-def world(seed: int = 0) -> World:
-    return World(ScaledClock(), WorldConfig(seed=seed))
+def world(seed: int = 0) -> SimulatedCell:
+    return SimulatedCell(ScaledClock(), SimulatedCellConfig(seed=seed))
 
 
-def go(cell: World, place: Place, height: float, *, steps: int) -> None:
+def go(cell: SimulatedCell, place: PlanarPose, height: float, *, steps: int) -> None:
     """Move the gripper evenly to a place about the taught hole, the part's lower face at `height`."""
     config = cell.config
     x, y, yaw = place
@@ -39,7 +39,7 @@ def go(cell: World, place: Place, height: float, *, steps: int) -> None:
         cell.advance(1)
 
 
-def grasped(seed: int = 0) -> World:
+def grasped(seed: int = 0) -> SimulatedCell:
     cell = world(seed)
     cell.advance(100)
     cell.command_gripper(width=0.032, speed=0.1, force=12.0)
@@ -47,7 +47,7 @@ def grasped(seed: int = 0) -> World:
     return cell
 
 
-def in_line(truth: dict[str, Any]) -> Place:
+def in_line(truth: dict[str, Any]) -> PlanarPose:
     """Where the gripper must be about the taught hole to be right over the true one."""
     x, y, yaw = truth["part"]["misalignment"]
     pose = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)).inverse()
@@ -147,7 +147,7 @@ def test_the_hand_waits_until_the_gripper_is_at_rest() -> None:
 def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
     Pace.create(path := str(tmp_path / "pace"))
     clock = ScaledClock(10.0, path)
-    cell = World(clock, WorldConfig(seed=3))
+    cell = SimulatedCell(clock, SimulatedCellConfig(seed=3))
     begun, steps = clock.now(), 0
     ending = threading.Event()
 
@@ -166,7 +166,7 @@ def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
 
 def test_a_step_that_does_not_divide_the_arms_cycle_is_refused() -> None:
     with pytest.raises(UsageError, match="must divide 4 ms"):
-        WorldConfig(step=3e-3)
+        SimulatedCellConfig(step=3e-3)
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
@@ -177,7 +177,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
 
 
 def test_the_world_in_a_process_of_its_own_does_the_same() -> None:
-    with RemoteWorld(ScaledClock(4.0), WorldConfig(seed=3)) as remote:
+    with SimulatedCellProcess(ScaledClock(4.0), SimulatedCellConfig(seed=3)) as remote:
         assert remote.gripper_state()[0] == pytest.approx(0.06, abs=1e-6)
         wait_for(lambda: (remote.truth()["part"] or {}).get("phase") == "held out")
         assert remote.truth()["part"]["misalignment"] == pytest.approx(
@@ -193,7 +193,7 @@ def test_the_world_in_a_process_of_its_own_does_the_same() -> None:
 
 
 def test_a_world_that_died_is_named() -> None:
-    remote = RemoteWorld(ScaledClock(4.0)).start()
+    remote = SimulatedCellProcess(ScaledClock(4.0)).start()
     assert remote._process is not None
     remote.command_arm(np.array([math.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
     wait_for(lambda: remote._process is not None and remote._process.poll() is not None)

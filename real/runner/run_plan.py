@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from gelflow.observation import FlowMap, flow_map
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell, open_cell
+from gelflow.real.runner.insertion_runner import Attempt, Insertion, InsertionRunner, Operator
 from gelflow.real.runner.lab import Lab
-from gelflow.real.runner.motion import Mover
-from gelflow.real.runner.observer import Touch
-from gelflow.real.runner.preflight import Item, preflight
-from gelflow.real.runner.runner import Attempt, Insertion, InsertionRunner, Operator
+from gelflow.real.runner.motion_executor import MotionExecutor
+from gelflow.real.runner.preflight import PreflightItem, preflight
 from gelflow.real.runner.supervisor import Supervisor
+from gelflow.real.runner.tactile_observer import TactileObserver
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import describe_session
 from gelflow.task import InsertionTask
@@ -32,8 +32,8 @@ class RunPlan:
     session: Path  # the recording, a new file
     checkpoint: Path | None = None  # of the policy, for the recording
     insertions: int = 1
-    operator: Callable[[Mover], Operator] | None = None  # None: the lab's waiting time
-    on_preflight: Callable[[list[Item]], None] = lambda items: None
+    operator: Callable[[MotionExecutor], Operator] | None = None  # None: the lab's waiting time
+    on_preflight: Callable[[list[PreflightItem]], None] = lambda items: None
     on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
     on_insertion: Callable[[Insertion], None] = lambda insertion: None
     before_insertion: Callable[[int], None] = lambda number: None
@@ -42,21 +42,21 @@ class RunPlan:
 class WaitingOperator:
     """A fixture or a robot-side feeder: the part is there after a while."""
 
-    def __init__(self, mover: Mover, seconds: float) -> None:
-        self._mover, self._seconds = mover, seconds
+    def __init__(self, motion: MotionExecutor, seconds: float) -> None:
+        self._motion, self._seconds = motion, seconds
 
     def present(self, number: int) -> None:
-        self._mover.wait(self._seconds)
+        self._motion.wait(self._seconds)
 
     def take(self, number: int) -> None:
-        self._mover.wait(self._seconds)
+        self._motion.wait(self._seconds)
 
 
 @dataclass(frozen=True)
 class DryRun:
     """What a run would have started with; nothing moved."""
 
-    items: list[Item]
+    items: list[PreflightItem]
     targets: list[str]  # the first targets, as the supervisor saw them
     observation: FlowMap  # of two frames at rest: what the pads show without contact
     action: NDArray[np.float64]  # what the policy says to it
@@ -66,12 +66,12 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
     """Run the plan's insertions and record everything. Raises the first error that makes going on unsafe."""
     results = []
     with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
-        supervisor, mover = runner_parts(cell)
+        supervisor, motion = runner_parts(cell)
         plan.on_preflight(preflight(cell, supervisor))
-        operator = WaitingOperator(mover, plan.lab.part.load_wait) if plan.operator is None else plan.operator(mover)
-        with mover:
+        operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
+        with motion:
             runner = InsertionRunner(
-                cell, plan.policy, task=plan.task, mover=mover, operator=operator, on_attempt=plan.on_attempt
+                cell, plan.policy, task=plan.task, motion=motion, operator=operator, on_attempt=plan.on_attempt
             )
             for number in range(plan.insertions):
                 plan.before_insertion(number)
@@ -83,27 +83,27 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
 def dry_run(plan: RunPlan) -> DryRun:
     """Everything up to the first motion: connect, preflight, check the first targets, read the pads, ask the policy."""
     with _recording(plan, dry_run=True) as recorder, open_cell(plan.lab, recorder, dry_run=True) as cell:
-        supervisor, mover = runner_parts(cell)
+        supervisor, motion = runner_parts(cell)
         items = preflight(cell, supervisor)
         runner = InsertionRunner(
-            cell, plan.policy, task=plan.task, mover=mover, operator=WaitingOperator(mover, plan.lab.part.load_wait)
+            cell, plan.policy, task=plan.task, motion=motion, operator=WaitingOperator(motion, plan.lab.part.load_wait)
         )
-        touch = Touch(cell.cameras, runner.mounts, stale=plan.lab.limits.stale_frame)
-        touch.start(0.0)
-        reading = touch.next()
+        observer = TactileObserver(cell.cameras, runner.mounts, stale=plan.lab.limits.stale_frame)
+        observer.start(0.0)
+        reading = observer.next()
         while reading is None:
-            reading = touch.next()
-        assert touch.reference is not None
-        observation = flow_map([reading.frame], touch.reference.frame, grid=plan.task.grid)
+            reading = observer.next()
+        assert observer.reference is not None
+        observation = flow_map([reading.frame], observer.reference.frame, grid=plan.task.grid)
         plan.policy.reset()
         action = np.asarray(plan.policy.act(observation), dtype=float)
         return DryRun(items, runner.check_plan(supervisor), observation, action)
 
 
-def runner_parts(cell: Cell) -> tuple[Supervisor, Mover]:
-    """The supervisor and the mover of a cell; the mover's thread is started by `with`."""
+def runner_parts(cell: Cell) -> tuple[Supervisor, MotionExecutor]:
+    """The supervisor and the motion of a cell; the motion's thread is started by `with`."""
     supervisor = Supervisor(cell.lab)
-    mover = Mover(
+    motion = MotionExecutor(
         cell.arm,
         cell.gripper,
         cell.cameras,
@@ -112,7 +112,7 @@ def runner_parts(cell: Cell) -> tuple[Supervisor, Mover]:
         supervisor=supervisor,
         recorder=cell.recorder,
     )
-    return supervisor, mover
+    return supervisor, motion
 
 
 @contextmanager

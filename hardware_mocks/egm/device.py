@@ -17,17 +17,17 @@ import numpy as np
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
+from gelflow.geometry import PoseTuple
 from gelflow.hardware_mocks.egm.controller import MockEgmConfig, MockEgmReport, joints_of
 from gelflow.hardware_mocks.plant import ArmPlant
 from gelflow.helper_process import Child
-from gelflow.real.kinematics import Frame
 
-__all__ = ["MockEgm", "MockEgmConfig", "MockEgmReport"]
+__all__ = ["MockEgmArm", "MockEgmConfig", "MockEgmReport"]
 
 _REPLY_LIMIT = 10.0  # of our own process, its start included [s, wall]
 
 
-class MockEgm:
+class MockEgmArm:
     """The controller on the wire. `start` and `stop`; the other methods are the operator and the faults.
 
     Each of those takes effect before it returns, and raises PeerError when the controller's process is gone.
@@ -146,7 +146,7 @@ class MockEgm:
             # It ended just now; the next read says so, and whoever asks it anything is told.
             return
 
-    def _pose(self) -> Frame:
+    def _pose(self) -> PoseTuple:
         position, quaternion = self._plant.arm_pose()
         (x, y, z), (a, b, c, d) = position.tolist(), quaternion.tolist()
         return (x, y, z), (a, b, c, d)

@@ -15,14 +15,14 @@ import pytest
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout, SafetyError, UsageError
 from gelflow.hardware_mocks.plant import KinematicGripper
-from gelflow.hardware_mocks.wsg.fingers import WsgDeviceConfig
-from gelflow.hardware_mocks.wsg.gripper import MockWsg
+from gelflow.hardware_mocks.wsg.device import MockWsgGripper
+from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.protocols import Gripper, GripperState
 from gelflow.real.transport import TcpTransport, transport_for
 from gelflow.real.wsg.codec import crc16, reply
 from gelflow.real.wsg.config import WsgConfig, WsgLimits
+from gelflow.real.wsg.constants import STATE_COMMANDS, Command, Status
 from gelflow.real.wsg.driver import WsgGripper
-from gelflow.real.wsg.tables import STATE_COMMANDS, Command, Status
 
 CLOCK = ScaledClock(5.0)
 PATIENT = 10.0  # a time-out that only a failing test reaches [s, wall]
@@ -97,17 +97,17 @@ class Relay:
 
 @contextmanager
 def mock(
-    *, width: float = 0.050, config: WsgDeviceConfig | None = None, clock: ScaledClock = CLOCK
-) -> Iterator[tuple[MockWsg, KinematicGripper]]:
+    *, width: float = 0.050, config: MockWsgConfig | None = None, clock: ScaledClock = CLOCK
+) -> Iterator[tuple[MockWsgGripper, KinematicGripper]]:
     plant = KinematicGripper(clock, width=width)
-    with MockWsg(plant, clock=clock, config=config, tcp_port=0) as device:
+    with MockWsgGripper(plant, clock=clock, config=config, tcp_port=0) as device:
         yield device, plant
 
 
 @contextmanager
 def connected(
-    *, config: WsgConfig = CONFIG, device: WsgDeviceConfig | None = None, width: float = 0.050
-) -> Iterator[tuple[WsgGripper, MockWsg, KinematicGripper, Notebook]]:
+    *, config: WsgConfig = CONFIG, device: MockWsgConfig | None = None, width: float = 0.050
+) -> Iterator[tuple[WsgGripper, MockWsgGripper, KinematicGripper, Notebook]]:
     with mock(config=device, width=width) as (server, plant):
         notes = Notebook()
         transport = transport_for(server.addresses[0], clock=CLOCK)
@@ -232,7 +232,7 @@ def test_nothing_outside_the_limits_is_sent() -> None:
 
 def test_a_laboratorys_own_limits_and_the_devices_hold_too() -> None:
     narrow = WsgConfig(reply_timeout=20, stale_after=20, limits=WsgLimits(width=(0.010, 0.090), force=(5, 30)))
-    with connected(config=narrow, device=WsgDeviceConfig(stroke=0.080), width=0.060) as (gripper, _, _, _):
+    with connected(config=narrow, device=MockWsgConfig(stroke=0.080), width=0.060) as (gripper, _, _, _):
         assert gripper.limits == WsgLimits(width=(0.010, 0.080), force=(5, 30))
         gripper.home()
         for width in (0.009, 0.081):

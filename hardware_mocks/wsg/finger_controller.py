@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from gelflow.hardware_mocks.plant import GripperPlant
-from gelflow.real.wsg.tables import HOME_INWARDS, Command, GraspState, Status, SystemFlag
+from gelflow.real.wsg.constants import HOME_INWARDS, Command, GraspState, Status, SystemFlag
 
 _REACHED = 0.2e-3  # this near to its goal a motion is done [m]
 _STILL = 1e-3  # slower than this the fingers stand [m/s]
@@ -16,7 +16,7 @@ _LOOSE = 0.1  # [s]
 
 
 @dataclass(frozen=True)
-class WsgDeviceConfig:
+class MockWsgConfig:
     """What a laboratory sets on the device, or what its type says. SI units."""
 
     stroke: float = 0.110  # [m]
@@ -41,10 +41,10 @@ class _Motion:
     still_since: float | None = None
 
 
-class Fingers:
+class FingerController:
     """The state machine over a plant. Not thread-safe: the device holds a lock."""
 
-    def __init__(self, plant: GripperPlant, config: WsgDeviceConfig) -> None:
+    def __init__(self, plant: GripperPlant, config: MockWsgConfig) -> None:
         self._plant = plant
         self._config = config
         self._motion: _Motion | None = None

@@ -12,8 +12,8 @@ from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
 from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState, Camera, Gripper
+from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm, EgmFlag
-from gelflow.real.egm.ring import EgmRecord
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.session.recorder import SessionRecorder
@@ -27,7 +27,7 @@ class PartLost(PeerError):
     """The part slipped out of the fingers: the attempt ends."""
 
 
-class Mover:
+class MotionExecutor:
     """Moves the gripper frame. A thread posts the newest target again and again; each posting lives only shortly, so
     that whatever becomes of this program, the arm holds.
 
@@ -60,9 +60,9 @@ class Mover:
         self._cycles = 0
         self._flags = EgmFlag(0)
         self.failure: GelflowError | None = None
-        self._thread = threading.Thread(target=self._run, name="mover", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="motion", daemon=True)
 
-    def __enter__(self) -> "Mover":
+    def __enter__(self) -> "MotionExecutor":
         self._thread.start()
         return self
 
@@ -211,7 +211,7 @@ class Mover:
         for event in self._arm.drain_events():
             self._recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
 
-    def _gripper_heights(self, records: Sequence[EgmRecord]) -> list[float]:
+    def _gripper_heights(self, records: Sequence[EgmCycle]) -> list[float]:
         """Measured heights of the gripper frame in the base [m]: the third row of R t + p, for all records at once."""
         if not records:
             return []
@@ -220,7 +220,7 @@ class Mover:
         heights = rows @ np.array(self._lab.tool.position) + [record.measured[0][2] for record in records]
         return [float(height) for height in heights]
 
-    def _record(self, record: EgmRecord) -> None:
+    def _record(self, record: EgmCycle) -> None:
         state = ArmState(
             position=np.array(record.measured[0]),
             quaternion=np.array(record.measured[1]),

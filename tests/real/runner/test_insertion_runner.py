@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from gelflow.cli.commands.mock import lab_for
 from gelflow.cli.main import main
 from gelflow.errors import GelflowError, PeerTimeout, SafetyError
-from gelflow.hardware_mocks.robot import MockRobot, RobotConfig
-from gelflow.hardware_mocks.simulated_cell.simulation import WorldConfig
+from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.observation import FlowMap
+from gelflow.real.runner.insertion_runner import Attempt, Insertion
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
-from gelflow.real.runner.run import RunPlan, dry_run, run_insertions
-from gelflow.real.runner.runner import Attempt, Insertion
-from gelflow.real.wsg.codec import Decoder, Frame, plausible_request
-from gelflow.real.wsg.tables import Command
+from gelflow.real.runner.run_plan import RunPlan, dry_run, run_insertions
+from gelflow.real.wsg.codec import Decoder, Packet, plausible_request
+from gelflow.real.wsg.constants import Command
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
 
@@ -46,7 +46,9 @@ def free_port(kind: socket.SocketKind) -> int:
 
 @pytest.fixture
 def robot() -> Iterator[MockRobot]:
-    config = RobotConfig(world=WorldConfig(seed=2), egm_port=free_port(socket.SOCK_DGRAM), rotations=(90, 180))
+    config = MockRobotConfig(
+        cell=SimulatedCellConfig(seed=2), egm_port=free_port(socket.SOCK_DGRAM), rotations=(90, 180)
+    )
     with MockRobot(FACTOR, config) as running:
         yield running
 
@@ -65,7 +67,7 @@ class Told:
     def act(self, observation: FlowMap) -> NDArray[np.float64]:
         self.seen.append(observation)
         self._answer()
-        x, y, yaw = self._robot.world.truth()["part"]["misalignment"]
+        x, y, yaw = self._robot.cell.truth()["part"]["misalignment"]
         back, here = -yaw, -self._place[2]
         wanted = np.array([-np.cos(back) * x + np.sin(back) * y, -np.sin(back) * x - np.cos(back) * y, -yaw])
         dx, dy, turn = wanted - self._place
@@ -77,7 +79,7 @@ class Told:
 
 def mean_displacement(robot: MockRobot) -> NDArray[np.float64]:
     """Of each pad's markers along the finger, now [mm]."""
-    return np.array([robot.world.marker_displacement(finger)[:, 0].mean() for finger in (0, 1)])
+    return np.array([robot.cell.marker_displacement(finger)[:, 0].mean() for finger in (0, 1)])
 
 
 def plan_for(robot: MockRobot, folder: Path, policy: Any, **changes: Any) -> RunPlan:
@@ -128,11 +130,11 @@ def test_it_inserts_a_part_and_records_what_it_did(robot: MockRobot, tmp_path: P
     results: list[Insertion] = run_insertions(plan)
 
     assert [result.outcome for result in results] == ["inserted"]
-    assert robot.world.truth()["parts"][0]["inserted"]
+    assert robot.cell.truth()["parts"][0]["inserted"]
     assert len(made) == len(results[0].attempts) >= 2 and made[-1].inserted
     # The rim was met, which stopped the descent, and every map that the policy saw is normalized.
     first = made[0]
-    assert first.contact and first.stopped and 0.3e-3 < first.depth < 1.15e-3
+    assert first.contact and first.stopped_by_contact and 0.3e-3 < first.depth < 1.15e-3
     # The depth of the last frames is the depth where they were taken, not where the arm was a moment before.
     assert made[-1].depth == pytest.approx(INSERTION.descent, abs=0.05e-3)
     for seen in policy.seen:
@@ -220,13 +222,13 @@ class Relay:
     def commands(self) -> list[int]:
         """The ids of all frames that the driver sent."""
         frames = Decoder(plausible=plausible_request).feed(self._sent)
-        assert frames and all(isinstance(frame, Frame) for frame in frames)
-        return [frame.id for frame in frames if isinstance(frame, Frame)]
+        assert frames and all(isinstance(frame, Packet) for frame in frames)
+        return [frame.id for frame in frames if isinstance(frame, Packet)]
 
 
 def moving(robot: MockRobot) -> bool:
     """Whether the arm follows a descent: a part is held and lowered."""
-    part = robot.world.truth()["part"]
+    part = robot.cell.truth()["part"]
     return part is not None and part["phase"] == "gripped" and part["height"] < 0.0315
 
 
@@ -254,12 +256,12 @@ def test_what_goes_stale_or_stops_holds_the_arm_and_ends_the_run(
 
     # The arm stands, no reference is sent any more, and the part is still held.
     answers = robot.arm.report.answers
-    before = robot.world.arm_pose()[0]
+    before = robot.cell.arm_pose()[0]
     time.sleep(0.3)
     assert robot.arm.report.answers == answers
-    assert robot.world.arm_pose()[0] == pytest.approx(before, abs=1e-6)
-    assert robot.world.truth()["part"]["phase"] == "gripped"
-    assert robot.world.gripper_state()[2] > 10
+    assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-6)
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
+    assert robot.cell.gripper_state()[2] > 10
     # The recording is whole, and says why.
     told = dict(events(plan.session))
     assert named.lower() in told["stopped"]["reason"].lower()
@@ -288,7 +290,7 @@ def test_a_policy_that_says_nonsense_moves_nothing(robot: MockRobot, tmp_path: P
 
     with pytest.raises(SafetyError, match="expected three finite numbers"):
         run_insertions(plan_for(robot, tmp_path, Nonsense()))
-    assert robot.world.truth()["part"]["phase"] == "gripped"
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
 
 
 def test_preflight_names_all_that_is_wrong_and_nothing_moves(robot: MockRobot, tmp_path: Path) -> None:
@@ -303,7 +305,7 @@ def test_preflight_names_all_that_is_wrong_and_nothing_moves(robot: MockRobot, t
     message = str(error.value)
     assert "gripper: it is not homed" in message and "pose: target refused: |y| = 50.00 mm" in message
     assert robot.arm.report.largest_step < 1e-9
-    assert robot.world.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
+    assert robot.cell.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
 
 
 def test_ctrl_c_stops_announces_and_closes_the_recording(robot: MockRobot, tmp_path: Path) -> None:
@@ -328,7 +330,7 @@ def test_ctrl_c_stops_announces_and_closes_the_recording(robot: MockRobot, tmp_p
     answers = robot.arm.report.answers
     time.sleep(0.2)
     assert robot.arm.report.answers == answers
-    assert robot.world.truth()["part"]["phase"] == "gripped"
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
 
 
 _SOURCE = str(Path(__file__).resolve().parents[3] / "src")
@@ -338,7 +340,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from gelflow.real.runner.lab_file import load_lab
-from gelflow.real.runner.run import RunPlan, run_insertions
+from gelflow.real.runner.run_plan import RunPlan, run_insertions
 from gelflow.task import INSERTION
 
 class Still:

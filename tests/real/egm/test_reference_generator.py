@@ -10,10 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gelflow.errors import SafetyError, UsageError
+from gelflow.geometry import PoseTuple, angle_between
 from gelflow.real.egm.codec import EgmFeedback
-from gelflow.real.egm.follower import EgmFlag, Follower
-from gelflow.real.egm.limits import EgmConfig, Target, check_target, tool_frame
-from gelflow.real.kinematics import HOME, Frame, Joints, angle_between, forward, inverse
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.reference_generator import EgmFlag, ReferenceGenerator
+from gelflow.real.egm.target import Target, check_target, tool_frame
+from gelflow.real.kinematics import HOME, Joints, forward, inverse
 
 CONFIG = EgmConfig(workspace_min=(0.35, -0.05, 0.25), workspace_max=(0.45, 0.05, 0.35))
 CYCLE = CONFIG.cycle
@@ -37,9 +39,9 @@ class Robot:
     """Feeds a follower; the robot is where the last reference was, `lag` cycles ago."""
 
     def __init__(self, config: EgmConfig = CONFIG, lag: int = 4) -> None:
-        self.follower = Follower(config)
+        self.follower = ReferenceGenerator(config)
         self.cycle = 0
-        self.sent: list[Frame] = []
+        self.sent: list[PoseTuple] = []
         self.lag = lag
 
     @property
@@ -72,7 +74,7 @@ def test_first_reference_is_the_feedback_and_nothing_moves_without_a_target() ->
 
 
 def test_before_the_controller_follows_the_reference_goes_with_the_feedback() -> None:
-    follower = Follower(CONFIG)
+    follower = ReferenceGenerator(CONFIG)
     for cycle, x in enumerate((0.40, 0.41, 0.42), start=1):
         follower.observe(feedback(cycle, (x, 0.0, 0.3), mci="stopped"), cycle * CYCLE)
         assert follower.advance(cycle * CYCLE)[0] == ((x, 0.0, 0.3), DOWN)
@@ -185,7 +187,7 @@ def test_sequence_restart_latches_while_following() -> None:
 
 
 def test_sequence_restart_before_following_is_taken_as_the_new_start() -> None:
-    follower = Follower(CONFIG)
+    follower = ReferenceGenerator(CONFIG)
     follower.observe(feedback(500, mci="stopped"), 1.0)
     assert follower.observe(feedback(0, time=3.0, mci="stopped"), 1.004)
     assert not follower.latched
@@ -194,7 +196,7 @@ def test_sequence_restart_before_following_is_taken_as_the_new_start() -> None:
 
 
 def test_duplicates_and_late_messages_are_not_answered_and_a_gap_is_flagged() -> None:
-    follower = Follower(CONFIG)
+    follower = ReferenceGenerator(CONFIG)
     assert follower.observe(feedback(10), 0.0)
     assert not follower.observe(feedback(10), 0.001)
     assert follower.observe(feedback(12), 0.008)

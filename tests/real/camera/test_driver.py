@@ -14,9 +14,9 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, UsageError
-from gelflow.hardware_mocks.camera.mjpeg_server import Corruption, MjpegServer
+from gelflow.hardware_mocks.camera.device import Corruption, MockMjpegCamera
 from gelflow.protocols import Camera, CameraImage
-from gelflow.real.camera.drivers import MjpegCamera, UvcCamera, open_camera
+from gelflow.real.camera.driver import MjpegCamera, UvcCamera, open_camera
 
 CLOCK = ScaledClock(1.0)
 PATIENT = 10.0  # a time-out that only a failing test reaches [s]
@@ -35,9 +35,9 @@ class Source:
 
 
 @contextmanager
-def served(rate: float = 100.0) -> Iterator[tuple[MjpegServer, Source]]:
+def served(rate: float = 100.0) -> Iterator[tuple[MockMjpegCamera, Source]]:
     source = Source()
-    with MjpegServer(source, CLOCK, rate=rate) as server:
+    with MockMjpegCamera(source, CLOCK, rate=rate) as server:
         yield server, source
 
 
@@ -165,7 +165,7 @@ def test_a_source_that_fails_ends_the_streams_and_is_raised() -> None:
     def broken() -> bytes:
         raise ValueError("no gel")
 
-    server = MjpegServer(broken, CLOCK).start()
+    server = MockMjpegCamera(broken, CLOCK).start()
     with MjpegCamera(server.url, "left", CLOCK) as camera, pytest.raises(PeerError, match="closed the stream"):
         camera.next(-1, PATIENT)
     with pytest.raises(PeerError, match="no gel"):
@@ -241,7 +241,7 @@ def test_what_the_recorder_raises_reaches_the_camera_s_user() -> None:
 def test_frames_come_no_faster_than_their_rate_in_robot_time() -> None:
     clock, source = ScaledClock(10.0), Source()
     begun = clock.now()
-    server = MjpegServer(source, clock, rate=20)
+    server = MockMjpegCamera(source, clock, rate=20)
     with server, MjpegCamera(server.url, "left", clock, timeout=PATIENT) as camera:
         camera.next(40, 10 * PATIENT)
     assert 40 < len(source.made) <= (clock.now() - begun) * 20 + 3
@@ -261,10 +261,10 @@ def test_wrong_sources_and_settings() -> None:
     with pytest.raises(UsageError, match="timeout"):
         MjpegCamera("http://host/", "left", CLOCK, timeout=0)
     with pytest.raises(UsageError, match="rate"):
-        MjpegServer(Source(), CLOCK, rate=0)
+        MockMjpegCamera(Source(), CLOCK, rate=0)
     with served() as (server, _):
         with pytest.raises(UsageError, match="another port"):
-            MjpegServer(Source(), CLOCK, port=server.port).start()
+            MockMjpegCamera(Source(), CLOCK, port=server.port).start()
         with pytest.raises(UsageError, match="how must be"):
             server.corrupt(how="painted")  # type: ignore[arg-type]
 

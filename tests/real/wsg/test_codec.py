@@ -13,20 +13,20 @@ from gelflow.real.wsg import codec
 from gelflow.real.wsg.codec import (
     Corrupt,
     Decoder,
-    Frame,
+    Packet,
     Reply,
     crc16,
     parse_reply,
     plausible_reply,
     plausible_request,
 )
-from gelflow.real.wsg.tables import Command, GraspState, Status, UpdateMode
+from gelflow.real.wsg.constants import Command, GraspState, Status, UpdateMode
 
 KNOWN_REQUESTS = {
     "aa aa aa 20 01 00 00 8f 83": codec.home(0),
     "aa aa aa 24 03 00 61 63 6b dc b9": codec.acknowledge(),
     "aa aa aa 21 09 00 00 00 00 a0 42 00 00 c8 42 ca e3": codec.pre_position(0.080, 0.100),
-    "aa aa aa 22 00 00 0e 76": Frame(Command.STOP),
+    "aa aa aa 22 00 00 0e 76": Packet(Command.STOP),
     "aa aa aa 43 03 00 01 14 00 36 8d": codec.request_updates(Command.WIDTH, UpdateMode.PERIODIC, 0.020),
 }
 KNOWN_REPLIES = {
@@ -42,7 +42,7 @@ def test_a_known_frame_is_encoded_and_decoded(text: str) -> None:
     assert message.encode() == raw
     assert crc16(raw) == 0
     (event,) = Decoder(plausible=plausible_request if text in KNOWN_REQUESTS else plausible_reply).feed(raw)
-    assert isinstance(event, Frame)
+    assert isinstance(event, Packet)
     if isinstance(message, Reply):
         assert parse_reply(event) == message
     else:
@@ -82,16 +82,16 @@ def test_a_period_the_device_does_not_take_is_refused(period: float) -> None:
 
 
 def test_a_frame_that_does_not_fit_is_refused() -> None:
-    for frame in (Frame(256), Frame(-1), Frame(Command.LOOP, bytes(65536))):
+    for frame in (Packet(256), Packet(-1), Packet(Command.LOOP, bytes(65536))):
         with pytest.raises(UsageError):
             frame.encode()
 
 
 def test_replies_that_the_tables_do_not_know_are_the_peers_fault() -> None:
     for frame, text in (
-        (Frame(0x99, b"\0\0"), "0x99"),
-        (Frame(Command.STOP, b"\0"), "without a status"),
-        (Frame(Command.STOP, struct.pack("<H", 31)), "status 31"),
+        (Packet(0x99, b"\0\0"), "0x99"),
+        (Packet(Command.STOP, b"\0"), "without a status"),
+        (Packet(Command.STOP, struct.pack("<H", 31)), "status 31"),
     ):
         with pytest.raises(PeerError, match=text):
             parse_reply(frame)
@@ -116,7 +116,7 @@ def cut(data: bytes, places: list[int]) -> list[bytes]:
     return [data[a:b] for a, b in itertools.pairwise(edges)]
 
 
-def decoded(chunks: list[bytes]) -> list[Frame | Corrupt]:
+def decoded(chunks: list[bytes]) -> list[Packet | Corrupt]:
     decoder = Decoder(plausible=plausible_reply)
     return [event for chunk in chunks for event in decoder.feed(chunk)]
 
@@ -124,7 +124,7 @@ def decoded(chunks: list[bytes]) -> list[Frame | Corrupt]:
 @given(st.lists(FRAMES, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
 def test_frames_survive_any_cutting(frames: list[bytes], places: list[int]) -> None:
     events = decoded(cut(b"".join(frames), places))
-    assert [event.encode() for event in events if isinstance(event, Frame)] == frames
+    assert [event.encode() for event in events if isinstance(event, Packet)] == frames
 
 
 @given(FRAMES, st.binary(max_size=60), st.lists(st.integers(0, 10_000), max_size=20))
@@ -135,7 +135,7 @@ def test_a_frame_behind_garbage_is_found(frame: bytes, garbage: bytes, places: l
         if not decoder.waiting:
             break
         events += decoder.expire()
-    assert any(isinstance(event, Frame) and event.encode() == frame for event in events)
+    assert any(isinstance(event, Packet) and event.encode() == frame for event in events)
 
 
 @given(st.lists(st.binary(max_size=50), max_size=20))
@@ -155,13 +155,13 @@ def test_garbage_never_hangs_and_never_makes_a_frame_with_a_wrong_checksum(chunk
 def test_a_changed_byte_never_passes(frame: bytes, place: int, change: int) -> None:
     bad = bytearray(frame)
     bad[place % len(frame)] ^= change
-    assert not any(isinstance(event, Frame) and event.encode() == frame for event in decoded([bytes(bad)]))
+    assert not any(isinstance(event, Packet) and event.encode() == frame for event in decoded([bytes(bad)]))
     good = codec.reply(Command.FORCE, Status.SUCCESS, 12.5).encode()
     decoder = Decoder(plausible=plausible_reply)
     events = decoder.feed(bytes(bad) + good)
     while decoder.waiting:
         events += decoder.expire()
-    assert any(isinstance(event, Frame) and event.encode() == good for event in events)
+    assert any(isinstance(event, Packet) and event.encode() == good for event in events)
 
 
 @given(FRAMES, st.integers(1, 10_000))
@@ -172,7 +172,7 @@ def test_half_a_frame_does_not_swallow_the_next(frame: bytes, length: int) -> No
     events = decoder.feed(half + good)
     while decoder.waiting:
         events += decoder.expire()
-    assert any(isinstance(event, Frame) and event.encode() == good for event in events)
+    assert any(isinstance(event, Packet) and event.encode() == good for event in events)
 
 
 def test_duplicates_are_two_frames_and_one_preamble_byte_too_many_is_nothing() -> None:

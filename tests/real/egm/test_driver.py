@@ -19,7 +19,7 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
-from gelflow.hardware_mocks.egm.arm import MockEgm, MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
 from gelflow.hardware_mocks.plant import KinematicArm
 from gelflow.protocols import Arm
 from gelflow.real.egm.codec import EgmFeedback, decode_sensor, encode_robot
@@ -54,7 +54,7 @@ class Cell:
         self.clock = ScaledClock(factor)
         port = free_port()
         self.plant = KinematicArm(self.clock, position=START, quaternion=DOWN, lag=0.004)
-        self.mock = MockEgm(self.plant, clock=self.clock, config=dataclasses.replace(mock, port=port))
+        self.mock = MockEgmArm(self.plant, clock=self.clock, config=dataclasses.replace(mock, port=port))
         self.arm = EgmArm(dataclasses.replace(config, port=port), clock=self.clock)
 
     def __enter__(self) -> "Cell":
@@ -335,7 +335,7 @@ def test_dry_run_checks_targets_and_sends_nothing() -> None:
     clock = ScaledClock()
     port = free_port()
     plant = KinematicArm(clock, position=START, quaternion=DOWN)
-    mock = MockEgm(plant, clock=clock, config=dataclasses.replace(MOCK, port=port))
+    mock = MockEgmArm(plant, clock=clock, config=dataclasses.replace(MOCK, port=port))
     mock.start()
     try:
         with EgmArm(dataclasses.replace(CONFIG, port=port, dry_run=True), clock=clock) as arm:
@@ -432,13 +432,13 @@ ORPHANS = """
 import sys, time
 import numpy as np
 from gelflow.clock import ScaledClock
-from gelflow.hardware_mocks.egm.arm import MockEgm, MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
 from gelflow.hardware_mocks.plant import KinematicArm
 from gelflow.real.egm.driver import EgmArm, EgmConfig
 clock = ScaledClock()
 port = int(sys.argv[1])
 plant = KinematicArm(clock, position=np.array([0.4, 0.0, 0.3]), quaternion=np.array([0.0, 0.0, 1.0, 0.0]))
-mock = MockEgm(plant, clock=clock, config=MockEgmConfig(port=port))
+mock = MockEgmArm(plant, clock=clock, config=MockEgmConfig(port=port))
 mock.start()
 arm = EgmArm(EgmConfig((0.3, -0.1, 0.2), (0.5, 0.1, 0.4), port=port, stale=1.0, silence=5.0), clock=clock)
 arm.connect(timeout=60)
@@ -519,7 +519,7 @@ def test_a_named_robot_is_the_only_one_heard() -> None:
     port = free_port()
     arm = EgmArm(dataclasses.replace(CONFIG, port=port, robot="192.0.2.1"), clock=ScaledClock(10))
     plant = KinematicArm(ScaledClock(10), position=START, quaternion=DOWN)
-    mock = MockEgm(plant, clock=ScaledClock(10), config=dataclasses.replace(MOCK, port=port))
+    mock = MockEgmArm(plant, clock=ScaledClock(10), config=dataclasses.replace(MOCK, port=port))
     mock.start()
     try:
         with pytest.raises(PeerTimeout, match="no EGM packet"):

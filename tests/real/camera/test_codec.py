@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gelflow.errors import PeerError, PeerRefused
-from gelflow.real.camera import mjpeg
+from gelflow.real.camera import codec
 
 BOUNDARY = b"boundarydonotcross"
 
@@ -25,7 +25,7 @@ def part(body: bytes, *, length: int | None = None, newline: bytes = b"\r\n", da
 
 
 def parse(data: bytes, cuts: list[int] | None = None) -> tuple[list[bytes], int]:
-    parser = mjpeg.MultipartParser(BOUNDARY)
+    parser = codec.MultipartParser(BOUNDARY)
     images = []
     edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts or []), len(data)]
     for start, end in itertools.pairwise(edges):
@@ -73,7 +73,7 @@ def test_the_stream_is_found_again_after_any_garbage(noise: bytes, kind: int) ->
 
 
 def test_an_image_with_a_length_is_given_out_with_its_last_byte() -> None:
-    parser = mjpeg.MultipartParser(BOUNDARY)
+    parser = codec.MultipartParser(BOUNDARY)
     data = part(jpeg(1), length=44)
     assert parser.feed(data[:-3]) == []
     assert parser.feed(data[-3:-2]) == [jpeg(1)]
@@ -110,12 +110,12 @@ def test_padding_and_extra_dashes() -> None:
 
 def test_endless_garbage_needs_bounded_memory_and_time() -> None:
     for opening in (b"", b"--" + BOUNDARY, part(b"")):
-        parser = mjpeg.MultipartParser(BOUNDARY)
+        parser = codec.MultipartParser(BOUNDARY)
         parser.feed(opening)
         started = time.monotonic()
         for _ in range(40):
             assert parser.feed(b"\0" * 1_000_000) == []
-        assert len(parser._buffer) <= mjpeg.MAX_PART + 1_000_000
+        assert len(parser._buffer) <= codec.MAX_PART + 1_000_000
         assert parser.feed(part(jpeg(1), length=44) + part(jpeg(2), length=44))[-1] == jpeg(2)
         assert time.monotonic() - started < 20  # a quadratic search would need hours
 
@@ -123,8 +123,8 @@ def test_endless_garbage_needs_bounded_memory_and_time() -> None:
 def test_heads() -> None:
     data = b'HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary="--abc"\r\n\r\nrest'
     for length in range(len(data) - 4):
-        assert mjpeg.parse_head(data[:length]) is None
-    head = mjpeg.parse_head(data)
+        assert codec.parse_head(data[:length]) is None
+    head = codec.parse_head(data)
     assert head is not None and head[1] == b"rest" and head[0].boundary() == b"abc"
 
 
@@ -143,7 +143,7 @@ def test_heads() -> None:
 )
 def test_wrong_answers_are_named(data: bytes, kind: type[PeerError], says: str) -> None:
     with pytest.raises(kind, match=says) as caught:
-        head = mjpeg.parse_head(data)
+        head = codec.parse_head(data)
         assert head is not None
         head[0].boundary()
     assert type(caught.value) is kind

@@ -15,7 +15,7 @@ from ABBRobotEGM import EGM
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
-from gelflow.hardware_mocks.egm.arm import MockEgm, MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
 from gelflow.hardware_mocks.plant import KinematicArm
 
 START = np.array([0.40, 0.0, 0.30])
@@ -33,7 +33,7 @@ class Bench:
         self.client = EGM(port)
         self.plant = KinematicArm(self.clock, position=START, quaternion=DOWN, lag=0.004)
         config = dataclasses.replace(MockEgmConfig(port=port, comm_timeout=1.0), **changes)  # type: ignore[arg-type]
-        self.mock = MockEgm(self.plant, clock=self.clock, config=config)
+        self.mock = MockEgmArm(self.plant, clock=self.clock, config=config)
 
     def __enter__(self) -> "Bench":
         self.mock.start()
@@ -198,7 +198,7 @@ def test_a_plant_out_of_reach_is_said_at_the_start() -> None:
     clock = ScaledClock()
     plant = KinematicArm(clock, position=START + 1.0, quaternion=DOWN)
     with pytest.raises(UsageError, match=r"the mock arm cannot start where its plant is: .*out of reach"):
-        MockEgm(plant, clock=clock).start()
+        MockEgmArm(plant, clock=clock).start()
 
 
 def test_a_mock_that_is_not_running_says_so(bench: Bench) -> None:

@@ -10,9 +10,10 @@ from enum import IntFlag
 from typing import NamedTuple
 
 from gelflow.errors import SafetyError
+from gelflow.geometry import PoseTuple, Quaternion, Vector, angle_between, multiply
 from gelflow.real.egm.codec import EgmFeedback
-from gelflow.real.egm.limits import EgmConfig, Target, check_target, tool_frame
-from gelflow.real.kinematics import Frame, Quaternion, Vector, angle_between, multiply
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.target import Target, check_target, tool_frame
 
 # UDP may swap neighbours; a message this far back is no late one, the controller has started to count anew.
 _REORDERED = 10
@@ -39,15 +40,15 @@ class EgmEvent(NamedTuple):
     text: str
 
 
-class Follower:
+class ReferenceGenerator:
     """Turns feedback and targets into references. `now` is robot time [s] throughout."""
 
     def __init__(self, config: EgmConfig) -> None:
         self._config = config
         self._feedback: EgmFeedback | None = None
         self._heard = -math.inf
-        self._tool: Frame | None = None
-        self._reference: Frame | None = None
+        self._tool: PoseTuple | None = None
+        self._reference: PoseTuple | None = None
         self._target: Target | None = None
         self._rate = 0.0  # of the target's speed, 0 to 1
         self._following = False
@@ -97,7 +98,7 @@ class Follower:
         self._flags = flags
         return True
 
-    def advance(self, now: float) -> tuple[Frame | None, EgmFlag]:
+    def advance(self, now: float) -> tuple[PoseTuple | None, EgmFlag]:
         """The reference that answers the newest feedback, one cycle on; None: nothing may be sent."""
         if self.latched or self._reference is None:
             return None, self._flags | EgmFlag.LATCHED
@@ -179,7 +180,7 @@ class Follower:
         turn = angle_between(self._feedback.quaternion, quaternion)
         return lead > self._config.max_lead or turn > self._config.max_turn_lead
 
-    def _step(self, reference: Frame, target: Target) -> Frame:
+    def _step(self, reference: PoseTuple, target: Target) -> PoseTuple:
         """One cycle along the straight line and the shorter turn, both ending together; slower near both ends."""
         move, turn = _difference(reference, target)
         duration = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
@@ -211,7 +212,7 @@ class Follower:
         return max(0.0, aligned) * min(1.0, old.speed / target.speed)
 
 
-def _difference(reference: Frame, target: Target) -> tuple[Vector, Vector]:
+def _difference(reference: PoseTuple, target: Target) -> tuple[Vector, Vector]:
     """The way to the target: displacement [m], and turn as a rotation vector [rad] in the reference's frame."""
     (px, py, pz), (rw, rx, ry, rz) = reference
     x, y, z = target.position

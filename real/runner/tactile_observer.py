@@ -17,12 +17,12 @@ from gelflow.task import InsertionTask
 _FEWEST = 0.6  # of a pad's markers must be seen: below this a frame says nothing
 
 
-class Unreadable(PeerError):
+class MarkersUnreadable(PeerError):
     """Frames came, but no markers could be read from them: the attempt may be tried again."""
 
 
 @dataclass(frozen=True)
-class Reading:
+class TactileReading:
     """One moment as both pads felt it."""
 
     frame: TactileFrame
@@ -35,7 +35,7 @@ class Reading:
         return tuple(image.sequence for image in self.images)
 
 
-class Touch:
+class TactileObserver:
     """Reads the pads during one attempt: fresh trackers, the first readable pair of images is the reference."""
 
     def __init__(self, cameras: Sequence[Camera], mounts: Sequence[CameraMount], *, stale: float) -> None:
@@ -43,28 +43,30 @@ class Touch:
         self._trackers = [MarkerTracker(mount.tracker_config()) for mount in mounts]
         self._last = [-1] * len(cameras)
         self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order
-        self.reference: Reading | None = None
-        self.readings: list[Reading] = []
+        self.reference: TactileReading | None = None
+        self.readings: list[TactileReading] = []
         self.unreadable = 0
 
-    def start(self, since: float) -> Reading:
+    def start(self, since: float) -> TactileReading:
         """The reference, from the first frames that came after the robot time `since` [s].
 
-        Raises Unreadable when they show no markers, PeerTimeout when no frames come.
+        Raises MarkersUnreadable when they show no markers, PeerTimeout when no frames come.
         """
         images = self.images(since)
         self._last = [image.sequence for image in images]
         try:
             trackeds = self._track(images)
         except (PeerError, UsageError) as error:  # UsageError: another grid than the lab file's
-            raise Unreadable(f"no reference frame: {error}") from None
+            raise MarkersUnreadable(f"no reference frame: {error}") from None
         frame = self._frame(trackeds, images)
         if frame is None:
-            raise Unreadable(f"no reference frame: fewer than {_FEWEST:.0%} of the markers are seen; look at the gels")
-        self.reference = Reading(frame, images, 0.0, 0.0)
+            raise MarkersUnreadable(
+                f"no reference frame: fewer than {_FEWEST:.0%} of the markers are seen; look at the gels"
+            )
+        self.reference = TactileReading(frame, images, 0.0, 0.0)
         return self.reference
 
-    def next(self) -> Reading | None:
+    def next(self) -> TactileReading | None:
         """The newest pair of frames that was not read yet, with depth 0; None where the pair was unreadable.
 
         Raises PeerTimeout when no new frames come.
@@ -84,7 +86,7 @@ class Touch:
             images.append(image)
         return tuple(images)
 
-    def read(self, images: tuple[CameraImage, ...]) -> Reading | None:
+    def read(self, images: tuple[CameraImage, ...]) -> TactileReading | None:
         """What a pair of frames shows, with depth 0; None where it is unreadable."""
         assert self.reference is not None, "start comes first"
         self._last = [image.sequence for image in images]
@@ -95,20 +97,20 @@ class Touch:
         if frame is None:
             self.unreadable += 1
             return None
-        return Reading(frame, images, 0.0, mean_shear(frame, self.reference.frame))
+        return TactileReading(frame, images, 0.0, mean_shear(frame, self.reference.frame))
 
-    def keep(self, reading: Reading) -> None:
+    def keep(self, reading: TactileReading) -> None:
         """Add a reading, with its depth, to those that the observation is chosen from."""
         self.readings.append(reading)
 
-    def chosen(self, depths: Sequence[float]) -> list[Reading]:
+    def chosen(self, depths: Sequence[float]) -> list[TactileReading]:
         """For each depth [m] the reading nearest to it; where the descent was stopped before, the last one."""
         if not self.readings:
-            raise Unreadable("no frame of the descent could be read; look at the gels")
+            raise MarkersUnreadable("no frame of the descent could be read; look at the gels")
         found = np.array([reading.depth for reading in reversed(self.readings)])  # of equal depths the newest counts
         return [self.readings[-1 - int(np.abs(found - min(depth, found[0])).argmin())] for depth in depths]
 
-    def observe(self, frames: Sequence[Reading], task: InsertionTask) -> FlowMap:
+    def observe(self, frames: Sequence[TactileReading], task: InsertionTask) -> FlowMap:
         """The flow map of chosen readings against the reference."""
         assert self.reference is not None
         return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)

@@ -19,7 +19,7 @@ Corruption = Literal["truncated", "garbage", "length"]
 CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
 
 
-class MjpegServer:
+class MockMjpegCamera:
     """Serves one camera to any number of clients: `source` gives one JPEG per call.
 
     Frames are made `rate` times a second of robot time, in a thread of its own, once for all clients together, and
@@ -195,7 +195,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, where: tuple[str, int], camera: MjpegServer) -> None:
+    def __init__(self, where: tuple[str, int], camera: MockMjpegCamera) -> None:
         self.camera = camera
         super().__init__(where, _Handler)
 

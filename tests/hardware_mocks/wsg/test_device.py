@@ -13,8 +13,8 @@ import pytest
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.plant import KinematicGripper
-from gelflow.hardware_mocks.wsg.fingers import WsgDeviceConfig
-from gelflow.hardware_mocks.wsg.gripper import MockWsg
+from gelflow.hardware_mocks.wsg.device import MockWsgGripper
+from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 
 CLOCK = ScaledClock(5.0)
 PATIENT = 10.0  # a time-out that only a failing test reaches [s, wall]
@@ -91,7 +91,7 @@ class Client:
 
 
 @contextmanager
-def line(mock: MockWsg) -> Iterator[Client]:
+def line(mock: MockWsgGripper) -> Iterator[Client]:
     descriptor = os.open(mock.serial_path, os.O_RDWR | os.O_NOCTTY)
     try:
         yield Client(descriptor)
@@ -100,21 +100,21 @@ def line(mock: MockWsg) -> Iterator[Client]:
 
 
 @contextmanager
-def port(mock: MockWsg) -> Iterator[Client]:
+def port(mock: MockWsgGripper) -> Iterator[Client]:
     with socket.create_connection(mock.tcp_address) as connection:
         yield Client(connection.fileno())
 
 
 @contextmanager
 def serving(
-    *, width: float = 0.050, part: float | None = None, config: WsgDeviceConfig | None = None
-) -> Iterator[tuple[MockWsg, KinematicGripper]]:
+    *, width: float = 0.050, part: float | None = None, config: MockWsgConfig | None = None
+) -> Iterator[tuple[MockWsgGripper, KinematicGripper]]:
     plant = KinematicGripper(CLOCK, width=width, part_width=part)
-    with MockWsg(plant, clock=CLOCK, config=config, tcp_port=0) as mock:
+    with MockWsgGripper(plant, clock=CLOCK, config=config, tcp_port=0) as mock:
         yield mock, plant
 
 
-Wire = Callable[[MockWsg], AbstractContextManager[Client]]
+Wire = Callable[[MockWsgGripper], AbstractContextManager[Client]]
 WIRES = pytest.mark.parametrize("wire", [line, port])
 
 
@@ -218,7 +218,7 @@ def test_an_unannounced_close_raises_fast_stop_and_an_announced_one_does_not() -
             time.sleep(0.005)
         with port(mock) as client:
             assert client.ask(HOME, "<B", 1)[0] == DENIED
-    with serving(config=WsgDeviceConfig(fast_stop_on_disconnect=False)) as (mock, _):
+    with serving(config=MockWsgConfig(fast_stop_on_disconnect=False)) as (mock, _):
         with port(mock) as client:
             client.flags()
         with port(mock) as client:
@@ -331,13 +331,13 @@ def test_bad_bytes_are_survived() -> None:
 
 
 def test_a_device_without_checksums_takes_zeros() -> None:
-    with serving(config=WsgDeviceConfig(crc=False)) as (mock, _), line(mock) as client:
+    with serving(config=MockWsgConfig(crc=False)) as (mock, _), line(mock) as client:
         client.send(frame(STOP)[:-2] + b"\0\0")
         assert client.exactly(10) == b"\xaa\xaa\xaa" + struct.pack("<BHHH", STOP, 2, SUCCESS, 0)
 
 
 def test_a_device_in_a_hurry_says_overrun_to_all_but_a_stop() -> None:
-    with serving(config=WsgDeviceConfig(shortest_command_interval=5.0)) as (mock, _), line(mock) as client:
+    with serving(config=MockWsgConfig(shortest_command_interval=5.0)) as (mock, _), line(mock) as client:
         assert client.ask(0x50)[0] == SUCCESS
         assert client.ask(0x50)[0] == 27
         assert client.ask(STOP)[0] == SUCCESS
@@ -346,10 +346,10 @@ def test_a_device_in_a_hurry_says_overrun_to_all_but_a_stop() -> None:
 def test_wrong_use_of_the_mock_is_named() -> None:
     plant = KinematicGripper(CLOCK)
     with pytest.raises(UsageError, match="pty"):
-        MockWsg(plant, clock=CLOCK, serial=False)
+        MockWsgGripper(plant, clock=CLOCK, serial=False)
     with serving() as (mock, _):
         with pytest.raises(UsageError, match="listen"):
-            MockWsg(plant, clock=CLOCK, tcp_port=mock.tcp_address[1]).open()
+            MockWsgGripper(plant, clock=CLOCK, tcp_port=mock.tcp_address[1]).open()
         with pytest.raises(UsageError, match="already open"):
             mock.open()
         assert mock.addresses == (f"serial:{mock.serial_path}", f"tcp:127.0.0.1:{mock.tcp_address[1]}")

@@ -11,8 +11,9 @@ import tempfile
 from typing import NamedTuple
 
 from gelflow.errors import UsageError
-from gelflow.real.egm.follower import EgmFlag
-from gelflow.real.kinematics import Frame, Joints
+from gelflow.geometry import PoseTuple
+from gelflow.real.egm.reference_generator import EgmFlag
+from gelflow.real.kinematics import Joints
 
 _RECORD = struct.Struct("@32d")
 _HEADER = 64  # bytes: how many were written, how many were read, messages that were not for us
@@ -20,13 +21,13 @@ _WRITTEN, _READ, _FOREIGN, _MALFORMED, _DUPLICATES = range(5)
 _NAN7 = (float("nan"),) * 7
 
 
-class EgmRecord(NamedTuple):
+class EgmCycle(NamedTuple):
     """One 4 ms cycle."""
 
     stamp: float  # robot time of reception [s]
-    commanded: Frame | None  # the target: position [m] and quaternion w x y z; None: no target, hold
-    applied: Frame | None  # the reference that was sent; None: nothing was sent
-    measured: Frame  # the controller's pose
+    commanded: PoseTuple | None  # the target: position [m] and quaternion w x y z; None: no target, hold
+    applied: PoseTuple | None  # the reference that was sent; None: nothing was sent
+    measured: PoseTuple  # the controller's pose
     joints: Joints  # [rad]
     flags: EgmFlag
     sequence: int  # the controller's count of its messages
@@ -34,7 +35,7 @@ class EgmRecord(NamedTuple):
     answered: float  # robot time at which the answer was sent [s]; NaN when none was
 
 
-class Counts(NamedTuple):
+class MessageCounts(NamedTuple):
     """Messages that were not followed."""
 
     foreign: int  # from another sender than the controller
@@ -42,7 +43,7 @@ class Counts(NamedTuple):
     duplicates: int  # seen before, or too late
 
 
-class EgmRing:
+class EgmCycleLog:
     """A bounded log in an anonymous file that both processes map."""
 
     def __init__(self, descriptor: int, capacity: int) -> None:
@@ -73,8 +74,8 @@ class EgmRing:
         return self._words[_WRITTEN] - self._words[_READ] >= self._capacity
 
     @property
-    def counts(self) -> Counts:
-        return Counts(self._words[_FOREIGN], self._words[_MALFORMED], self._words[_DUPLICATES])
+    def counts(self) -> MessageCounts:
+        return MessageCounts(self._words[_FOREIGN], self._words[_MALFORMED], self._words[_DUPLICATES])
 
     def count(self, *, foreign: int = 0, malformed: int = 0, duplicates: int = 0) -> None:
         """Writer only."""
@@ -82,7 +83,7 @@ class EgmRing:
         self._words[_MALFORMED] += malformed
         self._words[_DUPLICATES] += duplicates
 
-    def append(self, record: EgmRecord) -> bool:
+    def append(self, record: EgmCycle) -> bool:
         """Add a record. False: the ring is full, nothing was written. Writer only."""
         if self.full:
             return False
@@ -98,7 +99,7 @@ class EgmRing:
         self._words[_WRITTEN] = written + 1
         return True
 
-    def latest(self) -> EgmRecord | None:
+    def latest(self) -> EgmCycle | None:
         """The newest record, read or not; None before the first."""
         while written := self._words[_WRITTEN]:
             record = self._record(written - 1)
@@ -107,16 +108,16 @@ class EgmRing:
                 return record
         return None
 
-    def drain(self) -> list[EgmRecord]:
+    def drain(self) -> list[EgmCycle]:
         """All records that were not read yet. Reader only."""
         read, written = self._words[_READ], self._words[_WRITTEN]
         records = [self._record(number) for number in range(read, written)]
         self._words[_READ] = written
         return records
 
-    def _record(self, number: int) -> EgmRecord:
+    def _record(self, number: int) -> EgmCycle:
         v = _RECORD.unpack_from(self._map, _HEADER + number % self._capacity * _RECORD.size)
-        return EgmRecord(
+        return EgmCycle(
             stamp=v[0],
             commanded=_frame(v[1:8]),
             applied=_frame(v[8:15]),
@@ -129,6 +130,6 @@ class EgmRing:
         )
 
 
-def _frame(v: tuple[float, ...]) -> Frame | None:
+def _frame(v: tuple[float, ...]) -> PoseTuple | None:
     # A position that is not a number stands for none.
     return None if v[0] != v[0] else ((v[0], v[1], v[2]), (v[3], v[4], v[5], v[6]))

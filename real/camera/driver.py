@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
-from gelflow.real.camera import mjpeg
+from gelflow.real.camera import codec
 from gelflow.real.camera.stream import OnImage, StreamCamera
 
 FRESH = 0.25  # how old a frame may be before it is stale [s]
@@ -64,7 +64,7 @@ class MjpegCamera(StreamCamera):
         self._target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         self._connect_timeout = connect_timeout
         self._socket: socket.socket | None = None
-        self._parser: mjpeg.MultipartParser | None = None
+        self._parser: codec.MultipartParser | None = None
         self._early = b""  # what came together with the head
 
     @property
@@ -81,15 +81,15 @@ class MjpegCamera(StreamCamera):
             reason = error.strerror or str(error)
             raise PeerError(f"camera {self.name}: cannot reach {self.source}: {reason}; is the camera on?") from error
         try:
-            link.sendall(mjpeg.request(self._host, self._target))
+            link.sendall(codec.request(self._host, self._target))
             data = b""
-            while (head := mjpeg.parse_head(data)) is None:
+            while (head := codec.parse_head(data)) is None:
                 link.settimeout(self._left(deadline))
                 received = link.recv(65536)
                 if not received:
                     raise PeerError("closed the connection before it answered")
                 data += received
-            self._parser = mjpeg.MultipartParser(head[0].boundary())
+            self._parser = codec.MultipartParser(head[0].boundary())
             self._early = head[1]
             # The thread wakes this often to see whether it shall end; a stall is measured by whoever waits for frames.
             link.settimeout(0.2)

@@ -17,14 +17,14 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.observation import FlowMap
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell
-from gelflow.real.runner.motion import Mover, PartLost
-from gelflow.real.runner.observer import Reading, Touch, Unreadable
+from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
 from gelflow.real.runner.supervisor import Supervisor
+from gelflow.real.runner.tactile_observer import MarkersUnreadable, TactileObserver, TactileReading
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 from gelflow.time_sync import RUNNER
 
-Place = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
+PlanarPose = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
 _REST = 0.1  # until the arm and the cameras' newest frames are at rest after a hold [s]
 _AT_DEPTH = 0.02e-3  # this near its end a descent is over [m]
 
@@ -46,17 +46,17 @@ class Attempt:
     """One lowering, and what came of it."""
 
     number: int
-    place: Place  # where it was made
+    planar_pose: PlanarPose  # where it was made
     depth: float  # how deep the gripper came below the start [m]
     shear: float  # felt at the deepest frame: mean shear along the finger [mm]
     contact: bool  # the part touched something
-    stopped: bool  # the descent was stopped by touch
+    stopped_by_contact: bool  # the descent was stopped by touch
     inserted: bool  # as the robot sees it
     duration: float  # [s]
     observation: FlowMap | None = None  # None where the policy was not asked
     action: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
-    reference: Reading | None = None
-    deepest: Reading | None = None
+    reference: TactileReading | None = None
+    deepest: TactileReading | None = None
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Insertion:
 
     number: int
     outcome: str  # inserted, not inserted, part lost, or what went wrong
-    place: Place  # the last one
+    planar_pose: PlanarPose  # the last one
     duration: float  # [s]
     attempts: tuple[Attempt, ...] = field(default=())
 
@@ -75,7 +75,7 @@ class Insertion:
 
 
 class InsertionRunner:
-    """Runs insertions on an open cell. `run` may be called once; use as a context manager around the mover."""
+    """Runs insertions on an open cell. `run` may be called once; use as a context manager around the motion."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class InsertionRunner:
         policy: Policy,
         *,
         task: InsertionTask,
-        mover: Mover,
+        motion: MotionExecutor,
         operator: Operator,
         on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None,
     ) -> None:
@@ -93,38 +93,38 @@ class InsertionRunner:
             raise SafetyError(f"the task descends {deep:g} mm, the lab's max_depth allows {allowed:g} mm")
         self._cell, self._policy, self._task = cell, policy, task
         self._lab, self._clock, self._recorder = lab, cell.clock, cell.recorder
-        self._mover, self._operator, self._on_attempt = mover, operator, on_attempt
+        self._motion, self._operator, self._on_attempt = motion, operator, on_attempt
         self.mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
 
     def insert(self, number: int) -> Insertion:
         """Insert one part; returns how it went. Raises what makes going on unsafe (a stale feed, a fault, a latch)."""
         start = self._clock.now()
         attempts: list[Attempt] = []
-        place: Place = (0.0, 0.0, 0.0)
+        planar_pose: PlanarPose = (0.0, 0.0, 0.0)
         self._policy.reset()
         self._recorder.event("insertion", {"number": number})
         try:
             self._load(number)
             outcome = "not inserted"
             for attempt in range(self._task.attempts):
-                made = self._attempt_with_retries(number, attempt, place)
+                made = self._attempt_with_retries(number, attempt, planar_pose)
                 attempts.append(made)
                 self._on_attempt(number, made)
                 if made.inserted:
                     outcome = "inserted"
                     break
-                place = self._next_place(place, made)
-            self._finish(number, place, inserted=outcome == "inserted")
+                planar_pose = self._next_pose(planar_pose, made)
+            self._finish(number, planar_pose, inserted=outcome == "inserted")
         except PartLost:
             outcome = "part lost"
-            self._give_up(place)
+            self._give_up(planar_pose)
         except NotGrasped as error:
             outcome = str(error)
-            self._give_up(place)
-        except Unreadable as error:
+            self._give_up(planar_pose)
+        except MarkersUnreadable as error:
             outcome = str(error)
-            self._finish(number, place, inserted=False)
-        result = Insertion(number, outcome, place, self._clock.now() - start, tuple(attempts))
+            self._finish(number, planar_pose, inserted=False)
+        result = Insertion(number, outcome, planar_pose, self._clock.now() - start, tuple(attempts))
         tries = len(attempts)
         self._recorder.event("insertion ended", {"number": number, "outcome": outcome, "attempts": tries})
         return result
@@ -135,7 +135,7 @@ class InsertionRunner:
         state = self._cell.arm.state()
         before = lab.gripper_pose(state.position, state.quaternion)
         turn_speed = math.radians(lab.arm.max_turn_speed_deg)
-        taught: Place = (0.0, 0.0, 0.0)
+        taught: PlanarPose = (0.0, 0.0, 0.0)
         checked = []
         for name, height, speed in (
             ("hand-over", lab.part.load_height, lab.arm.max_speed),
@@ -151,120 +151,120 @@ class InsertionRunner:
 
     # The steps of an insertion
 
-    def pose(self, place: Place, height: float) -> Pose:
-        """The gripper frame in the base, at a place about the taught hole, the part's lower face at `height` [m]."""
-        x, y, yaw = place
+    def pose(self, planar_pose: PlanarPose, height: float) -> Pose:
+        """Gripper pose in the base frame from a planar pose about the taught hole and the lower face's `height` [m]."""
+        x, y, yaw = planar_pose
         above = np.array([x, y, height + self._lab.part.grasp_height])
         return self._lab.hole.pose @ Pose(above, yaw_quaternion(yaw))
 
     def _load(self, number: int) -> None:
         """Above the hole, take a part."""
         part, lab = self._lab.part, self._lab.gripper
-        self._mover.expect_part(False)
-        self._mover.move(self.pose((0.0, 0.0, 0.0), part.load_height))
+        self._motion.expect_part(False)
+        self._motion.move(self.pose((0.0, 0.0, 0.0), part.load_height))
         state = self._cell.gripper.state()
         if abs(state.width - lab.open_width) > 1e-3:
             self._cell.gripper.move(width=lab.open_width, speed=lab.speed)
         self._operator.present(number)
-        self._mover.wait(0.0)
+        self._motion.wait(0.0)
         try:
             self._cell.gripper.grasp(width=lab.part_width, speed=lab.speed, force=lab.grasp_force)
         except PeerRefused as error:
             raise NotGrasped(str(error)) from error
-        self._mover.expect_part(True)
+        self._motion.expect_part(True)
 
-    def _attempt_with_retries(self, number: int, attempt: int, place: Place) -> Attempt:
+    def _attempt_with_retries(self, number: int, attempt: int, planar_pose: PlanarPose) -> Attempt:
         for _ in range(self._lab.limits.retries):
             try:
-                return self._attempt(number, attempt, place)
-            except Unreadable as error:
+                return self._attempt(number, attempt, planar_pose)
+            except MarkersUnreadable as error:
                 self._recorder.event("attempt repeated", {"attempt": attempt, "reason": str(error)})
-        return self._attempt(number, attempt, place)
+        return self._attempt(number, attempt, planar_pose)
 
-    def _attempt(self, number: int, attempt: int, place: Place) -> Attempt:
+    def _attempt(self, number: int, attempt: int, planar_pose: PlanarPose) -> Attempt:
         begun = self._clock.now()
-        self._mover.move(self.pose(place, self._task.start_height))
-        touch = Touch(self._cell.cameras, self.mounts, stale=self._lab.limits.stale_frame)
-        self._mover.wait(self._lab.descent.settle)
-        reference = touch.start(self._clock.now())
-        stopped = self._descend(place, touch, begun)
-        frames = touch.chosen(self._task.frame_depths)
-        deepest = touch.readings[-1]
+        self._motion.move(self.pose(planar_pose, self._task.start_height))
+        observer = TactileObserver(self._cell.cameras, self.mounts, stale=self._lab.limits.stale_frame)
+        self._motion.wait(self._lab.descent.settle)
+        reference = observer.start(self._clock.now())
+        stopped = self._descend(planar_pose, observer, begun)
+        frames = observer.chosen(self._task.frame_depths)
+        deepest = observer.readings[-1]
         contact = deepest.shear > self._lab.descent.contact_shear_mm
         reached = self._task.start_height - deepest.depth < self._task.success_height
-        inserted = reached and not contact and not stopped and self._lower(place, touch)
+        inserted = reached and not contact and not stopped and self._lower(planar_pose, observer)
         observation, action = None, None
         if not inserted:
-            observation = touch.observe(frames, self._task)
+            observation = observer.observe(frames, self._task)
             action = np.asarray(self._policy.act(observation), dtype=float)
-            self._record_decision(number, attempt, place, touch, frames, observation, action)
+            self._record_decision(number, attempt, planar_pose, observer, frames, observation, action)
         made = Attempt(
-            attempt, place, deepest.depth, deepest.shear, contact, stopped, inserted,
+            attempt, planar_pose, deepest.depth, deepest.shear, contact, stopped, inserted,
             self._clock.now() - begun, observation, action, reference, deepest,
         )  # fmt: skip
         self._recorder.attempt_end(_summary(number, made))
         return made
 
-    def _descend(self, place: Place, touch: Touch, begun: float) -> bool:
+    def _descend(self, planar_pose: PlanarPose, observer: TactileObserver, begun: float) -> bool:
         """Lower the gripper while feeling; True when touch stopped it."""
         lab = self._lab
         start = self._height()
-        self._mover.go(self.pose(place, self._task.start_height - self._task.descent), speed=lab.descent.speed)
+        self._motion.go(self.pose(planar_pose, self._task.start_height - self._task.descent), speed=lab.descent.speed)
         arrived = math.inf
         while True:
-            self._mover.wait(0.0)
-            images = touch.images()
+            self._motion.wait(0.0)
+            images = observer.images()
             with self._clock.urgent(RUNNER):
-                reading = touch.read(images)
+                reading = observer.read(images)
                 if reading is not None and reading.shear > lab.descent.stop_shear_mm:
-                    self._mover.hold()
+                    self._motion.hold()
             now = self._clock.now()
             if now - begun > lab.limits.attempt_time:
-                self._mover.hold()
+                self._motion.hold()
                 raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; is the arm following?")
             if reading is not None:
-                depth = self._keep(touch, reading, start)
+                depth = self._keep(observer, reading, start)
                 if reading.shear > lab.descent.stop_shear_mm:
-                    self._recorder.event("stopped by touch", {"shear_mm": reading.shear, "depth": depth})
-                    self._look_at_rest(touch, start)
+                    self._recorder.event("stopped by contact", {"shear_mm": reading.shear, "depth": depth})
+                    self._look_at_rest(observer, start)
                     return True
                 # Only frames that were taken at the end are the end's.
                 if min(image.stamp for image in images) > arrived:
                     return False
             if start - self._height() > lab.descent.max_depth:
-                self._mover.hold()
+                self._motion.hold()
                 raise SafetyError(f"the gripper went deeper than max_depth ({1e3 * lab.descent.max_depth:g} mm)")
-            if arrived == math.inf and self._mover.arrived(within=_AT_DEPTH):
+            if arrived == math.inf and self._motion.arrived(within=_AT_DEPTH):
                 arrived = now
 
-    def _look_at_rest(self, touch: Touch, start: float) -> None:
+    def _look_at_rest(self, observer: TactileObserver, start: float) -> None:
         """Once more where touch stopped a descent: cameras have no common beat, and pads in motion don't compare."""
-        self._mover.wait(_REST)
-        reading = touch.read(touch.images(self._clock.now()))
+        self._motion.wait(_REST)
+        reading = observer.read(observer.images(self._clock.now()))
         if reading is not None:
-            self._keep(touch, reading, start)
+            self._keep(observer, reading, start)
 
-    def _keep(self, touch: Touch, reading: Reading, start: float) -> float:
+    def _keep(self, observer: TactileObserver, reading: TactileReading, start: float) -> float:
         """Add a reading to the attempt's; returns its depth below `start` [m]."""
-        depth = start - self._mover.height_at(reading.frame.stamp)
-        touch.keep(replace(reading, depth=depth))
+        depth = start - self._motion.height_at(reading.frame.stamp)
+        observer.keep(replace(reading, depth=depth))
         return depth
 
-    def _lower(self, place: Place, touch: Touch) -> bool:
+    def _lower(self, planar_pose: PlanarPose, observer: TactileObserver) -> bool:
         """Nothing was felt where the rim would be: go on down. False when something is met after all."""
         stop = self._lab.descent.stop_shear_mm
 
         def feel() -> None:
-            reading = touch.next()
+            reading = observer.next()
             if reading is not None and reading.shear > stop:
-                self._mover.hold()
+                self._motion.hold()
                 self._recorder.event("met something below the rim", {"shear_mm": reading.shear})
                 raise _Met
 
         try:
-            self._mover.move(self.pose(place, self._lab.part.insert_to), while_moving=feel)
+            self._motion.move(self.pose(planar_pose, self._lab.part.insert_to), while_moving=feel)
         except _Met:
-            self._mover.move(self.pose(place, self._task.start_height))
+            self._motion.move(self.pose(planar_pose, self._task.start_height))
             return False
         return True
 
@@ -272,33 +272,33 @@ class InsertionRunner:
         self,
         number: int,
         attempt: int,
-        place: Place,
-        touch: Touch,
-        frames: list[Reading],
+        planar_pose: PlanarPose,
+        observer: TactileObserver,
+        frames: list[TactileReading],
         observation: FlowMap,
         action: NDArray[np.float64],
     ) -> None:
-        assert touch.reference is not None
-        target = self.pose(self._corrected(place, action), self._task.start_height)
+        assert observer.reference is not None
+        target = self.pose(self._corrected(planar_pose, action), self._task.start_height)
         decision = Decision.of(
             observation,
             insertion=number,
             attempt=attempt,
-            tracked=tuple(map(tuple, touch.tracked)),
-            reference=touch.reference.sequences,
+            tracked=tuple(map(tuple, observer.tracked)),
+            reference=observer.reference.sequences,
             frames=tuple(reading.sequences for reading in frames),
             action=action,
             correction=np.array([target.position[0], target.position[1], target.yaw]),
-            depths=(touch.reference.depth, *(reading.depth for reading in frames)),
+            depths=(observer.reference.depth, *(reading.depth for reading in frames)),
         )
         self._recorder.decision(decision.to_json())
 
-    def _next_place(self, place: Place, made: Attempt) -> Place:
+    def _next_pose(self, planar_pose: PlanarPose, made: Attempt) -> PlanarPose:
         assert made.action is not None
-        self._mover.move(self.pose(place, self._task.start_height))
-        return self._corrected(place, made.action)
+        self._motion.move(self.pose(planar_pose, self._task.start_height))
+        return self._corrected(planar_pose, made.action)
 
-    def _corrected(self, place: Place, action: NDArray[np.float64]) -> Place:
+    def _corrected(self, planar_pose: PlanarPose, action: NDArray[np.float64]) -> PlanarPose:
         """Where a correction leads, inside the task's workspace by the rule that the simulated environment has too.
 
         That rule is part of what an action means; the target made from it is then checked by the supervisor, which
@@ -306,28 +306,28 @@ class InsertionRunner:
         """
         if action.shape != (3,) or not np.isfinite(action).all():
             raise SafetyError(f"correction refused: the policy said {action.tolist()}, expected three finite numbers")
-        x, y, yaw = (float(v) for v in self._task.corrected(np.array(place), action))
+        x, y, yaw = (float(v) for v in self._task.corrected(np.array(planar_pose), action))
         return x, y, yaw
 
-    def _finish(self, number: int, place: Place, *, inserted: bool) -> None:
+    def _finish(self, number: int, planar_pose: PlanarPose, *, inserted: bool) -> None:
         """Let the part go: in the hole, or into somebody's hand."""
         part, lab = self._lab.part, self._lab.gripper
         if not inserted:
-            self._mover.move(self.pose((0.0, 0.0, 0.0), part.load_height))
+            self._motion.move(self.pose((0.0, 0.0, 0.0), part.load_height))
             self._operator.take(number)
-        self._mover.expect_part(False)
-        self._mover.wait(0.0)
+        self._motion.expect_part(False)
+        self._motion.wait(0.0)
         self._cell.gripper.release(width=lab.open_width, speed=lab.speed)
         if inserted:
-            self._mover.move(self.pose(place, part.load_height))
+            self._motion.move(self.pose(planar_pose, part.load_height))
 
-    def _give_up(self, place: Place) -> None:
+    def _give_up(self, planar_pose: PlanarPose) -> None:
         """The part is gone or was never held: up and away from it, fingers as they are."""
-        self._mover.expect_part(False)
-        self._mover.move(self.pose(place, self._lab.part.load_height))
+        self._motion.expect_part(False)
+        self._motion.move(self.pose(planar_pose, self._lab.part.load_height))
 
     def _height(self) -> float:
-        return float(self._mover.pose().position[2])
+        return float(self._motion.pose().position[2])
 
 
 class NotGrasped(PeerRefused):
@@ -344,10 +344,10 @@ def _summary(number: int, made: Attempt) -> dict[str, Any]:
         "insertion": number,
         "attempt": made.number,
         "outcome": "inserted" if made.inserted else "not inserted",
-        "place": made.place,
+        "planar_pose": made.planar_pose,
         "depth": made.depth,
         "shear_mm": made.shear,
         "contact": made.contact,
-        "stopped_by_touch": made.stopped,
+        "stopped_by_contact": made.stopped_by_contact,
         "duration": made.duration,
     }
