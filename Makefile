@@ -2,6 +2,7 @@
 #   make demo    the main job on the mock robot
 #   make test    all tests
 #   make check   lint, format, types, import rules
+#   make docs    the documentation site, in build/docs
 #   make core    rebuild the C++ parts after a change
 #   make sanitize   the core's tests, and random images through the tracker, watched by AddressSanitizer and UBSan
 #                   (GCC, Linux); FUZZ=1000000 images take some ten minutes
@@ -20,6 +21,7 @@ BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
 WHEEL := build/wheel
+DOCS_SETUP := .venv/.gelflow-docs
 CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc,$(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
@@ -30,7 +32,7 @@ SANITIZE_TESTS = $(patsubst %,tests/sim/core/test_%.py,every_part batch contact)
 FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
 
-.PHONY: demo test check core sanitize wheel setup clean
+.PHONY: demo test check docs core sanitize wheel setup clean
 
 demo: core
 	@.venv/bin/gelflow demo
@@ -44,6 +46,9 @@ check: core
 	$(if $(CXX_FILES),.venv/bin/clang-format --dry-run -Werror $(CXX_FILES))
 	.venv/bin/mypy
 	.venv/bin/lint-imports --no-logo
+
+docs: core $(DOCS_SETUP)
+	.venv/bin/sphinx-build -W --keep-going -q docs build/docs
 
 # The editable install leaves a configured build behind: from then on only what changed is compiled.
 core: setup
@@ -90,6 +95,10 @@ $(SETUP): pyproject.toml constraints.txt CMakeLists.txt sim/csrc/CMakeLists.txt 
 	@$(INSTALL) --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[dev]'
 	@touch $@
 
+$(DOCS_SETUP): $(SETUP)
+	@$(INSTALL) --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf build dist sim/_core*.so perception/_tracker*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP)
+	rm -rf build dist sim/_core*.so perception/_tracker*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP) $(DOCS_SETUP)
 	find sim perception policies real hardware_mocks src tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

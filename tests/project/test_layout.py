@@ -151,7 +151,8 @@ def test_every_dependency_is_pinned_and_names_no_machine() -> None:
     table = project()
     settings, build = table["project"], table["build-system"]
     assert isinstance(settings, dict) and isinstance(build, dict)
-    wanted = [*settings["dependencies"], *settings["optional-dependencies"]["dev"], *build["requires"]]
+    extras = settings["optional-dependencies"].values()
+    wanted = [*settings["dependencies"], *(text for extra in extras for text in extra), *build["requires"]]
     names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=!~ ]", text)[0]).lower() for text in wanted}
     assert names - pinned == set()
 
