@@ -14,8 +14,8 @@ from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene.mjcf import WORLD, JointDef, Mechanics, read_mechanics
 from gelflow.sim.scene.mjcf_file import compile_model, names
 from gelflow.sim.scene.scene import Scene
-from gelflow.sim.scene.toml_tables import read_toml
 from gelflow.sim.simulator import Simulator
+from gelflow.toml_tables import read_toml
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from scipy.special import j0, j1
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.scene.toml_tables import Table
+from gelflow.toml_tables import TomlTable
 
 Array = NDArray[np.float64]
 
@@ -105,35 +105,35 @@ def _like(numbers: NDArray[Any], forces: Any) -> Any:
     return torch.from_numpy(numbers).to(forces)
 
 
-def read_gel(table: Table, positions: Array, axes: Array, grid: Grid | None, area: float | None) -> Gel:
+def read_gel(table: TomlTable, positions: Array, axes: Array, grid: Grid | None, area: float | None) -> Gel:
     """The gel of a pad's table.
 
     Markers as in `PadDef`: `positions` [m], (n, 3), `axes` (n, 3, 3), in one frame; `area` that each stands for [m²],
     where it is known. Raises UsageError on wrong values, and for a layer where the markers are not on one plane.
     """
-    table.only(("compliance", "normal", "modulus", "poisson", "thickness"))
+    table.check_keys(("compliance", "normal", "modulus", "poisson", "thickness"))
     if "compliance" in table.data:
-        table.only(("compliance", "normal"))
-        shear = table.number("compliance", least=0)
-        return SpringGel(shear, table.number("normal", shear, least=0))
+        table.check_keys(("compliance", "normal"))
+        shear = table.number("compliance", minimum=0)
+        return SpringGel(shear, table.number("normal", shear, minimum=0))
     if "modulus" not in table.data:
-        raise UsageError(f"{table.where}: give either compliance, or modulus, poisson and thickness")
-    table.only(("modulus", "poisson", "thickness"))
+        raise UsageError(f"{table.location}: give either compliance, or modulus, poisson and thickness")
+    table.check_keys(("modulus", "poisson", "thickness"))
     endless = table.data.get("thickness") == np.inf
-    modulus, poisson = table.number("modulus", least=1e-9), table.number("poisson")
-    thickness = np.inf if endless else table.number("thickness", least=1e-9)
+    modulus, poisson = table.number("modulus", minimum=1e-9), table.number("poisson")
+    thickness = np.inf if endless else table.number("thickness", minimum=1e-9)
     if not -1 < poisson <= 0.5:
-        raise UsageError(f"{table.where}: poisson must be above -1 and at most 0.5, got {poisson:g}")
+        raise UsageError(f"{table.location}: poisson must be above -1 and at most 0.5, got {poisson:g}")
     local = (positions - positions[0]) @ axes[0]
     wide = max(float(np.ptp(local[:, :2], axis=0).max()), 1e-9)
     if np.abs(local[:, 2]).max() > 1e-6 * wide or np.abs(axes - axes[0]).max() > 1e-6:
         raise UsageError(
-            f"{table.where}: a layer needs markers on one plane, with the same axes; here only compliance is possible"
+            f"{table.location}: a layer needs coplanar markers with the same axes; use compliance for this pad"
         )
     if len(local) > MOST_MARKERS:
-        raise UsageError(f"{table.where}: a layer takes at most {MOST_MARKERS} markers, got {len(local)}")
+        raise UsageError(f"{table.location}: a layer takes at most {MOST_MARKERS} markers, got {len(local)}")
     flat = np.ascontiguousarray(local[:, :2])
-    cells = _cell_area(flat, table.where) if area is None else area
+    cells = _cell_area(flat, table.location) if area is None else area
     return LayerGel(modulus, poisson, thickness, flat, cells, None if grid is None else (grid.rows, grid.cols))
 
 

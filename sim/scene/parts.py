@@ -24,7 +24,7 @@ from gelflow.sim.scene.sampling import (
     turned_frames,
 )
 from gelflow.sim.scene.shapes import SHAPES
-from gelflow.sim.scene.toml_tables import Table, nearest
+from gelflow.toml_tables import TomlTable, suggestion
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -107,88 +107,92 @@ class Limit:
     damping: float = 0.0  # [N s/m] or [N m s/rad]
 
 
-def read_points(tables: Mapping[str, Table], mechanics: Mechanics) -> dict[str, PointsDef]:
+def read_points(tables: Mapping[str, TomlTable], mechanics: Mechanics) -> dict[str, PointsDef]:
     """Sample the geometries that the tables name. Raises UsageError on an unknown or unsuitable geometry."""
     geoms = {geom.name: geom for geom in mechanics.geoms}
     return {name: _sample(name, table, geoms) for name, table in tables.items()}
 
 
-def _sample(name: str, table: Table, geoms: Mapping[str, GeomDef]) -> PointsDef:
-    geom = _named(geoms, table.word("geom"), table, "geometry")
+def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef]) -> PointsDef:
+    geom = _named(geoms, table.string("geom"), table, "geometry")
     if geom.kind == "sphere" and "count" not in table.data:
         if len(table.data) > 1:
-            raise UsageError(f"{table.where}: without a count {geom.name!r} is one exact point, which takes geom alone")
+            raise UsageError(
+                f"{table.location}: without a count {geom.name!r} is one exact point, which takes geom alone"
+            )
         radius, center = float(geom.size[0]), geom.pose.pos[None]
         return PointsDef(name, geom.name, geom.body, center, np.ones((1, 3)), np.ones(1), radius, geom.pose, False)
     try:
         local, areas = _surface(table, geom)
     except UsageError as error:
-        raise UsageError(str(error) if str(error).startswith(table.where) else f"{table.where}: {error}") from None
-    per_area = table.word("stiffness", "per point", among=_PER_UNIT) == "per area"
+        raise UsageError(
+            str(error) if str(error).startswith(table.location) else f"{table.location}: {error}"
+        ) from None
+    per_area = table.string("stiffness", "per point", choices=_PER_UNIT) == "per area"
     weights = areas.sum(1) if per_area else np.ones(len(areas))
     return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, 0.0, geom.pose, per_area)
 
 
-def _surface(table: Table, geom: GeomDef) -> tuple[Array, Array]:
+def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
     """Points on a geometry's surface, in its frame [m], and the area of each across x, y, z [m²]."""
     size = geom.size.tolist()
     if geom.kind == "box":
-        table.only(("geom", "resolution", "faces", "stiffness"))
+        table.check_keys(("geom", "resolution", "faces", "stiffness"))
         resolution = [int(n) for n in table.numbers("resolution", 3)]
-        return box_surface(size, resolution, faces=table.words("faces", FACES))
+        return box_surface(size, resolution, faces=table.strings("faces", FACES))
     if geom.kind == "cylinder":
-        table.only(("geom", "angles", "radii", "heights", "faces", "stiffness"))
+        table.check_keys(("geom", "angles", "radii", "heights", "faces", "stiffness"))
         angles, radii = table.integer("angles", 8), table.integer("radii", 4)
-        faces, heights = table.words("faces", ENDS), table.integer("heights", 5)
+        faces, heights = table.strings("faces", ENDS), table.integer("heights", 5)
         if "heights" in table.data and "wall" not in faces:
             raise UsageError('heights are those of the wall; add faces = ["-z", "+z", "wall"]')
         return cylinder(*size[:2], angles=angles, radii=radii, heights=heights, faces=faces)
     if geom.mesh is not None:
-        table.only(("geom", "count", "stiffness"))
+        table.check_keys(("geom", "count", "stiffness"))
         return mesh_surface(geom.mesh, count=table.integer("count"))
     if geom.kind not in ("sphere", "capsule", "ellipsoid"):
         known = "box, cylinder, sphere, capsule, ellipsoid, mesh"
         raise UsageError(f"{geom.kind} {geom.name!r} can't be sampled; {known} can")
-    table.only(("geom", "count", "faces", "stiffness"))
-    count, faces = table.integer("count"), table.words("faces", ENDS)
+    table.check_keys(("geom", "count", "faces", "stiffness"))
+    count, faces = table.integer("count"), table.strings("faces", ENDS)
     if geom.kind == "ellipsoid":
         return ellipsoid(size, count=count, faces=faces)
     return capsule(size[0], size[1] if geom.kind == "capsule" else 0.0, count=count, faces=faces)
 
 
 def read_contacts(
-    tables: Mapping[str, Table], points: Mapping[str, PointsDef], mechanics: Mechanics, friction: str
+    tables: Mapping[str, TomlTable], points: Mapping[str, PointsDef], mechanics: Mechanics, friction: str
 ) -> tuple[ContactDef, ...]:
     """The contacts, one for every shape that a table's points are against."""
     geoms = {geom.name: geom for geom in mechanics.geoms}
     contacts = []
     for group, table in tables.items():
-        table.only(("points", "against", "damping", "law", *LAWS, *NUMBERS))
-        sampled = _named(points, table.word("points"), table, "points")
-        law = table.word("law", friction, among=LAWS)
-        damping = table.word("damping", "depth", among=("depth", "plain"))
+        table.check_keys(("points", "against", "damping", "law", *LAWS, *NUMBERS))
+        sampled = _named(points, table.string("points"), table, "points")
+        law = table.string("law", friction, choices=LAWS)
+        damping = table.string("damping", "depth", choices=("depth", "plain"))
         numbers = _law_numbers(table, law)
-        against = table.words("against")
+        against = table.strings("against")
         for shape in against:
             geom = _shape(geoms, shape, table)
             if geom.body == sampled.body:
-                raise UsageError(f"{table.where}: {sampled.geom!r} and {shape!r} are on one body and can't touch")
+                raise UsageError(f"{table.location}: {sampled.geom!r} and {shape!r} are on one body and can't touch")
             if sampled.radius > 0 and geom.kind != "plane":
                 raise UsageError(
-                    f"{table.where}: the one exact point of a sphere touches planes; let {shape!r} be the sampled side "
-                    f"or give points {sampled.name!r} a count"
+                    f"{table.location}: the exact contact point of a sphere supports planes only; sample {shape!r} "
+                    f"instead, or give points {sampled.name!r} a count"
                 )
             if sampled.radius > 0 and law == "elastic":
                 raise UsageError(
-                    f"{table.where}: the exact point of {sampled.geom!r} moves over the sphere as it rolls and can't "
-                    'keep an anchor; set law = "viscous" for this contact'
+                    f"{table.location}: the exact point of {sampled.geom!r} moves over the sphere as it rolls and "
+                    'cannot keep an anchor; set law = "viscous" for this contact'
                 )
             name = group if len(against) == 1 else f"{group}/{shape}"
             contacts.append(ContactDef(name, group, sampled.name, shape, law, damping, numbers))
     return tuple(contacts)
 
 
-def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, folder: Path) -> tuple[PadDef, ...]:
+def read_pads(tables: Mapping[str, TomlTable], mechanics: Mechanics, friction: str, folder: Path) -> tuple[PadDef, ...]:
     """The pads: markers about a site of the model, whose z is the outward normal and x points to the tip.
 
     `folder` is where the files of markers are looked for.
@@ -197,15 +201,15 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
     common = ("site", "shape", "against", "stiffness", "law", "pushes", "gel", *LAWS, *NUMBERS)
     pads = []
     for name, table in tables.items():
-        shape = table.word("shape", "rectangle", among=tuple(_PAD_KEYS))
-        table.only((*common, *_PAD_KEYS[shape]))
-        body, frame = _named(mechanics.sites, table.word("site"), table, "site")
+        shape = table.string("shape", "rectangle", choices=tuple(_PAD_KEYS))
+        table.check_keys((*common, *_PAD_KEYS[shape]))
+        body, frame = _named(mechanics.sites, table.string("site"), table, "site")
         markers = _markers(table, shape, folder)
-        law = table.word("law", friction, among=LAWS)
-        per_area = table.word("stiffness", "per point", among=_PER_UNIT) == "per area"
+        law = table.string("law", friction, choices=LAWS)
+        per_area = table.string("stiffness", "per point", choices=_PER_UNIT) == "per area"
         if per_area and markers.area is None:
-            raise UsageError(f"{table.where}: the area of given markers is not known; set stiffness per point")
-        against = tuple(_shape(geoms, other, table).name for other in table.words("against"))
+            raise UsageError(f"{table.location}: the area of given markers is not known; set stiffness per point")
+        against = tuple(_shape(geoms, other, table).name for other in table.strings("against"))
         pads.append(
             PadDef(
                 name=name,
@@ -219,20 +223,20 @@ def read_pads(tables: Mapping[str, Table], mechanics: Mechanics, friction: str, 
                 against=against,
                 law=law,
                 numbers=_law_numbers(table, law),
-                pushes=table.flag("pushes", default=False),
+                pushes=table.boolean("pushes", default=False),
                 gel=_gel(table, markers),
             )
         )
     return tuple(pads)
 
 
-def _gel(table: Table, markers: _Markers) -> Gel | None:
+def _gel(table: TomlTable, markers: _Markers) -> Gel | None:
     if "gel" not in table.data:
         return None
     return read_gel(table.table("gel"), markers.positions, markers.axes, markers.grid, markers.area)
 
 
-def _markers(table: Table, shape: str, folder: Path) -> _Markers:
+def _markers(table: TomlTable, shape: str, folder: Path) -> _Markers:
     """The markers of a pad of this shape; files are looked for in `folder`.
 
     Raises UsageError, in one line, on missing or wrong values.
@@ -242,7 +246,7 @@ def _markers(table: Table, shape: str, folder: Path) -> _Markers:
         return _flat(grid.positions() * 1e-3, (grid.pitch * 1e-3) ** 2, grid)
     if shape == "points":
         return _given(table, folder)
-    radius, count = table.number("radius", least=1e-9), table.integer("count")
+    radius, count = table.number("radius", minimum=1e-9), table.integer("count")
     if shape == "disc":
         flat = disc_lattice(radius, count) + table.numbers("center", 2, (0.0, 0.0))
         return _flat(flat, np.pi * radius**2 / count, None)
@@ -256,34 +260,34 @@ def _flat(points: Array, area: float, grid: Grid | None) -> _Markers:
     return _Markers(positions, np.tile(np.eye(3), (len(points), 1, 1)), area, grid)
 
 
-def _grid(table: Table) -> Grid:
+def _grid(table: TomlTable) -> Grid:
     """Rows and columns with a pitch, or with the size of the area that they fill; TOML in m, the grid in mm."""
     rows, cols = table.integer("rows"), table.integer("cols")
     if ("pitch" in table.data) == ("size" in table.data):
-        raise UsageError(f"{table.where}: give either pitch (distance of markers) or size (area that they fill)")
+        raise UsageError(f"{table.location}: give either pitch (distance of markers) or size (area that they fill)")
     if "pitch" in table.data:
-        pitch = table.number("pitch", least=1e-9)
+        pitch = table.number("pitch", minimum=1e-9)
     else:
         size = table.numbers("size", 2)
         pitch = size[0] / rows
         if not np.isclose(pitch, size[1] / cols):
             raise UsageError(
-                f"{table.where}: {rows} × {cols} markers on {size} m are not equally far apart; give pitch"
+                f"{table.location}: {rows} × {cols} markers on {size} m are not equally far apart; give pitch"
             )
     center = table.numbers("center", 2, (0.0, 0.0))
     return Grid(rows, cols, pitch * 1e3, (center[0] * 1e3, center[1] * 1e3))
 
 
-def _given(table: Table, folder: Path) -> _Markers:
+def _given(table: TomlTable, folder: Path) -> _Markers:
     """Markers at points of the table or of a file: positions, and optionally normals and x axes."""
     if ("positions" in table.data) == ("file" in table.data):
-        raise UsageError(f"{table.where}: a pad of points needs either positions or a file")
+        raise UsageError(f"{table.location}: a pad of points needs either positions or a file")
     if "file" in table.data:
         if extra := [key for key in _GIVEN if key in table.data]:
-            raise UsageError(f"{table.where}: {extra[0]} must stand in the file, beside its positions")
-        found, where = _from_file(folder / table.word("file"), table.where)
+            raise UsageError(f"{table.location}: {extra[0]} must stand in the file, beside its positions")
+        found, where = _from_file(folder / table.string("file"), table.location)
     else:
-        found, where = {key: table.data[key] for key in _GIVEN if key in table.data}, table.where
+        found, where = {key: table.data[key] for key in _GIVEN if key in table.data}, table.location
     positions = _vectors(found, "positions", where)
     count = len(positions)
     normals = _units(found, "normals", where, count)
@@ -307,7 +311,7 @@ def _from_file(path: Path, where: str) -> tuple[dict[str, Any], str]:
             with np.load(path, allow_pickle=False) as arrays:
                 found = {name: arrays[name] for name in arrays.files}
             if unknown := [name for name in found if name not in _GIVEN]:
-                raise UsageError(f"{place}: unknown array {unknown[0]!r}; known are {', '.join(_GIVEN)}")
+                raise UsageError(f"{place}: unknown array {unknown[0]!r}; valid names: {', '.join(_GIVEN)}")
             return found, place
         if path.suffix != ".csv":
             raise UsageError(f"{place}: a file of markers must be .csv or .npz")
@@ -346,42 +350,44 @@ def _units(found: Mapping[str, Any], key: str, where: str, count: int) -> Array 
     return units
 
 
-def read_limits(tables: Mapping[str, Table], mechanics: Mechanics, where: str) -> tuple[Limit, ...]:
+def read_limits(tables: Mapping[str, TomlTable], mechanics: Mechanics, where: str) -> tuple[Limit, ...]:
     """How each joint resists beyond its range: as its table says, or as the model file's reader chose."""
     names = [joint.name for joint in mechanics.joints]
     for name, table in tables.items():
         if name not in names:
-            raise UsageError(f"{table.where}: the model has no joint {name!r}; {nearest(name, names)}")
-        table.only(("limit_stiffness", "limit_damping"))
+            raise UsageError(f"{table.location}: the model has no joint {name!r}; {suggestion(name, names)}")
+        table.check_keys(("limit_stiffness", "limit_damping"))
     limits = []
     for joint in mechanics.joints:
-        table = tables.get(joint.name, Table({}, where))
+        table = tables.get(joint.name, TomlTable({}, where))
         if table.data and joint.range is None:
             raise UsageError(f"{where}: joint {joint.name!r} has no range in the model; a limit needs one")
         stiffness, damping = joint.limit or (0.0, 0.0)
         if "limit_stiffness" in table.data:
-            stiffness, damping = table.number("limit_stiffness", least=0), 0.0
-        limits.append(Limit(stiffness, table.number("limit_damping", damping, least=0)))
+            stiffness, damping = table.number("limit_stiffness", minimum=0), 0.0
+        limits.append(Limit(stiffness, table.number("limit_damping", damping, minimum=0)))
     return tuple(limits)
 
 
-def _law_numbers(table: Table, law: str) -> dict[str, float]:
+def _law_numbers(table: TomlTable, law: str) -> dict[str, float]:
     """The force law's numbers: those of the law's own table before the common ones; no k_s under the viscous law."""
     for name in LAWS:
-        table.table(name).only(NUMBERS)
-    own = Table({**table.data, **table.table(law).data}, table.where)
-    numbers = {key: own.number(key, least=0) for key in NUMBERS if key != "ks"}
-    return {**numbers, "ks": own.number("ks", None if law == "elastic" else 0.0, least=0)}
+        table.table(name).check_keys(NUMBERS)
+    own = TomlTable({**table.data, **table.table(law).data}, table.location)
+    numbers = {key: own.number(key, minimum=0) for key in NUMBERS if key != "ks"}
+    return {**numbers, "ks": own.number("ks", None if law == "elastic" else 0.0, minimum=0)}
 
 
-def _shape(geoms: Mapping[str, GeomDef], name: str, table: Table) -> GeomDef:
+def _shape(geoms: Mapping[str, GeomDef], name: str, table: TomlTable) -> GeomDef:
     geom = _named(geoms, name, table, "geometry")
     if geom.kind not in SHAPES:
-        raise UsageError(f"{table.where}: {name!r} is a {geom.kind}; contact is computed against {', '.join(SHAPES)}")
+        raise UsageError(
+            f"{table.location}: {name!r} is a {geom.kind}; contact is computed against {', '.join(SHAPES)}"
+        )
     return geom
 
 
-def _named(things: Mapping[str, T], name: str, table: Table, what: str) -> T:
+def _named(things: Mapping[str, T], name: str, table: TomlTable, what: str) -> T:
     if name not in things:
-        raise UsageError(f"{table.where}: no {what} {name!r}; {nearest(name, list(things))}")
+        raise UsageError(f"{table.location}: no {what} {name!r}; {suggestion(name, list(things))}")
     return things[name]

@@ -9,14 +9,14 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.toml_tables import Table, nearest, set_path, tables_at
+from gelflow.toml_tables import TomlTable, set_by_path, suggestion, tables_at_path
 
 NAMES = ("fast", "balanced", "accurate")  # of the scenes that come along
 
 Presets = Mapping[str, Mapping[str, Any]]
 
 
-def read_presets(top: Table, *, free: Collection[str], parts: Collection[str]) -> Presets:
+def read_presets(top: TomlTable, *, free: Collection[str], parts: Collection[str]) -> Presets:
     """The presets of a scene's file: name → dotted key → value.
 
     Parameters
@@ -30,25 +30,25 @@ def read_presets(top: Table, *, free: Collection[str], parts: Collection[str]) -
     found = {name: dict(_flat(table.data)) for name, table in top.tables("presets").items()}
     known = {key: value for key, value in top.data.items() if key in parts}
     for name, values in found.items():
-        where = f"{top.where}, presets.{name}"
+        where = f"{top.location}, presets.{name}"
         for dotted in values:
             *way, last = dotted.split(".")
             if not way and last in free:
                 continue
             if not way:
-                raise UsageError(f"{where}: unknown key {last!r}; {nearest(last, [*free, *known])}")
-            for table in tables_at(known, way, f"{where}: {dotted!r}"):
+                raise UsageError(f"{where}: unknown key {last!r}; {suggestion(last, [*free, *known])}")
+            for table in tables_at_path(known, way, f"{where}: {dotted!r}"):
                 if last not in table:
-                    raise UsageError(f"{where}: {dotted!r}: unknown key {last!r}; {nearest(last, table)}")
+                    raise UsageError(f"{where}: {dotted!r}: unknown key {last!r}; {suggestion(last, table)}")
     return found
 
 
 def with_preset(data: dict[str, Any], presets: Presets, name: str, where: str) -> None:
     """Put a preset's values into a scene's tables. Raises UsageError when there is no such preset."""
     if name not in presets:
-        raise UsageError(f"{where}: no preset {name!r}; {nearest(name, list(presets))}")
+        raise UsageError(f"{where}: no preset {name!r}; {suggestion(name, list(presets))}")
     for dotted, value in presets[name].items():
-        set_path(data, dotted, value)
+        set_by_path(data, dotted, value)
 
 
 def _flat(table: Mapping[str, Any]) -> list[tuple[str, Any]]:

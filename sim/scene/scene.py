@@ -32,7 +32,7 @@ from gelflow.sim.scene.parts import (
 )
 from gelflow.sim.scene.presets import read_presets, with_preset
 from gelflow.sim.scene.shapes import ShapeDef, used_shapes
-from gelflow.sim.scene.toml_tables import Table, nearest, read_toml, set_path
+from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
@@ -264,19 +264,19 @@ def load_scene(
     """
     path = _find(scene)
     data = copy.deepcopy(read_toml(path))
-    presets = read_presets(Table(data, str(path)), free=_HOW, parts=_PARTS)
+    presets = read_presets(TomlTable(data, str(path)), free=_HOW, parts=_PARTS)
     if preset is not None:
         with_preset(data, presets, preset, str(path))
     for key, value in (overrides or {}).items():
-        set_path(data, key, value)
+        set_by_path(data, key, value)
     if friction is not None:
         data["friction"] = friction
-    top = Table(data, str(path))
+    top = TomlTable(data, str(path))
     if top.integer("format") > 1:
         raise UsageError(f"{path}: format is {top.integer('format')}; this gelflow reads format 1")
-    top.only(SECTIONS)
-    law = top.word("friction", "viscous", among=LAWS)
-    mechanics = read_mechanics(path.parent / top.word("model"))
+    top.check_keys(SECTIONS)
+    law = top.string("friction", "viscous", choices=LAWS)
+    mechanics = read_mechanics(path.parent / top.string("model"))
     points = read_points(top.tables("points"), mechanics)
     contacts = read_contacts(top.tables("contacts"), points, mechanics, law)
     pads = read_pads(top.tables("pads"), mechanics, law, path.parent)
@@ -287,15 +287,15 @@ def load_scene(
     return Scene(
         name=path.stem,
         path=path,
-        step=top.number("step", least=1e-6),
-        integrator=top.word("integrator", "bdf1", among=INTEGRATORS),
-        tolerance=top.number("tolerance", TOLERANCE, least=1e-15),
-        precision=cast("Precision", top.word("precision", "double", among=PRECISIONS)),
+        step=top.number("step", minimum=1e-6),
+        integrator=top.string("integrator", "bdf1", choices=INTEGRATORS),
+        tolerance=top.number("tolerance", TOLERANCE, minimum=1e-15),
+        precision=cast("Precision", top.string("precision", "double", choices=PRECISIONS)),
         friction=law,
         gravity=mechanics.gravity,
         bodies=mechanics.bodies,
         joints=mechanics.joints,
-        limits=read_limits(top.tables("joints"), mechanics, top.where),
+        limits=read_limits(top.tables("joints"), mechanics, top.location),
         actuators=mechanics.actuators,
         shapes=shapes,
         points=tuple(p for p in points.values() if any(c.points == p.name for c in contacts)),
@@ -313,7 +313,7 @@ def _find(scene: str | Path) -> Path:
         return path
     shipped = Path(str(_shipped())) / f"{scene}.toml"
     if not shipped.is_file():
-        raise UsageError(f"no scene {str(scene)!r}; {nearest(str(scene), scene_names())} (or give a .toml file)")
+        raise UsageError(f"no scene {str(scene)!r}; {suggestion(str(scene), scene_names())} (or give a .toml file)")
     return shipped
 
 
@@ -323,5 +323,5 @@ def _shipped() -> Any:
 
 def _index(what: str, name: str, names: list[str]) -> int:
     if name not in names:
-        raise UsageError(f"no {what} {name!r}; {nearest(name, names)}")
+        raise UsageError(f"no {what} {name!r}; {suggestion(name, names)}")
     return names.index(name)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim.scene.distance_grid import DEFAULT_RESOLUTION, LEAST_RESOLUTION, DistanceGrid, distance_grid
 from gelflow.sim.scene.mjcf import GeomDef, Mechanics, Pose
-from gelflow.sim.scene.toml_tables import Table, nearest
+from gelflow.toml_tables import TomlTable, suggestion
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class _Choice:
 
 
 def used_shapes(
-    mechanics: Mechanics, tables: Mapping[str, Table], wanted: Collection[str], sampled: Collection[str]
+    mechanics: Mechanics, tables: Mapping[str, TomlTable], wanted: Collection[str], sampled: Collection[str]
 ) -> tuple[tuple[ShapeDef, ...], tuple[str, ...]]:
     """The shapes that something is tested against, and a line on every geometry that is in nothing at all.
 
@@ -74,26 +74,28 @@ def used_shapes(
     return shapes, tuple(unused)
 
 
-def _choice(table: Table, name: str, mechanics: Mechanics) -> _Choice:
+def _choice(table: TomlTable, name: str, mechanics: Mechanics) -> _Choice:
     geoms = {geom.name: geom for geom in mechanics.geoms}
     if name not in geoms:
-        raise UsageError(f"{table.where}: no geometry {name!r}; {nearest(name, list(geoms))}")
+        raise UsageError(f"{table.location}: no geometry {name!r}; {suggestion(name, list(geoms))}")
     geom = geoms[name]
     if geom.kind not in _KEYS:
-        raise UsageError(f"{table.where}: a {geom.kind} takes no keys here; {', '.join(_KEYS)} do")
-    table.only(_KEYS[geom.kind])
-    rounding = table.number("rounding", 0.0, least=0)
+        raise UsageError(f"{table.location}: a {geom.kind} takes no keys here; {', '.join(_KEYS)} do")
+    table.check_keys(_KEYS[geom.kind])
+    rounding = table.number("rounding", 0.0, minimum=0)
     if geom.kind in _SIZES and rounding >= (least := float(geom.size[: _SIZES[geom.kind]].min())):
-        raise UsageError(f"{table.where}: rounding must be below the smallest half size, {least:g} m, got {rounding:g}")
-    return _Choice(rounding, table.integer("resolution", DEFAULT_RESOLUTION, least=LEAST_RESOLUTION))
+        raise UsageError(
+            f"{table.location}: rounding must be below the smallest half size, {least:g} m, got {rounding:g}"
+        )
+    return _Choice(rounding, table.integer("resolution", DEFAULT_RESOLUTION, minimum=LEAST_RESOLUTION))
 
 
-def _shape(geom: GeomDef, choice: _Choice, tables: Mapping[str, Table]) -> ShapeDef:
+def _shape(geom: GeomDef, choice: _Choice, tables: Mapping[str, TomlTable]) -> ShapeDef:
     if geom.mesh is None:
         return ShapeDef(geom.name, geom.body, geom.kind, geom.pose, geom.size, choice.rounding)
     try:
         grid = distance_grid(geom.mesh, geom.name, resolution=choice.resolution, rounding=choice.rounding)
     except UsageError as error:
-        where = f"{tables[geom.name].where}: " if geom.name in tables else ""
+        where = f"{tables[geom.name].location}: " if geom.name in tables else ""
         raise UsageError(f"{where}{error}") from None
     return ShapeDef(geom.name, geom.body, geom.kind, geom.pose, np.array([1.0, 0, 0]), choice.rounding, grid)

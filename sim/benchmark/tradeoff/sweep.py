@@ -16,8 +16,8 @@ import numpy as np
 from gelflow.errors import SimulationError
 from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, Run, Task, compare, drawn
 from gelflow.sim.scene.scene import Scene, load_scene
-from gelflow.sim.scene.toml_tables import read_toml
 from gelflow.sim.validation.reference_motions import reference_motion
+from gelflow.toml_tables import read_toml
 
 STEPS = (1, 2, 4, 8, 16, 32)  # that a frame of 10 ms is cut into: 10 to 0.3125 ms
 TOLERANCES = (1e-2, 1e-3, 1e-5, 1e-9)

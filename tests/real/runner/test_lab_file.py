@@ -55,26 +55,38 @@ def test_what_is_saved_is_read_back_equal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
-        ("grasp_force = 12.0", "grasp_forc = 12.0", "[gripper] unknown key 'grasp_forc'; nearest valid: grasp_force"),
-        ("[hole] ", "[holes] ", "unknown key 'holes'; nearest valid: hole"),
-        ("rows = 18", "row = 18", "[cameras.left] unknown key 'row'; nearest valid: rows"),
-        ("part_width = 0.035", "# none", "[gripper] the key 'part_width' is missing"),
+        (
+            "grasp_force = 12.0",
+            "grasp_forc = 12.0",
+            "lab.toml, gripper: unknown key 'grasp_forc'; did you mean 'grasp_force'?",
+        ),
+        ("[hole] ", "[holes] ", "lab.toml: unknown key 'holes'; did you mean 'hole'?"),
+        ("rows = 18", "row = 18", "lab.toml, cameras.left: unknown key 'row'; did you mean 'rows'?"),
+        ("part_width = 0.035", "# none", "lab.toml, gripper: part_width is missing"),
         ("format = 1", "format = 2", "lab file format 2; this gelflow reads format 1"),
-        ("format = 1", "", "the key format is missing"),
-        ("grasp_force = 12.0", 'grasp_force = "much"', "[gripper] 'grasp_force' must be a finite number, got 'much'"),
-        ("grasp_force = 12.0", "grasp_force = nan", "'grasp_force' must be a finite number"),
-        ("grasp_force = 12.0", "grasp_force = 300", "[gripper] grasp_force must be 5 to 80 N, got 300"),
+        ("format = 1", "", "lab.toml: format is missing"),
+        (
+            "grasp_force = 12.0",
+            'grasp_force = "much"',
+            "lab.toml, gripper: grasp_force must be a finite number, got 'much'",
+        ),
+        ("grasp_force = 12.0", "grasp_force = nan", "grasp_force must be a finite number"),
+        ("grasp_force = 12.0", "grasp_force = 300", "lab.toml, gripper: grasp_force must be 5 to 80 N, got 300"),
         ("open_width = 0.060", "open_width = 0.030", "0 < part_width < open_width"),
         ("serial:/dev/ttyUSB0", "/dev/ttyUSB0", "address must be serial:DEVICE or tcp:HOST:PORT"),
-        ("rows = 18", "rows = 18.5", "'rows' must be a whole number"),
-        ("rows = 18", "rows = true", "'rows' must be a whole number"),
-        ("position = [0.374, 0.05, 0.05]", "position = [0.374, 0.05]", "[hole] 'position' must be 3 numbers"),
+        ("rows = 18", "rows = 18.5", "rows must be an integer, got"),
+        ("rows = 18", "rows = true", "rows must be an integer, got"),
+        (
+            "position = [0.374, 0.05, 0.05]",
+            "position = [0.374, 0.05]",
+            "lab.toml, hole: position must be 3 finite numbers",
+        ),
         ("quaternion = [0.0, 1.0,", "quaternion = [0.0, 2.0,", "quaternion must have length 1, got 2.0000"),
         ("# rotation_deg = 0 ", "rotation_deg = 45 #", "rotation_deg must be 0, 90, 180 or 270, got 45"),
         ('# presentation = "prompt"', 'presentation = "hope"', 'presentation must be "prompt" or "wait"'),
         ("# stop_shear_mm = 0.12", "stop_shear_mm = 0.01", "stop_shear_mm must be above contact_shear_mm"),
-        ("pixels_per_mm = 15.7", "pixels_per_mm = 0.0", "[cameras.left] give either calibration"),
-        ("pixels_per_mm = 15.7", 'calibration = "none.json"', "[cameras.left] cannot read"),
+        ("pixels_per_mm = 15.7", "pixels_per_mm = 0.0", "lab.toml, cameras.left: give either calibration"),
+        ("pixels_per_mm = 15.7", 'calibration = "none.json"', "lab.toml, cameras.left: cannot read"),
         ("# stale_pose = 0.020", "stale_pose = 0", "stale_pose must be above 0"),
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
     ],
@@ -95,11 +107,11 @@ def test_a_calibration_is_named_from_where_the_lab_file_is(tmp_path: Path, examp
     save_lab(lab, tmp_path / "elsewhere" / "lab.toml", title="the same calibration")
     assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
     path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
-    assert "[cameras.left] the calibration is of 18 lines of 14" in refused(tmp_path, path.read_text())
+    assert "lab.toml, cameras.left: the calibration is of 18 lines of 14" in refused(tmp_path, path.read_text())
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"none\.toml: cannot read the lab file: No such file"):
+    with pytest.raises(UsageError, match=r"no such file: .*none\.toml"):
         load_lab(tmp_path / "none.toml")
 
 

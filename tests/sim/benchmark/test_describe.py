@@ -256,7 +256,7 @@ def test_the_printed_times_fit(capsys: pytest.CaptureFixture[str]) -> None:
     ("arguments", "message"),
     [
         (["insertin"], "no scene 'insertin'; did you mean 'insertion'? (or give a .toml file)"),
-        (["nowhere.toml"], "no such scene file: nowhere.toml"),
+        (["nowhere.toml"], "no such file: nowhere.toml"),
         (["rolling", "--repeats", "0"], "--repeats must be at least 1, got 0"),
     ],
 )

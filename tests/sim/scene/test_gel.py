@@ -260,11 +260,11 @@ REFUSED = {
     "gel = {}": "either compliance, or modulus, poisson and thickness",
     "gel = { complience = 1.0 }": "unknown key 'complience'; did you mean 'compliance'",
     "gel = { compliance = 1.0, modulus = 1.0 }": "unknown key 'modulus'",
-    "gel = { compliance = -1.0 }": "compliance must be a number ≥ 0",
+    "gel = { compliance = -1.0 }": "compliance must be a finite number ≥ 0",
     "gel = { modulus = 1e5, thickness = 1.0 }": "poisson is missing",
     "gel = { modulus = 1e5, poisson = 0.51, thickness = 1.0 }": "poisson must be above -1 and at most 0.5, got 0.51",
-    "gel = { modulus = 1e5, poisson = 0.4, thickness = 0 }": "thickness must be a number ≥ 1e-09, got 0",
-    "gel = { modulus = inf, poisson = 0.4, thickness = 1.0 }": "modulus must be a number",
+    "gel = { modulus = 1e5, poisson = 0.4, thickness = 0 }": "thickness must be a finite number ≥ 1e-09, got 0",
+    "gel = { modulus = inf, poisson = 0.4, thickness = 1.0 }": "modulus must be a finite number",
     "gel = 3": "gel must be a table",
 }
 
@@ -280,8 +280,11 @@ def test_what_is_refused(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("shape", "why"),
     [
-        (HEMISPHERE, "a layer needs markers on one plane"),
-        ('shape = "points"\npositions = [[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-4]]\n', "a layer needs markers on one"),
+        (HEMISPHERE, "a layer needs coplanar markers"),
+        (
+            'shape = "points"\npositions = [[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-4]]\n',
+            "a layer needs coplanar markers",
+        ),
         ('shape = "points"\npositions = [[0, 0, 0]]\n', "there is only one"),
         ('shape = "points"\npositions = [[0, 0, 0], [0, 0, 0], [1e-3, 0, 0]]\n', "at the same place"),
         ("rows = 40\ncols = 30\npitch = 1e-3\n", "at most 1000 markers, got 1200"),

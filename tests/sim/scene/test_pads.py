@@ -184,11 +184,11 @@ def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('shape = "hexagon"\nradius = 0.01', "shape is 'hexagon'; known are disc, hemisphere, points, rectangle"),
+        ('shape = "hexagon"\nradius = 0.01', "shape is 'hexagon'; valid names: disc, hemisphere, points, rectangle"),
         ('shape = "disk"\nradius = 0.01', "shape is 'disk'; did you mean 'disc'?"),
         ('shape = "hemisphere"\nradius = 0.01\nrows = 3', "unknown key 'rows'"),
         ('shape = "hemisphere"\nradius = 0.01', "count is missing"),
-        ('shape = "disc"\nradius = -1\ncount = 3', "radius must be a number ≥"),
+        ('shape = "disc"\nradius = -1\ncount = 3', "radius must be a finite number ≥"),
         ('shape = "points"', "needs either positions or a file"),
         ('shape = "points"\nfile = "no.csv"', "no.csv: no such file beside the scene"),
         ('shape = "points"\nfile = "s.toml"', "a file of markers must be .csv or .npz"),
@@ -196,7 +196,7 @@ def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Pa
         ('shape = "points"\nfile = "two.csv"', "expected 3, 6 or 9 columns (position, normal, x axis), got 2"),
         ('shape = "points"\nfile = "words.csv"', "words.csv can't be read"),
         ('shape = "points"\nfile = "words.npz"', "words.npz can't be read"),
-        ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; known are positions, normals, x_axes"),
+        ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; valid names: positions, normals, x_axes"),
         ('shape = "points"\npositions = [[0, 0]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = [[0, 0, nan]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = "tip"', "positions must be a list of [x, y, z], all finite"),

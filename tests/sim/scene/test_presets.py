@@ -101,8 +101,8 @@ def test_precision_and_tolerance_reach_the_simulator(tmp_path: Path) -> None:
         ('friction = "elastic"', "presets.mine: unknown key 'friction'"),
         ("points.bal.count = 5", "presets.mine: 'points.bal.count': no table 'bal'; did you mean 'ball'?"),
         ("points.ball.cuont = 5", "presets.mine: 'points.ball.cuont': unknown key 'cuont'; did you mean 'count'?"),
-        ("points.ball.faces = ['+z']", "presets.mine: 'points.ball.faces': unknown key 'faces'; known are"),
-        ("pads.pad.rows = 5", "presets.mine: 'pads.pad.rows': no table 'pads'; known are contacts, points"),
+        ("points.ball.faces = ['+z']", "presets.mine: 'points.ball.faces': unknown key 'faces'; valid names:"),
+        ("pads.pad.rows = 5", "presets.mine: 'pads.pad.rows': no table 'pads'; valid names: contacts, points"),
     ],
 )
 def test_an_unknown_key_is_named_with_the_nearest_one(tmp_path: Path, preset: str, message: str) -> None:

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure; prints tables. 1 when a timed run was too far from its converged twin."""
     from gelflow.measurement.machine import processor
     from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, BenchmarkOptions
-    from gelflow.sim.scene.toml_tables import nearest
+    from gelflow.toml_tables import suggestion
 
     quick = args.quick or not args.what
     repeats = args.repeats if args.repeats is not None else QUICK_REPEATS if quick else REPEATS
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--repeats must be at least 1, got {repeats}")
     for name in args.what:
         if name not in MEASUREMENTS:
-            raise UsageError(f"no measurement {name!r}; {nearest(name, tuple(MEASUREMENTS))}")
+            raise UsageError(f"no measurement {name!r}; {suggestion(name, tuple(MEASUREMENTS))}")
     wanted = list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]
     if args.picture is not None and ("growth" in wanted) == ("tracking" in wanted):
         raise UsageError("--picture draws growth or tracking: ask for one, as in gelflow bench growth --picture g.png")
