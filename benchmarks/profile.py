@@ -29,22 +29,28 @@ from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 STEPS = 100
 # Groups by the names of functions, looked for in this order; small ones are inlined into those that call them.
 GROUPS = {
-    "near points": (
-        "find_near_points",
-        "find_around",
+    "broad phase": (
+        "find_candidate_points",
+        "find_neighbors",
         "covers",
-        "for_near_points",
-        "for_near_leaves",
-        "for_near_blocks",
+        "for_candidate_points",
+        "for_candidate_leaves",
+        "for_candidate_blocks",
     ),
-    "forces": ("sum_forces", "add_pending", "touches", "distance", "point_force"),
-    "to joints": (
-        *("subtract_derivatives", "pair_columns", "subtract_impulses", "wrench_in_world", "subtract_contact_forces"),
+    "forces": ("sum_forces", "flush", "uncommon_distance", "distance", "point_force"),
+    "generalized forces": (
+        *(
+            "subtract_contact_derivatives",
+            "contact_jacobian",
+            "subtract_impulses",
+            "wrench_in_world",
+            "subtract_contact_forces",
+        ),
         *("pair_frame", "move_mount"),
     ),
-    "dynamics": ("inverse_dynamics", "floating_body", "subtract_joint_forces", "actuator_pull"),
-    "places": (
-        *("forward_", "arrive", "integrate", "quaternion"),
+    "dynamics": ("inverse_dynamics", "free_body", "subtract_joint_forces", "actuator_pull"),
+    "kinematics": (
+        *("forward_", "integrate_to_trial_state", "integrate", "quaternion"),
         *("axis_rotation", "right_jacobian", "position_by", "sincos"),
     ),
     "solver": ("factorize", "invert", "solve", "newton", "evaluate", "relative"),

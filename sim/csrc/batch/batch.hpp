@@ -88,13 +88,13 @@ class Batch {
     return params.data() + static_cast<std::size_t>(env) * model->param_names.size();
   }
   void kinematics(int env, Workspace<T>& w);
-  void read(T* out, Written* written);
+  void read(T* out, DirtyMarkers* dirty);
   void check_state() const;
   void check_controls(const T* u, int rows) const;
   std::vector<StepMemory<T>> memory_;     // one per thread
-  std::vector<T> low_;                    // (N, nq) in single precision: what q lacks (StateView)
+  std::vector<T> q_rounding_;             // (N, nq) in single precision: what q lacks (StateView)
   std::unique_ptr<Batch<double>> exact_;  // in single precision: for gradients
-  std::vector<Written> written_;          // per environment, of `readings`
+  std::vector<DirtyMarkers> dirty_;       // per environment, of `readings`
   ThreadPool pool_;
 };
 

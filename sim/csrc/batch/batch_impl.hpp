@@ -22,7 +22,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
       iterations(n),
       halved(n),
       pool_(threads) {
-  if (!std::is_same_v<T, Place<T>>) low_.resize(q.size());
+  if (!std::is_same_v<T, PositionScalar<T>>) q_rounding_.resize(q.size());
   for (int i = 0; i < pool_.size(); ++i) memory_.emplace_back(*model);
   for (int e = 0; e < n; ++e) {
     std::copy(model->param_defaults.begin(), model->param_defaults.end(),
@@ -36,7 +36,7 @@ StateView<T> Batch<T>::state(int env) {
   const auto e = static_cast<std::size_t>(env);
   return {q.data() + e * model->nq,       v.data() + e * model->nv,
           anchors.data() + e * model->na, anchored.data() + e * model->na,
-          history.data() + e * model->nh, low_.empty() ? nullptr : low_.data() + e * model->nq};
+          history.data() + e * model->nh, q_rounding_.empty() ? nullptr : q_rounding_.data() + e * model->nq};
 }
 
 template <class T>
@@ -45,7 +45,7 @@ void Batch<T>::reset(const std::uint8_t* which) {
     if (which && !which[e]) continue;
     const StateView<T> s = state(e);
     std::copy(model->q0.begin(), model->q0.end(), s.q);
-    if (s.low != nullptr) std::fill_n(s.low, model->nq, T(0));
+    if (s.q_rounding != nullptr) std::fill_n(s.q_rounding, model->nq, T(0));
     std::fill(s.v, s.v + model->nv, T(0));
     std::fill(s.anchored, s.anchored + model->na, 0);
     std::fill(s.anchors, s.anchors + model->na, V3<T>::Zero());
@@ -116,16 +116,16 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
     std::fill_n(difference, m.nv, T(0));
     if (status != Status::ok) return;
     for (const Joint& joint : m.joints) {
-      for (int a = 0; a < joint.plain(); ++a) {
+      for (int a = 0; a < joint.scalar_dofs(); ++a) {
         difference[joint.v + a] = whole.q[joint.q + a] - halves.q[joint.q + a];
       }
-      if (!joint.turns()) continue;
-      V4<T> back = vec4(halves.q.data() + joint.turn_q());
+      if (!joint.has_quaternion()) continue;
+      V4<T> back = vec4(halves.q.data() + joint.quaternion_q());
       back.template tail<3>() *= T(-1);
-      const V4<T> turn = quaternion_product<T>(back, vec4(whole.q.data() + joint.turn_q()));
+      const V4<T> turn = quaternion_product<T>(back, vec4(whole.q.data() + joint.quaternion_q()));
       const T sine = turn.template tail<3>().norm();  // a step turns by far less than half a turn
       const T scale = sine > T(1e-12) ? T(2) * std::atan2(sine, turn[0]) / sine : T(2);
-      for (int a = 0; a < 3; ++a) difference[joint.turn_v() + a] = scale * turn[1 + a];
+      for (int a = 0; a < 3; ++a) difference[joint.angular_v() + a] = scale * turn[1 + a];
     }
   });
 }
@@ -133,7 +133,7 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
 template <class T>
 void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
-  forward_state<true, T>(*model, params_of(env), s.q, s.low, s.v, w);
+  forward_state<true, T>(*model, params_of(env), s.q, s.q_rounding, s.v, w);
 }
 
 template <class T>
@@ -143,21 +143,21 @@ void Batch<T>::tactile(T* out) {
 
 template <class T>
 void Batch<T>::tactile() {
-  if (written_.empty()) {
+  if (dirty_.empty()) {
     readings.resize(static_cast<std::size_t>(n) * model->markers * 3);
-    written_.resize(n);
+    dirty_.resize(n);
   }
-  read(readings.data(), written_.data());
+  read(readings.data(), dirty_.data());
 }
 
 template <class T>
-void Batch<T>::read(T* out, Written* written) {
+void Batch<T>::read(T* out, DirtyMarkers* dirty) {
   pool_.run(n, [&](int e, int thread) {
     const StateView<T> s = state(e);
     Workspace<T>& w = memory_[thread].work;
-    forward_state<false, T>(*model, params_of(e), s.q, s.low, s.v, w);
+    forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
     read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
-                    out + static_cast<std::size_t>(e) * model->markers * 3, written == nullptr ? nullptr : written + e);
+                    out + static_cast<std::size_t>(e) * model->markers * 3, dirty == nullptr ? nullptr : dirty + e);
   });
 }
 
@@ -177,7 +177,7 @@ void Batch<T>::contact_forces(T* out) {
     kinematics(e, w);
     w.residual.setZero();
     const StepStart<T> from{T(1), nullptr, nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
-    subtract_contact_forces<false, T>(*model, params_of(e), from, Found::elsewhere, false, w);
+    subtract_contact_forces<false, T>(*model, params_of(e), from, CacheState::stale, false, w);
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }
@@ -188,7 +188,7 @@ void Batch<T>::poses(T* out) {
   for (int e = 0; e < n; ++e) {
     kinematics(e, w);
     for (std::size_t b = 0; b < model->bodies.size(); ++b, out += 7) {
-      const Eigen::Quaternion<Place<T>> turn(w.rotation[b]);
+      const Eigen::Quaternion<PositionScalar<T>> turn(w.rotation[b]);
       for (int i = 0; i < 3; ++i) out[i] = T(w.position[b][i]);
       out[3] = T(turn.w());
       out[4] = T(turn.x());
@@ -236,16 +236,17 @@ void Batch<T>::rollout(const Rollout<T>& r) {
     StepMemory<T>& memory = memory_[thread];
     r.status[e] = 0;
     int read = 0;
-    VX<T> low = VX<T>::Zero(std::is_same_v<T, Place<T>> ? 0 : m.nq);  // goes along with the last state
+    VX<T> q_rounding = VX<T>::Zero(std::is_same_v<T, PositionScalar<T>> ? 0 : m.nq);  // goes along with the last state
     const auto at = [&](int t) {
       const std::size_t row = t * N + e;
-      return StateView<T>{r.q + row * m.nq,      r.v + row * m.nv,       reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-                          r.anchored + row * na, r.history + row * m.nh, low.size() == 0 ? nullptr : low.data()};
+      return StateView<T>{
+          r.q + row * m.nq,      r.v + row * m.nv,       reinterpret_cast<V3<T>*>(r.anchors) + row * na,
+          r.anchored + row * na, r.history + row * m.nh, q_rounding.size() == 0 ? nullptr : q_rounding.data()};
     };
     for (int t = 0;; ++t) {
       const StateView<T> now = at(t);
       for (; read < r.reads && r.read_after[read] == t; ++read) {
-        forward_state<false, T>(m, params_of(env), now.q, now.low, now.v, memory.work);
+        forward_state<false, T>(m, params_of(env), now.q, now.q_rounding, now.v, memory.work);
         read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
                         r.tactile + (read * N + e) * m.markers * 3, nullptr);
       }
@@ -274,11 +275,11 @@ void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
     for (int t = 0; t < r.steps; ++t) {
       const std::size_t before = t * N + e, after = before + N;
       const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
-      Signature hash;
-      hash.add(branch_signature<T>(m, params_of(env), r.q + after * m.nq, r.v + after * m.nv,
-                                   reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na,
-                                   r.anchored + before * m.na, r.u + before * m.actuators.size(), read,
-                                   memory_[thread].work));
+      ModeHash hash;
+      hash.add(contact_mode_signature<T>(m, params_of(env), r.q + after * m.nq, r.v + after * m.nv,
+                                         reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na,
+                                         r.anchored + before * m.na, r.u + before * m.actuators.size(), read,
+                                         memory_[thread].work));
       hash.add(static_cast<std::uint64_t>(r.halvings[before]));
       out[before] = hash.value();
     }
@@ -320,8 +321,7 @@ void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>&
         const std::size_t row = r.read_after[read] * N + e;
         const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, nullptr, nullptr, nullptr};
         StateGradient<T> share(m);
-        tactile_transposed<T>(m, params_of(e), now, g.tactile + (read * N + e) * m.markers * 3, share,
-                              memory_[thread].work);
+        tactile_vjp<T>(m, params_of(e), now, g.tactile + (read * N + e) * m.markers * 3, share, memory_[thread].work);
         add_from_tangent<double>(m, q.data() + row * m.nq, share.q.template cast<double>(), by_q.data() + row * m.nq);
         for (int k = 0; k < m.nv; ++k) by_v[row * m.nv + k] += share.v[k];
       }

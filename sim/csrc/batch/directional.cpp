@@ -16,12 +16,12 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   for (const Joint& joint : m.joints) {
     const double* value = start.q + joint.q;
     const double* d = start.dq + joint.v;
-    const int plain = joint.plain();
+    const int plain = joint.scalar_dofs();
     for (int a = 0; a < plain; ++a) q[joint.q + a] = {value[a], d[a]};
-    if (!joint.turns()) continue;
+    if (!joint.has_quaternion()) continue;
     const V4<double> turn = vec4(value + plain);
     const V4<double> rate = quaternion_product<double>(turn, {0, d[plain] / 2, d[plain + 1] / 2, d[plain + 2] / 2});
-    for (int a = 0; a < 4; ++a) q[joint.turn_q() + a] = {turn[a], rate[a]};
+    for (int a = 0; a < 4; ++a) q[joint.quaternion_q() + a] = {turn[a], rate[a]};
   }
   std::vector<Dual> history(m.nh);
   for (int i = 0; i < m.nh; ++i) history[i] = {start.history[i], start.dhistory[i]};
@@ -42,12 +42,12 @@ DirectionalRollout directional_rollout(const Model& m, const RolloutStart& start
   for (const Dual& x : q) out.q.push_back(x.a);
   out.dq.resize(m.nv);
   for (const Joint& joint : m.joints) {
-    for (int a = 0; a < joint.plain(); ++a) out.dq[joint.v + a] = q[joint.q + a].b;
-    if (!joint.turns()) continue;
-    const Dual* t = &q[joint.turn_q()];
+    for (int a = 0; a < joint.scalar_dofs(); ++a) out.dq[joint.v + a] = q[joint.q + a].b;
+    if (!joint.has_quaternion()) continue;
+    const Dual* t = &q[joint.quaternion_q()];
     const V4<double> conjugate(t[0].a, -t[1].a, -t[2].a, -t[3].a), rate(t[0].b, t[1].b, t[2].b, t[3].b);
     const V4<double> turning = quaternion_product<double>(conjugate, rate);
-    for (int a = 0; a < 3; ++a) out.dq[joint.turn_v() + a] = 2 * turning[1 + a];
+    for (int a = 0; a < 3; ++a) out.dq[joint.angular_v() + a] = 2 * turning[1 + a];
   }
   const auto split = [](const Dual& x, std::vector<double>& value, std::vector<double>& derivative) {
     value.push_back(x.a);

@@ -47,7 +47,7 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   const StepStart<Taped> from{
       h,          t.q0.data(), t.v0.data(), nullptr, t.history.empty() ? nullptr : t.history.data(), t.anchors.data(),
       s.anchored, t.u.data()};
-  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), Found::elsewhere, false, w);
+  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), CacheState::stale, false, w);
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {

@@ -1,8 +1,8 @@
 // Trajectories of many steps, and the reverse pass through them.
 #pragma once
 
-#include "solver/adjoint.hpp"
 #include "batch/param_gradient.hpp"
+#include "solver/adjoint.hpp"
 
 namespace gelflow {
 
@@ -38,7 +38,7 @@ void transpose_one(const Model& m, const T* params, std::size_t e, std::size_t N
   StateGradient<T> gradient(m);
   std::copy_n(reinterpret_cast<const V3<T>*>(g.anchors_end) + e * na, na, gradient.anchors.begin());
   std::copy_n(g.history_end + e * m.nh, m.nh, gradient.history.data());
-  std::vector<Record<T>> records;
+  std::vector<SubstepRecord<T>> records;
   int read = r.reads - 1;
   for (int t = r.steps; t >= 0; --t) {
     const std::size_t row = t * N + e;
@@ -48,7 +48,7 @@ void transpose_one(const Model& m, const T* params, std::size_t e, std::size_t N
     gradient.v += Eigen::Map<const VX<T>>(g.v + row * m.nv, m.nv);
     for (; read >= 0 && r.read_after[read] == t; --read) {
       const T* by_reading = g.tactile + (read * N + e) * m.markers * 3;
-      tactile_transposed<T>(m, params, now, by_reading, gradient, memory.work);
+      tactile_vjp<T>(m, params, now, by_reading, gradient, memory.work);
       if (g.params) {
         const ParamState at{m.step, now.q, now.v, nullptr, nullptr, nullptr, now.anchors, now.anchored};
         add_reading_param_gradient(m, params, at, by_reading, g.params + e * m.param_names.size());
@@ -62,7 +62,7 @@ void transpose_one(const Model& m, const T* params, std::size_t e, std::size_t N
     const T* u = r.u + before * nu;
     records.clear();
     if (r.halvings[before] == 0) {
-      const StepStart<T> from = start_of<T>(m, T(m.step), true, old, u, memory);
+      const StepStart<T> from = step_start<T>(m, T(m.step), true, old, u, memory);
       records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
     } else {
       StateCopy<T> scratch(m, old);
@@ -72,10 +72,10 @@ void transpose_one(const Model& m, const T* params, std::size_t e, std::size_t N
                        });
     }
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
-      substep_transposed<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {
+      substep_vjp<T>(m, params, u, *it, gradient, g.u + before * nu, memory, [&](const VX<T>& c) {
         if (!g.params) return;
         const ParamState at{
-            it->h, it->q0.data(),      it->v_star.data(),  it->second ? it->history.data() : nullptr, it->v1.data(),
+            it->h, it->q0.data(),      it->v_star.data(),  it->bdf2 ? it->history.data() : nullptr, it->v1.data(),
             u,     it->anchors.data(), it->anchored.data()};
         add_step_param_gradient(m, params, at, c.data(), gradient.anchors.data(), g.params + e * m.param_names.size());
       });

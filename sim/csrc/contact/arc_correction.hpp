@@ -28,28 +28,28 @@ V3<T> moment_of(const M3<T>& m) {
 }
 
 // The springs of one point: p, ∂p/∂x, ∂p/∂v.
-template <class L>
-struct Springs {
-  Vec3<L> push;
-  Mat3<L> by_x, by_v;
+template <class P>
+struct SpringForce {
+  Vec3<P> push;
+  Mat3<P> by_x, by_v;
 };
 template <bool derivatives, class T>
-GELFLOW_INLINE Springs<Pack<T>> springs(const Touching<T>& t, const T& h) {
-  using L = Pack<T>;
-  Springs<L> s{-(t.law.kn * t.at.d) * t.at.n, zero33<L>(), zero33<L>()};
+GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const T& h) {
+  using P = Pack<T>;
+  SpringForce<P> s{-(t.law.kn * t.at.d) * t.at.n, zero33<P>(), zero33<P>()};
   s.by_x.row[2].z = -t.law.kn;  // n = z
   if (!t.law.elastic) return s;
   // −k_s s = k_t v_t + q f_t + (1 − q) f*
-  PointForce<L> f;
-  point_force<derivatives>(t.law, t.at, t.v, t.e, t.remembers, f);
-  const L zero(0.0), q = yielding(t.law, L(h)), rest = L(1.0) - q;
-  const auto remembered = [&](const L& x) GELFLOW_LOOP_BODY { return select(t.remembers, x, zero); };
-  const Vec3<L> e = t.law.kt * f.slip + q * f.friction + rest * f.wanted;
+  PointForce<P> f;
+  point_force<derivatives>(t.law, t.at, t.v, t.e, t.has_anchor, f);
+  const P zero(0.0), q = relaxation_factor(t.law, P(h)), rest = P(1.0) - q;
+  const auto remembered = [&](const P& x) GELFLOW_LOOP_BODY { return select(t.has_anchor, x, zero); };
+  const Vec3<P> e = t.law.kt * f.slip_velocity + q * f.friction + rest * f.trial;
   s.push.x += remembered(e.x);
   s.push.y += remembered(e.y);
   if constexpr (derivatives) {
     for (int i = 0; i < 2; ++i) {
-      Vec3<L> by_x = q * f.by_x.row[i], by_v = q * f.by_v.row[i];
+      Vec3<P> by_x = q * f.by_x.row[i], by_v = q * f.by_v.row[i];
       (i == 0 ? by_x.x : by_x.y) -= rest * t.law.ks;
       (i == 0 ? by_v.x : by_v.y) += q * t.law.kt;
       s.by_x.row[i] = {remembered(by_x.x), remembered(by_x.y), remembered(by_x.z)};
@@ -68,45 +68,46 @@ M3<T> sum33(const Mat3<Pack<T>>& m) {
 
 // Where the body's origin is in the shape's frame.
 template <class T>
-V3<T> origin_in(const PairFrame<T>& frame, int body, const Workspace<T>& w) {
-  return frame.to_world.transpose() * as<T>(V3<Place<T>>(w.position[body] - frame.origin.template cast<Place<T>>()));
+V3<T> body_origin_in_shape(const PairFrame<T>& frame, int body, const Workspace<T>& w) {
+  return frame.to_world.transpose() *
+         as<T>(V3<PositionScalar<T>>(w.position[body] - frame.origin.template cast<PositionScalar<T>>()));
 }
 
 // Subtracts h m from w.residual; with derivatives also from w.by_q and w.by_v.
 template <bool derivatives, class T>
-void subtract_arc_moments(const Model& m, int body, const PairFrame<T>& frame, const NearPoints<T>& near,
-                          const TouchRule<T>& rule, Workspace<T>& w) {
-  using L = Pack<T>;
-  const T& h = rule.h;
-  const ArcLever<T> lever(h * frame.angular, derivatives);
-  const Mat3<L> n = spread<L>(lever.value);
-  const Vec3<L> origin = spread<L>(origin_in<T>(frame, body, w)), spin = spread<L>(frame.angular);
-  Mat3<L> spread_sum = zero33<L>(), by_shift = spread_sum, by_turn = by_shift, by_slide = by_shift, by_spin = by_shift;
-  for_touching_points<false, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
-    const Vec3<L> r = t.center - origin;
-    const Springs<L> s = springs<derivatives, T>(t, h);
-    spread_sum += outer(r, s.push);
+void subtract_arc_correction(const Model& m, int body, const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
+                             const ContactSettings<T>& settings, Workspace<T>& w) {
+  using P = Pack<T>;
+  const T& h = settings.h;
+  const MomentArmCorrection<T> arm(h * frame.angular, derivatives);
+  const Mat3<P> n = broadcast<P>(arm.value);
+  const Vec3<P> origin = broadcast<P>(body_origin_in_shape<T>(frame, body, w)), spin = broadcast<P>(frame.angular);
+  Mat3<P> outer_sum = zero33<P>(), by_shift = outer_sum, by_turn = by_shift, by_slide = by_shift, by_spin = by_shift;
+  for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
+    const Vec3<P> r = t.center - origin;
+    const SpringForce<P> s = spring_force<derivatives, T>(t, h);
+    outer_sum += outer(r, s.push);
     if constexpr (derivatives) {
-      const Vec3<L> arm = n * r;
-      const Mat3<L> x = cross_columns(arm, s.by_x);
+      const Vec3<P> arm = n * r;
+      const Mat3<P> x = cross_columns(arm, s.by_x);
       by_shift += x;
       by_turn -= cross_rows(x, r);
       if (!t.law.elastic) return;
-      const Mat3<L> v = cross_columns(arm, s.by_v);
+      const Mat3<P> v = cross_columns(arm, s.by_v);
       by_slide += v;
       by_spin -= cross_rows(v, r);
       by_turn -= cross_rows(v, cross(spin, r));
     }
   });
   const int k = m.joints[m.bodies[body].joint_begin].v;
-  const M3<T> q = sum33<T>(spread_sum), rotation = frame.to_world.transpose() * as<T>(w.rotation[body]);
-  const V3<T> moment = rotation.transpose() * moment_of<T>(lever.value * q);
+  const M3<T> q = sum33<T>(outer_sum), rotation = frame.to_world.transpose() * as<T>(w.rotation[body]);
+  const V3<T> moment = rotation.transpose() * moment_of<T>(arm.value * q);
   for (int i = 0; i < 3; ++i) w.residual[k + 3 + i] -= h * moment[i];
   if constexpr (derivatives) {
     M3<T> by_theta, turn = sum33<T>(by_turn);
     for (int j = 0; j < 3; ++j) {
-      by_theta.col(j) = moment_of<T>(lever.by[j] * q);
-      turn.col(j) += moment_of<T>(lever.value * skew<T>(V3<T>(V3<T>::Unit(j))) * q);
+      by_theta.col(j) = moment_of<T>(arm.by[j] * q);
+      turn.col(j) += moment_of<T>(arm.value * skew<T>(V3<T>(V3<T>::Unit(j))) * q);
     }
     turn -= h * (by_theta * skew<T>(frame.angular));
     const M3<T> back = h * rotation.transpose();

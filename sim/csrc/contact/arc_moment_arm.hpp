@@ -1,4 +1,4 @@
-// By how much the mean lever arm of a body that turns differs from that at the step's end (arc_moments.hpp).
+// By how much the mean lever arm of a body that turns differs from that at the step's end (arc_correction.hpp).
 #pragma once
 
 #include "math/spatial.hpp"
@@ -7,9 +7,9 @@ namespace gelflow {
 
 // N = Jr(θ) − 1 and its derivatives: with K = [θ]×, N = −a K + b K², a = (1 − cos θ)/θ², b = (θ − sin θ)/θ³.
 template <class T>
-struct ArcLever {
+struct MomentArmCorrection {
   M3<T> value, by[3];
-  explicit ArcLever(const V3<T>& theta, bool derivatives) {
+  explicit MomentArmCorrection(const V3<T>& theta, bool derivatives) {
     const T squared = theta.squaredNorm();
     const RotationSeries<T> s(squared);
     const M3<T> k = skew<T>(theta), kk = k * k;

@@ -14,23 +14,23 @@
 namespace gelflow {
 
 template <class T>
-TouchRule<T> touch_rule(const Model& m, const Contact& contact, const T* params, const V3<T>* anchors,
-                        const std::uint8_t* anchored, const T& h = T(0)) {
+ContactSettings<T> contact_settings(const Model& m, const Contact& contact, const T* params, const V3<T>* anchors,
+                                    const std::uint8_t* anchored, const T& h = T(0)) {
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
   const PointSet& set = m.point_sets[contact.points];
   // A sphere's size is its first scale; what has no radius need not have scales either (a pad that pushes).
-  const T radius = set.radius > 0 ? T(T(set.radius) * params[set.mount.place + 6]) : T(0);
+  const T radius = set.radius > 0 ? T(T(set.radius) * params[set.mount.pose_param + 6]) : T(0);
   return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot, 1, h};
 }
 
 // What all points of one pair feel: W about the shape's origin in its frame, and with derivatives K and D. Moments come
 // before forces, turns before shifts.
 template <class T>
-struct PairSums {
-  static constexpr int spread_at = 6, k_at = 15, d_at = 51;
+struct ContactSums {
+  static constexpr int outer_at = 6, k_at = 15, d_at = 51;
   T numbers[88];  // W (6), Σ x fᵀ (9), K and D (36 each), and one to make it whole packs
   const T* wrench() const { return numbers; }
-  T spread(int i, int j) const { return numbers[spread_at + 3 * i + j]; }
+  T outer(int i, int j) const { return numbers[outer_at + 3 * i + j]; }
   T& k(int i, int j) { return numbers[k_at + 6 * i + j]; }
   T k(int i, int j) const { return numbers[k_at + 6 * i + j]; }
   T d(int i, int j) const { return numbers[d_at + 6 * i + j]; }
@@ -38,127 +38,128 @@ struct PairSums {
 
 // Packs of points whose forces are known and have yet to be summed.
 template <class T>
-struct Pending {
-  using L = Pack<T>;
-  static constexpr int most = 8;
+struct ForceBuffer {
+  using P = Pack<T>;
+  static constexpr int capacity = 8;
   struct Entry {
-    Vec3<L> x, force;
-    Mat3<L> by_pose, by_v;  // A and B
+    Vec3<P> x, force;
+    Mat3<P> by_pose, by_v;  // A and B
   };
   int count = 0;
-  Entry entry[most];
+  Entry entry[capacity];
 };
 
 // Adds to a sum, or starts it.
-template <bool first, class L>
-GELFLOW_INLINE void put(const L& value, L& sum) {
+template <bool first, class P>
+GELFLOW_INLINE void accumulate(const P& value, P& sum) {
   sum = first ? value : sum + value;
 }
 
 // Adds what A (or B) is in `matrix` of all entries to a 6 × 6 matrix; c = x + lift ẑ. Each loop runs over all entries and
 // keeps its few sums in registers.
 template <bool first, class T>
-GELFLOW_INLINE void add_blocks(const Pending<T>& pending, Mat3<Pack<T>> Pending<T>::Entry::* matrix, const T& lift,
-                               Pack<T>* out) {
-  using L = Pack<T>;
-  const L up(lift);
+GELFLOW_INLINE void add_blocks(const ForceBuffer<T>& buffer, Mat3<Pack<T>> ForceBuffer<T>::Entry::* matrix,
+                               const T& lift, Pack<T>* out) {
+  using P = Pack<T>;
+  const P up(lift);
   for (int i = 0; i < 3; ++i) {
-    Vec3<L> by_turn = zero3<L>(), by_shift = by_turn;
-    for (int n = 0; n < pending.count; ++n) {
-      const auto& e = pending.entry[n];
-      const Vec3<L>& row = (e.*matrix).row[i];
+    Vec3<P> by_turn = zero3<P>(), by_shift = by_turn;
+    for (int n = 0; n < buffer.count; ++n) {
+      const auto& e = buffer.entry[n];
+      const Vec3<P>& row = (e.*matrix).row[i];
       by_shift += row;
-      by_turn += cross(Vec3<L>{e.x.x, e.x.y, e.x.z + up}, row);
+      by_turn += cross(Vec3<P>{e.x.x, e.x.y, e.x.z + up}, row);
     }
     for (int j = 0; j < 3; ++j) {
-      put<first>(by_turn[j], out[(3 + i) * 6 + j]);
-      put<first>(by_shift[j], out[(3 + i) * 6 + 3 + j]);
+      accumulate<first>(by_turn[j], out[(3 + i) * 6 + j]);
+      accumulate<first>(by_shift[j], out[(3 + i) * 6 + 3 + j]);
     }
   }
   const auto moments = [&](int j, auto&& turned) GELFLOW_LOOP_BODY {
-    Vec3<L> by_turn = zero3<L>(), by_shift = by_turn;
-    for (int n = 0; n < pending.count; ++n) {
-      const auto& e = pending.entry[n];
-      const Mat3<L>& a = e.*matrix;
-      const Vec3<L> c{e.x.x, e.x.y, e.x.z + up};
-      by_shift += cross(e.x, Vec3<L>{a.row[0][j], a.row[1][j], a.row[2][j]});
-      by_turn += cross(e.x, Vec3<L>{turned(c, a.row[0]), turned(c, a.row[1]), turned(c, a.row[2])});
+    Vec3<P> by_turn = zero3<P>(), by_shift = by_turn;
+    for (int n = 0; n < buffer.count; ++n) {
+      const auto& e = buffer.entry[n];
+      const Mat3<P>& a = e.*matrix;
+      const Vec3<P> c{e.x.x, e.x.y, e.x.z + up};
+      by_shift += cross(e.x, Vec3<P>{a.row[0][j], a.row[1][j], a.row[2][j]});
+      by_turn += cross(e.x, Vec3<P>{turned(c, a.row[0]), turned(c, a.row[1]), turned(c, a.row[2])});
     }
     for (int i = 0; i < 3; ++i) {
-      put<first>(by_turn[i], out[i * 6 + j]);
-      put<first>(by_shift[i], out[i * 6 + 3 + j]);
+      accumulate<first>(by_turn[i], out[i * 6 + j]);
+      accumulate<first>(by_shift[i], out[i * 6 + 3 + j]);
     }
   };
-  using V = Vec3<L>;
+  using V = Vec3<P>;
   moments(0, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.y * r.z - c.z * r.y; });
   moments(1, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.z * r.x - c.x * r.z; });
   moments(2, [](const V& c, const V& r) GELFLOW_LOOP_BODY { return c.x * r.y - c.y * r.x; });
 }
 
-// Adds all entries to the sums, or starts these, which lie as in PairSums; K without what the forces themselves add.
+// Adds all entries to the sums, or starts these, which lie as in ContactSums; K without what the forces themselves add.
 template <bool first, bool derivatives, class T>
-__attribute__((noinline)) void add_pending(Pending<T>& pending, const T& lift, Pack<T>* sums) {
-  using L = Pack<T>;
-  Vec3<L> force = zero3<L>(), moment = force;
-  for (int n = 0; n < pending.count; ++n) {
-    const auto& e = pending.entry[n];
+__attribute__((noinline)) void flush(ForceBuffer<T>& buffer, const T& lift, Pack<T>* sums) {
+  using P = Pack<T>;
+  Vec3<P> force = zero3<P>(), moment = force;
+  for (int n = 0; n < buffer.count; ++n) {
+    const auto& e = buffer.entry[n];
     force += e.force;
     moment += cross(e.x, e.force);
   }
   for (int i = 0; i < 3; ++i) {
-    put<first>(moment[i], sums[i]);
-    put<first>(force[i], sums[3 + i]);
+    accumulate<first>(moment[i], sums[i]);
+    accumulate<first>(force[i], sums[3 + i]);
   }
   if constexpr (derivatives) {
-    Mat3<L> spread = zero33<L>();
-    for (int n = 0; n < pending.count; ++n) spread += outer(pending.entry[n].x, pending.entry[n].force);
+    Mat3<P> outer_sum = zero33<P>();
+    for (int n = 0; n < buffer.count; ++n) outer_sum += outer(buffer.entry[n].x, buffer.entry[n].force);
     for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) put<first>(spread.row[i][j], sums[PairSums<T>::spread_at + 3 * i + j]);
+      for (int j = 0; j < 3; ++j) accumulate<first>(outer_sum.row[i][j], sums[ContactSums<T>::outer_at + 3 * i + j]);
     }
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_pose, lift, sums + PairSums<T>::k_at);
-    add_blocks<first, T>(pending, &Pending<T>::Entry::by_v, T(0), sums + PairSums<T>::d_at);
+    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::by_pose, lift, sums + ContactSums<T>::k_at);
+    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::by_v, T(0), sums + ContactSums<T>::d_at);
   }
-  pending.count = 0;
+  buffer.count = 0;
 }
 
 // Sums over the points near the shape. Returns whether any of them touches.
 template <bool derivatives, class T>
-bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const TouchRule<T>& rule, PairSums<T>& sums) {
-  using L = Pack<T>;
+bool sum_forces(const PairFrame<T>& frame, const CandidatePoints<T>& candidates, const ContactSettings<T>& settings,
+                ContactSums<T>& sums) {
+  using P = Pack<T>;
   constexpr int numbers = derivatives ? 87 : 6, packed = derivatives ? 88 : 8;
-  L all[packed];
-  for (int i = numbers; i < packed; ++i) all[i] = L(0.0);
+  P all[packed];
+  for (int i = numbers; i < packed; ++i) all[i] = P(0.0);
   bool started = false;
-  Pending<T> pending;
+  ForceBuffer<T> buffer;
   const auto add = [&]() GELFLOW_LOOP_BODY {
     if (started) {
-      add_pending<false, derivatives, T>(pending, rule.rolling_radius, all);
+      flush<false, derivatives, T>(buffer, settings.rolling_radius, all);
     } else {
-      add_pending<true, derivatives, T>(pending, rule.rolling_radius, all);
+      flush<true, derivatives, T>(buffer, settings.rolling_radius, all);
     }
     started = true;
   };
-  for_touching_points<derivatives, T>(frame, near, rule, [&](const Touching<T>& t) GELFLOW_LOOP_BODY {
-    PointForce<L> force;
-    point_force<derivatives>(t.law, t.at, t.v, t.e, t.remembers, force);
-    auto& e = pending.entry[pending.count++];
+  for_contact_points<derivatives, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
+    PointForce<P> force;
+    point_force<derivatives>(t.law, t.at, t.v, t.e, t.has_anchor, force);
+    auto& e = buffer.entry[buffer.count++];
     e.x = t.x;
     e.force = force.force;
     if constexpr (derivatives) {
-      e.by_pose = force.by_x + cross_rows(force.by_v, spread<L>(frame.angular));
+      e.by_pose = force.by_x + cross_rows(force.by_v, broadcast<P>(frame.angular));
       e.by_v = force.by_v;
     }
-    if (pending.count == Pending<T>::most) add();
+    if (buffer.count == ForceBuffer<T>::capacity) add();
   });
-  if (pending.count > 0) add();
+  if (buffer.count > 0) add();
   if (!started) return false;
   sum_lanes(all, packed, sums.numbers);
   if constexpr (derivatives) {
     const T* const f = sums.wrench() + 3;
-    const T lift = rule.rolling_radius;
-    const T work = sums.spread(0, 0) + sums.spread(1, 1) + sums.spread(2, 2) + lift * f[2];  // Σ f·c
+    const T lift = settings.rolling_radius;
+    const T work = sums.outer(0, 0) + sums.outer(1, 1) + sums.outer(2, 2) + lift * f[2];  // Σ f·c
     for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) sums.k(i, j) += sums.spread(i, j);
+      for (int j = 0; j < 3; ++j) sums.k(i, j) += sums.outer(i, j);
       sums.k(2, i) += lift * f[i];
       sums.k(i, i) -= work;
       const int j = (i + 1) % 3, k = (i + 2) % 3;  // −[f]×
@@ -171,21 +172,21 @@ bool sum_forces(const PairFrame<T>& frame, const NearPoints<T>& near, const Touc
 
 // Subtracts h · (what the pair's sums say) from w.by_q and w.by_v.
 template <class T>
-void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) {
-  using L = Pack<T>;
+void subtract_contact_derivatives(const T& h, const ContactSums<T>& sums, Workspace<T>& w) {
+  using P = Pack<T>;
   constexpr int width = pack_width<T>;
-  PairColumns<T>& c = w.columns;
+  ContactJacobian<T>& c = w.jacobian;
   for (int i = 0; i < c.n; i += width) {  // what the displacement of these dofs changes
-    L s[6], y[6];
+    P s[6], y[6];
     for (int a = 0; a < 6; ++a) {
-      s[a] = load<L>(c.s.at(i, a));
-      y[a] = load<L>(c.y.at(i, a));
+      s[a] = load<P>(c.s.at(i, a));
+      y[a] = load<P>(c.y.at(i, a));
     }
     for (int a = 0; a < 6; ++a) {
-      L by_q = L(sums.k(a, 0)) * s[0] + L(sums.d(a, 0)) * y[0], by_v = L(sums.d(a, 0)) * s[0];
+      P by_q = P(sums.k(a, 0)) * s[0] + P(sums.d(a, 0)) * y[0], by_v = P(sums.d(a, 0)) * s[0];
       for (int b = 1; b < 6; ++b) {
-        const L d(sums.d(a, b));
-        by_q += L(sums.k(a, b)) * s[b] + d * y[b];
+        const P d(sums.d(a, b));
+        by_q += P(sums.k(a, b)) * s[b] + d * y[b];
         by_v += d * s[b];
       }
       store(by_q, c.force_q.at(i, a));
@@ -193,39 +194,39 @@ void subtract_derivatives(const T& h, const PairSums<T>& sums, Workspace<T>& w) 
     }
     // S_j ×* W: −(S_j ×* W) where j moves the first body, + where it moves the second; s_j S_j carries the sign.
     const T* const f = sums.wrench();
-    const Vec3<L> turn{s[0], s[1], s[2]}, shift{s[3], s[4], s[5]}, moment{L(f[0]), L(f[1]), L(f[2])},
-        force{L(f[3]), L(f[4]), L(f[5])};
-    const Vec3<L> top = cross(turn, moment) + cross(shift, force), bottom = cross(turn, force);
+    const Vec3<P> turn{s[0], s[1], s[2]}, shift{s[3], s[4], s[5]}, moment{P(f[0]), P(f[1]), P(f[2])},
+        force{P(f[3]), P(f[4]), P(f[5])};
+    const Vec3<P> top = cross(turn, moment) + cross(shift, force), bottom = cross(turn, force);
     for (int a = 0; a < 3; ++a) {
-      store(top[a], c.turned.at(i, a));
-      store(bottom[a], c.turned.at(i, 3 + a));
+      store(top[a], c.axis_wrench.at(i, a));
+      store(bottom[a], c.axis_wrench.at(i, 3 + a));
     }
   }
   // `from`: 3 for a row without an angular part; `carried`: some of its axes are.
   const auto add_row = [&](int r, auto from, auto carried) GELFLOW_LOOP_BODY {
     const int row = c.dofs->dof[r];
-    L s[6];
-    for (int a = from; a < 6; ++a) s[a] = L(T(h * c.s.at(r - r % width, a)[r % width]));
+    P s[6];
+    for (int a = from; a < 6; ++a) s[a] = P(T(h * c.s.at(r - r % width, a)[r % width]));
     for (int i = 0; i < c.n; i += width) {
-      L by_q(0.0), by_v(0.0), turned(0.0);
+      P by_q(0.0), by_v(0.0), turned(0.0);
       for (int a = from; a < 6; ++a) {
-        by_q += s[a] * load<L>(c.force_q.at(i, a));
-        by_v += s[a] * load<L>(c.force_v.at(i, a));
-        if (carried) turned += s[a] * load<L>(c.turned.at(i, a));
+        by_q += s[a] * load<P>(c.force_q.at(i, a));
+        by_v += s[a] * load<P>(c.force_v.at(i, a));
+        if (carried) turned += s[a] * load<P>(c.axis_wrench.at(i, a));
       }
-      if (carried) by_q -= load<L>(&c.dofs->turned[static_cast<std::size_t>(r) * c.n + i]) * turned;
+      if (carried) by_q -= load<P>(&c.dofs->axis_coupling[static_cast<std::size_t>(r) * c.n + i]) * turned;
       const std::ptrdiff_t at = row * w.by_q.outerStride() + c.dofs->start[i / width];
-      store(load<L>(w.by_q.data() + at) - by_q, w.by_q.data() + at);
-      store(load<L>(w.by_v.data() + at) - by_v, w.by_v.data() + at);
+      store(load<P>(w.by_q.data() + at) - by_q, w.by_q.data() + at);
+      store(load<P>(w.by_v.data() + at) - by_v, w.by_v.data() + at);
     }
   };
   using All = std::integral_constant<int, 0>;
   using Linear = std::integral_constant<int, 3>;
   for (int r = 0; r < c.n; ++r) {
     if (c.dofs->dof[r] < 0) continue;
-    if (!c.dofs->slides[r]) {
+    if (!c.dofs->linear[r]) {
       add_row(r, All(), std::true_type());
-    } else if (c.dofs->carried[r]) {
+    } else if (c.dofs->has_coupling[r]) {
       add_row(r, Linear(), std::true_type());
     } else {
       add_row(r, Linear(), std::false_type());
@@ -242,22 +243,22 @@ V6<T> wrench_in_world(const PairFrame<T>& frame, const T* wrench) {
 
 // Subtracts the impulses h · (the pair's wrench) from w.residual. `scale`: adds their size to w.forces.
 template <class T>
-void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bool scale, Workspace<T>& w) {
+void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bool add_impulses, Workspace<T>& w) {
   using std::abs;
-  using L = Pack<T>;
+  using P = Pack<T>;
   constexpr int width = pack_width<T>;
   const PackedDofs& dofs = pair.packed<width>();
   for (std::size_t n = 0; n < dofs.start.size(); ++n) {
     const int at = dofs.start[n];
-    L sum = L(wrench[0]) * load<L>(w.axis.row(0) + at);
-    for (int a = 1; a < 6; ++a) sum += L(wrench[a]) * load<L>(w.axis.row(a) + at);
+    P sum = P(wrench[0]) * load<P>(w.axis.row(0) + at);
+    for (int a = 1; a < 6; ++a) sum += P(wrench[a]) * load<P>(w.axis.row(a) + at);
     T impulse[width];
-    store(L(h) * load<L>(&dofs.sign[n * width]) * sum, impulse);
+    store(P(h) * load<P>(&dofs.sign[n * width]) * sum, impulse);
     for (int k = 0; k < width; ++k) {
       const int dof = dofs.dof[n * width + k];
       if (dof < 0) continue;
       w.residual[dof] -= impulse[k];
-      if (scale) w.forces[dof] += abs(impulse[k]);
+      if (add_impulses) w.impulses[dof] += abs(impulse[k]);
     }
   }
 }
@@ -265,27 +266,27 @@ void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bo
 // Subtracts h · (contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `found`: what the
 // workspace was last used for. `scale`: adds the impulses' size to w.forces.
 template <bool derivatives, class T>
-void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, Found found, bool scale,
-                             Workspace<T>& w) {
-  PairSums<T> sums;
+void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, CacheState cache,
+                             bool add_impulses, Workspace<T>& w) {
+  ContactSums<T> sums;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    TouchRule<T> rule = touch_rule<T>(m, contact, params, from.anchors, from.anchored, from.h);
-    rule.softness = from.softness;
-    find_near_points<T>(frame, set.cloud, rule, found, w.near[n]);
-    if (!sum_forces<derivatives, T>(frame, w.near[n], rule, sums)) {
-      if (!is_finite(frame.check())) w.residual[0] = frame.check();
+    ContactSettings<T> settings = contact_settings<T>(m, contact, params, from.anchors, from.anchored, from.h);
+    settings.continuation = from.continuation;
+    find_candidate_points<T>(frame, set.cloud, settings, cache, w.candidates[n]);
+    if (!sum_forces<derivatives, T>(frame, w.candidates[n], settings, sums)) {
+      if (!is_finite(frame.finiteness_probe())) w.residual[0] = frame.finiteness_probe();
       continue;
     }
-    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench()), scale, w);
+    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench()), add_impulses, w);
     if constexpr (derivatives) {
-      pair_columns<T>(contact.pair, set.mount.body, frame, w);
-      subtract_derivatives<T>(from.h, sums, w);
+      contact_jacobian<T>(contact.pair, set.mount.body, frame, w);
+      subtract_contact_derivatives<T>(from.h, sums, w);
     }
-    if (contact.on_arc && from.history == nullptr) {
-      subtract_arc_moments<derivatives, T>(m, set.mount.body, frame, w.near[n], rule, w);
+    if (contact.uses_arc_correction && from.history == nullptr) {
+      subtract_arc_correction<derivatives, T>(m, set.mount.body, frame, w.candidates[n], settings, w);
     }
   }
 }
@@ -299,10 +300,10 @@ void contact_wrenches(const Model& m, const T* params, const V3<T>* anchors, con
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored);
-    PairSums<T> sums;
-    find_near_points<T>(frame, set.cloud, rule, Found::elsewhere, w.near[n]);
-    if (!sum_forces<false, T>(frame, w.near[n], rule, sums)) std::fill_n(sums.numbers, 6, T(0));
+    const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored);
+    ContactSums<T> sums;
+    find_candidate_points<T>(frame, set.cloud, settings, CacheState::stale, w.candidates[n]);
+    if (!sum_forces<false, T>(frame, w.candidates[n], settings, sums)) std::fill_n(sums.numbers, 6, T(0));
     const V6<T> in_world = wrench_in_world<T>(frame, sums.wrench());
     for (int i = 0; i < 6; ++i) out[6 * n + i] = in_world[i];
   }
@@ -317,8 +318,8 @@ void advance_contact_anchors(const Model& m, const T* params, const T& h, const 
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, w.near[n], touch_rule<T>(m, contact, params, anchors, anchored, h), set.cloud.size(),
-                       next + contact.anchor, next_set + contact.anchor);
+    advance_anchors<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, h),
+                       set.cloud.size(), next + contact.anchor, next_set + contact.anchor);
   }
 }
 
@@ -326,41 +327,42 @@ void advance_contact_anchors(const Model& m, const T* params, const T& h, const 
 // the step's end (by_q, by_v) and to the anchors before (by_anchor). Second call, with c the multipliers of the residual:
 // what the residual says of the anchors before. `second`: the step was one of BDF2.
 template <bool from_next, class T>
-void contact_anchors_transposed(const Model& m, const T* params, const T& h, bool second, const V3<T>* anchors,
-                                const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next,
-                                const VX<T>& multipliers, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
-  using L = Pack<T>;
+void contact_anchors_vjp(const Model& m, const T* params, const T& h, bool bdf2, const V3<T>* anchors,
+                         const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, const VX<T>& multipliers,
+                         VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
+  using P = Pack<T>;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
-    pair_columns<T>(contact.pair, first.body, frame, w);
+    contact_jacobian<T>(contact.pair, first.body, frame, w);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-    const TouchRule<T> rule = touch_rule<T>(m, contact, params, anchors, anchored, h);
+    const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored, h);
     V3<T>* const by_own = by_anchor + contact.anchor;
     if constexpr (from_next) {
-      anchors_transposed<T>(frame, w.near[n], rule, by_next + contact.anchor, by_pose, by_twist, by_own);
-      pull_back<T>(w.columns, by_pose, by_twist, by_q, by_v);
+      anchors_vjp<T>(frame, w.candidates[n], settings, by_next + contact.anchor, by_pose, by_twist, by_own);
+      pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
     } else {
       V6<T> virtual_twist = V6<T>::Zero();
-      const PairColumns<T>& c = w.columns;
+      const ContactJacobian<T>& c = w.jacobian;
       for (int i = 0; i < c.n; ++i) {
         if (c.dofs->dof[i] >= 0) virtual_twist += c.s[i] * multipliers[c.dofs->dof[i]];
       }
-      const bool arc = contact.on_arc && !second;
-      const Mat3<L> lever = spread<L>(arc ? ArcLever<T>(h * frame.angular, false).value : M3<T>(M3<T>::Zero()));
-      const Vec3<L> origin = spread<L>(arc ? origin_in<T>(frame, first.body, w) : V3<T>(V3<T>::Zero()));
-      const Vec3<L> spin = spread<L>(V3<T>(top(virtual_twist))), slide = spread<L>(V3<T>(bottom(virtual_twist)));
-      for_touching_points<true, T>(frame, w.near[n], rule, [&](const Touching<T>& t) {
-        const Vec3<L> on_friction = L(h) * (slide + cross(spin, t.x)), none = zero3<L>();
-        const Vec3<L> on_spring =
-            L(h) * cross(spin, lever * (t.center - origin));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
-        const L q = yielding(t.law, L(h));
-        const Vec3<L> by = point_force_transposed(t.law, t.at, t.v, t.e, t.remembers, none, on_friction + q * on_spring,
-                                                  (L(1.0) - q) * on_spring, none)
+      const bool arc = contact.uses_arc_correction && !bdf2;
+      const Mat3<P> arm =
+          broadcast<P>(arc ? MomentArmCorrection<T>(h * frame.angular, false).value : M3<T>(M3<T>::Zero()));
+      const Vec3<P> origin = broadcast<P>(arc ? body_origin_in_shape<T>(frame, first.body, w) : V3<T>(V3<T>::Zero()));
+      const Vec3<P> spin = broadcast<P>(V3<T>(top(virtual_twist))), slide = broadcast<P>(V3<T>(bottom(virtual_twist)));
+      for_contact_points<true, T>(frame, w.candidates[n], settings, [&](const ContactPack<T>& t) {
+        const Vec3<P> on_friction = P(h) * (slide + cross(spin, t.x)), none = zero3<P>();
+        const Vec3<P> on_spring =
+            P(h) * cross(spin, arm * (t.center - origin));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
+        const P q = relaxation_factor(t.law, P(h));
+        const Vec3<P> by = point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, none, on_friction + q * on_spring,
+                                           (P(1.0) - q) * on_spring, none)
                                .anchor;
-        t.for_each_inside([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
+        t.for_each_active([&](int k, int i) { by_own[i] += lane3<T>(by, k); });
       });
     }
   }

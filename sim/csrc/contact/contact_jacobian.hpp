@@ -16,28 +16,28 @@ namespace gelflow {
 // A motion vector of the world in the shape's frame, for a pack of them.
 template <class T>
 struct PackedMotion {
-  using L = Pack<T>;
-  Vec3<L> angular, linear;
+  using P = Pack<T>;
+  Vec3<P> angular, linear;
 };
 template <class T>
 GELFLOW_INLINE PackedMotion<T> packed_motion(const PairFrame<T>& f, const SixRows<T>& x, int at) {
-  using L = Pack<T>;
-  const Vec3<L> w{load<L>(x.row(0) + at), load<L>(x.row(1) + at), load<L>(x.row(2) + at)};
-  const Vec3<L> v{load<L>(x.row(3) + at), load<L>(x.row(4) + at), load<L>(x.row(5) + at)};
-  const Mat3<L> turn = spread<L>(f.to_world);
-  return {transposed_times(turn, w), transposed_times(turn, v + cross(w, spread<L>(f.origin)))};
+  using P = Pack<T>;
+  const Vec3<P> w{load<P>(x.row(0) + at), load<P>(x.row(1) + at), load<P>(x.row(2) + at)};
+  const Vec3<P> v{load<P>(x.row(3) + at), load<P>(x.row(4) + at), load<P>(x.row(5) + at)};
+  const Mat3<P> turn = broadcast<P>(f.to_world);
+  return {transposed_times(turn, w), transposed_times(turn, v + cross(w, broadcast<P>(f.origin)))};
 }
 
 template <class T>
-void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Workspace<T>& w) {
-  using L = Pack<T>;
-  PairColumns<T>& c = w.columns;
+void contact_jacobian(const PairDofs& pair, int first, const PairFrame<T>& f, Workspace<T>& w) {
+  using P = Pack<T>;
+  ContactJacobian<T>& c = w.jacobian;
   c.dofs = &pair.packed<pack_width<T>>();
   c.n = static_cast<int>(c.dofs->dof.size());
   const V6<T> twist = f.motion(first == world ? V6<T>(V6<T>::Zero()) : w.twist[first]);
   for (int i = 0; i < c.n; i += pack_width<T>) {
     const int at = c.dofs->start[i / pack_width<T>];
-    const L sign = load<L>(&c.dofs->sign[i]);
+    const P sign = load<P>(&c.dofs->sign[i]);
     PackedMotion<T> s = packed_motion<T>(f, w.axis, at);
     s.angular = sign * s.angular;
     s.linear = sign * s.linear;
@@ -46,9 +46,9 @@ void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Worksp
       store(s.linear[a], c.s.at(i, 3 + a));
     }
     const PackedMotion<T> before = packed_motion<T>(f, w.twist_before, at);
-    const Vec3<L> angular = spread<L>(V3<T>(top(twist))) - before.angular;
-    const Vec3<L> linear = spread<L>(V3<T>(bottom(twist))) - before.linear;
-    const Vec3<L> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
+    const Vec3<P> angular = broadcast<P>(V3<T>(top(twist))) - before.angular;
+    const Vec3<P> linear = broadcast<P>(V3<T>(bottom(twist))) - before.linear;
+    const Vec3<P> turn = cross(s.angular, angular), shift = cross(s.angular, linear) + cross(s.linear, angular);
     for (int a = 0; a < 3; ++a) {
       store(turn[a], c.y.at(i, a));
       store(shift[a], c.y.at(i, 3 + a));
@@ -58,7 +58,7 @@ void pair_columns(const PairDofs& pair, int first, const PairFrame<T>& f, Worksp
 
 // Gradients with respect to the relative pose and twist, carried to the joints.
 template <class T>
-void pull_back(const PairColumns<T>& c, const V6<T>& by_pose, const V6<T>& by_twist, VX<T>& by_q, VX<T>& by_v) {
+void pull_back(const ContactJacobian<T>& c, const V6<T>& by_pose, const V6<T>& by_twist, VX<T>& by_q, VX<T>& by_v) {
   for (int i = 0; i < c.n; ++i) {
     const int dof = c.dofs->dof[i];
     if (dof < 0) continue;

@@ -25,194 +25,193 @@
 
 namespace gelflow {
 
-// Everything is written for a lane type L: some points at once (lanes.hpp). A point of weight 0 feels nothing.
-template <class L>
+// Everything is written for a lane type L: some points at once (simd_pack.hpp). A point of weight 0 feels nothing.
+template <class P>
 struct PointLaw {
-  L kn, kt, mu, kd, ks;  // of these points: already times their weights
-  L rounding;            // of places [m]
+  P kn, kt, mu, kd, ks;  // of these points: already times their weights
+  P rounding;            // of places [m]
   DampingLaw damping;
   bool elastic;
 };
 
-template <class L>
+template <class P>
 struct PointForce {
-  Vec3<L> force;
-  Mat3<L> by_x, by_v;  // ∂force/∂(x, v)
-  Mask<L> slips;
-  Vec3<L> friction, slip, wanted;  // f_t, v_t, f*
+  Vec3<P> force;
+  Mat3<P> by_x, by_v;  // ∂force/∂(x, v)
+  Mask<P> sliding;
+  Vec3<P> friction, slip_velocity, trial;  // f_t, v_t, f*
 };
 
 // What the force is made of.
-template <class L>
-struct ForceParts {
-  L rate, normal, by_d, by_rate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
-  L along;                        // n·e
-  Vec3<L> slip, wanted;           // v_t, f*
-  Mask<L> slips;
-  L inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where it slips, else 1
+template <class P>
+struct ForceTerms {
+  P rate, normal, normal_by_d, normal_by_rate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
+  P normal_offset;                              // n·e
+  Vec3<P> slip_velocity, trial;                 // v_t, f*
+  Mask<P> sliding;
+  P inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where it slips, else 1
 };
-template <class L>
-GELFLOW_INLINE void force_parts(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
-                                ForceParts<L>& p) {
+template <class P>
+GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v, const Vec3<P>& e,
+                                ForceTerms<P>& p) {
   using std::sqrt;
-  const L zero(0.0), one(1.0);
-  const Vec3<L>& n = at.n;
+  const P zero(0.0), one(1.0);
+  const Vec3<P>& n = at.n;
   p.rate = dot(n, v);
   if (law.damping == DampingLaw::depth) {
-    const L wanted = law.kn - law.kd * p.rate;
-    const Mask<L> pushes = wanted > zero;
-    const L stiffness = select(pushes, wanted, zero);
+    const P trial = law.kn - law.kd * p.rate;
+    const Mask<P> positive = trial > zero;
+    const P stiffness = select(positive, trial, zero);
     p.normal = -stiffness * at.d;
-    p.by_d = -stiffness;
-    p.by_rate = select(pushes, law.kd * at.d, zero);
+    p.normal_by_d = -stiffness;
+    p.normal_by_rate = select(positive, law.kd * at.d, zero);
   } else {
-    const L ramp(1e-6);  // [m]
-    const Mask<L> full = at.d < -ramp;
-    const L r = select(full, one, -at.d / ramp);
-    const L push = -law.kn * at.d - r * law.kd * p.rate;
-    const Mask<L> pushes = push > zero;
-    p.normal = select(pushes, push, zero);
-    p.by_d = select(pushes, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
-    p.by_rate = select(pushes, -r * law.kd, zero);
+    const P ramp(1e-6);  // [m]
+    const Mask<P> full = at.d < -ramp;
+    const P r = select(full, one, -at.d / ramp);
+    const P push = -law.kn * at.d - r * law.kd * p.rate;
+    const Mask<P> positive = push > zero;
+    p.normal = select(positive, push, zero);
+    p.normal_by_d = select(positive, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
+    p.normal_by_rate = select(positive, -r * law.kd, zero);
   }
-  p.slip = v - p.rate * n;
-  p.wanted = -law.kt * p.slip;
-  p.along = zero;
+  p.slip_velocity = v - p.rate * n;
+  p.trial = -law.kt * p.slip_velocity;
+  p.normal_offset = zero;
   if (law.elastic) {
-    p.along = dot(n, e);
-    p.wanted -= law.ks * (e - p.along * n);  // e is zero where there is no anchor
+    p.normal_offset = dot(n, e);
+    p.trial -= law.ks * (e - p.normal_offset * n);  // e is zero where there is no anchor
   }
-  const L bound = law.mu * p.normal, squared = dot(p.wanted, p.wanted);
+  const P bound = law.mu * p.normal, squared = dot(p.trial, p.trial);
   // After a slip without k_t the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
   // reverse and the readings must not take different sides.
-  const L limit = law.elastic ? bound * (one + L(1e-14)) + law.ks * law.rounding : bound;
-  p.slips = squared > limit * limit;
+  const P limit = law.elastic ? bound * (one + P(1e-14)) + law.ks * law.rounding : bound;
+  p.sliding = squared > limit * limit;
   p.inverse = p.ratio = one;
-  if (any(p.slips)) {
-    p.inverse = one / sqrt(select(p.slips, squared, one));
-    p.ratio = select(p.slips, bound * p.inverse, one);
+  if (any(p.sliding)) {
+    p.inverse = one / sqrt(select(p.sliding, squared, one));
+    p.ratio = select(p.sliding, bound * p.inverse, one);
   }
 }
 
-template <bool derivatives, class L>
-GELFLOW_INLINE void point_force(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v, const Vec3<L>& e,
-                                const Mask<L>& anchored, PointForce<L>& out) {
-  ForceParts<L> p;
-  force_parts(law, at, v, e, p);
-  const L zero(0.0);
-  const Vec3<L>& n = at.n;
-  out.slips = p.slips;
-  out.slip = p.slip;
-  out.wanted = p.wanted;
-  out.friction = p.ratio * p.wanted;
+template <bool derivatives, class P>
+GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v, const Vec3<P>& e,
+                                const Mask<P>& anchored, PointForce<P>& out) {
+  ForceTerms<P> p;
+  force_terms(law, at, v, e, p);
+  const P zero(0.0);
+  const Vec3<P>& n = at.n;
+  out.sliding = p.sliding;
+  out.slip_velocity = p.slip_velocity;
+  out.trial = p.trial;
+  out.friction = p.ratio * p.trial;
   out.force = p.normal * n + out.friction;
   if constexpr (derivatives) {
     // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature, the second only where there is an anchor, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
-    const L memory = law.elastic ? select(anchored, law.ks, zero) : zero;
-    const Vec3<L> direction = select(p.slips, p.inverse, zero) * p.wanted;
-    Vec3<L> normal_by_x = p.by_d * n;
-    const Vec3<L> lever = n + law.mu * direction;  // what a change of N adds
+    const P memory = law.elastic ? select(anchored, law.ks, zero) : zero;
+    const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
+    Vec3<P> normal_by_x = p.normal_by_d * n;
+    const Vec3<P> arm = n + law.mu * direction;  // what a change of N adds
     // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ), where t·n = 0 but for a field, whose ‖n‖ is not quite 1.
-    Mat3<L> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
-    if (at.bend == Bend::field) [[unlikely]] {
+    Mat3<P> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
+    if (at.form == HessianForm::field) [[unlikely]] {
       project += p.ratio * dot(direction, n) * outer(direction, n);
     }
     out.by_v = -law.kt * project;
-    out.by_v += outer(lever, p.by_rate * n);
+    out.by_v += outer(arm, p.normal_by_rate * n);
     if (law.elastic) {
       out.by_x = -memory * project;
     } else {
-      out.by_x = zero33<L>();
+      out.by_x = zero33<P>();
     }
-    if (at.bend != Bend::flat) {
-      const Mat3<L> bends = at.curvature();
-      const Vec3<L> hv = bends * v;
-      normal_by_x += p.by_rate * hv;
-      Mat3<L> wanted_by_x = law.kt * (outer(n, hv) + p.rate * bends);
-      if (law.elastic) wanted_by_x += memory * (outer(n, bends * e) + p.along * bends);
-      out.by_x += p.ratio * (wanted_by_x - outer(direction, transposed_times(wanted_by_x, direction)));
+    if (at.form != HessianForm::zero) {
+      const Mat3<P> bends = at.hessian_matrix();
+      const Vec3<P> hv = bends * v;
+      normal_by_x += p.normal_by_rate * hv;
+      Mat3<P> trial_by_x = law.kt * (outer(n, hv) + p.rate * bends);
+      if (law.elastic) trial_by_x += memory * (outer(n, bends * e) + p.normal_offset * bends);
+      out.by_x += p.ratio * (trial_by_x - outer(direction, transposed_times(trial_by_x, direction)));
       out.by_x += p.normal * bends;
     }
-    out.by_x += outer(lever, normal_by_x);
+    out.by_x += outer(arm, normal_by_x);
   }
 }
 
 // The reverse: gradients with respect to N n, to f_t, to f* and to v_t, carried back to (x, v, X). The anchor moves the
 // friction alone.
-template <class L>
+template <class P>
 struct PointGradient {
-  Vec3<L> x, v, anchor;
-  Mask<L> slips;
-  Vec3<L> force;  // what `point_force` says
+  Vec3<P> x, v, anchor;
+  Mask<P> sliding;
+  Vec3<P> force;  // what `point_force` says
 };
-template <class L>
-GELFLOW_INLINE PointGradient<L> point_force_transposed(const PointLaw<L>& law, const Distance<L>& at, const Vec3<L>& v,
-                                                       const Vec3<L>& e, const Mask<L>& anchored,
-                                                       const Vec3<L>& by_push, const Vec3<L>& by_friction,
-                                                       const Vec3<L>& by_wish, const Vec3<L>& by_slip) {
-  ForceParts<L> p;
-  force_parts(law, at, v, e, p);
-  const L zero(0.0);
-  const Vec3<L>& n = at.n;
-  const Vec3<L> direction = select(p.slips, p.inverse, zero) * p.wanted;
-  const L drawn = dot(direction, by_friction);
-  const Vec3<L> by_wanted = p.ratio * (by_friction - drawn * direction) + by_wish;
-  const L by_normal = dot(n, by_push) + law.mu * drawn;
+template <class P>
+GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v,
+                                                const Vec3<P>& e, const Mask<P>& anchored, const Vec3<P>& by_push,
+                                                const Vec3<P>& by_friction, const Vec3<P>& by_trial_direct,
+                                                const Vec3<P>& by_slip) {
+  ForceTerms<P> p;
+  force_terms(law, at, v, e, p);
+  const P zero(0.0);
+  const Vec3<P>& n = at.n;
+  const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
+  const P drawn = dot(direction, by_friction);
+  const Vec3<P> by_trial = p.ratio * (by_friction - drawn * direction) + by_trial_direct;
+  const P by_normal = dot(n, by_push) + law.mu * drawn;
   // slip = v − ḋ n, wanted = −k_t slip − k_s (e − (n·e) n)
-  const Vec3<L> on_slip = by_slip - law.kt * by_wanted;
-  const L by_rate = by_normal * p.by_rate - dot(n, on_slip);
-  PointGradient<L> g;
-  g.slips = p.slips;
-  g.force = p.normal * n + p.ratio * p.wanted;
-  g.v = on_slip + by_rate * n;
-  g.x = by_normal * p.by_d * n;
-  g.anchor = zero3<L>();
-  L by_along = zero;
+  const Vec3<P> by_slip_total = by_slip - law.kt * by_trial;
+  const P by_rate = by_normal * p.normal_by_rate - dot(n, by_slip_total);
+  PointGradient<P> g;
+  g.sliding = p.sliding;
+  g.force = p.normal * n + p.ratio * p.trial;
+  g.v = by_slip_total + by_rate * n;
+  g.x = by_normal * p.normal_by_d * n;
+  g.anchor = zero3<P>();
+  P by_normal_offset = zero;
   if (law.elastic) {
-    const L memory = select(anchored, law.ks, zero);
-    by_along = memory * dot(n, by_wanted);
-    g.anchor = memory * by_wanted - by_along * n;
+    const P memory = select(anchored, law.ks, zero);
+    by_normal_offset = memory * dot(n, by_trial);
+    g.anchor = memory * by_trial - by_normal_offset * n;
     g.x -= g.anchor;
   }
-  if (at.bend != Bend::flat) {
-    Vec3<L> by_n = p.normal * by_push + by_rate * v - p.rate * on_slip;
-    if (law.elastic) by_n += by_along * e + select(anchored, law.ks, zero) * p.along * by_wanted;
-    g.x += at.curvature_times(by_n);
+  if (at.form != HessianForm::zero) {
+    Vec3<P> by_n = p.normal * by_push + by_rate * v - p.rate * by_slip_total;
+    if (law.elastic) by_n += by_normal_offset * e + select(anchored, law.ks, zero) * p.normal_offset * by_trial;
+    g.x += at.hessian_times(by_n);
   }
   return g;
 }
 
 // q, see above.
-template <class L>
-GELFLOW_INLINE L yielding(const PointLaw<L>& law, const L& h) {
-  const L spring = h * law.ks, both = spring + law.kt;
-  return spring / select(both > L(0.0), both, L(1.0));
+template <class P>
+GELFLOW_INLINE P relaxation_factor(const PointLaw<P>& law, const P& h) {
+  const P spring = h * law.ks, both = spring + law.kt;
+  return spring / select(both > P(0.0), both, P(1.0));
 }
 
 // The anchor after an accepted step of length h, for a point that is inside (outside, the anchor is cleared).
-template <class L>
-GELFLOW_INLINE Vec3<L> next_anchor(const PointLaw<L>& law, const L& h, const PointForce<L>& f, const Vec3<L>& x,
-                                   const Vec3<L>& anchor, const Mask<L>& anchored) {
-  const L stiffness = select(law.ks > L(0.0), law.ks, L(1.0));  // of weight 0: what comes out is not used
-  const L q = yielding(law, h);
-  const Vec3<L> s = -(L(1.0) / stiffness) * (law.kt * f.slip + q * f.friction + (L(1.0) - q) * f.wanted);
-  return select3<L>(anchored, select3<L>(f.slips, x - s, anchor), x);
+template <class P>
+GELFLOW_INLINE Vec3<P> next_anchor(const PointLaw<P>& law, const P& h, const PointForce<P>& f, const Vec3<P>& x,
+                                   const Vec3<P>& anchor, const Mask<P>& anchored) {
+  const P stiffness = select(law.ks > P(0.0), law.ks, P(1.0));  // of weight 0: what comes out is not used
+  const P q = relaxation_factor(law, h);
+  const Vec3<P> s = -(P(1.0) / stiffness) * (law.kt * f.slip_velocity + q * f.friction + (P(1.0) - q) * f.trial);
+  return select3<P>(anchored, select3<P>(f.sliding, x - s, anchor), x);
 }
 
 // Gradient λ of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
-template <class L>
-GELFLOW_INLINE PointGradient<L> next_anchor_transposed(const PointLaw<L>& law, const L& h, const Distance<L>& at,
-                                                       const Vec3<L>& v, const Vec3<L>& e, const Mask<L>& anchored,
-                                                       const Vec3<L>& lambda) {
-  const L zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one), q = yielding(law, h);
-  const Vec3<L> none = zero3<L>(), scaled = one / stiffness * lambda;
-  PointGradient<L> g =
-      point_force_transposed(law, at, v, e, anchored, none, q * scaled, (one - q) * scaled, law.kt * scaled);
-  const Mask<L> yields = g.slips && anchored;
-  g.x = select3<L>(yields, g.x + lambda, select3<L>(anchored, none, lambda));
-  g.v = select3<L>(yields, g.v, none);
-  g.anchor = select3<L>(yields, g.anchor, select3<L>(anchored, lambda, none));
+template <class P>
+GELFLOW_INLINE PointGradient<P> next_anchor_vjp(const PointLaw<P>& law, const P& h, const Distance<P>& at,
+                                                const Vec3<P>& v, const Vec3<P>& e, const Mask<P>& anchored,
+                                                const Vec3<P>& lambda) {
+  const P zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one), q = relaxation_factor(law, h);
+  const Vec3<P> none = zero3<P>(), scaled = one / stiffness * lambda;
+  PointGradient<P> g = point_force_vjp(law, at, v, e, anchored, none, q * scaled, (one - q) * scaled, law.kt * scaled);
+  const Mask<P> relaxes = g.sliding && anchored;
+  g.x = select3<P>(relaxes, g.x + lambda, select3<P>(anchored, none, lambda));
+  g.v = select3<P>(relaxes, g.v, none);
+  g.anchor = select3<P>(relaxes, g.anchor, select3<P>(anchored, lambda, none));
   return g;
 }
 

@@ -6,7 +6,7 @@
 
 namespace gelflow {
 
-class Signature {
+class ModeHash {
  public:
   void add(std::uint64_t value) { hash_ = (hash_ ^ (value + 0x9e3779b97f4a7c15ULL)) * 0x100000001b3ULL; }
   std::uint64_t value() const { return hash_; }
@@ -30,33 +30,34 @@ std::uint64_t face(const V3<T>& normal, bool curved) {
 // Signature of the step that ended in (q, v), with the anchors from before it. Markers count where `markers` is true
 // or where they carry memory.
 template <class T>
-std::uint64_t branch_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
-                               const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
-  Signature hash;
+std::uint64_t contact_mode_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
+                                     const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
+  ModeHash hash;
   forward_state<true, T>(m, params, q, nullptr, v, w);
   int pair = 0;
-  const auto visit = [&](const Touching<T>& t) {
+  const auto visit = [&](const ContactPack<T>& t) {
     PointForce<Pack<T>> force;
-    point_force<false>(t.law, t.at, t.v, t.e, t.remembers, force);
+    point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
     const auto pulls = dot(force.force, t.at.n);
-    t.for_each_inside([&](int k, int i) {
+    t.for_each_active([&](int k, int i) {
       hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
-      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.bend != Bend::flat) * 16 + (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) +
-               (is_set(force.slips, k) ? 4 : 0) + (is_set(t.remembers, k) ? 2 : 0) + (lane(pulls, k) > T(0) ? 0 : 1));
+      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.form != HessianForm::zero) * 16 +
+               (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) + (is_set(force.sliding, k) ? 4 : 0) +
+               (is_set(t.has_anchor, k) ? 2 : 0) + (lane(pulls, k) > T(0) ? 0 : 1));
     });
   };
   for (const Contact& contact : m.contacts) {
     ++pair;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    for_touching_points<false, T>(frame, set.cloud, touch_rule<T>(m, contact, params, anchors, anchored), visit);
+    for_contact_points<false, T>(frame, set.cloud, contact_settings<T>(m, contact, params, anchors, anchored), visit);
   }
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       ++pair;
       if (!markers && pad.anchor < 0) continue;
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
-      for_touching_points<false, T>(frame, pad.cloud, touch_rule<T>(pad, s, params, anchors, anchored), visit);
+      for_contact_points<false, T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored), visit);
     }
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
@@ -68,7 +69,7 @@ std::uint64_t branch_signature(const Model& m, const T* params, const T* q, cons
     for (int k = joint.v; p[8] != T(0) && k < joint.v + joint.dofs; ++k) {
       hash.add(v[k] > T(friction_creep) ? 1 : v[k] < T(-friction_creep) ? 2 : 0);
     }
-    if (joint.turns()) continue;
+    if (joint.has_quaternion()) continue;
     const LimitPush<T> push = limit_push<T>(p, q[joint.q], v[joint.v]);
     hash.add(push.force > T(0) ? 1 : push.force < T(0) ? 2 : 0);
   }

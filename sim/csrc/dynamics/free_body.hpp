@@ -9,7 +9,7 @@
 // in velocity. Then linear momentum is kept whatever frame the body has:
 //     y = (ω × c − u)/h,     u = exp(−[θ]×) (ω* × c + z),     z = 0 under BDF1
 //     BDF2: ω* = 4/3 ω_{t-1} − 1/3 ω_{t-2} lacks that ω_{t-2} spoke in axes before δ: z = 1/3 (1 − exp(−[δ]×)) (ω_{t-2} × c)
-// Under BDF1 weight acts along the arc that the centre of mass takes (arc_moments.hpp): the moment gains (N c) × (−m Rᵀ g).
+// Under BDF1 weight acts along the arc that the centre of mass takes (arc_correction.hpp): the moment gains (N c) × (−m Rᵀ g).
 //
 // Derivatives, besides M by v_t:
 //     F by φ       −m R [y]×              moment   m [c]× [Rᵀ a]× − m [N c]× [Rᵀ g]×
@@ -44,8 +44,8 @@ CenterBefore<T> center_before(const StepStart<T>& from, int nv, int turn, const 
 }
 
 template <bool derivatives, class T>
-void add_floating_body(const Model& m, const Body& body, const T* params, const T& h, const T* v,
-                       const StepStart<T>* from, Workspace<T>& w) {
+void add_free_body(const Model& m, const Body& body, const T* params, const T& h, const T* v, const StepStart<T>* from,
+                   Workspace<T>& w) {
   const int k = m.joints[body.joint_begin].v;
   const T* n = params + body.mass;
   const T mass = n[0];
@@ -56,7 +56,8 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
   inertia << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
   const V3<T> angular_momentum = inertia * spin;
   V3<T> force = mass * a, moment = inertia * spin_rate + cross<T>(spin, angular_momentum);
-  const bool centered = std::is_floating_point_v<T> && c == V3<T>::Zero(), on_arc = from && from->history == nullptr;
+  const bool centered = std::is_floating_point_v<T> && c == V3<T>::Zero(),
+             uses_arc_correction = from && from->history == nullptr;
   CenterBefore<T> before;
   V3<T> y;
   if (!centered) {
@@ -67,7 +68,7 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
     moment += cross<T>(c, r.transpose() * force);
   }
   const V3<T> weight = -mass * (r.transpose() * gravity), turn = vec3(w.increment.data() + k + 3);
-  if (!centered && on_arc) moment += cross<T>(ArcLever<T>(turn, false).value * c, weight);
+  if (!centered && uses_arc_correction) moment += cross<T>(MomentArmCorrection<T>(turn, false).value * c, weight);
   for (int i = 0; i < 3; ++i) {
     w.residual[k + i] += h * force[i];
     w.residual[k + 3 + i] += h * moment[i];
@@ -91,8 +92,8 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
     const M3<T> by_turn = h * (skew<T>(before.u) * right_jacobian<T>(turn));
     w.by_v.template block<3, 3>(k, k + 3) -= turned * by_turn;
     w.by_v.template block<3, 3>(k + 3, k + 3) -= mass * (lever * by_turn);
-    if (!on_arc) return;
-    const ArcLever<T> arc(turn, true);
+    if (!uses_arc_correction) return;
+    const MomentArmCorrection<T> arc(turn, true);
     w.by_q.template block<3, 3>(k + 3, k + 3) += h * (skew<T>(arc.value * c) * skew<T>(weight));
     for (int j = 0; j < 3; ++j) {
       w.by_v.template block<3, 1>(k + 3, k + 3 + j) += h * h * cross<T>(arc.by[j] * c, weight);
@@ -102,12 +103,12 @@ void add_floating_body(const Model& m, const Body& body, const T* params, const 
 
 // What M leaves out of −(∂g/∂v*)ᵀ, −(∂g/∂(γ δ))ᵀ and −(∂g/∂v_{t-2})ᵀ times the multipliers: g depends on these by u too.
 template <class T>
-void floating_bodies_transposed(const Model& m, const T* params, const StepStart<T>& from, const Workspace<T>& w,
-                                const VX<T>& multipliers, VX<T>& by_v_star, VX<T>& by_shift, VX<T>& by_earlier) {
+void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& from, const Workspace<T>& w,
+                     const VX<T>& multipliers, VX<T>& by_v_star, VX<T>& by_shift, VX<T>& by_earlier) {
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const V3<T> c = vec3(params + body.mass + 1);
-    if (!body.floats || c == V3<T>::Zero()) continue;
+    if (!body.is_free || c == V3<T>::Zero()) continue;
     const int turn = m.joints[body.joint_begin].v + 3;
     const CenterBefore<T> before = center_before<T>(from, m.nv, turn, c, w);
     const V3<T> push = as<T>(w.rotation[i]).transpose() * vec3(multipliers.data() + turn - 3);

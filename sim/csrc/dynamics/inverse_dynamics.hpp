@@ -43,7 +43,7 @@ GELFLOW_INLINE V6<T> body_force(const Body& body, const T* params, const M3<T>& 
                                 const V6<T>& acceleration, Composite<T>& c) {
   const T* n = params + body.mass;
   c.mass = n[0];
-  if (body.translates) return stack<T>(V3<T>::Zero(), c.mass * bottom(acceleration));
+  if (body.translation_only) return stack<T>(V3<T>::Zero(), c.mass * bottom(acceleration));
   const V3<T> w = top(twist), v = bottom(twist), center = p + r * vec3(n + 1);
   M3<T> local;
   local << n[4], n[7], n[8], n[7], n[5], n[9], n[8], n[9], n[6];
@@ -77,8 +77,8 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
                           Workspace<T>& w) {
   const int bodies = static_cast<int>(m.bodies.size());
   for (int i = 0; i < bodies; ++i) {
-    if (m.bodies[i].floats) {
-      add_floating_body<derivatives, T>(m, m.bodies[i], params, h, v, from, w);
+    if (m.bodies[i].is_free) {
+      add_free_body<derivatives, T>(m, m.bodies[i], params, h, v, from, w);
       continue;
     }
     w.force[i] = body_force<derivatives, T>(m.bodies[i], params, as<T>(w.rotation[i]), as<T>(w.position[i]), w.twist[i],
@@ -92,20 +92,20 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
       Composite<T>& sum = w.composite[parent];
       const Composite<T>& own = w.composite[i];
       sum.mass += own.mass;
-      if (m.bodies[parent].translates) continue;
+      if (m.bodies[parent].translation_only) continue;
       sum.moment += own.moment;
       sum.inertia += own.inertia;
       sum.rate += own.rate;
       sum.momentum += own.momentum;
     }
   }
-  for (const int k : m.tied) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
+  for (const int k : m.articulated_dofs) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
   if constexpr (!derivatives) return;
-  for (const int j : m.tied) {
+  for (const int j : m.articulated_dofs) {
     const V6<T> s = w.axis[j];
     const int body = m.dof_body[j];
     const Composite<T>& composite = w.composite[body];
-    if (m.translates[j]) {
+    if (m.translation_only[j]) {
       const V3<T> momentum = composite.mass * bottom(s);
       for (const int k : m.bodies[body].dofs) {
         if (k > j) continue;
@@ -121,8 +121,8 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
     w.q_missing[j] = q;
     w.v_missing[j] = o;
   }
-  for (const int j : m.tied) {
-    if (m.translates[j]) continue;
+  for (const int j : m.articulated_dofs) {
+    if (m.translation_only[j]) continue;
     const int body = m.dof_body[j];
     const Composite<T>& composite = w.composite[body];
     const V6<T> s = w.axis[j];
@@ -140,7 +140,7 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
       w.mass(k, j) = dot6<T>(sk, force_a);
       if (same) continue;
       w.mass(j, k) = w.mass(k, j);
-      if (m.translates[k]) continue;
+      if (m.translation_only[k]) continue;
       // The transposed entry: dof j's force when the earlier dof k is displaced; the shared subtree is j's.
       // I is symmetric: Sⱼᵀ I = (I Sⱼ)ᵀ.
       w.by_q(j, k) += h * (dot6<T>(force_a, w.q_missing[k]) + rate_s.dot(top(w.p[k])));

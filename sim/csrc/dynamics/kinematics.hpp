@@ -25,61 +25,61 @@ V4<T> vec4(const T* p) {
 // A position and what it lacks. That is ignored where it is no rounding error of this position: another was written
 // since.
 template <class T>
-Place<T> whole(const T* q, const T* low, int i) {
-  if (std::is_same_v<T, Place<T>> || low == nullptr) return Place<T>(q[i]);
-  const Place<T> sum = Place<T>(q[i]) + Place<T>(low[i]);
-  return T(sum) == q[i] ? sum : Place<T>(q[i]);
+PositionScalar<T> position_with_rounding(const T* q, const T* q_rounding, int i) {
+  if (std::is_same_v<T, PositionScalar<T>> || q_rounding == nullptr) return PositionScalar<T>(q[i]);
+  const PositionScalar<T> sum = PositionScalar<T>(q[i]) + PositionScalar<T>(q_rounding[i]);
+  return T(sum) == q[i] ? sum : PositionScalar<T>(q[i]);
 }
 
 template <class T>
-void forward_positions(const Model& m, const T* params, const Place<T>* q, Workspace<T>& w) {
-  using P = Place<T>;
-  const auto set_axis = [&](int k, const V3<P>& moment, const V3<P>& direction) {
-    w.axis.set(k, as<T>(stack<P>(moment, direction)));
+void forward_positions(const Model& m, const T* params, const PositionScalar<T>* q, Workspace<T>& w) {
+  using Scalar = PositionScalar<T>;
+  const auto set_axis = [&](int k, const V3<Scalar>& moment, const V3<Scalar>& direction) {
+    w.axis.set(k, as<T>(stack<Scalar>(moment, direction)));
   };
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const bool root = body.parent == world;
-    M3<P> r = body.rotation.template cast<P>();
-    V3<P> p = as<P>(vec3(params + body.pos));
+    M3<Scalar> r = body.rotation.template cast<Scalar>();
+    V3<Scalar> p = as<Scalar>(vec3(params + body.pos));
     if (!root) {
       p = (w.position[body.parent] + w.rotation[body.parent] * p).eval();
       r = (w.rotation[body.parent] * r).eval();
     }
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       const Joint& joint = m.joints[j];
-      const P* value = q + joint.q;
+      const Scalar* value = q + joint.q;
       if (joint.type == JointType::free) {
         p = vec3(value);
-        r = rotation_of<P>(V4<P>(value[3], value[4], value[5], value[6]));
+        r = rotation_of<Scalar>(V4<Scalar>(value[3], value[4], value[5], value[6]));
         for (int a = 0; a < 3; ++a) {
-          set_axis(joint.v + a, V3<P>::Zero(), V3<P>::Unit(a));
-          const V3<P> turn = r.col(a);
-          set_axis(joint.v + 3 + a, turn, cross<P>(p, turn));
+          set_axis(joint.v + a, V3<Scalar>::Zero(), V3<Scalar>::Unit(a));
+          const V3<Scalar> turn = r.col(a);
+          set_axis(joint.v + 3 + a, turn, cross<Scalar>(p, turn));
         }
         continue;
       }
       if (joint.type == JointType::ball) {
-        const V3<P> offset = joint.pos.template cast<P>();
-        const V3<P> anchor = p + r * offset;
-        r = (r * rotation_of<P>(V4<P>(value[0], value[1], value[2], value[3]))).eval();
+        const V3<Scalar> offset = joint.pos.template cast<Scalar>();
+        const V3<Scalar> anchor = p + r * offset;
+        r = (r * rotation_of<Scalar>(V4<Scalar>(value[0], value[1], value[2], value[3]))).eval();
         p = anchor - r * offset;
         for (int a = 0; a < 3; ++a) {
-          const V3<P> turn = r.col(a);
-          set_axis(joint.v + a, turn, cross<P>(anchor, turn));
+          const V3<Scalar> turn = r.col(a);
+          set_axis(joint.v + a, turn, cross<Scalar>(anchor, turn));
         }
         continue;
       }
-      const V3<P> local = joint.axis.template cast<P>();
-      const V3<P> direction = r * local;
+      const V3<Scalar> local = joint.axis.template cast<Scalar>();
+      const V3<Scalar> direction = r * local;
       if (joint.type == JointType::slide) {
-        set_axis(joint.v, V3<P>::Zero(), direction);
-        p += direction * (value[0] - P(joint.ref));
+        set_axis(joint.v, V3<Scalar>::Zero(), direction);
+        p += direction * (value[0] - Scalar(joint.ref));
       } else {
-        const V3<P> offset = joint.pos.template cast<P>();
-        const V3<P> anchor = p + r * offset;
-        set_axis(joint.v, direction, cross<P>(anchor, direction));
-        r = (r * axis_rotation<P>(local, value[0] - P(joint.ref))).eval();
+        const V3<Scalar> offset = joint.pos.template cast<Scalar>();
+        const V3<Scalar> anchor = p + r * offset;
+        set_axis(joint.v, direction, cross<Scalar>(anchor, direction));
+        r = (r * axis_rotation<Scalar>(local, value[0] - Scalar(joint.ref))).eval();
         p = anchor - r * offset;
       }
     }
@@ -90,13 +90,13 @@ void forward_positions(const Model& m, const T* params, const Place<T>* q, Works
 
 // Twists V and accelerations A of every body; gravity enters as an acceleration of the world. `around`: also what is
 // before and after each dof, which derivatives need. What is before slides that nothing turns is not written down: only
-// its turning would count, and there is none. Bodies that float have no accelerations here (dynamics.hpp).
+// its turning would count, and there is none. Bodies that float have no accelerations here (inverse_dynamics.hpp).
 template <bool around, class T>
 void forward_velocities(const Model& m, const T* params, const T* v, const T* a, Workspace<T>& w) {
   const V6<T> base = stack<T>(V3<T>::Zero(), -vec3(params + m.gravity));
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
-    if (body.floats) {
+    if (body.is_free) {
       const int k = m.joints[body.joint_begin].v;
       const V3<T> slide = vec3(v + k), turn = as<T>(w.rotation[i]) * vec3(v + k + 3);
       w.twist[i] = stack<T>(turn, slide + cross<T>(as<T>(w.position[i]), turn));
@@ -111,7 +111,7 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
       const Joint& joint = m.joints[j];
       for (int k = joint.v; k < joint.v + joint.dofs;) {
-        if (m.translates[k]) {
+        if (m.translation_only[k]) {
           for (int axis = 3; axis < 6; ++axis) {
             twist[axis] += w.axis.row(axis)[k] * v[k];
             acceleration[axis] += w.axis.row(axis)[k] * a[k];
@@ -146,24 +146,27 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
 
 // Both of a state (q, v) with accelerations zero; `low`: what q lacks, or null.
 template <bool around, class T>
-void forward_state(const Model& m, const T* params, const T* q, const T* low, const T* v, Workspace<T>& w) {
+void forward_state(const Model& m, const T* params, const T* q, const T* q_rounding, const T* v, Workspace<T>& w) {
   w.update.setZero();
-  for (int i = 0; i < m.nq; ++i) w.q[i] = whole(q, low, i);
+  for (int i = 0; i < m.nq; ++i) w.q[i] = position_with_rounding(q, q_rounding, i);
   forward_positions<T>(m, params, w.q.data(), w);
   forward_velocities<around, T>(m, params, v, w.update.data(), w);
 }
 
 // q_t = q_{t-1} ⊕ increment; `low`: what q_{t-1} lacks, or null.
 template <class T>
-void integrate(const Model& m, const T* q0, const T* low, const VX<T>& increment, Place<T>* q1) {
-  using P = Place<T>;
+void integrate(const Model& m, const T* q0, const T* q_rounding, const VX<T>& increment, PositionScalar<T>* q1) {
+  using Scalar = PositionScalar<T>;
   for (const Joint& joint : m.joints) {
-    for (int i = joint.q, k = joint.v; i < joint.turn_q(); ++i, ++k) q1[i] = whole(q0, low, i) + P(increment[k]);
-    if (!joint.turns()) continue;
-    const int i = joint.turn_q();
-    const V4<P> before(whole(q0, low, i), whole(q0, low, i + 1), whole(q0, low, i + 2), whole(q0, low, i + 3));
-    const V3<T> turn = vec3(increment.data() + joint.turn_v());
-    V4<P> turned = quaternion_product<P>(before, quaternion_exp<P>(as<P>(turn)));
+    for (int i = joint.q, k = joint.v; i < joint.quaternion_q(); ++i, ++k)
+      q1[i] = position_with_rounding(q0, q_rounding, i) + Scalar(increment[k]);
+    if (!joint.has_quaternion()) continue;
+    const int i = joint.quaternion_q();
+    const V4<Scalar> before(position_with_rounding(q0, q_rounding, i), position_with_rounding(q0, q_rounding, i + 1),
+                            position_with_rounding(q0, q_rounding, i + 2),
+                            position_with_rounding(q0, q_rounding, i + 3));
+    const V3<T> turn = vec3(increment.data() + joint.angular_v());
+    V4<Scalar> turned = quaternion_product<Scalar>(before, quaternion_exp<Scalar>(as<Scalar>(turn)));
     using std::sqrt;
     turned /= sqrt(turned.squaredNorm());
     for (int a = 0; a < 4; ++a) q1[i + a] = turned[a];
@@ -174,8 +177,8 @@ void integrate(const Model& m, const T* q0, const T* low, const VX<T>& increment
 template <class T>
 void times_position_by_increment(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
   for (const Joint& joint : m.joints) {
-    if (!joint.turns()) continue;
-    const int k = joint.turn_v();
+    if (!joint.has_quaternion()) continue;
+    const int k = joint.angular_v();
     const M3<T> turn = right_jacobian<T>(vec3(increment.data() + k)).transpose();
     for (Eigen::Index row = 0; row < columns.rows(); ++row) {
       const V3<T> old = vec3(&columns(row, k)), turned = turn * old;
@@ -186,20 +189,20 @@ void times_position_by_increment(const Model& m, const VX<T>& increment, typenam
 
 // (∂q_t/∂increment)ᵀ λ and (∂q_t/∂q_{t-1})ᵀ λ on tangent vectors.
 template <class T>
-VX<T> position_by_increment_transposed(const Model& m, const VX<T>& increment, VX<T> lambda) {
+VX<T> position_by_increment_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
-    if (!joint.turns()) continue;
-    const int k = joint.turn_v();
+    if (!joint.has_quaternion()) continue;
+    const int k = joint.angular_v();
     const V3<T> part = lambda.template segment<3>(k);
     lambda.template segment<3>(k) = right_jacobian<T>(vec3(increment.data() + k)).transpose() * part;
   }
   return lambda;
 }
 template <class T>
-VX<T> position_by_position_transposed(const Model& m, const VX<T>& increment, VX<T> lambda) {
+VX<T> position_by_position_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
-    if (!joint.turns()) continue;
-    const int k = joint.turn_v();
+    if (!joint.has_quaternion()) continue;
+    const int k = joint.angular_v();
     const V3<T> part = lambda.template segment<3>(k);
     lambda.template segment<3>(k) = rotation_of<T>(quaternion_exp<T>(vec3(increment.data() + k))) * part;
   }
@@ -211,16 +214,16 @@ template <class T>
 VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
   VX<T> result(m.nv);
   for (const Joint& joint : m.joints) {
-    for (int a = 0; a < joint.plain(); ++a) result[joint.v + a] = gradient[joint.q + a];
-    if (!joint.turns()) continue;
-    const V4<T> turn = vec4(q + joint.turn_q());
+    for (int a = 0; a < joint.scalar_dofs(); ++a) result[joint.v + a] = gradient[joint.q + a];
+    if (!joint.has_quaternion()) continue;
+    const V4<T> turn = vec4(q + joint.quaternion_q());
     for (int a = 0; a < 3; ++a) {
       V4<T> unit = V4<T>::Zero();
       unit[1 + a] = T(0.5);
       const V4<T> column = quaternion_product<T>(turn, unit);
       T sum = T(0);
-      for (int i = 0; i < 4; ++i) sum += column[i] * gradient[joint.turn_q() + i];
-      result[joint.turn_v() + a] = sum;
+      for (int i = 0; i < 4; ++i) sum += column[i] * gradient[joint.quaternion_q() + i];
+      result[joint.angular_v() + a] = sum;
     }
   }
   return result;
@@ -228,12 +231,12 @@ VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
 template <class T>
 void add_from_tangent(const Model& m, const T* q, const VX<T>& tangent, T* gradient) {
   for (const Joint& joint : m.joints) {
-    for (int a = 0; a < joint.plain(); ++a) gradient[joint.q + a] += tangent[joint.v + a];
-    if (!joint.turns()) continue;
-    const int k = joint.turn_v();
+    for (int a = 0; a < joint.scalar_dofs(); ++a) gradient[joint.q + a] += tangent[joint.v + a];
+    if (!joint.has_quaternion()) continue;
+    const int k = joint.angular_v();
     const V4<T> turning(T(0), tangent[k], tangent[k + 1], tangent[k + 2]);
-    const V4<T> mapped = quaternion_product<T>(vec4(q + joint.turn_q()), turning) * T(2);
-    for (int i = 0; i < 4; ++i) gradient[joint.turn_q() + i] += mapped[i];
+    const V4<T> mapped = quaternion_product<T>(vec4(q + joint.quaternion_q()), turning) * T(2);
+    for (int i = 0; i < 4; ++i) gradient[joint.quaternion_q() + i] += mapped[i];
   }
 }
 

@@ -7,20 +7,22 @@ namespace gelflow {
 
 // How the distance bends: not at all; as around a point; with a normal of unit length; as a smooth field whose gradient
 // is only nearly so.
-enum class Bend : std::uint8_t { flat, round, curved, field };
+enum class HessianForm : std::uint8_t { zero, isotropic, general, field };
 
-template <class L>
+template <class P>
 struct Distance {
-  L d;
-  Vec3<L> n;
-  L bow;            // round: H = bow (1 − n nᵀ)
-  Mat3<L> hessian;  // only written where the distance bends and is not round
-  Bend bend;        // of the shape's kind, the same for all its points
+  P d;
+  Vec3<P> n;
+  P curvature;       // round: H = bow (1 − n nᵀ)
+  Mat3<P> hessian;   // only written where the distance bends and is not round
+  HessianForm form;  // of the shape's kind, the same for all its points
 
-  GELFLOW_INLINE Vec3<L> curvature_times(const Vec3<L>& a) const {
-    return bend == Bend::round ? bow * (a - dot(n, a) * n) : hessian * a;
+  GELFLOW_INLINE Vec3<P> hessian_times(const Vec3<P>& a) const {
+    return form == HessianForm::isotropic ? curvature * (a - dot(n, a) * n) : hessian * a;
   }
-  GELFLOW_INLINE Mat3<L> curvature() const { return bend == Bend::round ? bow * identity_minus_outer(n) : hessian; }
+  GELFLOW_INLINE Mat3<P> hessian_matrix() const {
+    return form == HessianForm::isotropic ? curvature * identity_minus_outer(n) : hessian;
+  }
 };
 
 }  // namespace gelflow

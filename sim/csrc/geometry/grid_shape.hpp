@@ -17,26 +17,26 @@
 
 namespace gelflow {
 
-template <class L>
-struct SplinePieces {
-  L value[4], slope[4], bend[4];
+template <class P>
+struct SplineBasis {
+  P value[4], first[4], second[4];
 };
 
-template <class L>
-GELFLOW_INLINE void spline_pieces(const L& t, SplinePieces<L>& p) {
-  const L s = L(1.0) - t, tt = t * t, ss = s * s, half(0.5), sixth(1.0 / 6), two_thirds(2.0 / 3);
+template <class P>
+GELFLOW_INLINE void spline_basis(const P& t, SplineBasis<P>& p) {
+  const P s = P(1.0) - t, tt = t * t, ss = s * s, half(0.5), sixth(1.0 / 6), two_thirds(2.0 / 3);
   p.value[0] = sixth * ss * s;
-  p.value[1] = two_thirds - tt * (L(1.0) - half * t);
-  p.value[2] = two_thirds - ss * (L(1.0) - half * s);
+  p.value[1] = two_thirds - tt * (P(1.0) - half * t);
+  p.value[2] = two_thirds - ss * (P(1.0) - half * s);
   p.value[3] = sixth * tt * t;
-  p.slope[0] = -half * ss;
-  p.slope[1] = t * (L(1.5) * t - L(2.0));
-  p.slope[2] = s * (L(2.0) - L(1.5) * s);
-  p.slope[3] = half * tt;
-  p.bend[0] = s;
-  p.bend[1] = L(3.0) * t - L(2.0);
-  p.bend[2] = L(3.0) * s - L(2.0);
-  p.bend[3] = t;
+  p.first[0] = -half * ss;
+  p.first[1] = t * (P(1.5) * t - P(2.0));
+  p.first[2] = s * (P(2.0) - P(1.5) * s);
+  p.first[3] = half * tt;
+  p.second[0] = s;
+  p.second[1] = P(3.0) * t - P(2.0);
+  p.second[2] = P(3.0) * s - P(2.0);
+  p.second[3] = t;
 }
 
 // The cell of a place along one axis; what is outside (or not a number) counts to the nearest (or first) cell.
@@ -45,63 +45,63 @@ GELFLOW_INLINE int grid_cell(double u, int cells) {
   return static_cast<int>(u > 0 ? (u < most ? u : most) : 0.0);
 }
 
-template <class L>
-GELFLOW_INLINE void grid_distance(const DistanceGrid& g, const L& scale, const Vec3<L>& x, Distance<L>& out) {
-  constexpr int width = lane_count<L>;
-  using T = LaneScalar<L>;
-  const L zero(0.0), one(1.0), per_cell = L(T(1 / g.spacing)) / scale;
+template <class P>
+GELFLOW_INLINE void grid_distance(const DistanceGrid& g, const P& scale, const Vec3<P>& x, Distance<P>& out) {
+  constexpr int width = lane_count<P>;
+  using T = PackScalar<P>;
+  const P zero(0.0), one(1.0), per_cell = P(T(1 / g.spacing)) / scale;
   const float* start[width];
   for (int l = 0; l < width; ++l) start[l] = g.coefficients.data();
-  SplinePieces<L> along[3];
-  Mask<L> within = one > zero;
+  SplineBasis<P> along[3];
+  Mask<P> within = one > zero;
   for (int a = 0; a < 3; ++a) {
-    const L u = per_cell * x[a] - L(T(g.origin[a] / g.spacing));
-    within = within && u > zero && u < L(T(g.cells[a]));
-    L cell;
+    const P u = per_cell * x[a] - P(T(g.origin[a] / g.spacing));
+    within = within && u > zero && u < P(T(g.cells[a]));
+    P cell;
     for (int l = 0; l < width; ++l) {
       const int i = grid_cell(real_part(lane(u, l)), g.cells[a]);
       start[l] += static_cast<std::ptrdiff_t>(i) * g.stride(a);
       set_lane(cell, l, T(i));
     }
-    spline_pieces<L>(u - cell, along[a]);
+    spline_basis<P>(u - cell, along[a]);
   }
-  const SplinePieces<L>&px = along[0], &py = along[1], &pz = along[2];
-  L value = zero;
-  Vec3<L> slope = zero3<L>();
-  L xx = zero, yy = zero, zz = zero, xy = zero, xz = zero, yz = zero;
+  const SplineBasis<P>&px = along[0], &py = along[1], &pz = along[2];
+  P value = zero;
+  Vec3<P> slope = zero3<P>();
+  P xx = zero, yy = zero, zz = zero, xy = zero, xz = zero, yz = zero;
   for (int i = 0; i < 4; ++i) {
-    L plane = zero, by_y = zero, by_z = zero, by_yy = zero, by_yz = zero, by_zz = zero;
+    P plane = zero, by_y = zero, by_z = zero, by_yy = zero, by_yz = zero, by_zz = zero;
     for (int j = 0; j < 4; ++j) {
       const std::ptrdiff_t row = i * g.stride(0) + j * g.stride(1);
-      L line = zero, line_z = zero, line_zz = zero;
+      P line = zero, line_z = zero, line_zz = zero;
       for (int k = 0; k < 4; ++k) {
-        const L c = gather<L>(start, row + k);
+        const P c = gather<P>(start, row + k);
         line += pz.value[k] * c;
-        line_z += pz.slope[k] * c;
-        line_zz += pz.bend[k] * c;
+        line_z += pz.first[k] * c;
+        line_zz += pz.second[k] * c;
       }
       plane += py.value[j] * line;
-      by_y += py.slope[j] * line;
-      by_yy += py.bend[j] * line;
+      by_y += py.first[j] * line;
+      by_yy += py.second[j] * line;
       by_z += py.value[j] * line_z;
-      by_yz += py.slope[j] * line_z;
+      by_yz += py.first[j] * line_z;
       by_zz += py.value[j] * line_zz;
     }
     value += px.value[i] * plane;
-    slope += Vec3<L>{px.slope[i] * plane, px.value[i] * by_y, px.value[i] * by_z};
-    xx += px.bend[i] * plane;
-    xy += px.slope[i] * by_y;
-    xz += px.slope[i] * by_z;
+    slope += Vec3<P>{px.first[i] * plane, px.value[i] * by_y, px.value[i] * by_z};
+    xx += px.second[i] * plane;
+    xy += px.first[i] * by_y;
+    xz += px.first[i] * by_z;
     yy += px.value[i] * by_yy;
     yz += px.value[i] * by_yz;
     zz += px.value[i] * by_zz;
   }
-  const L once(T(1 / g.spacing)), twice = per_cell * once;
+  const P once(T(1 / g.spacing)), twice = per_cell * once;
   out.d = select(within, scale * value, one);
-  out.n = select3<L>(within, once * slope, {one, zero, zero});
-  const L bends = select(within, twice, zero);
-  out.hessian = bends * Mat3<L>{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}};
-  out.bend = Bend::field;
+  out.n = select3<P>(within, once * slope, {one, zero, zero});
+  const P bends = select(within, twice, zero);
+  out.hessian = bends * Mat3<P>{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}};
+  out.form = HessianForm::field;
 }
 
 // For culling: no point where the spline is negative is nearer than this. From outside the grid's box everything in it

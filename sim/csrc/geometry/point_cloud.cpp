@@ -1,8 +1,8 @@
 // Points sorted in space, and the blocks that are skipped whole.
+#include "geometry/point_cloud.hpp"
+
 #include <algorithm>
 #include <numeric>
-
-#include "model/model.hpp"
 
 namespace gelflow {
 
@@ -73,7 +73,7 @@ struct Sphere {
   V3<double> center;
   double radius;
 };
-Sphere bounding_sphere(const PointCloud::Places& points, int begin, int end) {
+Sphere bounding_sphere(const PointCloud::Coordinates& points, int begin, int end) {
   V3<double> low = points[begin], high = low;
   for (int i = begin; i < end; ++i) {
     low = low.cwiseMin(points[i]);
@@ -99,13 +99,13 @@ void pad_blocks(PointCloud::Blocks& blocks) {
 
 }  // namespace
 
-void PointCloud::Places::add(const V3<double>& p) {
+void PointCloud::Coordinates::add(const V3<double>& p) {
   x.push_back(p[0]);
   y.push_back(p[1]);
   z.push_back(p[2]);
 }
 
-void PointCloud::Places::pad() {
+void PointCloud::Coordinates::pad() {
   for (std::vector<double>* axis : {&x, &y, &z}) axis->resize(axis->size() + padding);
 }
 

@@ -10,7 +10,7 @@
 
 namespace gelflow {
 
-constexpr int small = 16;
+constexpr int max_inverse_size = 16;
 
 // Brings the row with the largest number in column k, of those not yet used, to place k.
 template <class T, class Rows>
@@ -19,12 +19,12 @@ T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
   const std::ptrdiff_t stride = a.outerStride();
   T* const row = a.data() + k * stride;
   int largest = k;
-  T size = abs(row[k]);
+  T magnitude = abs(row[k]);
   for (int i = k + 1; i < n; ++i) {
-    const T other = abs(a.data()[i * stride + k]);
-    const bool larger = other > size;
-    largest = larger ? i : largest;
-    size = larger ? other : size;
+    const T candidate = abs(a.data()[i * stride + k]);
+    const bool is_larger = candidate > magnitude;
+    largest = is_larger ? i : largest;
+    magnitude = is_larger ? candidate : magnitude;
   }
   pivots[k] = largest;
   if (largest != k) std::swap_ranges(row, row + n, a.data() + largest * stride);
@@ -34,29 +34,29 @@ T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
 // Replaces the first n columns of `a`, which are so many packs, by those of its inverse.
 template <int packs, class T, class Rows>
 void invert(Rows& a, int n, std::vector<int>& pivots) {
-  using L = Pack<T>;
+  using P = Pack<T>;
   constexpr int width = pack_width<T>;
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
-  L number[packs];
-  for (int i = 0; i < packs * width; ++i) set_lane(number[i / width], i % width, T(i));
+  P column[packs];
+  for (int i = 0; i < packs * width; ++i) set_lane(column[i / width], i % width, T(i));
   for (int k = 0; k < n; ++k) {
-    T* const own = pivot_row<T>(a, n, k, pivots);
-    const L inverse(T(1) / own[k]);
-    Mask<L> here[packs];  // column k, which is to be that of the inverse
-    L pivot[packs];
+    T* const pivot_values = pivot_row<T>(a, n, k, pivots);
+    const P inverse(T(1) / pivot_values[k]);
+    Mask<P> in_column[packs];  // column k, which is to be that of the inverse
+    P pivot[packs];
     for (int p = 0; p < packs; ++p) {
-      here[p] = !(number[p] < L(T(k))) && !(number[p] > L(T(k)));
-      pivot[p] = select(here[p], inverse, inverse * load<L>(own + p * width));
-      store(pivot[p], own + p * width);
+      in_column[p] = !(column[p] < P(T(k))) && !(column[p] > P(T(k)));
+      pivot[p] = select(in_column[p], inverse, inverse * load<P>(pivot_values + p * width));
+      store(pivot[p], pivot_values + p * width);
     }
     for (int i = 0; i < n; ++i) {
       if (i == k) continue;
       T* const row = start + i * stride;
-      const L factor(row[k]);
+      const P factor(row[k]);
       for (int p = 0; p < packs; ++p) {
-        const L old = load<L>(row + p * width);
-        store(select(here[p], L(0.0), old) - factor * pivot[p], row + p * width);
+        const P old = load<P>(row + p * width);
+        store(select(in_column[p], P(0.0), old) - factor * pivot[p], row + p * width);
       }
     }
   }
@@ -67,15 +67,15 @@ void invert(Rows& a, int n, std::vector<int>& pivots) {
 }
 template <class T, class Rows, int packs = 1>
 void invert(Rows& a, int n, std::vector<int>& pivots) {
-  if constexpr ((packs + 1) * pack_width<T> <= small) {
+  if constexpr ((packs + 1) * pack_width<T> <= max_inverse_size) {
     if (n > packs * pack_width<T>) return invert<T, Rows, packs + 1>(a, n, pivots);
   }
   invert<packs, T>(a, n, pivots);
 }
 
 template <class T>
-bool inverts(int n) {
-  return pack_width<T> > 1 && n <= small;
+bool uses_inverse(int n) {
+  return pack_width<T> > 1 && n <= max_inverse_size;
 }
 
 // Makes `a`, whose rows are longer than n by a pack or more, ready for `solve`. Where it is singular, what that finds is
@@ -83,21 +83,21 @@ bool inverts(int n) {
 template <class T, class Rows>
 void factorize(Rows& a, int n, std::vector<int>& pivots) {
   if constexpr (pack_width<T> > 1) {
-    if (inverts<T>(n)) return invert<T>(a, n, pivots);
+    if (uses_inverse<T>(n)) return invert<T>(a, n, pivots);
   }
   // P A = L U; on the diagonal stands 1/U.
-  using L = Pack<T>;
+  using P = Pack<T>;
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
   for (int k = 0; k < n; ++k) {
-    T* const own = pivot_row<T>(a, n, k, pivots);
-    own[k] = T(1) / own[k];
+    T* const pivot_values = pivot_row<T>(a, n, k, pivots);
+    pivot_values[k] = T(1) / pivot_values[k];
     for (int i = k + 1; i < n; ++i) {
       T* const row = start + i * stride;
-      row[k] *= own[k];
-      const L factor(row[k]);
+      row[k] *= pivot_values[k];
+      const P factor(row[k]);
       for (int j = k + 1; j < n; j += pack_width<T>) {
-        store(load<L>(row + j) - factor * load<L>(own + j), row + j);
+        store(load<P>(row + j) - factor * load<P>(pivot_values + j), row + j);
       }
     }
   }
@@ -108,23 +108,23 @@ template <class T, class Rows>
 void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<T>& x) {
   const std::ptrdiff_t stride = a.outerStride();
   const T* const start = a.data();
-  if (inverts<T>(n)) {
-    using L = Pack<T>;
+  if (uses_inverse<T>(n)) {
+    using P = Pack<T>;
     constexpr int width = pack_width<T>;
-    T right[small + LaneTypes<float>::width];
+    T right[max_inverse_size + NativePack<float>::width];
     std::copy(b, b + n, right);
     std::fill(right + n, right + n + width, T(0));
     for (int i = 0; i < n; i += width) {
-      L sums[width];
+      P sums[width];
       for (int k = 0; k < width; ++k) {
         const T* const row = start + std::min(i + k, n - 1) * stride;
-        L sum = load<L>(row) * load<L>(right);
-        for (int j = width; j < n; j += width) sum += load<L>(row + j) * load<L>(right + j);
+        P sum = load<P>(row) * load<P>(right);
+        for (int j = width; j < n; j += width) sum += load<P>(row + j) * load<P>(right + j);
         sums[k] = sum;
       }
-      T found[width];
-      sum_lanes(sums, width, found);
-      std::copy(found, found + std::min(width, n - i), x.data() + i);
+      T sums_out[width];
+      sum_lanes(sums, width, sums_out);
+      std::copy(sums_out, sums_out + std::min(width, n - i), x.data() + i);
     }
     return;
   }

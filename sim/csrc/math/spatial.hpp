@@ -33,15 +33,15 @@ using MX = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 
 // What places in the world are written in: in single precision their differences would be lost (`Batch<float>`).
 template <class T>
-struct PlaceOf {
+struct PositionScalarOf {
   using type = T;
 };
 template <>
-struct PlaceOf<float> {
+struct PositionScalarOf<float> {
   using type = double;
 };
 template <class T>
-using Place = typename PlaceOf<T>::type;
+using PositionScalar = typename PositionScalarOf<T>::type;
 
 // The same numbers as those of type T.
 template <class T, class Matrix>

@@ -73,17 +73,17 @@ PairDofs Model::pair_dofs(int first, int second) {
       }
     }
     for (const int row : packed.dof) {
-      packed.slides.push_back(row >= 0 && angular[row] == 0);
-      packed.carried.push_back(0);
+      packed.linear.push_back(row >= 0 && angular[row] == 0);
+      packed.has_coupling.push_back(0);
       for (const int column : packed.dof) {
         const bool both = row >= 0 && column >= 0;
-        const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && carries(column, row)
-                                                       : signs[row] > 0 || !carries(column, row));
-        packed.turned.push_back(counts ? 1.0 : 0.0);
-        if (counts) packed.carried.back() = 1;
+        const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && is_ancestor(column, row)
+                                                       : signs[row] > 0 || !is_ancestor(column, row));
+        packed.axis_coupling.push_back(counts ? 1.0 : 0.0);
+        if (counts) packed.has_coupling.back() = 1;
       }
     }
-    columns = std::max(columns, static_cast<int>(packed.dof.size()));
+    jacobian_columns = std::max(jacobian_columns, static_cast<int>(packed.dof.size()));
     return packed;
   };
   return {pack(1), pack(4), pack(8)};
@@ -109,7 +109,7 @@ void ModelSpec::check_body(const std::string& what, int body, bool world_allowed
   }
 }
 
-int ModelSpec::add_place(const std::string& owner, const V3<double>& pos, bool scales) {
+int ModelSpec::add_pose_params(const std::string& owner, const V3<double>& pos, bool scales) {
   check_finite(owner, "pos", pos.data(), 3);
   const int offset =
       add_params(owner, {"pos.x", "pos.y", "pos.z", "turn.x", "turn.y", "turn.z"}, {pos[0], pos[1], pos[2], 0, 0, 0});
@@ -173,13 +173,13 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
   if (free && (owner.parent != world || owner.joint_begin != next_index(model_.joints))) {
     refuse("joint '" + name + "': a free joint must be the only joint of a body whose parent is the world");
   }
-  if (!joint.turns()) {
+  if (!joint.has_quaternion()) {
     if (!(axis.norm() > 1e-9)) refuse("joint '" + name + "': axis must not be zero");
     joint.axis = axis.normalized();
     if (!(lower < upper)) refuse("joint '" + name + "': lower limit must be below upper");
   }
-  joint.dofs = joint.plain() + (joint.turns() ? 3 : 0);
-  joint.ref = joint.turns() ? 0 : ref;
+  joint.dofs = joint.scalar_dofs() + (joint.has_quaternion() ? 3 : 0);
+  joint.ref = joint.has_quaternion() ? 0 : ref;
   joint.param =
       add_params(name,
                  {"damping", "armature", "stiffness", "springref", "lower", "upper", "limit_stiffness", "limit_damping",
@@ -187,11 +187,11 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
                  {damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping, frictionloss});
   for (int i = 0; i < joint.dofs; ++i) {
     const int k = model_.nv + i;
-    const bool turning = joint.turns() && i >= joint.plain();
+    const bool turning = joint.has_quaternion() && i >= joint.scalar_dofs();
     model_.dof_body.push_back(body);
     model_.dof_joint.push_back(next_index(model_.joints));
-    model_.group_begin.push_back(turning ? joint.turn_v() : k);
-    model_.group_end.push_back(turning ? joint.turn_v() + 3 : k + 1);
+    model_.group_begin.push_back(turning ? joint.angular_v() : k);
+    model_.group_end.push_back(turning ? joint.angular_v() + 3 : k + 1);
     model_.angular.push_back(turning || joint.type == JointType::hinge ? 1 : 0);
   }
   if (free) {
@@ -202,7 +202,7 @@ int ModelSpec::add_joint(const std::string& name, int body, const std::string& t
   } else {
     model_.q0.push_back(ref);
   }
-  model_.nq += joint.plain() + (joint.turns() ? 4 : 0);
+  model_.nq += joint.scalar_dofs() + (joint.has_quaternion() ? 4 : 0);
   model_.nv += joint.dofs;
   model_.joints.push_back(joint);
   owner.joint_end = next_index(model_.joints);
@@ -250,7 +250,7 @@ int ModelSpec::add_shape(const std::string& name, int body, const std::string& k
   shape.grid = std::move(grid);
   shape.size = add_params(name, {"size.x", "size.y", "size.z"}, {size[0], size[1], size[2]});
   if (rounding > 0) add_params(name, {"rounding"}, {rounding});
-  shape.place = add_place(name + ".shape", pos, false);
+  shape.pose_param = add_pose_params(name + ".shape", pos, false);
   model_.shapes.push_back(shape);
   return next_index(model_.shapes) - 1;
 }
@@ -271,7 +271,7 @@ int ModelSpec::add_points(const std::string& name, int body, const std::vector<V
   if (!areas.empty() && areas.size() != points.size())
     refuse("points '" + name + "': as many areas as points are needed");
   const M3<double> rotation = rotation_from("points '" + name + "'", quat);
-  const Mount mount{body, pos, rotation, add_place(name + ".points", pos, true), true};
+  const Mount mount{body, pos, rotation, add_pose_params(name + ".points", pos, true), true};
   PointCloud cloud(points, weights);
   for (std::size_t i = 0; i < areas.size(); ++i) cloud.areas.push_back(areas[cloud.original[i]]);
   model_.point_sets.push_back({name, mount, radius, std::move(cloud)});
@@ -333,7 +333,7 @@ int ModelSpec::add_pad(const std::string& name, int body, const std::vector<V3<d
   pad.law = friction_law(owner, law);
   check_law(owner, law_numbers, pad.law);
   pad.param = add_params(name, {"kn", "kt", "mu", "kd", "ks"}, {law_numbers.begin(), law_numbers.end()});
-  pad.mount = {body, pos, rotation, add_place(name + ".markers", pos, false), false};
+  pad.mount = {body, pos, rotation, add_pose_params(name + ".markers", pos, false), false};
   pad.anchor = -1;
   if (pad.law == FrictionLaw::elastic) {
     pad.anchor = model_.na;
@@ -359,7 +359,7 @@ int ModelSpec::add_actuator(const std::string& name, int joint, const std::strin
                             double gain, double bias) {
   const std::string owner = "actuator '" + name + "'";
   if (joint < 0 || joint >= next_index(model_.joints)) refuse(owner + ": no such joint");
-  if (model_.joints[joint].turns()) refuse(owner + ": only slide and hinge joints can be actuated");
+  if (model_.joints[joint].has_quaternion()) refuse(owner + ": only slide and hinge joints can be actuated");
   if (!(force_lower < force_upper)) refuse(owner + ": force_lower must be below force_upper");
   if (!(ctrl_lower < ctrl_upper)) refuse(owner + ": ctrl_lower must be below ctrl_upper");
   Actuator actuator;
@@ -408,28 +408,28 @@ Model ModelSpec::build() const {
       for (int i = 0; i < model.joints[j].dofs; ++i) body.dofs.push_back(model.joints[j].v + i);
     }
   }
-  model.translates.assign(nv, 0);
+  model.translation_only.assign(nv, 0);
   for (Body& body : model.bodies) {
-    body.translates = true;
+    body.translation_only = true;
     for (const int k : body.dofs) {  // root first
-      body.translates = body.translates && !model.angular[k];
-      model.translates[k] = body.translates;
+      body.translation_only = body.translation_only && !model.angular[k];
+      model.translation_only[k] = body.translation_only;
     }
   }
   for (std::size_t i = 0; i < model.bodies.size(); ++i) {
     const auto carried = [&](const Body& other) { return other.parent == static_cast<int>(i); };
     Body& body = model.bodies[i];
-    body.floats = body.joint_end == body.joint_begin + 1 && model.joints[body.joint_begin].type == JointType::free &&
-                  std::none_of(model.bodies.begin(), model.bodies.end(), carried);
+    body.is_free = body.joint_end == body.joint_begin + 1 && model.joints[body.joint_begin].type == JointType::free &&
+                   std::none_of(model.bodies.begin(), model.bodies.end(), carried);
   }
   for (int k = 0; k < nv; ++k) {
-    if (!model.bodies[model.dof_body[k]].floats) model.tied.push_back(k);
+    if (!model.bodies[model.dof_body[k]].is_free) model.articulated_dofs.push_back(k);
   }
-  model.carries_.assign(static_cast<std::size_t>(nv) * nv, 0);
+  model.ancestor_.assign(static_cast<std::size_t>(nv) * nv, 0);
   for (int k = 0; k < nv; ++k) {
     for (const int j : model.bodies[model.dof_body[k]].dofs) {
       if (j <= k || model.group_begin[j] == model.group_begin[k]) {
-        model.carries_[static_cast<std::size_t>(j) * nv + k] = 1;
+        model.ancestor_[static_cast<std::size_t>(j) * nv + k] = 1;
       }
     }
   }
@@ -437,8 +437,9 @@ Model ModelSpec::build() const {
     const PointSet& set = model.point_sets[contact.points];
     const Shape& shape = model.shapes[contact.shape];
     contact.pair = model.pair_dofs(set.mount.body, shape.body);
-    contact.on_arc = set.mount.body != world && model.bodies[set.mount.body].floats && shape.body == world &&
-                     shape.kind == ShapeKind::plane && (set.radius == 0 || set.cloud.extent > 0);
+    contact.uses_arc_correction = set.mount.body != world && model.bodies[set.mount.body].is_free &&
+                                  shape.body == world && shape.kind == ShapeKind::plane &&
+                                  (set.radius == 0 || set.cloud.extent > 0);
   }
   for (auto& pad : model.pads) {
     for (const int s : pad.shapes) pad.pairs.push_back(model.pair_dofs(pad.mount.body, model.shapes[s].body));

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "geometry/distance_grid.hpp"
+#include "geometry/point_cloud.hpp"
 
 namespace gelflow {
 
@@ -37,10 +38,10 @@ struct Body {
   V4<double> quat;      // of the frame in the parent's frame at q = 0;
   M3<double> rotation;  // the same
   int joint_begin, joint_end;
-  int mass, pos;            // offsets in Params: mass, com (3), inertia (6); pos (3)
-  std::vector<int> dofs;    // all dofs that move this body, root first
-  bool translates = false;  // all of them do (Model::translates)
-  bool floats = false;      // a free joint, and no body on it
+  int mass, pos;                  // offsets in Params: mass, com (3), inertia (6); pos (3)
+  std::vector<int> dofs;          // all dofs that move this body, root first
+  bool translation_only = false;  // all of them do (Model::translates)
+  bool is_free = false;           // a free joint, and no body on it
 };
 
 struct Joint {
@@ -55,10 +56,10 @@ struct Joint {
                          // frictionloss
 
   // A ball or free joint turns by a unit quaternion; before it come `plain` positions that are just numbers.
-  bool turns() const { return type == JointType::ball || type == JointType::free; }
-  int plain() const { return type == JointType::free ? 3 : type == JointType::ball ? 0 : 1; }
-  int turn_q() const { return q + plain(); }
-  int turn_v() const { return v + plain(); }
+  bool has_quaternion() const { return type == JointType::ball || type == JointType::free; }
+  int scalar_dofs() const { return type == JointType::free ? 3 : type == JointType::ball ? 0 : 1; }
+  int quaternion_q() const { return q + scalar_dofs(); }
+  int angular_v() const { return v + scalar_dofs(); }
 };
 
 struct Shape {
@@ -66,45 +67,10 @@ struct Shape {
   ShapeKind kind;
   int body;
   M3<double> rotation;  // in the body's frame, before it is turned
-  int size;   // offset in Params (3): half sizes or half axes; radius, then half length along z; a grid's scale. The
-              // rounding is the fourth, where there is one
-  int place;  // offset in Params (6): pos, turn
+  int size;  // offset in Params (3): half sizes or half axes; radius, then half length along z; a grid's scale. The
+             // rounding is the fourth, where there is one
+  int pose_param;                            // offset in Params (6): pos, turn
   std::shared_ptr<const DistanceGrid> grid;  // of the kind grid
-};
-
-// Points sorted so that neighbours in space are neighbours in memory, in two levels of blocks with bounding spheres:
-// a block whose sphere lies outside a shape is skipped whole. Coordinates stand side by side, to be taken a pack at a
-// time, with `padding` numbers behind the last.
-struct PointCloud {
-  static constexpr int padding = 8, few = 8;
-  struct Places {
-    std::vector<double> x, y, z;
-    void add(const V3<double>& p);
-    void pad();
-    V3<double> operator[](int i) const { return {x[i], y[i], z[i]}; }
-  };
-  struct Blocks {
-    Places center;
-    std::vector<double> radius;
-    std::vector<int> begin, end;  // points (of leaves) or leaves (of groups)
-    int count() const { return static_cast<int>(begin.size()); }
-  };
-  Places points;                  // sorted
-  std::vector<double> weights;    // sorted
-  std::vector<V3<double>> areas;  // sorted; of weights that are areas, by the axis across them; empty: they are not
-  std::vector<int> original;      // sorted index → index as given
-  Blocks leaves, groups;
-  double extent = 0;   // distance of the farthest point from the origin of the body's frame [m]
-  double spacing = 0;  // between neighbours, about [m]
-
-  PointCloud() = default;
-  PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& weights);
-  int size() const { return static_cast<int>(original.size()); }
-
-  // What single precision makes of places and weights, for who reads them all again and again.
-  struct Rounded {
-    std::vector<float> x, y, z, weights;
-  } rounded;
 };
 
 // The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and
@@ -113,8 +79,8 @@ struct Mount {
   int body;
   V3<double> pos;
   M3<double> rotation;
-  int place;    // offset in Params (6): pos, turn; (9) where it scales: scale
-  bool scales;  // points do, pads do not
+  int pose_param;  // offset in Params (6): pos, turn; (9) where it scales: scale
+  bool scales;     // points do, pads do not
 };
 
 struct PointSet {
@@ -125,13 +91,14 @@ struct PointSet {
 };
 
 // The dofs that move one body of a pair and not the other; they alone change the relative motion. In packs of
-// neighbouring dofs, for each of the widths that numbers come in (lanes.hpp).
+// neighbouring dofs, for each of the widths that numbers come in (simd_pack.hpp).
 struct PackedDofs {
-  std::vector<int> start;      // first dof of each pack
-  std::vector<int> dof;        // per column, −1 where the column is none of the pair's
-  std::vector<double> sign;    // +1 where the dof moves the first body, −1 the second, 0 none of the pair's
-  std::vector<double> turned;  // columns × columns: 1 where ∂S_row/∂q_column counts (pair_columns.hpp), else 0
-  std::vector<std::uint8_t> slides, carried;  // per column: it never turns; as a row of `turned` it has a 1
+  std::vector<int> start;    // first dof of each pack
+  std::vector<int> dof;      // per column, −1 where the column is none of the pair's
+  std::vector<double> sign;  // +1 where the dof moves the first body, −1 the second, 0 none of the pair's
+  std::vector<double>
+      axis_coupling;  // columns × columns: 1 where ∂S_row/∂q_column counts (contact_jacobian.hpp), else 0
+  std::vector<std::uint8_t> linear, has_coupling;  // per column: it never turns; as a row of `turned` it has a 1
 };
 struct PairDofs {
   PackedDofs single, four, eight;
@@ -150,7 +117,7 @@ struct Contact {
   int param;   // kn, kt, mu, kd, ks
   int anchor;  // first anchor slot, −1 under the viscous law
   PairDofs pair;
-  bool on_arc = false;  // a free body on a plane of the world (arc_moments.hpp)
+  bool uses_arc_correction = false;  // a free body on a plane of the world (arc_correction.hpp)
 };
 
 struct Pad {
@@ -190,18 +157,18 @@ struct Model {
 
   int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
   int nh = 0;                               // BDF2's history: 2 nv + 1 numbers, see step.hpp; BDF1 has none
-  int columns = 0;                          // the most that a pair has, see PackedDofs
+  int jacobian_columns = 0;                 // the most that a pair has, see PackedDofs
   std::vector<double> q0;                   // reference positions
 
   // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, whether it and all before it
   // on its chain are slides, its joint.
   std::vector<int> dof_body, dof_joint;
   std::vector<int> group_begin, group_end;
-  std::vector<int> tied;  // dofs of bodies that do not float
-  std::vector<std::uint8_t> angular, translates;
+  std::vector<int> articulated_dofs;  // dofs of bodies that do not float
+  std::vector<std::uint8_t> angular, translation_only;
   // carries(j, k): moving dof j carries dof k's axis along (j is before k on its chain, or in its group).
-  std::vector<std::uint8_t> carries_;
-  bool carries(int j, int k) const { return carries_[static_cast<std::size_t>(j) * nv + k] != 0; }
+  std::vector<std::uint8_t> ancestor_;
+  bool is_ancestor(int j, int k) const { return ancestor_[static_cast<std::size_t>(j) * nv + k] != 0; }
 
   double step = 5e-3;       // h [s]
   double tolerance = 1e-7;  // Newton: residual relative to the forces at work
@@ -254,7 +221,7 @@ class ModelSpec {
   Model model_;
   int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
   void check_body(const std::string& what, int body, bool world_allowed) const;
-  int add_place(const std::string& owner, const V3<double>& pos, bool scales);
+  int add_pose_params(const std::string& owner, const V3<double>& pos, bool scales);
 };
 
 }  // namespace gelflow

@@ -46,7 +46,7 @@ struct SixPacks {
   std::vector<T> numbers_;
 };
 
-// Bodies that move together, about the world's origin (dynamics.hpp).
+// Bodies that move together, about the world's origin (inverse_dynamics.hpp).
 template <class T>
 struct Composite {
   T mass;
@@ -58,38 +58,39 @@ struct Composite {
 
 // What the near points of a step were found for before: another environment perhaps; an earlier step of the same one; the
 // same step.
-enum class Found : std::uint8_t { elsewhere, earlier, now };
+enum class CacheState : std::uint8_t { stale, warm, current };
 
 // Where a search for near points was made, and how far around the shape.
 template <class T>
-struct Search {
+struct BroadPhaseQuery {
   M3<T> rotation;  // first body → shape
   V3<T> offset;
   double margin;  // [m]
 };
 
-// The points of one cloud that may touch one shape, side by side (near_points.hpp).
+// The points of one cloud that may touch one shape, side by side (broad_phase.hpp).
 template <class T>
-struct NearPoints {
+struct CandidatePoints {
   int count = 0, capacity = 0;
-  std::vector<int> index;                                  // in the cloud
-  std::vector<T> x, y, z, weight;                          // in the first body's frame
-  std::vector<T> anchor_x, anchor_y, anchor_z, remembers;  // in the shape's frame, 1 where there is one; elastic law
-  Search<T> search;
+  std::vector<int> index;                                   // in the cloud
+  std::vector<T> x, y, z, weight;                           // in the first body's frame
+  std::vector<T> anchor_x, anchor_y, anchor_z, has_anchor;  // in the shape's frame, 1 where there is one; elastic law
+  BroadPhaseQuery<T> query;
   // Those among which the next steps look.
-  std::vector<int> around;
-  std::vector<double> around_x, around_y, around_z;
-  Search<T> wide;
+  std::vector<int> neighbors;
+  std::vector<double> neighbor_x, neighbor_y, neighbor_z;
+  BroadPhaseQuery<T> neighbor_query;
 };
 
-// The dofs of a pair in the shape's frame (pair_columns.hpp).
+// The dofs of a pair in the shape's frame (contact_jacobian.hpp).
 template <class T>
-struct PairColumns {
-  explicit PairColumns(int most) : s(most), y(most), force_q(most), force_v(most), turned(most) {}
+struct ContactJacobian {
+  explicit ContactJacobian(int capacity)
+      : s(capacity), y(capacity), force_q(capacity), force_v(capacity), axis_wrench(capacity) {}
   const PackedDofs* dofs = nullptr;
-  int n = 0;                             // columns, a whole number of packs
-  SixPacks<T> s, y;                      // S and Y, signs applied
-  SixPacks<T> force_q, force_v, turned;  // what their displacements change (contact.hpp)
+  int n = 0;                                  // columns, a whole number of packs
+  SixPacks<T> s, y;                           // S and Y, signs applied
+  SixPacks<T> force_q, force_v, axis_wrench;  // what their displacements change (contact.hpp)
 };
 
 // What a step's residual needs beside v_t.
@@ -97,13 +98,14 @@ template <class T>
 struct StepStart {
   T h;  // β h
   const T *q0, *v_star;
-  const T* low;      // what q0 lacks, or null (StateView)
-  const T* history;  // δ and v_{t-2}; null under BDF1
+  const T* q_rounding;  // what q0 lacks, or null (StateView)
+  const T* history;     // δ and v_{t-2}; null under BDF1
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
-  Found found = Found::elsewhere;  // what the workspace was last used for
-  double softness = 1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+  CacheState cache = CacheState::stale;  // what the workspace was last used for
+  double continuation =
+      1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
 
   T length() const { return history == nullptr ? h : T(h * T(1.5)); }  // of the step itself
 };
@@ -126,8 +128,8 @@ struct Workspace {
         q_missing(m.nv),
         v_missing(m.nv),
         residual(stride),
-        forces(stride),
-        scale(stride),
+        impulses(stride),
+        residual_scale(stride),
         increment(m.nv),
         update(m.nv),
         trial(m.nv),
@@ -141,9 +143,9 @@ struct Workspace {
         tangent(m.nv, stride),
         q(m.nq),
         pivots(m.nv),
-        columns(m.columns),
-        near(m.contacts.size()) {
-    forces.setZero();
+        jacobian(m.jacobian_columns),
+        candidates(m.contacts.size()) {
+    impulses.setZero();
     mass.setZero();
     tangent.setZero();
   }
@@ -153,30 +155,30 @@ struct Workspace {
   int stride;
 
   // Kinematics, world frame; spatial vectors at the world's origin.
-  std::vector<M3<Place<T>>> rotation;
-  std::vector<V3<Place<T>>> position;
+  std::vector<M3<PositionScalar<T>>> rotation;
+  std::vector<V3<PositionScalar<T>>> position;
   std::vector<V6<T>> twist, acceleration, force;
-  std::vector<Composite<T>> composite;  // of the subtree (dynamics.hpp)
+  std::vector<Composite<T>> composite;  // of the subtree (inverse_dynamics.hpp)
   SixRows<T> axis;                      // S_k per dof
   SixRows<T> twist_before;              // around the dof's group
   std::vector<V6<T>> twist_after, acceleration_before;
 
-  std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (dynamics.hpp)
+  std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
 
   // The step's residual g and its derivatives.
-  VX<T> residual, forces, scale;  // behind the last number as many zeros as rows have (newton.hpp)
-  VX<T> increment;                // q_t = q_{t-1} ⊕ increment
-  VX<T> update, trial;            // accelerations; v_t − v*
-  VX<T> direction, start, best;   // Newton's
-  Rows mass, by_q, by_v;          // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
-  VX<T> by_u;                     // ∂g_dof/∂u per actuator
-  Rows tangent;                   // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
-  VX<Place<T>> q;                 // q_t of the trial velocity
+  VX<T> residual, impulses, residual_scale;  // behind the last number as many zeros as rows have (newton.hpp)
+  VX<T> increment;                           // q_t = q_{t-1} ⊕ increment
+  VX<T> update, trial;                       // accelerations; v_t − v*
+  VX<T> direction, start, best;              // Newton's
+  Rows mass, by_q, by_v;                     // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  VX<T> by_u;                                // ∂g_dof/∂u per actuator
+  Rows tangent;             // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
+  VX<PositionScalar<T>> q;  // q_t of the trial velocity
   std::vector<int> pivots;
 
-  PairColumns<T> columns;           // of the pair at work
-  std::vector<NearPoints<T>> near;  // per contact
-  NearPoints<T> near_markers;       // of the pad at work
+  ContactJacobian<T> jacobian;                 // of the pair at work
+  std::vector<CandidatePoints<T>> candidates;  // per contact
+  CandidatePoints<T> marker_candidates;        // of the pad at work
 };
 
 }  // namespace gelflow

@@ -38,7 +38,7 @@ inline std::shared_ptr<const DistanceGrid> grid_of(const V3<double>& origin, dou
 
 // Distance, normal and curvature at points of a shape's frame, by the packs that the simulator uses.
 inline py::tuple distance_at(const Model& m, const std::string& name, const Array<double>& points) {
-  using L = Pack<double>;
+  using P = Pack<double>;
   constexpr int width = pack_width<double>;
   const auto found =
       std::find_if(m.shapes.begin(), m.shapes.end(), [&](const Shape& shape) { return shape.name == name; });
@@ -48,11 +48,11 @@ inline py::tuple distance_at(const Model& m, const std::string& name, const Arra
   py::array_t<double> d(n), normal({n, py::ssize_t{3}}), hessian({n, py::ssize_t{3}, py::ssize_t{3}});
   double *to_d = d.mutable_data(), *to_normal = normal.mutable_data(), *to_hessian = hessian.mutable_data();
   for (py::ssize_t begin = 0; begin < n; begin += width) {
-    Vec3<L> at;
+    Vec3<P> at;
     for (int k = 0; k < width; ++k) set_lane3<double>(at, k, x[std::min(begin + k, n - 1)]);
-    Distance<L> found_at;
+    Distance<P> found_at;
     distance<true>(found->kind, m.param_defaults.data() + found->size, found->grid.get(), at, found_at);
-    found_at.hessian = found_at.bend == Bend::flat ? zero33<L>() : found_at.curvature();
+    found_at.hessian = found_at.form == HessianForm::zero ? zero33<P>() : found_at.hessian_matrix();
     for (int k = 0; k < width && begin + k < n; ++k) {
       const py::ssize_t i = begin + k;
       to_d[i] = lane(found_at.d, k);

@@ -23,25 +23,24 @@ struct StateGradient {
 
 // What the reverse pass needs of one accepted substep.
 template <class T>
-struct Record {
-  Record(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool whole)
+struct SubstepRecord {
+  SubstepRecord(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool full_step)
       : h(from.h),
-        second(from.history != nullptr),
-        whole(whole),
+        bdf2(from.history != nullptr),
+        full_step(full_step),
         q0(Eigen::Map<const VX<T>>(from.q0, m.nq)),
         v_star(Eigen::Map<const VX<T>>(from.v_star, m.nv)),
         v1(v_new),
         anchors(from.anchors, from.anchors + m.na),
         anchored(from.anchored, from.anchored + m.na) {
-    if (second) history = Eigen::Map<const VX<T>>(from.history, 2 * m.nv);
+    if (bdf2) history = Eigen::Map<const VX<T>>(from.history, 2 * m.nv);
   }
   StepStart<T> start(const T* u) const {
-    return {h, q0.data(), v_star.data(), nullptr, second ? history.data() : nullptr, anchors.data(), anchored.data(),
-            u};
+    return {h, q0.data(), v_star.data(), nullptr, bdf2 ? history.data() : nullptr, anchors.data(), anchored.data(), u};
   }
   T h;
-  bool second;  // a step of BDF2
-  bool whole;   // not one of several substeps: BDF2 goes on from it
+  bool bdf2;       // a step of BDF2
+  bool full_step;  // not one of several substeps: BDF2 goes on from it
   VX<T> q0, v_star, history, v1;
   std::vector<V3<T>> anchors;
   std::vector<std::uint8_t> anchored;
@@ -65,24 +64,24 @@ struct StateCopy {
 // `g` enters as the gradient at the substep's end and leaves as the gradient at its start; by_u is added to. Before the
 // anchors' gradient changes, multipliers(c) is called.
 template <class T, class Multipliers>
-void substep_transposed(const Model& m, const T* params, const T* u, const Record<T>& r, StateGradient<T>& g, T* by_u,
-                        StepMemory<T>& memory, Multipliers&& multipliers) {
+void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecord<T>& r, StateGradient<T>& g, T* by_u,
+                 StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.start(u), r.v1.data(), Found::elsewhere, false, w);
+  evaluate<true, T>(m, params, r.start(u), r.v1.data(), CacheState::stale, false, w);
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     const T length = r.start(u).length();
-    contact_anchors_transposed<true, T>(m, params, length, r.second, r.anchors.data(), r.anchored.data(), w,
-                                        g.anchors.data(), g.v, g.q, g.v, by_anchor.data());
-    marker_anchors_transposed<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
-                                 by_anchor.data());
+    contact_anchors_vjp<true, T>(m, params, length, r.bdf2, r.anchors.data(), r.anchored.data(), w, g.anchors.data(),
+                                 g.v, g.q, g.v, by_anchor.data());
+    marker_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+                          by_anchor.data());
   }
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
-  if (m.nh > 0 && r.whole) {
+  if (m.nh > 0 && r.full_step) {
     by_increment = g.history.head(m.nv);
     by_v0 = g.history.segment(m.nv, m.nv);
   }
-  const VX<T> b = g.v + r.h * (position_by_increment_transposed<T>(m, w.increment, g.q) + by_increment);
+  const VX<T> b = g.v + r.h * (position_by_increment_vjp<T>(m, w.increment, g.q) + by_increment);
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> c(m.nv);
@@ -91,28 +90,28 @@ void substep_transposed(const Model& m, const T* params, const T* u, const Recor
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
   const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c;
   VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_earlier = VX<T>::Zero(m.nv);
-  by_increment += position_by_increment_transposed<T>(m, w.increment, by_q1);
-  floating_bodies_transposed<T>(m, params, r.start(u), w, c, by_v_star, by_increment, by_earlier);
-  g.q = position_by_position_transposed<T>(m, w.increment, by_q1);
-  g.v = by_v0 + (r.second ? T(4) / T(3) : T(1)) * by_v_star;
+  by_increment += position_by_increment_vjp<T>(m, w.increment, by_q1);
+  free_bodies_vjp<T>(m, params, r.start(u), w, c, by_v_star, by_increment, by_earlier);
+  g.q = position_by_position_vjp<T>(m, w.increment, by_q1);
+  g.v = by_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * by_v_star;
   g.history.setZero();
-  if (r.second) {
+  if (r.bdf2) {
     g.history.head(m.nv) = by_increment / T(3);
     g.history.segment(m.nv, m.nv) = by_earlier - by_v_star / T(3);
   }
   if (m.na > 0) {
-    contact_anchors_transposed<false, T>(m, params, r.h, r.second, r.anchors.data(), r.anchored.data(), w, nullptr, c,
-                                         g.q, g.v, by_anchor.data());
+    contact_anchors_vjp<false, T>(m, params, r.h, r.bdf2, r.anchors.data(), r.anchored.data(), w, nullptr, c, g.q, g.v,
+                                  by_anchor.data());
     g.anchors.swap(by_anchor);
   }
 }
 
 // Gradient of marker readings at a state, added to g.
 template <class T>
-void tactile_transposed(const Model& m, const T* params, const StateView<T>& s, const T* by_reading,
-                        StateGradient<T>& g, Workspace<T>& w) {
-  forward_state<true, T>(m, params, s.q, s.low, s.v, w);
-  read_markers_transposed<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
+void tactile_vjp(const Model& m, const T* params, const StateView<T>& s, const T* by_reading, StateGradient<T>& g,
+                 Workspace<T>& w) {
+  forward_state<true, T>(m, params, s.q, s.q_rounding, s.v, w);
+  read_markers_vjp<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
 }
 
 }  // namespace gelflow

@@ -16,11 +16,11 @@ template <class T>
 double relative(const VX<T>& residual, const VX<T>& impulses, int n) {
   double total = 0;
   if constexpr (std::is_floating_point_v<T>) {
-    using L = Pack<double>;
-    const L least(1e-30);
-    L squares(0.0);
+    using P = Pack<double>;
+    const P least(1e-30);
+    P squares(0.0);
     for (int k = 0; k < n; k += pack_width<double>) {  // behind the last stand zeros
-      const L impulse = load<L>(&impulses[k]), value = load<L>(&residual[k]) / select(impulse > least, impulse, least);
+      const P impulse = load<P>(&impulses[k]), value = load<P>(&residual[k]) / select(impulse > least, impulse, least);
       squares += value * value;
     }
     total = sum(squares);
@@ -40,7 +40,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
                        const Workspace<T>& w) {
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
   double reach = 0, turn = 1, mass = 0, speed = 0, spin = 0;  // turn: of the largest angle, or of a quaternion
-  for (const V3<Place<T>>& position : w.position) {
+  for (const V3<PositionScalar<T>>& position : w.position) {
     for (int a = 0; a < 3; ++a) reach = std::max(reach, std::abs(real_part(position[a])));
   }
   for (const Joint& joint : m.joints) {
@@ -58,7 +58,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
       stiffness += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? turn : reach);
       own += std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
     }
-    const double bound = unit * (stiffness + own + real_part(w.forces[i]));
+    const double bound = unit * (stiffness + own + real_part(w.impulses[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
   }
   return true;
@@ -85,27 +85,28 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
               Workspace<T>& w) {
   constexpr int full_steps = 6, patience = 6, most_old = 6;
   constexpr double quick = 0.15, enough = 0.1, exacting = 1e-9;
-  constexpr double margin = std::is_same_v<T, Place<T>> ? 0.1 : 1.0, plenty = margin * margin;
-  constexpr double least = std::is_same_v<T, Place<T>> ? 1000 : 100;  // rounding units; places are better than single
+  constexpr double margin = std::is_same_v<T, PositionScalar<T>> ? 0.1 : 1.0, plenty = margin * margin;
+  constexpr double least =
+      std::is_same_v<T, PositionScalar<T>> ? 1000 : 100;  // rounding units; places are better than single
   const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
-  const double tolerance = from.softness < 1 ? std::max(own, 1e-3) : own;
+  const double tolerance = from.continuation < 1 ? std::max(own, 1e-3) : own;
   const bool inexact = std::is_floating_point_v<T> && tolerance > exacting;
   bool fresh = false;  // w holds the derivatives at v
-  const auto look = [&](bool derivatives, Found found) {
+  const auto look = [&](bool derivatives, CacheState cache) {
     if (derivatives) {
-      evaluate<true, T>(m, params, from, v.data(), found, true, w);
+      evaluate<true, T>(m, params, from, v.data(), cache, true, w);
     } else {
-      evaluate<false, T>(m, params, from, v.data(), found, true, w);
+      evaluate<false, T>(m, params, from, v.data(), cache, true, w);
     }
     fresh = derivatives;
   };
   const auto measure = [&](bool derivatives) {
-    look(derivatives, Found::now);
-    return relative(w.residual, w.scale, m.nv);
+    look(derivatives, CacheState::current);
+    return relative(w.residual, w.residual_scale, m.nv);
   };
-  look(true, from.found);
-  w.scale = w.forces;  // what residuals are compared by
-  double size = relative(w.residual, w.scale, m.nv), best = size, before = size, mark = size;
+  look(true, from.cache);
+  w.residual_scale = w.impulses;  // what residuals are compared by
+  double size = relative(w.residual, w.residual_scale, m.nv), best = size, before = size, mark = size;
   if (!std::isfinite(size)) return Status::not_finite;
   w.best = v;
   bool settled = false;  // no better residual can be had
@@ -115,7 +116,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     // Where an update made the residual that much smaller, its derivatives do for one more, which costs a quarter.
     const bool again = inexact && !fresh && k <= most_old && size < quick * before;
     const bool unmeasured = inexact && m.na == 0 && polish <= 0 && (fresh || again);
-    const double left = relative(w.residual, w.forces, m.nv);
+    const double left = relative(w.residual, w.impulses, m.nv);
     const bool would_do = left <= (old ? margin : 1.0) * tolerance;
     const bool converged = settled || (unmeasured ? left <= plenty * tolerance : would_do);
     if (converged && polish-- <= 0) return Status::ok;
@@ -130,7 +131,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
     if (last && w.direction.allFinite()) {
       ++iterations;
       v -= w.direction;
-      arrive<T>(m, from, v.data(), w);
+      integrate_to_trial_state<T>(m, from, v.data(), w);
       return Status::ok;
     }
     if (last && would_do) return Status::ok;  // the matrix is singular
@@ -176,24 +177,24 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
 // and a search gets stuck beside it. So k_t, k_s and the gains start soft, which makes the range wide, and grow to what
 // they are, each solution being the next one's start.
 template <class T>
-Status newton_from_softer(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
-                          int& iterations, Workspace<T>& w) {
+Status newton_by_continuation(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
+                              int& iterations, Workspace<T>& w) {
   constexpr double softest = 1e-8, least_growth = 1.3;
   StepStart<T> soft = from;
   VX<T> reached = v;
   double solved = 0, growth = 100;
-  for (soft.softness = softest;;) {
+  for (soft.continuation = softest;;) {
     v = reached;
-    const Status status = newton<T>(m, params, soft, soft.softness < 1 ? 0 : polish, v, iterations, w);
+    const Status status = newton<T>(m, params, soft, soft.continuation < 1 ? 0 : polish, v, iterations, w);
     if (status == Status::ok) {
-      if (soft.softness == 1) return status;
+      if (soft.continuation == 1) return status;
       reached = v;
-      solved = soft.softness;
+      solved = soft.continuation;
     } else {
       growth = std::sqrt(growth);
       if (solved == 0 || growth < least_growth) return status;
     }
-    soft.softness = std::min(1.0, solved * growth);
+    soft.continuation = std::min(1.0, solved * growth);
   }
 }
 

@@ -35,7 +35,7 @@ struct ActuatorPull {
 };
 template <class T, class Q>
 ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, const Q* q, const T* v,
-                              double softness = 1) {
+                              double continuation = 1) {
   const T gear = p[0], kp = p[1], kd = p[2];
   ActuatorPull<T> pull{T(0), T(1), T(0), T(0), 0};
   T bias = T(0);
@@ -62,10 +62,10 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
   }
   pull.force =
       gain * control + bias + pull.by_length * (gear * T(q[actuator.q])) + pull.by_speed * (gear * v[actuator.dof]);
-  if (softness < 1) {
-    pull.force *= T(softness);
-    pull.by_length *= T(softness);
-    pull.by_speed *= T(softness);
+  if (continuation < 1) {
+    pull.force *= T(continuation);
+    pull.by_length *= T(continuation);
+    pull.by_speed *= T(continuation);
   }
   if (pull.force < p[3] || pull.force > p[4]) {
     const bool below = pull.force < p[3];
@@ -76,10 +76,10 @@ ActuatorPull<T> actuator_pull(const Actuator& actuator, const T* p, const T& u, 
 
 // Joint-space forces: damping, friction, springs, limits, actuators. Adds −h f and its derivatives to the residual.
 template <bool derivatives, class T>
-void subtract_joint_forces(const Model& m, const T* params, const T& h, const Place<T>* q, const T* v, const T* u,
-                           double softness, bool scale, Workspace<T>& w) {
+void subtract_joint_forces(const Model& m, const T* params, const T& h, const PositionScalar<T>* q, const T* v,
+                           const T* u, double continuation, bool add_impulses, Workspace<T>& w) {
   using std::abs;
-  const T creep(friction_creep / softness);
+  const T creep(friction_creep / continuation);
   for (const Joint& joint : m.joints) {
     const T* p = params + joint.param;
     const T damping = p[0], armature = p[1], stiffness = p[2], rest = p[3];
@@ -90,7 +90,7 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Pl
         const bool slides = abs(v[k]) > creep;
         const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / creep * v[k]);
         w.residual[k] += h * force;
-        if (scale) w.forces[k] += h * p[8];
+        if (add_impulses) w.impulses[k] += h * p[8];
         if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / creep);
       }
       if (armature != T(0)) {
@@ -101,7 +101,7 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Pl
         }
       }
     }
-    if (joint.turns()) continue;
+    if (joint.has_quaternion()) continue;
     const int k = joint.v;
     const T value(q[joint.q]);
     w.residual[k] += h * stiffness * (value - rest);
@@ -118,9 +118,9 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Pl
     const T* p = params + actuator.param;
     const T gear = p[0];
     const int k = actuator.dof;
-    const ActuatorPull<T> pull = actuator_pull<T>(actuator, p, u[a], q, v, softness);
+    const ActuatorPull<T> pull = actuator_pull<T>(actuator, p, u[a], q, v, continuation);
     w.residual[k] -= h * gear * pull.force;
-    if (scale) w.forces[k] += h * abs(gear * pull.force);
+    if (add_impulses) w.impulses[k] += h * abs(gear * pull.force);
     if constexpr (derivatives) {
       w.by_u[a] = -h * gear * pull.by_u;
       w.by_q(k, k) -= h * gear * gear * pull.by_length;
@@ -131,22 +131,22 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Pl
 
 // Where v leads: w.increment and w.q.
 template <class T>
-void arrive(const Model& m, const StepStart<T>& from, const T* v, Workspace<T>& w) {
+void integrate_to_trial_state(const Model& m, const StepStart<T>& from, const T* v, Workspace<T>& w) {
   for (int k = 0; k < m.nv; ++k) {
     w.increment[k] = from.h * v[k];
     if (from.history) w.increment[k] += from.history[k] / T(3);
   }
-  integrate<T>(m, from.q0, from.low, w.increment, w.q.data());
+  integrate<T>(m, from.q0, from.q_rounding, w.increment, w.q.data());
 }
 
 // Residual at (w.q, v); w.tangent = ∂g/∂v_t where derivatives are asked for. `scale` also sets w.forces, the impulses at
 // work there, which Newton's tolerance refers to (they take the mass matrix of the last evaluation with derivatives).
 // `found`: what w was last used for.
 template <bool derivatives, class T>
-void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, Found found, bool scale,
-              Workspace<T>& w) {
+void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, CacheState cache,
+              bool add_impulses, Workspace<T>& w) {
   const T& h = from.h;
-  arrive<T>(m, from, v, w);
+  integrate_to_trial_state<T>(m, from, v, w);
   for (int k = 0; k < m.nv; ++k) w.trial[k] = v[k] - from.v_star[k];
   w.update = w.trial / h;  // accelerations
   forward_positions<T>(m, params, w.q.data(), w);
@@ -158,11 +158,11 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T
   }
   add_inverse_dynamics<derivatives, T>(m, params, h, v, &from, w);
   if constexpr (derivatives) w.by_v += w.mass;
-  if (scale) {
-    for (int k = 0; k < m.nv; ++k) w.forces[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
+  if (add_impulses) {
+    for (int k = 0; k < m.nv; ++k) w.impulses[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
-  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.softness, scale, w);
-  subtract_contact_forces<derivatives, T>(m, params, from, found, scale, w);
+  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.continuation, add_impulses, w);
+  subtract_contact_forces<derivatives, T>(m, params, from, cache, add_impulses, w);
   if constexpr (derivatives) {
     w.tangent = h * w.by_q;
     times_position_by_increment<T>(m, w.increment, w.tangent);

@@ -12,8 +12,8 @@
 #include <bit>
 #include <cstring>
 
-#include "solver/newton.hpp"
 #include "contact/tactile.hpp"
+#include "solver/newton.hpp"
 
 namespace gelflow {
 
@@ -26,7 +26,7 @@ struct StateView {
   V3<T>* anchors;
   std::uint8_t* anchored;
   T* history;
-  T* low = nullptr;  // what q lacks in single precision, half a rounding unit at most: so small steps add up
+  T* q_rounding = nullptr;  // what q lacks in single precision, half a rounding unit at most: so small steps add up
 };
 
 // Calls visit(i) where set[i] is not 0. Most are not: they are looked at eight at a time.
@@ -53,23 +53,23 @@ struct StepReport {
 template <class T>
 struct StepMemory {
   explicit StepMemory(const Model& m)
-      : work(m), q(m.nq), low(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), history(m.nh) {}
+      : work(m), q(m.nq), q_rounding(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), history(m.nh) {}
   Workspace<T> work;
-  VX<T> q, low, v, v_new, v_star, history;
+  VX<T> q, q_rounding, v, v_new, v_star, history;
   std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
-  Found found = Found::elsewhere;              // what work was last used for
+  CacheState cache = CacheState::stale;        // what work was last used for
 
-  void keep(const Model& m, const StateView<T>& s) {
+  void save(const Model& m, const StateView<T>& s) {
     q = Eigen::Map<const VX<T>>(s.q, m.nq);
-    if (s.low != nullptr) low = Eigen::Map<const VX<T>>(s.low, m.nq);
+    if (s.q_rounding != nullptr) q_rounding = Eigen::Map<const VX<T>>(s.q_rounding, m.nq);
     v = Eigen::Map<const VX<T>>(s.v, m.nv);
     history = Eigen::Map<const VX<T>>(s.history, m.nh);
     anchors.clear();
     for_each_set(s.anchored, m.na, [&](int i) { anchors.emplace_back(i, s.anchors[i]); });
   }
-  void give_back(const Model& m, const StateView<T>& s) const {
+  void restore(const Model& m, const StateView<T>& s) const {
     std::copy(q.data(), q.data() + m.nq, s.q);
-    if (s.low != nullptr) std::copy(low.data(), low.data() + m.nq, s.low);
+    if (s.q_rounding != nullptr) std::copy(q_rounding.data(), q_rounding.data() + m.nq, s.q_rounding);
     std::copy(v.data(), v.data() + m.nv, s.v);
     std::copy(history.data(), history.data() + m.nh, s.history);
     std::fill(s.anchored, s.anchored + m.na, 0);
@@ -82,11 +82,11 @@ struct StepMemory {
 
 // How a substep of length h, `whole` or a part of the step, starts from state s: β, v*, which is kept in `memory`, and δ.
 template <class T>
-StepStart<T> start_of(const Model& m, const T& h, bool whole, const StateView<T>& s, const T* u,
-                      StepMemory<T>& memory) {
+StepStart<T> step_start(const Model& m, const T& h, bool full_step, const StateView<T>& s, const T* u,
+                        StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
-  StepStart<T> from{h, s.q, memory.v_star.data(), s.low, nullptr, s.anchors, s.anchored, u, memory.found};
-  if (m.nh == 0 || !whole || !(s.history[2 * m.nv] > T(0))) return from;
+  StepStart<T> from{h, s.q, memory.v_star.data(), s.q_rounding, nullptr, s.anchors, s.anchored, u, memory.cache};
+  if (m.nh == 0 || !full_step || !(s.history[2 * m.nv] > T(0))) return from;
   for (int k = 0; k < m.nv; ++k) memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
   from.h = h * T(2) / T(3);
   from.history = s.history;
@@ -102,15 +102,15 @@ struct NoObserver {
 // One substep of length h from state s, which moves on only if the substep succeeds. `whole`: it is the step itself, not
 // a part of it.
 template <class T, class Observer>
-Status substep(const Model& m, const T* params, const T& h, bool whole, const T* u, int polish, const StateView<T>& s,
-               StepMemory<T>& memory, int& iterations, Observer&& accepted) {
-  const StepStart<T> from = start_of<T>(m, h, whole, s, u, memory);
+Status substep(const Model& m, const T* params, const T& h, bool full_step, const T* u, int polish,
+               const StateView<T>& s, StepMemory<T>& memory, int& iterations, Observer&& accepted) {
+  const StepStart<T> from = step_start<T>(m, h, full_step, s, u, memory);
   memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
   Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
-  memory.found = Found::earlier;
+  memory.cache = CacheState::warm;
   if (status != Status::ok) {
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-    status = newton_from_softer<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+    status = newton_by_continuation<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
   }
   if (status != Status::ok) return status;
   accepted(from, memory);
@@ -118,7 +118,7 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   advance_marker_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
   if (m.nh > 0) {
     std::fill(s.history, s.history + m.nh, T(0));
-    if (whole) {
+    if (full_step) {
       std::copy(memory.work.increment.data(), memory.work.increment.data() + m.nv, s.history);
       std::copy(s.v, s.v + m.nv, s.history + m.nv);
       s.history[2 * m.nv] = T(1);
@@ -126,7 +126,7 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
   }
   for (int i = 0; i < m.nq; ++i) {
     s.q[i] = T(memory.work.q[i]);
-    if (s.low != nullptr) s.low[i] = T(memory.work.q[i] - Place<T>(s.q[i]));
+    if (s.q_rounding != nullptr) s.q_rounding[i] = T(memory.work.q[i] - PositionScalar<T>(s.q[i]));
   }
   std::copy(memory.v_new.data(), memory.v_new.data() + m.nv, s.v);
   return Status::ok;
@@ -138,24 +138,24 @@ Status substep(const Model& m, const T* params, const T& h, bool whole, const T*
 // `follows`: memory was last used for a step of the same environment.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
-                bool follows, Observer&& accepted = {}, int parts = 1) {
-  memory.found = follows ? Found::earlier : Found::elsewhere;
+                bool same_environment, Observer&& accepted = {}, int parts = 1) {
+  memory.cache = same_environment ? CacheState::warm : CacheState::stale;
   StepReport report;
   const double span = m.step / parts;
-  const int whole = 1 << m.max_halvings;  // lengths in units of the shortest substep
-  for (int at = 0, length = whole; at < whole;) {
-    const T h = length == whole ? T(span) : T(span * length / whole);
-    const bool itself = length == whole && parts == 1;
-    if (at == 0 && length == whole / 2) memory.keep(m, s);  // only a part of a step may have to be taken back
+  const int full_step = 1 << m.max_halvings;  // lengths in units of the shortest substep
+  for (int at = 0, length = full_step; at < full_step;) {
+    const T h = length == full_step ? T(span) : T(span * length / full_step);
+    const bool itself = length == full_step && parts == 1;
+    if (at == 0 && length == full_step / 2) memory.save(m, s);  // only a part of a step may have to be taken back
     report.status = substep<T>(m, params, h, itself, u, polish, s, memory, report.iterations, accepted);
     if (report.status == Status::ok) {
       at += length;
-      if (at % (2 * length) == 0 && at + 2 * length <= whole) length *= 2;
+      if (at % (2 * length) == 0 && at + 2 * length <= full_step) length *= 2;
     } else if (length > 1 && report.iterations < m.max_step_iterations) {
       length /= 2;
-      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(whole / length)));
+      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(full_step / length)));
     } else {
-      if (at > 0) memory.give_back(m, s);
+      if (at > 0) memory.restore(m, s);
       return report;
     }
   }
