@@ -48,7 +48,7 @@ def test_right_against_central_differences(name: str, law: str, integrator: str)
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("kind", [*SHAPES, FREE])
 def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
-    """Pressed onto it; a free body that spins on a plane, and so takes the way by arcs (arc_moments.hpp)."""
+    """Pressed onto it; a free body that spins on a plane, and so takes the way by arcs (arc_correction.hpp)."""
     left_out = []
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(seed)
