@@ -14,7 +14,8 @@ from urllib.parse import parse_qs, urlsplit
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
-from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
+from gelflow.hardware_mocks.egm.controller import MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper

@@ -1,1 +1,9 @@
-"""Codecs, transports, drivers and the insertion runner for real hardware."""
+"""Drivers of the robot cell (gripper, arm, cameras) and the insertion runner.
+
+To add a device, write a class that fits `Gripper`, `Arm` or `Camera` of `gelflow.protocols`; `real/wsg/driver.py`,
+`real/egm/driver.py` and `real/camera/driver.py` are the examples.
+"""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

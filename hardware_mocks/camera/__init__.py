@@ -1,1 +1,5 @@
-"""The mock camera server."""
+"""Mock of a tactile camera: an MJPEG server."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

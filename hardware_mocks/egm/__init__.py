@@ -1,1 +1,5 @@
-"""The mock ABB arm."""
+"""Mock of an ABB IRB 120 controller that runs EGM."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

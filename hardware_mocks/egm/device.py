@@ -22,8 +22,6 @@ from gelflow.hardware_mocks.egm.controller import MockEgmConfig, MockEgmReport, 
 from gelflow.hardware_mocks.plant import ArmPlant
 from gelflow.helper_process import Child
 
-__all__ = ["MockEgmArm", "MockEgmConfig", "MockEgmReport"]
-
 _REPLY_LIMIT = 10.0  # of our own process, its start included [s, wall]
 
 

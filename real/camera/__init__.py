@@ -1,1 +1,5 @@
-"""Tactile cameras: MJPEG streams and UVC devices."""
+"""Drivers of tactile cameras: MJPEG streams over HTTP and UVC devices."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,1 +1,5 @@
-"""Driver of an ABB arm over EGM (externally guided motion)."""
+"""Driver of an ABB IRB 120 arm over externally guided motion (EGM)."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

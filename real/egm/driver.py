@@ -27,8 +27,6 @@ from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog, MessageCounts
 from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag
 from gelflow.real.egm.target import Target, check_target, tool_frame
 
-__all__ = ["EgmArm", "EgmConfig", "EgmCycle", "EgmEvent", "EgmFlag"]
-
 # Wall-clock limits on our own process, which owes nothing to the robot's clock [s].
 _START_LIMIT = 30.0
 _OBEY_LIMIT = 1.0

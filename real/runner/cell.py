@@ -15,7 +15,8 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.protocols import CameraImage
 from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
-from gelflow.real.egm.driver import EgmArm, EgmConfig
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.driver import EgmArm
 from gelflow.real.runner.lab import Lab
 from gelflow.real.transport import transport_for
 from gelflow.real.wsg.config import WsgConfig

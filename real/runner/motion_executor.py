@@ -13,7 +13,8 @@ from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
 from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState, Camera, Gripper
 from gelflow.real.egm.cycle_log import EgmCycle
-from gelflow.real.egm.driver import EgmArm, EgmFlag
+from gelflow.real.egm.driver import EgmArm
+from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.session.recorder import SessionRecorder

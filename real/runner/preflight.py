@@ -23,7 +23,7 @@ class PreflightItem:
     text: str  # what was found, or what is wrong
 
 
-def preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
+def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
     """Check cameras, gripper and arm; homes the gripper outwards where the lab allows it, otherwise nothing moves.
 
     Returns all items. Raises SafetyError, naming each that failed.

@@ -14,7 +14,7 @@ from gelflow.real.runner.cell import Cell, open_cell
 from gelflow.real.runner.insertion_runner import Attempt, Insertion, InsertionRunner, Operator
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.motion_executor import MotionExecutor
-from gelflow.real.runner.preflight import PreflightItem, preflight
+from gelflow.real.runner.preflight import PreflightItem, run_preflight
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.tactile_observer import TactileObserver
 from gelflow.session.recorder import SessionRecorder
@@ -67,7 +67,7 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
     results = []
     with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
         supervisor, motion = runner_parts(cell)
-        plan.on_preflight(preflight(cell, supervisor))
+        plan.on_preflight(run_preflight(cell, supervisor))
         operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
         with motion:
             runner = InsertionRunner(
@@ -84,7 +84,7 @@ def dry_run(plan: RunPlan) -> DryRun:
     """Everything up to the first motion: connect, preflight, check the first targets, read the pads, ask the policy."""
     with _recording(plan, dry_run=True) as recorder, open_cell(plan.lab, recorder, dry_run=True) as cell:
         supervisor, motion = runner_parts(cell)
-        items = preflight(cell, supervisor)
+        items = run_preflight(cell, supervisor)
         runner = InsertionRunner(
             cell, plan.policy, task=plan.task, motion=motion, operator=WaitingOperator(motion, plan.lab.part.load_wait)
         )

@@ -15,7 +15,8 @@ from ABBRobotEGM import EGM
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
-from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
+from gelflow.hardware_mocks.egm.controller import MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.plant import KinematicArm
 
 START = np.array([0.40, 0.0, 0.30])

@@ -19,11 +19,14 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
-from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
+from gelflow.hardware_mocks.egm.controller import MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.plant import KinematicArm
 from gelflow.protocols import Arm
 from gelflow.real.egm.codec import EgmFeedback, decode_sensor, encode_robot
-from gelflow.real.egm.driver import EgmArm, EgmConfig, EgmFlag
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.egm.driver import EgmArm
+from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.kinematics import HOME, forward, inverse
 
 START = np.array([0.40, 0.0, 0.30])
@@ -432,9 +435,8 @@ ORPHANS = """
 import sys, time
 import numpy as np
 from gelflow.clock import ScaledClock
-from gelflow.hardware_mocks.egm.device import MockEgmArm, MockEgmConfig
-from gelflow.hardware_mocks.plant import KinematicArm
-from gelflow.real.egm.driver import EgmArm, EgmConfig
+from gelflow.hardware_mocks import KinematicArm, MockEgmArm, MockEgmConfig
+from gelflow.real import EgmArm, EgmConfig
 clock = ScaledClock()
 port = int(sys.argv[1])
 plant = KinematicArm(clock, position=np.array([0.4, 0.0, 0.3]), quaternion=np.array([0.0, 0.0, 1.0, 0.0]))

@@ -1,0 +1,37 @@
+from .camera.device import MockMjpegCamera as MockMjpegCamera
+from .egm.controller import MockEgmConfig as MockEgmConfig
+from .egm.controller import MockEgmReport as MockEgmReport
+from .egm.device import MockEgmArm as MockEgmArm
+from .plant import ArmPlant as ArmPlant
+from .plant import GelPlant as GelPlant
+from .plant import GripperPlant as GripperPlant
+from .plant import KinematicArm as KinematicArm
+from .plant import KinematicGripper as KinematicGripper
+from .robot import MockRobot as MockRobot
+from .robot import MockRobotConfig as MockRobotConfig
+from .simulated_cell.cell import SimulatedCell as SimulatedCell
+from .simulated_cell.cell import SimulatedCellConfig as SimulatedCellConfig
+from .simulated_cell.cell import preset_config as preset_config
+from .simulated_cell.process import SimulatedCellProcess as SimulatedCellProcess
+from .wsg.device import MockWsgGripper as MockWsgGripper
+from .wsg.finger_controller import MockWsgConfig as MockWsgConfig
+
+__all__ = [
+    "ArmPlant",
+    "GelPlant",
+    "GripperPlant",
+    "KinematicArm",
+    "KinematicGripper",
+    "MockEgmArm",
+    "MockEgmConfig",
+    "MockEgmReport",
+    "MockMjpegCamera",
+    "MockRobot",
+    "MockRobotConfig",
+    "MockWsgConfig",
+    "MockWsgGripper",
+    "SimulatedCell",
+    "SimulatedCellConfig",
+    "SimulatedCellProcess",
+    "preset_config",
+]

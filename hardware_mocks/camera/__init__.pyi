@@ -1,0 +1,5 @@
+from .device import MockMjpegCamera as MockMjpegCamera
+
+__all__ = [
+    "MockMjpegCamera",
+]

@@ -1,0 +1,7 @@
+from .device import MockWsgGripper as MockWsgGripper
+from .finger_controller import MockWsgConfig as MockWsgConfig
+
+__all__ = [
+    "MockWsgConfig",
+    "MockWsgGripper",
+]

@@ -1,0 +1,39 @@
+from .cell import Cell as Cell
+from .cell import open_cell as open_cell
+from .insertion_runner import Attempt as Attempt
+from .insertion_runner import Insertion as Insertion
+from .insertion_runner import InsertionRunner as InsertionRunner
+from .insertion_runner import Operator as Operator
+from .lab import Lab as Lab
+from .lab_file import load_lab as load_lab
+from .lab_file import save_lab as save_lab
+from .motion_executor import MotionExecutor as MotionExecutor
+from .preflight import PreflightItem as PreflightItem
+from .preflight import run_preflight as run_preflight
+from .run_plan import RunPlan as RunPlan
+from .run_plan import dry_run as dry_run
+from .run_plan import run_insertions as run_insertions
+from .supervisor import Supervisor as Supervisor
+from .tactile_observer import TactileObserver as TactileObserver
+from .tactile_observer import TactileReading as TactileReading
+
+__all__ = [
+    "Attempt",
+    "Cell",
+    "Insertion",
+    "InsertionRunner",
+    "Lab",
+    "MotionExecutor",
+    "Operator",
+    "PreflightItem",
+    "RunPlan",
+    "Supervisor",
+    "TactileObserver",
+    "TactileReading",
+    "dry_run",
+    "load_lab",
+    "open_cell",
+    "run_insertions",
+    "run_preflight",
+    "save_lab",
+]
