@@ -16,7 +16,7 @@ from rich.progress import track
 
 from gelflow.measurement.machine import processor
 from gelflow.sim import _core
-from gelflow.sim.simulator import STATUS
+from gelflow.sim.simulator import STATUS_MESSAGES
 from gelflow.sim.validation.reference_motions import SCENES
 from gelflow.sim.validation.stress import KINDS, StepStatistics, StressTest, stress_batches
 
@@ -61,7 +61,7 @@ def main() -> int:
     total, normal = rows["", "everything"], rows["kind", "normal"]
     cap = _core.ModelSpec().max_step_iterations
     for status, count in sorted(total.reasons.items()):
-        print(f"failed, {STATUS[status]}: {count}")
+        print(f"failed, {STATUS_MESSAGES[status]}: {count}")
     print(f"{total.steps} steps in {wall:.0f} s; Newton iterations of a step are capped at {cap}")
     result = {"processor": processor(), "seconds": round(wall, 1), "rows": table}
     args.out.write_text(json.dumps(result, indent=1) + "\n")

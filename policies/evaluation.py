@@ -71,11 +71,6 @@ class Outcome:
     success: NDArray[np.bool_]  # inserted
 
 
-def penalty(pose: Array) -> Array:
-    """The environment's reward of a pose (…, 3) [m, m, rad]: −1e4 ‖position‖² − 20 yaw²."""
-    return np.asarray(-1e4 * (pose[..., :2] ** 2).sum(-1) - 20 * pose[..., 2] ** 2)
-
-
 class Attempts:
     """A gymnasium vector environment of insertions, with noise on its flow maps."""
 
@@ -99,7 +94,7 @@ class Attempts:
         """New parts everywhere; returns the flow maps of their first attempts."""
         self._rng = np.random.default_rng(seed)
         images, info = self.env.reset(seed=seed)
-        self._before = penalty(info["pose"])
+        self._before = self.task.reward(info["pose"])
         return self._noisy(images, np.ones(self.count, dtype=bool))
 
     def step(self, corrections: Array) -> Outcome:
@@ -110,7 +105,7 @@ class Attempts:
         if done.any() and not self._same_step:
             images, info = self.env.reset(options={"reset_mask": done})
         better = reward - self._before
-        self._before = penalty(info["pose"])
+        self._before = self.task.reward(info["pose"])
         return Outcome(self._noisy(images, done), np.asarray(reward, dtype=float), better, done, np.asarray(terminated))
 
     def _noisy(self, images: NDArray[Any], fresh: NDArray[np.bool_]) -> NDArray[np.float32]:

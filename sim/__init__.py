@@ -1,1 +1,5 @@
-"""The differentiable tactile simulator: scenes, C++ core, torch layer, tasks."""
+"""The differentiable tactile simulator: scenes, batched environments, gradients, PyTorch functions, Gymnasium tasks."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -12,7 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
 
-STATUS = {0: "ok", 1: "Newton's method did not converge, even with the shortest substeps", 2: "a force overflowed"}
+STATUS_MESSAGES = {
+    0: "ok",
+    1: "Newton's method did not converge, even with the shortest substeps",
+    2: "a force overflowed",
+}
 
 
 class Buildable(Protocol):
@@ -34,7 +38,7 @@ class Trajectory:
     tactile: NDArray[Any]  # (reads, N, markers, 3): shear x, shear y, normal [N]
     read_after: NDArray[np.int32]  # markers were read after that many steps
     halvings: NDArray[np.int8]  # (steps, N): the step was taken as 2^halvings substeps
-    status: NDArray[np.int32]  # (N): 0, or why the environment stopped (`STATUS`)
+    status: NDArray[np.int32]  # (N): 0, or why the environment stopped (`STATUS_MESSAGES`)
 
 
 @dataclass(frozen=True)
@@ -135,8 +139,8 @@ class Simulator:
     def step(self, u: ArrayLike, steps: int = 1) -> None:
         """Take `steps` steps under controls u (N, nu), or (nu,) for all environments alike.
 
-        An environment that fails keeps its last good state and gets a `status` other than 0 (see `STATUS`); it stays
-        still until `reset`. Raises UsageError when a control or the state is not finite.
+        An environment that fails keeps its last good state and gets a `status` other than 0 (see `STATUS_MESSAGES`); it
+        stays still until `reset`. Raises UsageError when a control or the state is not finite.
         """
         try:
             self._batch.step(self._numbers(u), steps)
@@ -156,7 +160,7 @@ class Simulator:
         """Raises SimulationError when an environment has failed, naming the first."""
         failed = np.flatnonzero(self.status)
         if len(failed):
-            raise SimulationError(f"environment {failed[0]}: {STATUS[int(self.status[failed[0]])]}")
+            raise SimulationError(f"environment {failed[0]}: {STATUS_MESSAGES[int(self.status[failed[0]])]}")
 
     def error_estimate(self, u: ArrayLike) -> NDArray[Any]:
         """What one step under u would be off by: its positions less those of two half steps, (N, nv) [m, rad].
@@ -170,7 +174,7 @@ class Simulator:
         except ValueError as error:
             raise UsageError(str(error)) from None
         if failed := np.flatnonzero(status).tolist():
-            raise SimulationError(f"environment {failed[0]}: {STATUS[int(status[failed[0]])]}")
+            raise SimulationError(f"environment {failed[0]}: {STATUS_MESSAGES[int(status[failed[0]])]}")
         return np.asarray(estimate)
 
     def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:

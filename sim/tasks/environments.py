@@ -240,10 +240,3 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._reset_pool.draw(self.np_random)
         self._pool_result = self._reset_pool.attempt(self.np_random)
         self._pool_rows = np.flatnonzero(~self._pool_result.inserted & ~self._pool_result.failed)
-
-
-gymnasium.register(
-    id="gelflow/Insertion-v0",
-    entry_point="gelflow.sim.tasks.environments:InsertionEnv",
-    vector_entry_point="gelflow.sim.tasks.environments:InsertionVectorEnv",
-)

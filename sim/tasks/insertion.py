@@ -233,8 +233,8 @@ class InsertionAttempts:
         return height, inside & (height < self.task.success_height)
 
     def reward(self) -> Array:
-        """−1e4 ‖position error‖² − 20 (yaw error)² of the present poses: eq. 27 as a penalty, shape (N,)."""
-        return np.asarray(-1e4 * (self.pose[:, :2] ** 2).sum(1) - 20 * self.pose[:, 2] ** 2)
+        """Reward of the present poses, shape (N,); see `InsertionTask.reward`."""
+        return self.task.reward(self.pose)
 
     def copy_parts(self, rows: NDArray[np.int64], other: "InsertionAttempts", other_rows: NDArray[np.int64]) -> None:
         """Replace the parts of `rows` by parts of another batch: physics, grasp and pose."""

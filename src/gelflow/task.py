@@ -90,6 +90,11 @@ class InsertionTask:
         limit = np.asarray(self.workspace)
         return np.asarray(np.clip(moved, -limit, limit))
 
+    def reward(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Reward of gripper poses in the hole's frame, shape (…, 3) [m, m, rad]: −1e4 ‖(x, y)‖² − 20 yaw² (eq. 27)."""
+        pose = np.asarray(pose, dtype=float)
+        return np.asarray(-1e4 * (pose[..., :2] ** 2).sum(-1) - 20 * pose[..., 2] ** 2)
+
     def draw_misalignment(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Where `count` episodes start: (x [m], y [m], yaw [rad]) in the hole's frame, shape (count, 3)."""
         limit = np.asarray(self.misalignment)

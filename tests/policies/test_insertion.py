@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import load, load_policy, save
-from gelflow.policies.evaluation import Attempts, NetworkActor, Noise, RandomActor, evaluate, penalty
+from gelflow.policies.evaluation import Attempts, NetworkActor, Noise, RandomActor, evaluate
 from gelflow.policies.networks import (
     Architecture,
     History,
@@ -61,7 +61,7 @@ class Toy(VectorEnv[Any, Any, Any]):
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.error += actions * np.array(INSERTION.action_scale)
         self.tries += 1
-        reward = penalty(self.error)
+        reward = INSERTION.reward(self.error)
         inserted = (np.abs(self.error) < np.array(INSERTION.misalignment) / 3).all(1)
         ended = ~inserted & (self.tries >= INSERTION.attempts)
         if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
@@ -274,10 +274,10 @@ def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
     env = Toy(4)
     attempts = Attempts(env, INSERTION)
     attempts.reset(0)
-    total = penalty(env.error)
+    total = INSERTION.reward(env.error)
     for _ in range(3):
         outcome = attempts.step(np.full((4, 3), 1e-3))
-        total = np.where(outcome.done, penalty(env.error), total + outcome.better)
+        total = np.where(outcome.done, INSERTION.reward(env.error), total + outcome.better)
         assert np.allclose(total[~outcome.done], outcome.reward[~outcome.done])
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
 from gelflow.sim.scene.scene import Scene, load_scene
-from gelflow.sim.simulator import STATUS, Simulator
+from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
 Array = NDArray[np.float64]
@@ -194,7 +194,7 @@ def test_a_failed_environment_keeps_its_last_good_state_and_its_neighbours_do_no
         sim.step(now)
     assert sim.status[2] != 0
     assert not np.delete(sim.status, 2).any()
-    with pytest.raises(SimulationError, match="environment 2: " + STATUS[int(sim.status[2])].split(",")[0]):
+    with pytest.raises(SimulationError, match="environment 2: " + STATUS_MESSAGES[int(sim.status[2])].split(",")[0]):
         sim.check()
     for kept, now in zip(good, (sim.q, sim.v, sim.anchors, sim.anchored), strict=True):
         np.testing.assert_array_equal(now[2], kept)

@@ -7,7 +7,7 @@ import pytest
 from gelflow.sim import _core
 from gelflow.sim.scene.parts import LAWS
 from gelflow.sim.scene.scene import INTEGRATORS, load_scene
-from gelflow.sim.simulator import STATUS, Simulator
+from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.validation.reference_motions import SCENES
 from gelflow.sim.validation.stress import Precision, StepStatistics, StressBatch, StressTest, stress_batches
 
@@ -25,7 +25,7 @@ def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision:
     run = sim.rollout(u, read_after=[10, 20])
     for values in (run.q, run.v, run.anchors, run.tactile, run.history):
         assert np.isfinite(values).all()
-    assert set(run.status.tolist()) <= set(STATUS)
+    assert set(run.status.tolist()) <= set(STATUS_MESSAGES)
     assert (run.status == 0).any()
     gradient = sim.rollout_gradient(run, q=1.0, v=1.0, tactile=1.0)
     for values in (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history):

@@ -1,0 +1,43 @@
+from .benchmark.describe import describe as describe
+from .scene.scene import Scene as Scene
+from .scene.scene import load_scene as load_scene
+from .scene.scene import scene_names as scene_names
+from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
+from .simulator import Simulator as Simulator
+from .simulator import Trajectory as Trajectory
+from .simulator import TrajectoryGradient as TrajectoryGradient
+from .tasks.environments import InsertionEnv as InsertionEnv
+from .tasks.environments import InsertionVectorEnv as InsertionVectorEnv
+from .tasks.insertion import InsertionAttempts as InsertionAttempts
+from .tasks.insertion import insertion_scene as insertion_scene
+from .tasks.randomization import Randomization as Randomization
+from .torch_layer import TorchRollout as TorchRollout
+from .torch_layer import TorchState as TorchState
+from .torch_layer import torch_rollout as torch_rollout
+from .torch_layer import torch_state as torch_state
+from .torch_layer import torch_step as torch_step
+from .validation.energy import Energy as Energy
+from .validation.energy import EnergyGauge as EnergyGauge
+
+__all__ = [
+    "STATUS_MESSAGES",
+    "Energy",
+    "EnergyGauge",
+    "InsertionAttempts",
+    "InsertionEnv",
+    "InsertionVectorEnv",
+    "Randomization",
+    "Scene",
+    "Simulator",
+    "TorchRollout",
+    "TorchState",
+    "Trajectory",
+    "TrajectoryGradient",
+    "describe",
+    "insertion_scene",
+    "load_scene",
+    "scene_names",
+    "torch_rollout",
+    "torch_state",
+    "torch_step",
+]
