@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gelflow.perception.synthetic.flaws import FACTORS, PRESETS, look_of
+from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, make_appearance
 from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
 FILE = Path(__file__).parents[1] / "docs" / "pictures" / "gel_classes.jpg"
@@ -19,7 +19,7 @@ ACROSS = 4
 
 def tile(name: str, preset: str, changed: dict[str, object], seed: int) -> np.ndarray:
     """Most of one image, with its name."""
-    look = look_of(preset, seed=seed, **changed)
+    look = make_appearance(preset, seed=seed, **changed)
     sequence = GelSequence(look, FIELDS[seed % len(FIELDS)], period=48, frames=2 * SHOWN)
     image = list(sequence)[SHOWN].image[:200, 20:300]
     cv2.putText(image, name, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 3, cv2.LINE_AA)

@@ -19,7 +19,8 @@ from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
-from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.real.kinematics import Joints
 from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, Pace
 
@@ -39,7 +40,7 @@ class MockRobotConfig:
     tcp_port: int = 0  # of the gripper, beside its pty; 0 takes a free one
     truth_port: int = 0  # of the side channel that tells the truth; 0 takes a free one
     camera_rate: float = 12.5  # frames a second: one every 80 ms, as the real set-up processes them
-    look: GelLook = field(default_factory=GelLook)
+    look: GelAppearance = field(default_factory=GelAppearance)
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and the right camera's image [°]: 0, 90, 180 or 270
 
 
@@ -107,7 +108,7 @@ class MockRobot:
         self.stop()
 
 
-def _look(config: MockRobotConfig, finger: int) -> GelLook:
+def _look(config: MockRobotConfig, finger: int) -> GelAppearance:
     rotation = config.rotations[finger]
     width, height = config.look.width, config.look.height
     turned = (height, width) if rotation in (90, 270) else (width, height)
@@ -118,9 +119,9 @@ def _look(config: MockRobotConfig, finger: int) -> GelLook:
 class _Gel:
     """The picture source of one camera."""
 
-    def __init__(self, cell: SimulatedCellProcess, finger: int, look: GelLook) -> None:
+    def __init__(self, cell: SimulatedCellProcess, finger: int, look: GelAppearance) -> None:
         self._cell, self._finger = cell, finger
-        self._renderer = GelRenderer(look)
+        self._renderer = FastGelRenderer(look)
         self._count = 0
 
     def __call__(self) -> bytes:

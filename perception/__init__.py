@@ -1,5 +1,5 @@
 """Camera images to tactile frames: detect dots, fit the grid, measure displacement."""
 
-from gelflow.perception.tracker import MarkerTracker, StartRefused, Tracked, TrackerConfig
+from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackerInitError, TrackingResult
 
-__all__ = ["MarkerTracker", "StartRefused", "Tracked", "TrackerConfig"]
+__all__ = ["MarkerTracker", "TrackerConfig", "TrackerInitError", "TrackingResult"]

@@ -100,7 +100,7 @@ class Calibration:
         middle, right, down = self.to_pixels(np.array([[0, 0], [0.1, 0], [0, 0.1]]))
         return float(np.linalg.norm(right - middle)) / 0.1, float(np.linalg.norm(down - middle)) / 0.1
 
-    def nodes_mm(self) -> Floats:
+    def marker_positions_mm(self) -> Floats:
         """Where the markers are on the gel at rest [mm], shape (rows * cols, 2), line by line."""
         right, down = np.meshgrid(np.arange(self.cols), np.arange(self.rows))
         middle = ((self.cols - 1) / 2, (self.rows - 1) / 2)
@@ -115,7 +115,7 @@ class Calibration:
                 "calibrate the camera as it is used now"
             )
 
-    def rectified(self, image: Image) -> Image:
+    def rectify(self, image: Image) -> Image:
         """`image` as a camera straight above would see it: the grid and one spacing around it, at the same scale."""
         self.check_size(image)
         scale = max(self.pixels_per_mm())
@@ -168,7 +168,7 @@ def fit_calibration(
 
 def _fit(blank: Calibration, rest: Floats, used: NDArray[np.bool_], coefficients: int, off_center: bool) -> Calibration:
     """Least squares of the distances in the picture, with so many radial coefficients, and the lens's centre or not."""
-    nodes, measured = blank.nodes_mm()[used], rest[used]
+    nodes, measured = blank.marker_positions_mm()[used], rest[used]
     half = blank._half_diagonal
     middle = np.array(blank.center)
     plane, _ = cv2.findHomography(nodes, (measured - middle) / half)
@@ -223,7 +223,7 @@ def _stretch(square: Floats, radial: Sequence[float] | Floats) -> Floats:
 
 def _distances(fit: Calibration, rest: Floats) -> Floats:
     """How far each marker lies from its node of the grid [px], shape (markers,)."""
-    return np.asarray(np.linalg.norm(fit.to_pixels(fit.nodes_mm()) - rest, axis=1))
+    return np.asarray(np.linalg.norm(fit.to_pixels(fit.marker_positions_mm()) - rest, axis=1))
 
 
 def _criterion(fit: Calibration, distance: Floats) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gelflow.perception._tracker import PROFILE_STEPS, Tracker
 from gelflow.perception.detect import PLANES, plane_of
-from gelflow.perception.errors import StartRefused, draw_seen
+from gelflow.perception.errors import TrackerInitError, draw_seen
 from gelflow.perception.grid import Found
 
 Floats = NDArray[np.float64]
@@ -40,14 +40,14 @@ class Learned:
 def learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
     """A tracker for the markers `found` in `image` (B G R), started there.
 
-    Raises StartRefused when the dots do not look alike, or like no dots: then they are no print.
+    Raises TrackerInitError when the dots do not look alike, or like no dots: then they are no print.
     """
     _alike(image, found, found.seen.astype(np.float64).reshape(-1))
     try:
         return _learn(image, found)
     except ValueError as error:  # of a shape without an edge, of dots that touch
         picture = draw_seen(image, found.positions[found.seen], found.radius, None)
-        raise StartRefused(
+        raise TrackerInitError(
             f"the spots in lines and columns are no dots that can be measured: {error}", picture
         ) from None
 
@@ -77,7 +77,7 @@ def _alike(image: NDArray[np.uint8], found: Found, quality: Floats) -> NDArray[n
     """Which dots have the common shape."""
     seen, dots = quality > 0, int(found.seen.sum())
     if seen.sum() < max(_ALIKE * dots, 6):
-        raise StartRefused(
+        raise TrackerInitError(
             f"of {dots} spots in lines and columns only {seen.sum()} look alike: they are no printed markers, "
             "or too blurred or damaged",
             draw_seen(image, found.positions[found.seen], found.radius, None),

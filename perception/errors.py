@@ -11,7 +11,7 @@ _LINE = (255, 180, 0)
 _SHIFT = 4  # OpenCV takes coordinates in 1/16 px
 
 
-class StartRefused(PeerError):
+class TrackerInitError(PeerError):
     """The image shows no grid of markers that can be trusted. The message says why.
 
     `picture` (B G R, uint8) is the image with what was seen drawn over it: yellow rings are dots, blue lines join

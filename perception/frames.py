@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import Grid, TactileFrame
 from gelflow.perception.calibration import Calibration
-from gelflow.perception.tracker import Tracked, TrackerConfig
+from gelflow.perception.tracker import TrackerConfig, TrackingResult
 
 Image = NDArray[np.uint8]
 
@@ -82,7 +82,7 @@ class CameraMount:
         """What displacements are known in."""
         return "px" if self.calibration is None and self.pixels_per_mm is None else "mm"
 
-    def displacement_mm(self, tracked: Tracked) -> NDArray[np.float64]:
+    def displacement_mm(self, tracked: TrackingResult) -> NDArray[np.float64]:
         """Displacements in the image's axes (right, down) [mm], shape (markers, 2). Raises UsageError in "px"."""
         if self.calibration is not None:
             return self.calibration.displacement_mm(tracked.position, tracked.displacement)
@@ -98,7 +98,7 @@ class CameraMount:
         return np.stack([down, -right if self.mirrored else right], axis=1)
 
 
-def decode(data: bytes) -> Image:
+def decode_image(data: bytes) -> Image:
     """The image in `data` (JPEG or PNG) as B G R, uint8, shape (height, width, 3).
 
     Raises PeerError when the bytes are no image. Live and replay both decode here, so that they see the same.
@@ -112,7 +112,7 @@ def decode(data: bytes) -> Image:
     return np.asarray(image, dtype=np.uint8)
 
 
-def tactile_frame(trackeds: Sequence[Tracked], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
+def tactile_frame(trackeds: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
     """What all sensors felt: one tracked image and one mount per sensor, sensor 0 (the left finger) first.
 
     The unit is "mm" when every mount knows it, otherwise "px". Raises UsageError when the numbers of images

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots, smaller
-from gelflow.perception.errors import StartRefused, draw_seen
+from gelflow.perception.errors import TrackerInitError, draw_seen
 from gelflow.perception.lattice import Lattice, fill, grow
 
 Polarity = Literal["auto", "dark", "bright"]
@@ -57,7 +57,7 @@ def find_grid(
 
     With `rows` and `cols` the grid has that many lines and columns (with `either_way`, or the other way round);
     lines beyond, which the image's border cuts, are left out. Without, every line that is mostly there counts.
-    Raises StartRefused when there is no grid, or one of other rows and columns than asked for; UsageError when no
+    Raises TrackerInitError when there is no grid, or one of other rows and columns than asked for; UsageError when no
     grid can have these.
     """
     wanted = _wanted(rows, cols, either_way)
@@ -75,7 +75,7 @@ def find_grid(
     if lattice is not None and not refusal:
         refusal, part = _window(lattice, dots, rows, cols, wanted)
     if part is None:
-        raise StartRefused(refusal, draw_seen(small, dots.centers, radius, lattice.dots if lattice else None))
+        raise TrackerInitError(refusal, draw_seen(small, dots.centers, radius, lattice.dots if lattice else None))
     return _found(look, part, dots).scaled(shrink)
 
 
@@ -87,7 +87,7 @@ def _looks(image: NDArray[np.uint8], polarity: Polarity) -> tuple[Look, ...]:
     return BRIGHT + DARK if float((stands_out**3).mean()) > 0 else DARK + BRIGHT
 
 
-def _nothing(image: NDArray[np.uint8], look: Look, polarity: Polarity) -> StartRefused:
+def _nothing(image: NDArray[np.uint8], look: Look, polarity: Polarity) -> TrackerInitError:
     """The refusal of an image without a grid, by what stands out in it."""
     sizes = [
         (r, find_dots(contrast(image, look, round(5 * r)), radius=r, apart=1.5 * r, least=0.1)) for r in _RADII[::2]
@@ -100,7 +100,7 @@ def _nothing(image: NDArray[np.uint8], look: Look, polarity: Polarity) -> StartR
     else:
         seen = f"{len(dots) or 'no'} dots stand out, and a grid of markers has at least 3 × 3"
     picture = draw_seen(image, dots.centers, radius, None)
-    return StartRefused(f"no grid of markers found in the image: {seen}{_hint(polarity)}", picture)
+    return TrackerInitError(f"no grid of markers found in the image: {seen}{_hint(polarity)}", picture)
 
 
 def _hint(polarity: Polarity) -> str:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.perception.tracker import Tracked
+from gelflow.perception.tracker import TrackingResult
 
 _SHIFT = 4  # OpenCV takes coordinates in 1/16 px
 _ARROW = (255, 255, 255)
@@ -14,7 +14,7 @@ _EDGE = (0, 0, 0)
 
 
 def draw_overlay(
-    image: NDArray[np.uint8], tracked: Tracked, *, magnify: float = 3.0, smallest: int = 900
+    image: NDArray[np.uint8], tracked: TrackingResult, *, magnify: float = 3.0, smallest: int = 900
 ) -> NDArray[np.uint8]:
     """`image` (B G R) with the tracked markers drawn over it, enlarged to at least `smallest` px on its longer side.
 
@@ -67,7 +67,7 @@ def _draw_grid(
                 cv2.line(picture, _fixed(places[i, j]), _fixed(places[i + 1, j]), columns[j], 1, cv2.LINE_AA, _SHIFT)
 
 
-def _caption(picture: NDArray[np.uint8], tracked: Tracked, magnify: float) -> None:
+def _caption(picture: NDArray[np.uint8], tracked: TrackingResult, magnify: float) -> None:
     lengths = np.linalg.norm(tracked.displacement[tracked.valid], axis=1)
     largest = f"{lengths.max():.1f} px" if len(lengths) else "none"
     seen = f"{tracked.valid.sum()}/{tracked.valid.size} valid, {tracked.inferred.sum()} inferred"

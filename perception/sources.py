@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
-from gelflow.perception.frames import ENCODED, decode
+from gelflow.perception.frames import ENCODED, decode_image
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS
 
@@ -31,7 +31,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True)
-class Frame:
+class SourceImage:
     """One image of a source."""
 
     name: str  # of its file, or its number
@@ -41,7 +41,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Source:
+class ImageSource:
     """A finite or endless sequence of images."""
 
     text: str  # as the user wrote it
@@ -57,7 +57,7 @@ class Source:
         """Whether it goes on until it is told to stop."""
         return self.kind in ("stream", "camera")
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[SourceImage]:
         """One image after the other. Raises PeerError when one can not be had."""
         if self.kind == "session":
             return self._from_session()
@@ -77,31 +77,31 @@ class Source:
         capture.release()
         return number if number > 0 else None
 
-    def _from_files(self) -> Iterator[Frame]:
+    def _from_files(self) -> Iterator[SourceImage]:
         for number, file in enumerate(self.files):
             try:
                 data = file.read_bytes()
                 kept = data if data.startswith(ENCODED) else None
-                yield Frame(file.name, decode(data), number / self.rate, kept)
+                yield SourceImage(file.name, decode_image(data), number / self.rate, kept)
             except PeerError as error:
                 raise PeerError(f"{file}: {error}") from None
             except OSError as error:
                 raise PeerError(f"{file} can not be read: {error.strerror}") from None
 
-    def _from_session(self) -> Iterator[Frame]:
+    def _from_session(self) -> Iterator[SourceImage]:
         empty = True
         with SessionReader(self.text) as session:
             for record in session.records([f"/{self.sensor}/image"]):
                 empty = False
                 name = f"{record.value.sequence:06d}"
                 try:
-                    yield Frame(name, decode(record.value.data), record.stamp, record.value.data)
+                    yield SourceImage(name, decode_image(record.value.data), record.stamp, record.value.data)
                 except PeerError as error:
                     raise PeerError(f"{self.text}, image {name} of the {self.sensor} sensor: {error}") from None
         if empty:
             raise PeerError(f"session {self.text} has no image of the {self.sensor} sensor")
 
-    def _from_capture(self) -> Iterator[Frame]:
+    def _from_capture(self) -> Iterator[SourceImage]:
         capture = self._open()
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else self.rate
@@ -114,7 +114,7 @@ class Source:
                 if image.ndim == 2:
                     image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
                 stamp = self.clock.now() if self.live else number / rate
-                yield Frame(f"{number:06d}", np.asarray(image, dtype=np.uint8), stamp)
+                yield SourceImage(f"{number:06d}", np.asarray(image, dtype=np.uint8), stamp)
                 number += 1
         finally:
             capture.release()
@@ -171,7 +171,7 @@ class Source:
             raise PeerError(f"{self.text} is a text file, not an image or a video")
 
 
-def find_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Source:
+def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> ImageSource:
     """What `text` means: a number is a camera, scheme://... a stream, .mcap a session, otherwise a folder or a file.
 
     `sensor` chooses the images of a session; `rate` [Hz] gives those of a folder their stamps. Raises UsageError when
@@ -184,20 +184,20 @@ def find_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Sourc
     if not 0.01 <= rate <= 10000:
         raise UsageError(f"rate must be within 0.01 to 10000 Hz, got {rate}")
     if text.isascii() and text.isdigit():
-        return Source(text, "camera", rate=rate)
+        return ImageSource(text, "camera", rate=rate)
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
-        return Source(text, "stream", rate=rate)
+        return ImageSource(text, "stream", rate=rate)
     path = Path(text)
     if path.suffix.lower() == ".mcap":
-        return Source(text, "session", sensor=sensor)
+        return ImageSource(text, "session", sensor=sensor)
     if path.is_dir():
         files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural))
         if not files:
             raise UsageError(f"folder {text} has no images (known are {', '.join(sorted(IMAGE_SUFFIXES))})")
-        return Source(text, "folder", files, rate=rate)
+        return ImageSource(text, "folder", files, rate=rate)
     if not path.exists():
         raise UsageError(f"expected a folder, a file, a URL or a camera's number, got {text}, which does not exist")
-    return Source(text, "image", (path,)) if _is_image(path) else Source(text, "video", rate=rate)
+    return ImageSource(text, "image", (path,)) if _is_image(path) else ImageSource(text, "video", rate=rate)
 
 
 def natural(path: Path) -> tuple[tuple[int, int, str], ...]:

@@ -17,10 +17,10 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
 from gelflow.perception.detect import smaller
 from gelflow.perception.dot_model import learn
-from gelflow.perception.errors import StartRefused
+from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid import Polarity, find_grid
 
-__all__ = ["MarkerTracker", "StartRefused", "Tracked", "TrackerConfig"]
+__all__ = ["MarkerTracker", "TrackerConfig", "TrackerInitError", "TrackingResult"]
 
 _LARGEST = 10.0  # radius of a dot [px]; in a larger image nothing is gained by more pixels, it is made smaller
 
@@ -36,7 +36,7 @@ class TrackerConfig:
 
 
 @dataclass(frozen=True)
-class Tracked:
+class TrackingResult:
     """The markers in one image, line by line from the top, each line from the left."""
 
     position: NDArray[np.float64]  # (right, down) [px], shape (markers, 2); where not valid, where it is expected
@@ -79,11 +79,11 @@ class MarkerTracker:
             raise UsageError("the tracker has no rest positions yet: start it with an image at rest")
         return _larger(self._started.tracker.rest(), self._started.shrink)
 
-    def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> Tracked:
+    def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> TrackingResult:
         """Finds the grid in `image` (B G R, or grey) and takes it as the reference; displacements in it are zero.
 
         `rows` and `cols` are lines and markers in a line; left out, the configuration's, and if it has none, found.
-        Raises StartRefused when the image shows no such grid, or not clearly; UsageError when it is no image.
+        Raises TrackerInitError when the image shows no such grid, or not clearly; UsageError when it is no image.
         """
         c = self.config
         image = _colours(image)
@@ -96,9 +96,9 @@ class MarkerTracker:
         rows, cols = found.shape
         self._started = _Started(tracker, size, shrink, rows, cols, found.spacing)
         none, seen = np.zeros_like(rest), learned.seen
-        return Tracked(rest, none, seen, ~seen, learned.quality, rows, cols, found.spacing)
+        return TrackingResult(rest, none, seen, ~seen, learned.quality, rows, cols, found.spacing)
 
-    def track(self, image: NDArray[np.uint8]) -> Tracked:
+    def track(self, image: NDArray[np.uint8]) -> TrackingResult:
         """The markers in the next image (B G R, or grey). The first call is `start`.
 
         A marker that is not seen, or not for certain, is not valid. Raises PeerError when the image's size changes,
@@ -116,7 +116,7 @@ class MarkerTracker:
         if shrink > 1:
             position, displacement = _larger(position, shrink), shrink * displacement
         grid = started.rows, started.cols, started.spacing
-        return Tracked(position, displacement, valid, inferred, quality, *grid)
+        return TrackingResult(position, displacement, valid, inferred, quality, *grid)
 
 
 def _colours(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

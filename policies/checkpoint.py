@@ -43,7 +43,7 @@ def default_checkpoint() -> Path:
     return Path(__file__).resolve().parent / "checkpoints" / "insertion.safetensors"
 
 
-def save(
+def save_checkpoint(
     path: Path,
     *,
     task: InsertionTask,
@@ -75,7 +75,7 @@ def save(
     partial.replace(path)
 
 
-def load(path: Path) -> Checkpoint:
+def load_checkpoint(path: Path) -> Checkpoint:
     """Read a checkpoint.
 
     Raises UsageError in one line when the file is missing, is no checkpoint, is damaged, or is of a newer format.
@@ -107,7 +107,7 @@ def load_policy(path: str | Path, *, task: InsertionTask = INSERTION) -> Network
     message names the fields that differ).
     """
     path = Path(path)
-    checkpoint = load(path)
+    checkpoint = load_checkpoint(path)
     if different := task_differences(checkpoint.task, task.to_json()):
         raise UsageError(f"{path} was trained for another task: {different}; train for this one, or run that one")
     try:

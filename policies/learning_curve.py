@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gelflow.policies.evaluation import Evaluation
+from gelflow.policies.evaluation import EvaluationResult
 
 
 @dataclass(frozen=True)
-class Progress:
+class LearningCurvePoint:
     """One point of the learning curve."""
 
     attempts: int
@@ -19,13 +19,13 @@ class Progress:
     reward: float  # mean over the attempts since the last point; nan at an evaluation
     success: float  # share of the last training episodes that ended inserted; nan before the first ended
     spread: float  # standard deviation of the actions, in units of the reach
-    evaluation: Evaluation | None = None
+    evaluation: EvaluationResult | None = None
 
 
 COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated attempts")
 
 
-def write_table(path: Path, points: Sequence[Progress]) -> None:
+def write_table(path: Path, points: Sequence[LearningCurvePoint]) -> None:
     """Write the points as CSV with a header line; evaluations fill the last two columns."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -36,7 +36,7 @@ def write_table(path: Path, points: Sequence[Progress]) -> None:
             writer.writerow([p.attempts, *numbers, *tail])
 
 
-def draw(path: Path, points: Sequence[Progress]) -> None:
+def draw(path: Path, points: Sequence[LearningCurvePoint]) -> None:
     """Draw success and reward over attempts to a picture file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # here: training alone draws
     from matplotlib.figure import Figure
@@ -49,7 +49,7 @@ def draw(path: Path, points: Sequence[Progress]) -> None:
     x = np.array([p.attempts for p in updates]) / 1000
     top.plot(x, [100 * p.success for p in updates], color="tab:gray", label="training, exploring")
     x_evaluated = [attempts / 1000 for attempts, _ in evaluated]
-    low, high = np.array([e.interval() for _, e in evaluated]).reshape(-1, 2).T * 100
+    low, high = np.array([e.confidence_interval() for _, e in evaluated]).reshape(-1, 2).T * 100
     top.plot(x_evaluated, [100 * e.success for _, e in evaluated], "o-", color="tab:blue", label="evaluation, 95 %")
     top.fill_between(x_evaluated, low, high, color="tab:blue", alpha=0.2, linewidth=0)
     top.set(ylabel="parts inserted [%]", ylim=(0, 100), title="Insertion policy, simulation")

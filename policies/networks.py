@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap, Grid
-from gelflow.policies.symmetry import Mirrors, exponents
+from gelflow.policies.symmetry import MirrorSymmetry, exponents
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -152,7 +152,7 @@ class Network:
                 raise UsageError(f"tensor {name} has shape {tensors[name].shape}; expected {shape}")
             if not np.isfinite(tensors[name]).all():
                 raise UsageError(f"tensor {name} has values that are not finite")
-        self._mirrors = Mirrors(architecture.degree, architecture.history, task)
+        self._mirrors = MirrorSymmetry(architecture.degree, architecture.history, task)
         self._basis: Array = tensors["basis"].astype(float)
         self._scale: Array = tensors["scale"].astype(float)
         depth = len(architecture.hidden) + 1
@@ -169,7 +169,7 @@ class Network:
         return reduce_maps(images, self._basis) / self._scale
 
     def canonical(self, inputs: Array) -> tuple[Array, Array]:
-        """What the perceptron sees of inputs that `History.observe` made, and its answer's signs: see `Mirrors`."""
+        """Perceptron inputs from `History.observe` inputs, and the signs of its outputs; see `MirrorSymmetry`."""
         return self._mirrors.canonical(inputs)
 
     def corrections(self, inputs: Array) -> Array:

@@ -26,8 +26,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from gelflow.errors import UsageError
 from gelflow.policies import checkpoint
 from gelflow.policies import learning_curve as curve
-from gelflow.policies.evaluation import Attempts, Evaluation, NetworkActor, Noise, evaluate
-from gelflow.policies.learning_curve import Progress
+from gelflow.policies.environment import FlowMapNoise, PolicyEnv
+from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
+from gelflow.policies.learning_curve import LearningCurvePoint
 from gelflow.policies.networks import Architecture, Network, polynomial_basis, reduce_maps, tensor_shapes
 
 Array = NDArray[np.float64]
@@ -60,11 +61,11 @@ CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "lea
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainingResult:
     """What a training run made."""
 
     checkpoint: Path
-    best: Evaluation
+    best: EvaluationResult
     curve: Path
     picture: Path
 
@@ -75,7 +76,7 @@ class HistoryVecEnv(VecEnv):
     render_mode = None
 
     def __init__(
-        self, attempts: Attempts, architecture: Architecture, basis: Array, scale: Array, *, seed: int
+        self, attempts: PolicyEnv, architecture: Architecture, basis: Array, scale: Array, *, seed: int
     ) -> None:
         size = architecture.inputs(attempts.task)
         super().__init__(
@@ -136,27 +137,27 @@ class _Run:
     """What belongs together while a run lasts."""
 
     env: HistoryVecEnv
-    validation: Attempts
+    validation: PolicyEnv
     architecture: Architecture
     basis: Array
     scale: Array
     settings: PPOSettings
-    noise: Noise | None
+    noise: FlowMapNoise | None
     out: Path
     command: Sequence[str]
-    report: Callable[[Progress], None] | None
+    report: Callable[[LearningCurvePoint], None] | None
 
 
 def train(
-    attempts: Attempts,
-    validation: Attempts,
+    attempts: PolicyEnv,
+    validation: PolicyEnv,
     *,
     out: Path,
     architecture: Architecture | None = None,
     settings: PPOSettings | None = None,
     command: Sequence[str] = (),
-    report: Callable[[Progress], None] | None = None,
-) -> Trained:
+    report: Callable[[LearningCurvePoint], None] | None = None,
+) -> TrainingResult:
     """Train on `attempts`, keep the checkpoint that does best on `validation`.
 
     Parameters
@@ -223,7 +224,7 @@ def export(model: PPO, architecture: Architecture, basis: Array, scale: Array) -
     return tensors
 
 
-def calibrate(attempts: Attempts, architecture: Architecture, basis: Array, settings: PPOSettings) -> Array:
+def calibrate(attempts: PolicyEnv, architecture: Architecture, basis: Array, settings: PPOSettings) -> Array:
     """Root mean square of every feature over random attempts, noise included: what the features are divided by.
 
     The same for both pads of a frame and never less than 1e-3, so that a feature which is only noise stays small.
@@ -249,8 +250,8 @@ class _Keeper(BaseCallback):
         self._run = run
         self._start = time.monotonic()
         self._next = run.settings.evaluate_every
-        self._best: Evaluation | None = None
-        self._points: list[Progress] = []
+        self._best: EvaluationResult | None = None
+        self._points: list[LearningCurvePoint] = []
 
     def _on_step(self) -> bool:
         return self._minutes() < self._run.settings.minutes
@@ -269,13 +270,13 @@ class _Keeper(BaseCallback):
     def _minutes(self) -> float:
         return (time.monotonic() - self._start) / 60
 
-    def _point(self, evaluation: Evaluation | None) -> None:
+    def _point(self, evaluation: EvaluationResult | None) -> None:
         env = self._run.env
         spread = float(torch.as_tensor(self.model.policy.log_std).detach().exp().mean())
         reward = float(np.mean(env.rewards)) if env.rewards else float("nan")
         success = float(np.mean(env.successes)) if env.successes else float("nan")
         env.rewards.clear()
-        point = Progress(self.num_timesteps, self._minutes(), reward, success, spread, evaluation)
+        point = LearningCurvePoint(self.num_timesteps, self._minutes(), reward, success, spread, evaluation)
         self._points.append(point)
         if self._run.report:
             self._run.report(point)
@@ -300,16 +301,18 @@ class _Keeper(BaseCallback):
                 "versions": {"torch": str(torch.__version__), "stable_baselines3": stable_baselines3.__version__},
             }
             path = run.out / CHECKPOINT
-            checkpoint.save(path, task=task, architecture=run.architecture, tensors=tensors, training=training)
+            checkpoint.save_checkpoint(
+                path, task=task, architecture=run.architecture, tensors=tensors, training=training
+            )
         self._point(result)
         curve.write_table(run.out / CURVE, self._points)
 
-    def finish(self) -> Trained:
+    def finish(self) -> TrainingResult:
         """Draw the curve; what was made."""
         assert self._best is not None
         curve.draw(self._run.out / PICTURE, self._points)
         out = self._run.out
-        return Trained(out / CHECKPOINT, self._best, out / CURVE, out / PICTURE)
+        return TrainingResult(out / CHECKPOINT, self._best, out / CURVE, out / PICTURE)
 
 
 def _plain(settings: PPOSettings) -> dict[str, Any]:
@@ -317,11 +320,11 @@ def _plain(settings: PPOSettings) -> dict[str, Any]:
     return {key: None if value == float("inf") else value for key, value in dataclasses.asdict(settings).items()}
 
 
-def _zeros(architecture: Architecture, attempts: Attempts) -> dict[str, NDArray[Any]]:
+def _zeros(architecture: Architecture, attempts: PolicyEnv) -> dict[str, NDArray[Any]]:
     return {name: np.zeros(shape) for name, shape in tensor_shapes(architecture, attempts.task).items()}
 
 
-def _check(settings: PPOSettings, attempts: Attempts) -> None:
+def _check(settings: PPOSettings, attempts: PolicyEnv) -> None:
     """One line for settings that stable-baselines3 would take and misuse, or refuse with a traceback."""
     collected = settings.rollout * attempts.count
     if settings.attempts < 1 or not settings.minutes > 0:

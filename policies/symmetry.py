@@ -20,7 +20,7 @@ def exponents(degree: int) -> list[tuple[int, int]]:
     return [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
 
 
-class Mirrors:
+class MirrorSymmetry:
     """Mirrored inputs of the network. Pads sit at the gripper's ∓x, so mirroring x swaps them.
 
     On a pad, mirroring x or y runs the columns backwards and turns the shear's y over (the pads' y axes are opposite).

@@ -38,7 +38,7 @@ class Own:
         self._tracker = MarkerTracker()
 
     def start(self, image: Image, rest: Points, seen: Flags, rows: int, cols: int) -> Found:
-        """Raises StartRefused as the tracker does, and UsageError when it found another grid."""
+        """Raises TrackerInitError as the tracker does, and UsageError when it found another grid."""
         tracked = self._tracker.start(image)
         if (tracked.rows, tracked.cols) != (rows, cols):
             raise UsageError(f"found {tracked.rows} × {tracked.cols} markers, there are {rows} × {cols}")

@@ -12,7 +12,7 @@ from gelflow.perception.benchmark.baselines import FOLLOWERS
 from gelflow.perception.benchmark.metrics import Figures
 from gelflow.perception.benchmark.speed import measure_speed
 from gelflow.perception.benchmark.tracking import LARGE, Case
-from gelflow.perception.synthetic.flaws import SIZES, look_of
+from gelflow.perception.synthetic.appearance import SIZES, make_appearance
 from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
 _SEQUENCE: dict[str, Any] = {"frames": 20, "period": 32}  # from rest to the peak
@@ -26,7 +26,9 @@ class Curve:
     name: str
     label: str
     values: tuple[float, ...]
-    at: Callable[[float], tuple[dict[str, Any], dict[str, Any]]]  # value → changes of the look and of the sequence
+    at: Callable[
+        [float], tuple[dict[str, Any], dict[str, Any]]
+    ]  # value → changes of the appearance and of the sequence
 
 
 ERRORS = (
@@ -57,9 +59,9 @@ def measure_curves(options: BenchmarkOptions) -> Report:
     timed = [("markers", markers, markers, LARGE) for markers in SIZES]
     timed += [("width", width, 130, (width, width * 3 // 4)) for width in WIDTHS]
     for name, value, markers, size in [timed[0], timed[len(SIZES)]] if options.quick else timed:
-        look = look_of("typical", markers=markers, width=size[0], height=size[1])
-        frames = list(GelSequence(look, frames=_TIMED))
-        images, first, grid = [frame.image for frame in frames], frames[0], look.grid
+        appearance = make_appearance("typical", markers=markers, width=size[0], height=size[1])
+        frames = list(GelSequence(appearance, frames=_TIMED))
+        images, first, grid = [frame.image for frame in frames], frames[0], appearance.grid
         timings = measure_speed(
             FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=options.repeats
         )

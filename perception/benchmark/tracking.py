@@ -10,8 +10,8 @@ from gelflow.measurement.timing import BenchmarkOptions, Report
 from gelflow.perception.benchmark.baselines import FOLLOWERS
 from gelflow.perception.benchmark.metrics import Course, Figures, follow
 from gelflow.perception.benchmark.speed import measure_speed
-from gelflow.perception.synthetic.error_bound import floor_errors
-from gelflow.perception.synthetic.flaws import FACTORS, PRESETS, FlawedLook, look_of
+from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, DegradedGelAppearance, make_appearance
+from gelflow.perception.synthetic.error_bound import cramer_rao_errors
 from gelflow.perception.synthetic.sequences import FIELDS, REST, Field, GelSequence
 
 if TYPE_CHECKING:
@@ -46,17 +46,21 @@ class Case:
     markers: int = 130
     size: tuple[int, int] = SMALL  # of the image [px]
 
-    def look(self, seed: int) -> FlawedLook:
+    def appearance(self, seed: int) -> DegradedGelAppearance:
         width, height = self.size
-        return look_of(self.preset, markers=self.markers, width=width, height=height, seed=seed, **dict(self.changed))
+        return make_appearance(
+            self.preset, markers=self.markers, width=width, height=height, seed=seed, **dict(self.changed)
+        )
 
     def follow(self, names: Iterable[str], fields: Sequence[Field], **motion: Any) -> dict[str, list[Course]]:
         """The courses of trackers on one sequence for each of `fields`, every one with another print and light."""
         courses: dict[str, list[Course]] = {name: [] for name in names}
         for field in fields:
-            look = self.look(seed=FIELDS.index(field))
+            appearance = self.appearance(seed=FIELDS.index(field))
             followers: dict[str, Follower] = {name: FOLLOWERS[name]() for name in courses}
-            found = follow(GelSequence(look, field, **motion), look.grid.rows, look.grid.cols, followers)
+            found = follow(
+                GelSequence(appearance, field, **motion), appearance.grid.rows, appearance.grid.cols, followers
+            )
             for name, course in found.items():
                 courses[name].append(course)
         return courses
@@ -96,8 +100,10 @@ def _errors(cases: Sequence[Case], options: BenchmarkOptions) -> Report:
         names = tuple(FOLLOWERS) if case.size == SMALL else (OWN,)
         frames = QUICK_FRAMES if options.quick else FRAMES
         figures = {n: Figures.of(c) for n, c in case.follow(names, _fields(options), frames=frames).items()}
-        looks = [(case.look(FIELDS.index(field)), field) for field in _fields(options)]
-        floor = np.concatenate([floor_errors(GelSequence(look, field, frames=frames)) for look, field in looks])
+        looks = [(case.appearance(FIELDS.index(field)), field) for field in _fields(options)]
+        floor = np.concatenate(
+            [cramer_rao_errors(GelSequence(appearance, field, frames=frames)) for appearance, field in looks]
+        )
         own, least = figures[OWN], float(np.median(floor))
         rows.append(
             (
@@ -235,10 +241,10 @@ def _speed(options: BenchmarkOptions) -> Report:
     options.progress.begin("tracking: speed", len(sizes))
     rows, results = [], []
     for markers, (width, height) in sizes:
-        look = look_of("typical", markers=markers, width=width, height=height)
-        frames = list(GelSequence(look, "press", frames=QUICK_FRAMES if options.quick else FRAMES))
+        appearance = make_appearance("typical", markers=markers, width=width, height=height)
+        frames = list(GelSequence(appearance, "press", frames=QUICK_FRAMES if options.quick else FRAMES))
         images = [frame.image for frame in frames]
-        first, grid = frames[0], look.grid
+        first, grid = frames[0], appearance.grid
         timings = measure_speed(
             FOLLOWERS, images, first.position, first.visible, grid.rows, grid.cols, repeats=options.repeats
         )

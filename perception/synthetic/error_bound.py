@@ -7,7 +7,7 @@ far each dot seems to have moved in the noisy image, together with the dot's con
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.perception.synthetic.ground_truth import TruthRenderer
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.sequences import GelSequence
 
 _GREY = np.array([0.114, 0.587, 0.299])  # of blue, green and red
@@ -16,9 +16,9 @@ _STEP = 0.2  # that the dots are moved to see how the image changes [px]
 Array = NDArray[np.float64]
 
 
-def floor_errors(sequence: GelSequence, *, every: int = 8) -> Array:
+def cramer_rao_errors(sequence: GelSequence, *, every: int = 8) -> Array:
     """Endpoint errors of that fit for the visible dots of every `every`-th image [px], shape (n,)."""
-    renderer = TruthRenderer(sequence.look)
+    renderer = AccurateGelRenderer(sequence.appearance)
     found = []
     for number in range(0, len(sequence), every):
         still, around = sequence.displacement(number), sequence.surroundings(number)
@@ -30,12 +30,12 @@ def floor_errors(sequence: GelSequence, *, every: int = 8) -> Array:
     return np.array(found)
 
 
-def _known(renderer: TruthRenderer, sequence: GelSequence, number: int) -> Array:
+def _known(renderer: AccurateGelRenderer, sequence: GelSequence, number: int) -> Array:
     """Noiseless grey image and its change with the dots' place to the right and down, shape (3, height, width)."""
     still, around = sequence.displacement(number), sequence.surroundings(number)
 
     def grey(right: float, down: float) -> Array:
-        moved = still + np.array([down, right]) / sequence.look.pixels_per_mm
+        moved = still + np.array([down, right]) / sequence.appearance.pixels_per_mm
         return np.asarray(renderer.expose(moved, **around).picture @ _GREY)
 
     rightward = (grey(_STEP, 0) - grey(-_STEP, 0)) / (2 * _STEP)
@@ -45,10 +45,10 @@ def _known(renderer: TruthRenderer, sequence: GelSequence, number: int) -> Array
 
 def _error(image: Array, known: Array, place: Array, sequence: GelSequence) -> float | None:
     """Of one dot [px]; None where its surroundings are not wholly in the image."""
-    look = sequence.look
-    reach = int(np.ceil(1.3 * look.radius * np.sqrt(look.oval) + 2 * look.blur))
+    appearance = sequence.appearance
+    reach = int(np.ceil(1.3 * appearance.radius * np.sqrt(appearance.oval) + 2 * appearance.blur))
     right, down = (int(at) for at in np.rint(place))
-    if min(right, down) < reach or right + reach >= look.width or down + reach >= look.height:
+    if min(right, down) < reach or right + reach >= appearance.width or down + reach >= appearance.height:
         return None
     window = np.s_[down - reach : down + reach + 1, right - reach : right + reach + 1]
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]

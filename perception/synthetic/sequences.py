@@ -1,4 +1,4 @@
-"""Sequences of gel images with their truth: a contact presses, shears, twists or slips over a gel of a given look."""
+"""Image sequences with ground truth: a contact presses, shears, twists or slips on a gel."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.perception.synthetic.flaws import FlawedLook
-from gelflow.perception.synthetic.ground_truth import Frame, TruthRenderer
-from gelflow.perception.synthetic.layers import Contact
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, Frame
+from gelflow.perception.synthetic.appearance import DegradedGelAppearance
+from gelflow.perception.synthetic.image_layers import Contact
 
 Field = Literal["press", "shear", "twist", "slip"]
 Motion = Literal["smooth", "jump", "rest"]
@@ -33,7 +33,7 @@ class GelSequence:
     "jump" is at the peak from one image to the next and stays there; "rest" stays at rest.
     """
 
-    look: FlawedLook
+    appearance: DegradedGelAppearance
     field: Field = "shear"
     frames: int = 64
     peak: float = 0.4  # largest displacement of the gel, as a share of the spacing
@@ -56,13 +56,13 @@ class GelSequence:
         return self.frames
 
     def __iter__(self) -> Iterator[Frame]:
-        renderer = TruthRenderer(self.look)
+        renderer = AccurateGelRenderer(self.appearance)
         for number in range(self.frames):
             yield renderer.render(self.displacement(number), number=number, **self.surroundings(number))
 
     def surroundings(self, number: int) -> dict[str, Any]:
-        """What else happens in image `number`: contact, smear and progress, as `TruthRenderer.expose` takes them."""
-        depth, radius = self._strength(number), self._radius() * self.look.spacing
+        """Contact, motion blur and occluder progress of image `number`: arguments of `AccurateGelRenderer.expose`."""
+        depth, radius = self._strength(number), self._radius() * self.appearance.spacing
         return {
             "contact": Contact(self._in_image(self._center(number)), radius, depth) if depth else None,
             "smear": self._smear(number),
@@ -82,37 +82,40 @@ class GelSequence:
 
     def _center(self, number: float) -> Points:
         """Of the contact, from the grid's middle in spacings (right, down)."""
-        turn = 2 * np.pi * number / 97 + self.look.seed if self.motion == "smooth" else self.look.seed
+        turn = 2 * np.pi * number / 97 + self.appearance.seed if self.motion == "smooth" else self.appearance.seed
         return np.array([_WANDER * np.cos(turn), _WANDER * np.sin(2 * turn)])
 
     def _radius(self) -> float:
         """Of the contact in spacings."""
-        return _CONTACT * (min(self.look.grid.rows, self.look.grid.cols) - 1)
+        return _CONTACT * (min(self.appearance.grid.rows, self.appearance.grid.cols) - 1)
 
     def _in_image(self, center: Points) -> tuple[float, float]:
-        middle = np.array([(self.look.width - 1) / 2, (self.look.height - 1) / 2])
-        right, down = self.look.warp((center * self.look.spacing + middle)[None])[0]
+        middle = np.array([(self.appearance.width - 1) / 2, (self.appearance.height - 1) / 2])
+        right, down = self.appearance.warp((center * self.appearance.spacing + middle)[None])[0]
         return float(right), float(down)
 
     def displacement(self, number: float) -> Points:
         """Of the markers along the pad's x and y [mm], shape (markers, 2)."""
-        look = self.look
-        x, y = ((look.positions_mm() - look.grid.center) / look.grid.pitch).T
-        right, down = (-y if look.mirrored else y), x
+        appearance = self.appearance
+        x, y = ((appearance.positions_mm() - appearance.grid.center) / appearance.grid.pitch).T
+        right, down = (-y if appearance.mirrored else y), x
         at = np.stack([right, down], axis=1) - self._center(number)
-        moved = self.peak * self._strength(int(number)) * _unit_field(self.field, at, self._radius(), look.seed)
+        moved = self.peak * self._strength(int(number)) * _unit_field(self.field, at, self._radius(), appearance.seed)
         return np.asarray(
-            np.stack([moved[:, 1], -moved[:, 0] if look.mirrored else moved[:, 0]], axis=1) * look.grid.pitch
+            np.stack([moved[:, 1], -moved[:, 0] if appearance.mirrored else moved[:, 0]], axis=1)
+            * appearance.grid.pitch
         )
 
     def _smear(self, number: int) -> Points:
         """Way of each marker during the exposure [px], shape (markers, 2)."""
         step = self.displacement(number + 1) - self.displacement(number - 1)
-        fastest = np.pi * self.peak / self.period * self.look.grid.pitch
+        fastest = np.pi * self.peak / self.period * self.appearance.grid.pitch
         if self.motion != "smooth" or fastest == 0:
             return np.zeros_like(step)
-        plain = self.look.to_pixels(self.look.positions_mm() + step) - self.look.to_pixels(self.look.positions_mm())
-        return np.asarray(self.look.motion_blur * plain / (2 * fastest * self.look.pixels_per_mm))
+        plain = self.appearance.to_pixels(self.appearance.positions_mm() + step) - self.appearance.to_pixels(
+            self.appearance.positions_mm()
+        )
+        return np.asarray(self.appearance.motion_blur * plain / (2 * fastest * self.appearance.pixels_per_mm))
 
 
 def _unit_field(field: Field, at: Points, radius: float, seed: int) -> Points:

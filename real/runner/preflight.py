@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gelflow.errors import GelflowError, PeerError, SafetyError
-from gelflow.perception.frames import CameraMount, decode
+from gelflow.perception.frames import CameraMount, decode_image
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, unfit
@@ -53,7 +53,7 @@ def _look(name: str, check: Callable[[], str]) -> PreflightItem:
 
 def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     image = cell.cameras[sensor].latest()
-    picture = decode(image.data)
+    picture = decode_image(image.data)
     if mount.calibration is not None:
         mount.calibration.check_size(picture)
     tracked = MarkerTracker(mount.tracker_config()).start(picture)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import FlowMap, TactileFrame, flow_map
-from gelflow.perception.frames import CameraMount, decode, tactile_frame
-from gelflow.perception.tracker import MarkerTracker, Tracked
+from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.tracker import MarkerTracker, TrackingResult
 from gelflow.protocols import Camera, CameraImage
 from gelflow.task import InsertionTask
 
@@ -115,16 +115,16 @@ class TactileObserver:
         assert self.reference is not None
         return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)
 
-    def _track(self, images: Sequence[CameraImage]) -> list[Tracked]:
+    def _track(self, images: Sequence[CameraImage]) -> list[TrackingResult]:
         trackeds = []
         for sensor, image in enumerate(images):
-            pixels = decode(image.data)
+            pixels = decode_image(image.data)
             # Listed as soon as the tracker saw it, readable or not: a replay must show it the same images.
             self.tracked[sensor].append(image.sequence)
             trackeds.append(self._trackers[sensor].track(pixels))
         return trackeds
 
-    def _frame(self, trackeds: Sequence[Tracked], images: Sequence[CameraImage]) -> TactileFrame | None:
+    def _frame(self, trackeds: Sequence[TrackingResult], images: Sequence[CameraImage]) -> TactileFrame | None:
         frame = tactile_frame(trackeds, self._mounts, max(image.stamp for image in images))
         return frame if (frame.valid.mean(axis=1) >= _FEWEST).all() else None
 

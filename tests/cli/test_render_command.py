@@ -7,9 +7,9 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.perception.sources import find_source
-from gelflow.perception.synthetic.files import read_truth
-from gelflow.perception.synthetic.flaws import look_of
+from gelflow.perception.sources import image_source
+from gelflow.perception.synthetic.appearance import make_appearance
+from gelflow.perception.synthetic.sequence_files import read_truth
 from gelflow.perception.synthetic.sequences import GelSequence
 
 
@@ -18,16 +18,16 @@ def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
     folder, video = tmp_path / "images", tmp_path / "images.mjpeg"
     for out in (folder, video):
         assert main(["render", str(out), *command.split(), "--markers", "63", "--seed", "4"]) == 0
-    look = look_of("hard", markers=63, seed=4, contrast=0.4, bridges=3, cut_row=True)
+    look = make_appearance("hard", markers=63, seed=4, contrast=0.4, bridges=3, cut_row=True)
     drawn = list(GelSequence(look, "twist", frames=6, peak=0.8))
     for file in (folder / "truth.npz", tmp_path / "images.npz"):
         truth = read_truth(file)
         np.testing.assert_allclose(truth.position, [frame.position for frame in drawn], atol=1e-4)
         np.testing.assert_array_equal(truth.visible, [frame.visible for frame in drawn])
-        assert (truth.rows, truth.cols) == (7, 9) and truth.made_from["look"]["bridges"] == 3
+        assert (truth.rows, truth.cols) == (7, 9) and truth.made_from["appearance"]["bridges"] == 3
     assert b"".join(file.read_bytes() for file in sorted(folder.glob("*.jpg"))) == video.read_bytes()
     for source in (folder, video):
-        images = [frame.image for frame in find_source(str(source))]
+        images = [frame.image for frame in image_source(str(source))]
         assert len(images) == 6
         for image, frame in zip(images, drawn, strict=True):  # decoders differ a little where colours change
             assert np.abs(image.astype(int) - frame.image).mean() < 1.0
@@ -39,7 +39,7 @@ def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
         (["--set", "blurr=1"], "--set takes NAME=VALUE, names are radius"),
         (["--set", "dust=1.5"], "--set dust must be a whole number, got '1.5'"),
         (["--set", "bright=1"], "--set bright must be yes or no, got '1'"),
-        (["--set", "oval=9"], "oval of a flawed look must be within 1.0 to 3.0, got 9.0"),
+        (["--set", "oval=9"], "oval of a gel appearance must be within 1.0 to 3.0, got 9.0"),
         (["--size", "320"], "--size must be width x height in pixels, as 640x480; got '320'"),
         (["--peak", "9"], "a peak of 0 to 2 spacings, got 64, 60 and 9.0"),
     ],

@@ -15,14 +15,15 @@ from gelflow.cli.track_output import Step
 from gelflow.cli.track_summary import Summary
 from gelflow.observation import Grid
 from gelflow.perception.calibration import load_calibration
-from gelflow.perception.sources import Frame
-from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
-from gelflow.perception.tracker import Tracked
+from gelflow.perception.sources import SourceImage
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
+from gelflow.perception.tracker import TrackingResult
 from gelflow.session.reader import SessionReader
 from gelflow.session.recover import recover
 
 MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
-LOOK = GelLook(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320, noise=0.5)
+LOOK = GelAppearance(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320, noise=0.5)
 
 
 def track(*arguments: str) -> tuple[int, str]:
@@ -37,7 +38,7 @@ def field(number: int) -> np.ndarray:
 
 
 def draw(folder: Path, images: int) -> Path:
-    renderer = GelRenderer(LOOK)
+    renderer = FastGelRenderer(LOOK)
     folder.mkdir()
     for number in range(images):
         data = renderer.encode(renderer.render(field(number % 12), sequence=number))
@@ -160,7 +161,7 @@ def test_wrong_options_are_told(
     draw(Path("images"), 1)
     Path("notes.txt").write_text("mine")
     if "other.json" in options:
-        Path("big.jpg").write_bytes(GelRenderer().encode(GelRenderer().render(np.zeros((252, 2)))))
+        Path("big.jpg").write_bytes(FastGelRenderer().encode(FastGelRenderer().render(np.zeros((252, 2)))))
         assert main(["calibrate-camera", "big.jpg", "--spacing-mm", "1.4", "--out", "other.json"]) == 0
     assert main(["track", "images", *options]) == 2
     assert expected in capsys.readouterr().err and Path("notes.txt").read_text() == "mine"
@@ -173,6 +174,6 @@ def test_jitter_is_the_noise_and_not_the_motion() -> None:
     for number in range(60):
         shake = rng.normal(0, 1.0, 2)  # of the whole camera
         moved = 0.05 * number * np.sin(rest / 100) + shake + rng.normal(0, 0.03, rest.shape)
-        tracked = Tracked(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
-        summary.add(Step(number, Frame("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
+        tracked = TrackingResult(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
+        summary.add(Step(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
     assert summary.jitter() == pytest.approx(0.03, rel=0.2)

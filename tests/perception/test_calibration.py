@@ -8,7 +8,7 @@ import pytest
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, load_calibration, save_calibration
-from gelflow.perception.synthetic.flaws import look_of
+from gelflow.perception.synthetic.appearance import make_appearance
 from gelflow.perception.synthetic.sequences import GelSequence
 from gelflow.perception.tracker import MarkerTracker
 
@@ -89,8 +89,8 @@ def test_markers_not_seen_or_measured_wrongly_do_not_bend_it() -> None:
 
 
 def test_a_rendered_gel_end_to_end() -> None:
-    look = look_of("typical", keystone=0.15, barrel=0.08, seed=3)
-    sequence = GelSequence(look, "twist", frames=31, peak=0.8)
+    appearance = make_appearance("typical", keystone=0.15, barrel=0.08, seed=3)
+    sequence = GelSequence(appearance, "twist", frames=31, peak=0.8)
     tracker, errors, with_one_scale = MarkerTracker(), [], []
     for number, frame in enumerate(sequence):
         if number == 0:
@@ -115,7 +115,7 @@ def test_a_rectified_picture_shows_the_grid_straight() -> None:
         ink = np.clip(4.5 - np.hypot(right - place[0], down - place[1]), 0, 1)
         image -= (160 * ink).astype(np.uint8)[..., None]
     tracker = MarkerTracker()
-    tracker.start(calibration.rectified(image), rows=ROWS, cols=COLS)
+    tracker.start(calibration.rectify(image), rows=ROWS, cols=COLS)
     grid = tracker.rest.reshape(ROWS, COLS, 2)
     lines, columns = grid[..., 1], grid[..., 0]
     assert lines.std(axis=1).mean() < 0.1 and columns.std(axis=0).mean() < 0.1  # several px in the image itself

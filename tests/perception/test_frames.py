@@ -7,9 +7,10 @@ import pytest
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration
-from gelflow.perception.frames import CameraMount, decode, tactile_frame
-from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
-from gelflow.perception.tracker import MarkerTracker, Tracked
+from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
+from gelflow.perception.tracker import MarkerTracker, TrackingResult
 from gelflow.session.records import restore, to_json
 
 SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
@@ -19,26 +20,26 @@ SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
 @pytest.mark.parametrize("mirrored", [True, False])
 def test_every_way_to_mount_a_camera_gives_the_pads_own_axes(rotation: int, mirrored: bool) -> None:
     width, height = SIZES[rotation]
-    look = GelLook(width=width, height=height, rotation=rotation, mirrored=mirrored)  # type: ignore[arg-type]
-    mount = CameraMount(rotation=rotation, mirrored=mirrored, pixels_per_mm=look.pixels_per_mm)  # type: ignore[arg-type]
-    renderer, tracker = GelRenderer(look), MarkerTracker(mount.tracker_config())
-    x, y = look.positions_mm().T
+    appearance = GelAppearance(width=width, height=height, rotation=rotation, mirrored=mirrored)  # type: ignore[arg-type]
+    mount = CameraMount(rotation=rotation, mirrored=mirrored, pixels_per_mm=appearance.pixels_per_mm)  # type: ignore[arg-type]
+    renderer, tracker = FastGelRenderer(appearance), MarkerTracker(mount.tracker_config())
+    x, y = appearance.positions_mm().T
     field = np.stack([0.3 + 0.02 * y, -0.1 + 0.01 * x], axis=1)  # no symmetry that a wrong sign could hide in
     reference = tactile_frame([tracker.start(renderer.render(np.zeros_like(field)))], [mount], stamp=1.0)
     frame = tactile_frame([tracker.track(renderer.render(field, sequence=1))], [mount], stamp=2.0)
-    assert frame.unit == "mm" and frame.grid == look.grid and frame.stamp == 2.0
+    assert frame.unit == "mm" and frame.grid == appearance.grid and frame.stamp == 2.0
     assert frame.valid.all() and np.abs(frame.shear[0] - field).max() < 0.02
     assert np.abs(reference.shear).max() == 0
-    assert np.allclose(frame.positions, look.positions_mm(), atol=1e-5)
+    assert np.allclose(frame.positions, appearance.positions_mm(), atol=1e-5)
 
 
-def tracked(rows: int = 18, cols: int = 14) -> Tracked:
+def tracked(rows: int = 18, cols: int = 14) -> TrackingResult:
     n = rows * cols
     valid = np.ones(n, dtype=bool)
     valid[5] = False
     displacement = np.tile([1.0, 2.0], (n, 1))
     displacement[5] = np.nan
-    return Tracked(np.zeros((n, 2)), displacement, valid, ~valid, valid.astype(float), rows, cols, 22.0)
+    return TrackingResult(np.zeros((n, 2)), displacement, valid, ~valid, valid.astype(float), rows, cols, 22.0)
 
 
 def test_without_a_scale_the_frame_is_in_pixels() -> None:
@@ -53,11 +54,11 @@ def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() 
     matrix = ((13.5, 0.0, 0.0), (0.0, 13.5, 0.0), (0.2, 0.0, 1.0))
     calibration = Calibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
     mount = CameraMount(rotation=270, mirrored=True, calibration=calibration)
-    rest_mm = calibration.nodes_mm()
+    rest_mm = calibration.marker_positions_mm()
     moved = np.tile([0.3, -0.2], (len(rest_mm), 1))
     rest, position = calibration.to_pixels(rest_mm), calibration.to_pixels(rest_mm + moved)
     all_of_them = np.ones(len(rest), dtype=bool)
-    seen = Tracked(position, position - rest, all_of_them, ~all_of_them, all_of_them.astype(float), 14, 18, 22.0)
+    seen = TrackingResult(position, position - rest, all_of_them, ~all_of_them, all_of_them.astype(float), 14, 18, 22.0)
     frame = tactile_frame([seen], [mount], stamp=0.0)
     assert frame.unit == "mm" and np.allclose(frame.shear, [0.3, -0.2], atol=1e-6)
     assert restore(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
@@ -91,17 +92,17 @@ def test_impossible_mounts_are_refused(settings: dict[str, float]) -> None:
 @pytest.mark.parametrize("data", [b"", b"no image at all", b"\xff\xd8\xff\xe0 cut off"])
 def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
     with pytest.raises(PeerError, match="expected a JPEG or PNG image"):
-        decode(data)
+        decode_image(data)
 
 
 def test_an_image_that_is_cut_off_is_told_so() -> None:
-    renderer = GelRenderer()
+    renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
     with pytest.raises(PeerError, match="cut off, or damaged"):
-        decode(data[: len(data) // 2])
+        decode_image(data[: len(data) // 2])
 
 
 def test_decoding_is_repeatable() -> None:
-    renderer = GelRenderer()
+    renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
-    assert decode(data).shape == (427, 320, 3) and (decode(data) == decode(data)).all()
+    assert decode_image(data).shape == (427, 320, 3) and (decode_image(data) == decode_image(data)).all()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gelflow.perception import MarkerTracker
-from gelflow.perception.sources import find_source
-from gelflow.perception.synthetic.files import read_truth, truth_file
+from gelflow.perception.sources import image_source
+from gelflow.perception.synthetic.sequence_files import read_truth, truth_file
 
 DATA = Path(__file__).parents[1] / "data" / "tracking"
 
@@ -21,7 +21,7 @@ def test_a_recorded_sequence_is_tracked(name: str, kind: str, median: float, hig
     `high` [px] is for the displacement's 95th percentile: where a damaged dot's middle was printed can't be seen, but
     how far it went can.
     """
-    source, truth = find_source(str(DATA / name)), read_truth(truth_file(DATA / name))
+    source, truth = image_source(str(DATA / name)), read_truth(truth_file(DATA / name))
     assert source.kind == kind
     images = [frame.image for frame in source]
     assert len(images) == len(truth.position)

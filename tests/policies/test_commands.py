@@ -6,20 +6,22 @@ from pathlib import Path
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.policies.checkpoint import default_checkpoint, load, load_policy
-from gelflow.policies.evaluation import NetworkActor, Noise, evaluate
-from gelflow.policies.simulation import simulated
+from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
+from gelflow.policies.environment import FlowMapNoise, make_insertion_env
+from gelflow.policies.evaluation import NetworkActor, evaluate
 from gelflow.task import INSERTION
 
 
 def test_the_policy_that_comes_with_gelflow_inserts_in_simulation() -> None:
     path = default_checkpoint()
     assert path.stat().st_size < 2_000_000
-    checkpoint = load(path)
+    checkpoint = load_checkpoint(path)
     assert checkpoint.training["command"][:3] == ["gelflow", "train", "insertion"]
     assert checkpoint.training["validation"]["success"] > 0.8
     network = load_policy(path, task=INSERTION).network
-    result = evaluate("policy", NetworkActor(network, 32), simulated(32, noise=Noise()), episodes=48, seed=5)
+    result = evaluate(
+        "policy", NetworkActor(network, 32), make_insertion_env(32, noise=FlowMapNoise()), episodes=48, seed=5
+    )
     assert result.successes >= 36  # 48 · 0.9 less more than three standard deviations
     assert result.attempts < 8
 
@@ -29,7 +31,7 @@ def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsy
     assert main(arguments) == 0
     assert "checkpoint" in capsys.readouterr().out
     made = tmp_path / "run" / "insertion.safetensors"
-    assert load(made).training["command"] == ["gelflow", *arguments]
+    assert load_checkpoint(made).training["command"] == ["gelflow", *arguments]
     assert main(arguments) == 2
     assert "already holds a trained policy" in capsys.readouterr().err
     assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "4", "--envs", "4", "--json"]) == 0

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
-from gelflow.policies.checkpoint import load, load_policy, save
-from gelflow.policies.evaluation import Attempts, NetworkActor, Noise, RandomActor, evaluate
+from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
+from gelflow.policies.environment import FlowMapNoise, PolicyEnv
+from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 from gelflow.policies.networks import (
     Architecture,
     History,
@@ -100,7 +101,9 @@ def images(count: int, seed: int = 0) -> NDArray[np.float32]:
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
     path = tmp_path / "policy.safetensors"
-    save(path, task=INSERTION, architecture=SMALL, tensors=tensors(), training={"command": ["made", "by a test"]})
+    save_checkpoint(
+        path, task=INSERTION, architecture=SMALL, tensors=tensors(), training={"command": ["made", "by a test"]}
+    )
     return path
 
 
@@ -108,7 +111,10 @@ def test_a_stored_policy_acts_as_before_and_twice_the_same(stored: Path) -> None
     before = NetworkActor(Network(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1)
     expected = [before.act(image[None])[0] for image in images(5)]
     policy = load_policy(stored)
-    assert isinstance(load(stored).digest, str) and load(stored).training["command"] == ["made", "by a test"]
+    assert isinstance(load_checkpoint(stored).digest, str) and load_checkpoint(stored).training["command"] == [
+        "made",
+        "by a test",
+    ]
     assert stored.stat().st_size < 2_000_000
     for _ in range(2):
         policy.reset()
@@ -208,10 +214,10 @@ def test_a_missing_file_a_folder_and_a_giant_are_refused(tmp_path: Path) -> None
         load_policy(tmp_path)
     with pytest.raises(UsageError, match="more than 2000000"):
         wide = Architecture(hidden=(800, 800))
-        save(tmp_path / "giant", task=INSERTION, architecture=wide, tensors=tensors(wide), training={})
+        save_checkpoint(tmp_path / "giant", task=INSERTION, architecture=wide, tensors=tensors(wide), training={})
     (tmp_path / "giant").write_bytes(b"\0" * 2_000_001)
     with pytest.raises(UsageError, match="larger than any checkpoint"):
-        load(tmp_path / "giant")
+        load_checkpoint(tmp_path / "giant")
 
 
 def test_features_reproduce_low_polynomials_and_average_noise() -> None:
@@ -243,7 +249,7 @@ def test_parts_in_one_history_do_not_mix() -> None:
     together, alone = NetworkActor(network, 3), NetworkActor(network, 1)
     for i in range(6):
         if i == 2:
-            together.forget(np.array([True, False, True]))
+            together.reset(np.array([True, False, True]))
         stack = images(3, seed=i)
         both = together.act(stack)
         assert np.allclose(both[1], alone.act(stack[1:2])[0], rtol=1e-12, atol=1e-15)
@@ -272,7 +278,7 @@ def test_a_mirrored_part_gets_the_mirrored_corrections(in_x: bool, in_y: bool) -
 
 def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
     env = Toy(4)
-    attempts = Attempts(env, INSERTION)
+    attempts = PolicyEnv(env, INSERTION)
     attempts.reset(0)
     total = INSERTION.reward(env.error)
     for _ in range(3):
@@ -283,34 +289,34 @@ def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
 
 @pytest.mark.parametrize("same_step", [True, False])
 def test_random_actions_are_counted_by_episode(same_step: bool) -> None:
-    attempts = Attempts(Toy(16, same_step=same_step), INSERTION)
+    attempts = PolicyEnv(Toy(16, same_step=same_step), INSERTION)
     result = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
     again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
     assert result == again
     assert result.episodes == 50 and 0 < result.successes < 50
     assert 1 <= result.attempts <= INSERTION.attempts
-    low, high = result.interval()
+    low, high = result.confidence_interval()
     assert low < result.success < high
 
 
 def test_an_environment_of_another_shape_or_late_reset_is_refused() -> None:
     with pytest.raises(UsageError, match=r"observes \(4, 13, 10\); the task describes \(8, 13, 10\)"):
-        Attempts(Toy(2), dataclasses.replace(INSERTION, frame_depths=(5e-4, 1.1e-3)))
+        PolicyEnv(Toy(2), dataclasses.replace(INSERTION, frame_depths=(5e-4, 1.1e-3)))
     late = Toy(2)
     late.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
     with pytest.raises(UsageError, match="same step"):
-        Attempts(late, INSERTION)
+        PolicyEnv(late, INSERTION)
 
 
 def test_noise_keeps_the_longest_vector_and_turns_both_components() -> None:
     rng = np.random.default_rng(0)
     maps = images(50)
-    noise = Noise()
+    noise = FlowMapNoise()
     noisy = noise.apply(maps, noise.part(50, 2, rng), rng)
     length = np.sqrt((noisy.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2))
     assert np.allclose(length, np.sqrt((maps.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2)), rtol=1e-5)
     assert 0.02 < np.std(noisy - maps) < 0.2
-    none = Noise(marker=0, offset=0, gain=0, turn=0)
+    none = FlowMapNoise(marker=0, offset=0, gain=0, turn=0)
     assert np.allclose(none.apply(maps, none.part(50, 2, rng), rng), maps, atol=1e-6)
     still = np.zeros_like(maps)
     assert not np.abs(noise.apply(still, noise.part(50, 2, rng), rng)).max() > 0
@@ -322,18 +328,18 @@ SHORT = PPOSettings(attempts=20_480, batch=256, evaluate_every=5_000, evaluate_e
 def test_a_short_run_beats_random_and_is_repeatable(tmp_path: Path) -> None:
     points: list[Any] = []
     made = train(
-        Attempts(Toy(32), INSERTION, Noise()),
-        Attempts(Toy(32, same_step=False), INSERTION, Noise()),
+        PolicyEnv(Toy(32), INSERTION, FlowMapNoise()),
+        PolicyEnv(Toy(32, same_step=False), INSERTION, FlowMapNoise()),
         out=tmp_path / "run",
         architecture=SMALL,
         settings=SHORT,
         command=["gelflow", "train"],
         report=points.append,
     )
-    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), Attempts(Toy(32), INSERTION), episodes=256, seed=1)
-    checkpoint = load(made.checkpoint)
+    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), PolicyEnv(Toy(32), INSERTION), episodes=256, seed=1)
+    checkpoint = load_checkpoint(made.checkpoint)
     actor = NetworkActor(Network(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
-    policy = evaluate("policy", actor, Attempts(Toy(32), INSERTION, Noise()), episodes=256, seed=1)
+    policy = evaluate("policy", actor, PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), episodes=256, seed=1)
     assert policy.success > 0.9 and policy.success > random.success + 0.2
     assert policy.attempts < random.attempts
     assert checkpoint.training["command"] == ["gelflow", "train"]
@@ -346,8 +352,8 @@ def test_a_short_run_beats_random_and_is_repeatable(tmp_path: Path) -> None:
 def test_the_same_seed_makes_the_same_tensors_and_time_ends_a_run(tmp_path: Path) -> None:
     def run(name: str, **changes: Any) -> Any:
         settings = dataclasses.replace(SHORT, attempts=2048, evaluate_episodes=32, **changes)
-        sides = [Attempts(Toy(32), INSERTION, Noise()) for _ in range(2)]
-        return load(train(*sides, out=tmp_path / name, architecture=SMALL, settings=settings).checkpoint)
+        sides = [PolicyEnv(Toy(32), INSERTION, FlowMapNoise()) for _ in range(2)]
+        return load_checkpoint(train(*sides, out=tmp_path / name, architecture=SMALL, settings=settings).checkpoint)
 
     first, second, other = run("a"), run("b"), run("c", seed=1)
     assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
@@ -358,5 +364,5 @@ def test_the_same_seed_makes_the_same_tensors_and_time_ends_a_run(tmp_path: Path
 def test_settings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     for changes in ({"attempts": 0}, {"minutes": 0.0}, {"batch": 300}):
         with pytest.raises(UsageError):
-            sides = [Attempts(Toy(32), INSERTION) for _ in range(2)]
+            sides = [PolicyEnv(Toy(32), INSERTION) for _ in range(2)]
             train(*sides, out=tmp_path, settings=dataclasses.replace(SHORT, **changes))

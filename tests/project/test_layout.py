@@ -66,7 +66,7 @@ ALLOWED = [
     ("real", "gelflow.perception"),
     ("hardware_mocks", "gelflow.sim"),
     ("hardware_mocks", "gelflow.real.wsg.codec"),
-    ("hardware_mocks", "gelflow.perception.synthetic.gel_image"),
+    ("hardware_mocks", "gelflow.perception.synthetic.fast_renderer"),
     ("src/gelflow/cli", "gelflow.real.wsg.driver"),
     ("src/gelflow/cli", "gelflow.policies"),
     ("src/gelflow/cli", "gelflow.hardware_mocks"),

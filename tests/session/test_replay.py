@@ -13,8 +13,9 @@ from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError
 from gelflow.observation import FlowMap, Grid, TactileFrame, flow_map
-from gelflow.perception.frames import CameraMount, decode, tactile_frame
-from gelflow.perception.synthetic.gel_image import GelLook, GelRenderer
+from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.policies import checkpoint
 from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
@@ -198,7 +199,7 @@ def test_differences() -> None:
 
 # The real tracker and a real checkpoint, through the command
 
-LOOK = GelLook()
+LOOK = GelAppearance()
 MOUNT = CameraMount(pixels_per_mm=LOOK.pixels_per_mm)
 
 
@@ -208,7 +209,7 @@ def untrained(path: Path, seed: int) -> Path:
     shape = Architecture(hidden=(8,))
     tensors = {name: 0.1 * rng.normal(size=size) for name, size in tensor_shapes(shape, INSERTION).items()}
     tensors["scale"] = np.ones_like(tensors["scale"])
-    checkpoint.save(path, task=INSERTION, architecture=shape, tensors=tensors, training={})
+    checkpoint.save_checkpoint(path, task=INSERTION, architecture=shape, tensors=tensors, training={})
     return path
 
 
@@ -217,7 +218,7 @@ def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("session")
     policy_file = untrained(folder / "policy.safetensors", 1)
     policy: NetworkPolicy = checkpoint.load_policy(policy_file)
-    renderer = [GelRenderer(dataclasses.replace(LOOK, seed=sensor)) for sensor in (0, 1)]
+    renderer = [FastGelRenderer(dataclasses.replace(LOOK, seed=sensor)) for sensor in (0, 1)]
     rng = np.random.default_rng(3)
     config = MOUNT.tracker_config()
     with SessionRecorder(folder / "session.mcap", CLOCK) as recorder:
@@ -239,7 +240,7 @@ def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
                     picture = renderer[sensor].render(moved, sequence=sequence)
                     image = CameraImage(renderer[sensor].encode(picture), CLOCK.now(), sequence)
                     recorder.image(sensor, image)
-                    pixels = decode(image.data)
+                    pixels = decode_image(image.data)
                     tracked.append(trackers[sensor].track(pixels) if step else trackers[sensor].start(pixels))
                 frames.append(tactile_frame(tracked, [MOUNT, MOUNT], CLOCK.now()))
                 sequence += 1

@@ -46,13 +46,13 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
 
 def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
     """The deepest image, with where its markers went since the reference."""
-    from gelflow.perception.frames import decode
+    from gelflow.perception.frames import decode_image
     from gelflow.perception.tracker import MarkerTracker
 
     assert made.reference is not None and made.deepest is not None
     tracker = MarkerTracker(mount.tracker_config())
-    tracker.start(decode(made.reference.images[sensor].data))
-    image = decode(made.deepest.images[sensor].data)
+    tracker.start(decode_image(made.reference.images[sensor].data))
+    image = decode_image(made.deepest.images[sensor].data)
     tracked = tracker.track(image)
     axis.imshow(image[:, :, ::-1])
     (x, y), (right, down) = tracked.position[tracked.valid].T, tracked.displacement[tracked.valid].T

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 
 from gelflow.errors import PeerError
-from gelflow.perception.tracker import StartRefused
+from gelflow.perception.tracker import TrackerInitError
 
 
 @contextmanager
@@ -15,7 +15,7 @@ def picture_of_refusal(beside: Path) -> Iterator[None]:
     """Where a start in here is refused, says why, and saves what was seen beside a file that the command writes."""
     try:
         yield
-    except StartRefused as refused:
+    except TrackerInitError as refused:
         file = beside.with_name(f"{beside.stem}-refused.png")
         told = f"the picture {file} shows what was seen"
         if not cv2.imwrite(str(file), refused.picture):

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.overlay import draw_overlay
-from gelflow.perception.sources import Frame
-from gelflow.perception.tracker import Tracked
+from gelflow.perception.sources import SourceImage
+from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import SENSORS
@@ -36,8 +36,8 @@ class Step:
     """One image, tracked."""
 
     number: int  # from 0
-    frame: Frame
-    tracked: Tracked
+    frame: SourceImage
+    tracked: TrackingResult
     position_mm: Floats | None = None  # on the gel, shape (markers, 2); None without a calibration
     displacement_mm: Floats | None = None
 

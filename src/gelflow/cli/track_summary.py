@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.track_output import Step
-from gelflow.perception.tracker import Tracked
+from gelflow.perception.tracker import TrackingResult
 
 _SCALE = 1 / (0.6745 * np.sqrt(6))  # from the median of |a − 2 b + c| to the standard deviation of each
 _FEWEST = 8  # triples of images from which jitter is told
@@ -27,7 +27,7 @@ class Summary:
     _inferred: list[float] = field(default_factory=list)
     _noise: list[float] = field(default_factory=list)  # of each three images in a row [px]
     _newest: list[NDArray[np.float64]] = field(default_factory=list)
-    _first: Tracked | None = None
+    _first: TrackingResult | None = None
 
     def add(self, step: Step, seconds: float) -> None:
         """One more image, and how long tracking it took [s]."""

@@ -17,8 +17,8 @@ from gelflow.errors import PeerError
 from gelflow.perception.benchmark.baselines import FOLLOWERS
 from gelflow.perception.benchmark.metrics import Course, Figures, follow
 from gelflow.perception.benchmark.tracking import CLASSES, FACTORED, OWN, SIZED, Case, Motion
-from gelflow.perception.synthetic.error_bound import floor_errors
-from gelflow.perception.synthetic.flaws import look_of
+from gelflow.perception.synthetic.appearance import make_appearance
+from gelflow.perception.synthetic.error_bound import cramer_rao_errors
 from gelflow.perception.synthetic.sequences import GelSequence
 
 SPACING = 20.0
@@ -83,26 +83,26 @@ def test_a_tracker_that_gives_up_has_nothing_from_there_on() -> None:
         def track(self, image: Any) -> Any:
             raise PeerError("lost it")
 
-    look = look_of("clean", markers=35)
-    found = follow(GelSequence(look, frames=3), 5, 7, {"fragile": Fragile()})["fragile"]
+    appearance = make_appearance("clean", markers=35)
+    found = follow(GelSequence(appearance, frames=3), 5, 7, {"fragile": Fragile()})["fragile"]
     assert found.failed == "lost it" and found.valid[0].all() and not found.valid[1:].any()
-    assert found.near() == 0.0 and found.spacing == pytest.approx(look.spacing)
+    assert found.near() == 0.0 and found.spacing == pytest.approx(appearance.spacing)
     assert Figures.of([found]).failed == ("lost it",)
 
 
 @pytest.mark.parametrize(("noise", "blur", "markers"), [(2.0, 1.0, 63), (3.0, 1.5, 130)])
 def test_the_floor_is_that_of_cramer_and_rao(noise: float, blur: float, markers: int) -> None:
     """Of a disc with a soft edge, per axis: noise / contrast · √(2 blur / (√π radius)); rounding adds a little."""
-    look = look_of("clean", noise=noise, blur=blur, markers=markers)
-    errors = floor_errors(GelSequence(look, motion="rest", frames=19), every=3)
-    bound = noise / (look.contrast * look.light) * np.sqrt(2 * blur / (np.sqrt(np.pi) * look.radius))
+    appearance = make_appearance("clean", noise=noise, blur=blur, markers=markers)
+    errors = cramer_rao_errors(GelSequence(appearance, motion="rest", frames=19), every=3)
+    bound = noise / (appearance.contrast * appearance.light) * np.sqrt(2 * blur / (np.sqrt(np.pi) * appearance.radius))
     assert 1.0 < np.sqrt((errors**2).mean() / 2) / bound < 1.25
 
 
 def test_the_cases_are_those_that_must_hold() -> None:
     names = [case.name for case in (*CLASSES, *SIZED, *FACTORED)]
     assert len(set(names)) == len(names)
-    assert [case.look(0).quality for case in CLASSES] == [100, 90, 75]
+    assert [case.appearance(0).quality for case in CLASSES] == [100, 90, 75]
     assert {(case.markers, case.size) for case in (*CLASSES, *SIZED)} == {
         (markers, size) for markers in (63, 130, 154) for size in ((320, 240), (640, 480))
     }

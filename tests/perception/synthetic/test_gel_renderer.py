@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.perception.synthetic.flaws import FACTORS, PRESETS, SIZES, look_of
-from gelflow.perception.synthetic.ground_truth import TruthRenderer
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
+from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, SIZES, make_appearance
 from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
 # Even light, no noise: then a dot's centre is the mean place of what it darkens.
@@ -41,22 +41,22 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
     ids=lambda changed: " ".join(changed) or "plain",
 )
 def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
-    look = look_of("typical", markers=63, seed=1, **{**EVEN, **changed})
-    exposed = TruthRenderer(look).expose(GelSequence(look, "twist").displacement(20))
+    appearance = make_appearance("typical", markers=63, seed=1, **{**EVEN, **changed})
+    exposed = AccurateGelRenderer(appearance).expose(GelSequence(appearance, "twist").displacement(20))
     assert exposed.visible.all()
     off = centroids(exposed.picture, exposed.position, reach=12) - exposed.position
     assert np.abs(off).max() < 0.003
 
 
 def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
-    look = look_of("typical", markers=63, **EVEN)
-    renderer, still = TruthRenderer(look), np.zeros((63, 2))
+    appearance = make_appearance("typical", markers=63, **EVEN)
+    renderer, still = AccurateGelRenderer(appearance), np.zeros((63, 2))
     smeared = renderer.expose(still, smear=np.tile([4.0, 0.0], (63, 1)))
     off = centroids(smeared.picture, smeared.position, reach=12) - smeared.position
     assert np.abs(off).max() < 0.003
     plain = renderer.expose(still).picture
     ink = [(np.median(picture) - picture[..., 1]).clip(0) for picture in (plain, smeared.picture)]
-    right = np.arange(look.width)
+    right = np.arange(appearance.width)
     variance = []
     for layer in ink:  # of the first dot across, over which a box of 4 px is folded: 4²/12 more
         x, y = np.rint(smeared.position[0]).astype(int)
@@ -69,28 +69,31 @@ def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
 
 @pytest.mark.parametrize("field", FIELDS)
 def test_a_sequence_goes_from_rest_to_its_peak_and_back(field: Any) -> None:
-    look = look_of("hard", markers=63, seed=2)
-    sequence = GelSequence(look, field, peak=0.4)
+    appearance = make_appearance("hard", markers=63, seed=2)
+    sequence = GelSequence(appearance, field, peak=0.4)
     frames = [sequence.displacement(number) for number in range(len(sequence))]
-    lengths = np.linalg.norm(frames, axis=-1).max(axis=1) / look.grid.pitch
+    lengths = np.linalg.norm(frames, axis=-1).max(axis=1) / appearance.grid.pitch
     assert not lengths[:4].any() and lengths[-1] < 1e-12
     assert 0.35 < lengths.max() <= 0.4
-    steps = np.linalg.norm(np.diff(frames, axis=0), axis=-1).max() / look.grid.pitch
+    steps = np.linalg.norm(np.diff(frames, axis=0), axis=-1).max() / appearance.grid.pitch
     assert steps < 0.05, "smooth"
-    jump = GelSequence(look, field, peak=0.7, motion="jump")
-    assert not jump.displacement(2).any() and np.linalg.norm(jump.displacement(3), axis=1).max() > 0.6 * look.grid.pitch
+    jump = GelSequence(appearance, field, peak=0.7, motion="jump")
+    assert (
+        not jump.displacement(2).any()
+        and np.linalg.norm(jump.displacement(3), axis=1).max() > 0.6 * appearance.grid.pitch
+    )
 
 
 def test_the_same_sequence_gives_the_same_images() -> None:
-    look = look_of("hard", seed=5)
-    one, other = (list(GelSequence(look, "slip", frames=6)) for _ in range(2))
+    appearance = make_appearance("hard", seed=5)
+    one, other = (list(GelSequence(appearance, "slip", frames=6)) for _ in range(2))
     assert [frame.jpeg for frame in one] == [frame.jpeg for frame in other]
     assert len({frame.jpeg for frame in one}) == 6, "noise differs from image to image, at rest too"
-    assert next(iter(GelSequence(look_of("hard", seed=6), frames=1))).jpeg != one[0].jpeg
+    assert next(iter(GelSequence(make_appearance("hard", seed=6), frames=1))).jpeg != one[0].jpeg
 
 
 def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
-    sequence = list(GelSequence(look_of("typical", occluders=2, missing=0.05, seed=1), frames=25))
+    sequence = list(GelSequence(make_appearance("typical", occluders=2, missing=0.05, seed=1), frames=25))
     visible = np.array([frame.visible for frame in sequence])
     assert visible[0].sum() == visible[-1].sum() == 130 - round(0.05 * 130)
     hidden_once = visible[0] & ~visible.all(axis=0)
@@ -105,27 +108,29 @@ def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
     ("name", "markers"), [*((name, 130) for name in (*PRESETS, *FACTORS)), *(("hard", markers) for markers in SIZES)]
 )
 def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -> None:
-    look = look_of(name, markers=markers) if name in PRESETS else look_of(markers=markers, **FACTORS[name])
-    frame = next(iter(GelSequence(look, frames=1)))
+    appearance = (
+        make_appearance(name, markers=markers) if name in PRESETS else make_appearance(markers=markers, **FACTORS[name])
+    )
+    frame = next(iter(GelSequence(appearance, frames=1)))
     assert frame.image.shape == (240, 320, 3) and frame.position.shape == (markers, 2)
-    rows = frame.position.reshape(look.grid.rows, look.grid.cols, 2)
+    rows = frame.position.reshape(appearance.grid.rows, appearance.grid.cols, 2)
     assert (np.diff(rows[..., 0], axis=1) > 0).all() and (np.diff(rows[..., 1], axis=0) > 0).all()
-    assert frame.visible.sum() == markers - round(look.missing * markers)
+    assert frame.visible.sum() == markers - round(appearance.missing * markers)
 
 
 def test_wrong_looks_and_sequences_are_refused() -> None:
     for wrong, message in (
         ({"preset": "dirty"}, "expected an image class out of clean, typical, hard, got 'dirty'"),
         ({"markers": 100}, "expected one of 35, 63, 130, 154, 252 markers, got 100"),
-        ({"blurr": 1.0}, "a look has no 'blurr'; it has barrel"),
-        ({"damaged": 1.5}, "damaged of a flawed look must be within 0.0 to 1.0, got 1.5"),
-        ({"blur": 0.2}, "blur of a flawed look must be within 0.5"),
+        ({"blurr": 1.0}, "a appearance has no 'blurr'; it has barrel"),
+        ({"damaged": 1.5}, "damaged of a gel appearance must be within 0.0 to 1.0, got 1.5"),
+        ({"blur": 0.2}, "blur of a gel appearance must be within 0.5"),
     ):
         with pytest.raises(UsageError, match=message):
-            look_of(**wrong)
+            make_appearance(**wrong)
     with pytest.raises(UsageError, match="expected a field out of press, shear, twist, slip"):
-        GelSequence(look_of(), "pull")  # type: ignore[arg-type]
+        GelSequence(make_appearance(), "pull")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="at least 1 frame"):
-        GelSequence(look_of(), frames=0)
+        GelSequence(make_appearance(), frames=0)
     with pytest.raises(UsageError, match="finite"):
-        TruthRenderer(look_of()).render(np.full((130, 2), np.nan))
+        AccurateGelRenderer(make_appearance()).render(np.full((130, 2), np.nan))

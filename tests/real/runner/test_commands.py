@@ -11,7 +11,7 @@ import pytest
 from gelflow.cli.commands.demo import ask, mock_robot
 from gelflow.cli.main import main
 from gelflow.errors import PeerError
-from gelflow.policies.checkpoint import save
+from gelflow.policies.checkpoint import save_checkpoint
 from gelflow.policies.networks import Architecture, tensor_shapes
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.task import INSERTION
@@ -27,7 +27,7 @@ def checkpoint(tmp_path: Path) -> Path:
     shapes = tensor_shapes(architecture, INSERTION)
     tensors = {name: 0.1 * rng.standard_normal(shape) for name, shape in shapes.items()}
     path = tmp_path / "untrained.safetensors"
-    save(path, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "none"})
+    save_checkpoint(path, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "none"})
     return path
 
 

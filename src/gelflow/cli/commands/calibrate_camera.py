@@ -11,7 +11,7 @@ from rich.table import Table
 from gelflow.cli.refused import picture_of_refusal
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
-from gelflow.perception.sources import find_source
+from gelflow.perception.sources import image_source
 from gelflow.perception.tracker import MarkerTracker
 
 _MAGNIFY = 20  # residuals in the picture
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{file} exists; name a new file with --out")
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
-    image = next(iter(find_source(args.source, sensor=args.sensor))).image
+    image = next(iter(image_source(args.source, sensor=args.sensor))).image
     tracker = MarkerTracker()
     with picture_of_refusal(args.out):
         first = tracker.start(image, rows=args.rows, cols=args.cols)
@@ -66,7 +66,7 @@ def draw_fit(image: NDArray[np.uint8], rest: Floats, seen: NDArray[np.bool_], fi
     for line in _lines(fit):
         left.plot(*fit.to_pixels(line).T, color="tab:cyan", linewidth=0.8)
     measured = rest[seen]
-    off = measured - fit.to_pixels(fit.nodes_mm())[seen]
+    off = measured - fit.to_pixels(fit.marker_positions_mm())[seen]
     left.quiver(
         *measured.T, *(_MAGNIFY * off.T), color="red", angles="xy", scale_units="xy", scale=1, width=0.003, zorder=3
     )
@@ -74,7 +74,7 @@ def draw_fit(image: NDArray[np.uint8], rest: Floats, seen: NDArray[np.bool_], fi
     left.set_title(
         f"fitted grid; red: residuals × {_MAGNIFY}, {fit.residual_px:.2f} px (root mean square)", fontsize=10
     )
-    right.imshow(fit.rectified(image)[..., ::-1], extent=_extent(fit))
+    right.imshow(fit.rectify(image)[..., ::-1], extent=_extent(fit))
     right.set(xlabel="x (right) [mm]", ylabel="y (down) [mm]", title="rectified: its lines must be straight and even")
     right.title.set_fontsize(10)
     try:
@@ -85,7 +85,7 @@ def draw_fit(image: NDArray[np.uint8], rest: Floats, seen: NDArray[np.bool_], fi
 
 def _lines(fit: Calibration) -> list[Floats]:
     """The lines and columns of the grid [mm], each shape (points, 2)."""
-    nodes = fit.nodes_mm().reshape(fit.rows, fit.cols, 2)
+    nodes = fit.marker_positions_mm().reshape(fit.rows, fit.cols, 2)
     ends = [(line[0], line[-1], fit.cols) for line in nodes]
     ends += [(column[0], column[-1], fit.rows) for column in nodes.swapaxes(0, 1)]
     return [np.asarray(np.linspace(first, last, _STEPS * number)) for first, last, number in ends]
@@ -98,14 +98,14 @@ def _extent(fit: Calibration) -> tuple[float, ...]:
 
 
 def _table(fit: Calibration, rest: Floats, seen: NDArray[np.bool_], *, written: str) -> Table:
-    distance = np.linalg.norm(rest - fit.to_pixels(fit.nodes_mm()), axis=1)[seen]
+    distance = np.linalg.norm(rest - fit.to_pixels(fit.marker_positions_mm()), axis=1)[seen]
     left_out = int((distance > fit.largest_px * (1 + 1e-9)).sum())
     along, down = fit.pixels_per_mm()
     lens = ", ".join(f"k{i} {k:+.3f}" for i, k in enumerate(fit.radial, start=1)) or "none that the markers show"
     moved = np.subtract(fit.center, ((fit.width - 1) / 2, (fit.height - 1) / 2))
     if moved.any():
         lens += f", its centre {moved[0]:+.0f}, {moved[1]:+.0f} px from the image's"
-    nodes = fit.nodes_mm()
+    nodes = fit.marker_positions_mm()
     scales = [_scale(fit, node) for node in nodes]
     table = Table(show_header=False)
     table.add_row(

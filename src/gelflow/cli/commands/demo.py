@@ -202,10 +202,10 @@ def table(done: Demonstration, title: str) -> Table:
 
 def in_simulation(policy: "NetworkPolicy", *, preset: str | None = None) -> str:
     """How the policy does without wires and cameras, and what luck would do: the figures that the demo's compare to."""
+    from gelflow.policies.environment import make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
-    from gelflow.policies.simulation import simulated
 
-    attempts = simulated(_COMPARED, preset=preset)
+    attempts = make_insertion_env(_COMPARED, preset=preset)
     reach = policy.network.architecture.reach
     ways = (NetworkActor(policy.network, _COMPARED), RandomActor(reach, _COMPARED, 0))
     own, random = (evaluate("", way, attempts, episodes=_COMPARED, seed=1) for way in ways)

@@ -14,7 +14,7 @@ from gelflow.errors import UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
-    from gelflow.policies.evaluation import Evaluation
+    from gelflow.policies.evaluation import EvaluationResult
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,14 +36,14 @@ def run(args: argparse.Namespace) -> int:
 
     path = args.checkpoint or default_checkpoint()
     network = load_policy(path, task=INSERTION).network
-    from gelflow.policies.evaluation import Attempts, NetworkActor, Noise, RandomActor, evaluate
-    from gelflow.policies.simulation import simulated
+    from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
+    from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 
     console = Console()
     count = min(args.envs, args.episodes)
-    plain, noisy = (simulated(count, noise=noise, preset=args.preset) for noise in (None, Noise()))
+    plain, noisy = (make_insertion_env(count, noise=noise, preset=args.preset) for noise in (None, FlowMapNoise()))
     reach = network.architecture.reach
-    ways: list[tuple[str, NetworkActor | RandomActor, Attempts]] = [
+    ways: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
         ("policy", NetworkActor(network, count), plain),
         ("policy, noisy flow maps", NetworkActor(network, count), noisy),
         ("random, policy's reach", RandomActor(reach, count, args.seed), plain),
@@ -61,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _plain(result: "Evaluation", path: str) -> dict[str, object]:
-    low, high = result.interval()
+def _plain(result: "EvaluationResult", path: str) -> dict[str, object]:
+    low, high = result.confidence_interval()
     attempts = result.attempts if result.successes else None
     return dataclasses.asdict(result) | {
         "attempts": attempts,
@@ -72,12 +72,12 @@ def _plain(result: "Evaluation", path: str) -> dict[str, object]:
     }
 
 
-def _table(results: "list[Evaluation]", path: Path, episodes: int) -> Table:
+def _table(results: "list[EvaluationResult]", path: Path, episodes: int) -> Table:
     table = Table(title=f"Insertion in simulation: {episodes} parts, {path.name}")
     for heading in ("actions", "inserted", "95 % interval", "attempts", "reward"):
         table.add_column(heading, justify="left" if heading == "actions" else "right")
     for result in results:
-        low, high = result.interval()
+        low, high = result.confidence_interval()
         attempts = f"{result.attempts:.1f}" if result.successes else "none"
         row = (f"{result.success:.1%}", f"{low:.0%} to {high:.0%}", attempts, f"{result.reward:.1f}")
         table.add_row(result.name, *row)

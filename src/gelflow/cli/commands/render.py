@@ -10,14 +10,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gelflow.errors import UsageError
-from gelflow.perception.synthetic.files import truth_file, write_sequence
-from gelflow.perception.synthetic.flaws import PRESETS, SIZES, FlawedLook, look_of
+from gelflow.perception.synthetic.appearance import PRESETS, SIZES, DegradedGelAppearance, make_appearance
+from gelflow.perception.synthetic.sequence_files import truth_file, write_sequence
 from gelflow.perception.synthetic.sequences import FIELDS, MOTIONS, GelSequence
 
 # Fields of a look that --set takes, and their types; the others have options of their own or follow from these.
 _SETTABLE: dict[str, Any] = {
     field.name: field.type
-    for field in dataclasses.fields(FlawedLook)
+    for field in dataclasses.fields(DegradedGelAppearance)
     if field.type in (float, int, bool) and field.name not in ("width", "height", "seed", "mirrored", "pixels_per_mm")
 }
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--seed must be at least 0, got {args.seed}")
     changed = dict(_factor(text) for text in args.set)
     width, height = (int(part) for part in size.groups())
-    look = look_of(args.preset, markers=args.markers, width=width, height=height, seed=args.seed, **changed)
+    look = make_appearance(args.preset, markers=args.markers, width=width, height=height, seed=args.seed, **changed)
     sequence = GelSequence(look, args.field, frames=args.frames, peak=args.peak, motion=args.motion, period=args.period)
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

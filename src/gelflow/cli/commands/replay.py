@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, Perception]:
     """Task and perception as the session describes them. Raises PeerError when the description lacks a part."""
-    from gelflow.perception.frames import CameraMount, decode, tactile_frame
-    from gelflow.perception.tracker import MarkerTracker, Tracked, TrackerConfig
+    from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+    from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 
     try:
         task = InsertionTask.from_json(dict(description["task"]))
@@ -67,13 +67,13 @@ def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, Perception]:
         def __init__(self, sensor: int) -> None:
             self._tracker = MarkerTracker(configs[sensor])
 
-        def start(self, data: bytes) -> Tracked:
-            return self._tracker.start(decode(data))
+        def start(self, data: bytes) -> TrackingResult:
+            return self._tracker.start(decode_image(data))
 
-        def track(self, data: bytes) -> Tracked:
-            return self._tracker.track(decode(data))
+        def track(self, data: bytes) -> TrackingResult:
+            return self._tracker.track(decode_image(data))
 
-    def frame(trackeds: Sequence[Tracked], stamp: float) -> TactileFrame:
+    def frame(trackeds: Sequence[TrackingResult], stamp: float) -> TactileFrame:
         return tactile_frame(trackeds, mounts, stamp)
 
     return task, Perception(Tracker, frame)

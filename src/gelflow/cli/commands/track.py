@@ -15,8 +15,8 @@ from gelflow.cli.track_output import CODECS, PICTURES, CsvOutput, McapOutput, Ou
 from gelflow.cli.track_summary import Summary
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, load_calibration
-from gelflow.perception.sources import Frame, Source, find_source
-from gelflow.perception.tracker import MarkerTracker, Tracked, TrackerConfig
+from gelflow.perception.sources import ImageSource, SourceImage, image_source
+from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
 
@@ -41,7 +41,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Tracks, writes what was asked for, prints a summary."""
     _check(args)
-    source = find_source(args.source, sensor=args.sensor, rate=args.rate)
+    source = image_source(args.source, sensor=args.sensor, rate=args.rate)
     polarity = "dark" if args.dark else "bright" if args.bright else "auto"
     tracker = MarkerTracker(TrackerConfig(rows=args.rows, cols=args.cols, polarity=polarity))  # type: ignore[arg-type]
     calibration = load_calibration(args.calibration) if args.calibration else None
@@ -72,7 +72,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _follow(
-    source: Source,
+    source: ImageSource,
     tracker: MarkerTracker,
     calibration: Calibration | None,
     summary: Summary,
@@ -121,7 +121,7 @@ def _outputs(args: argparse.Namespace, calibration: Calibration | None) -> Itera
         yield McapOutput(args.mcap, args.sensor, description)
 
 
-def _step(number: int, frame: Frame, tracked: Tracked, calibration: Calibration | None) -> Step:
+def _step(number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None) -> Step:
     if calibration is None:
         return Step(number, frame, tracked)
     displacement = calibration.displacement_mm(tracked.position, tracked.displacement)

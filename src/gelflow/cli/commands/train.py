@@ -26,10 +26,12 @@ def run(args: argparse.Namespace) -> int:
     """Train, with a progress bar; says where the checkpoint is."""
     if args.envs < 1 or args.seed < 0:
         raise UsageError(f"--envs must be at least 1 and --seed at least 0, got {args.envs} and {args.seed}")
-    from gelflow.policies.evaluation import Noise  # here: torch takes seconds to import
-    from gelflow.policies.learning_curve import Progress as Point
+    from gelflow.policies.environment import (
+        FlowMapNoise,  # here: torch takes seconds to import
+        make_insertion_env,
+    )
+    from gelflow.policies.learning_curve import LearningCurvePoint
     from gelflow.policies.ppo import PPOSettings, train
-    from gelflow.policies.simulation import simulated
 
     given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
     settings = PPOSettings(seed=args.seed, **given)
@@ -38,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     with Progress(*columns, TimeRemainingColumn(), console=console) as bars:
         bar = bars.add_task("training", total=settings.attempts)
 
-        def report(point: Point) -> None:
+        def report(point: LearningCurvePoint) -> None:
             text = f"reward {point.reward:6.2f}  inserted {point.success:4.0%}"
             if point.evaluation is None:
                 bars.update(bar, completed=point.attempts, description=text)
@@ -50,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
                 )
 
         made = train(
-            simulated(args.envs, noise=Noise(), preset=args.preset),
-            simulated(args.envs, noise=Noise(), preset=args.preset),
+            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
+            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
             out=args.out,
             settings=settings,
             command=_command(args, settings.attempts),

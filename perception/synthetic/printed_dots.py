@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from gelflow.perception.synthetic.flaws import FlawedLook
-from gelflow.perception.synthetic.layers import SHARP, Layer, places
+from gelflow.perception.synthetic.appearance import DegradedGelAppearance
+from gelflow.perception.synthetic.image_layers import SHARP, Layer, places
 
 Array = NDArray[np.float64]
 Patches = NDArray[np.float32]  # shape (dots, side, side)
@@ -22,7 +22,7 @@ _DAMAGES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "worn": ((0.0, 0.0), (0.06, 0.2)),
 }
 _LITTLE = 6  # holes of a worn dot
-_DENSE = 0.96  # usual density of the ink; the look's contrast is that of a density of 1
+_DENSE = 0.96  # usual density of the ink; the appearance's contrast is that of a density of 1
 
 
 @dataclass(frozen=True)
@@ -61,15 +61,15 @@ def _drawn_damage(rng: np.random.Generator) -> Damage:
 class Dots:
     """Square patches of pixels, one around each dot, in one image."""
 
-    look: FlawedLook
+    appearance: DegradedGelAppearance
     centers: Array  # [px], shape (dots, 2)
-    shapes: Array  # a dot's ellipse is this matrix times a disc of the look's radius, shape (dots, 2, 2)
+    shapes: Array  # a dot's ellipse is this matrix times a disc of the appearance's radius, shape (dots, 2, 2)
     smear: Array  # way of each dot during the exposure [px], shape (dots, 2)
 
     @cached_property
     def _half(self) -> Array:
         """Half the width and height of each dot with its smear [px], shape (dots, 2)."""
-        return np.asarray(self.look.radius * np.linalg.norm(self.shapes, axis=-1) + np.abs(self.smear) / 2)
+        return np.asarray(self.appearance.radius * np.linalg.norm(self.shapes, axis=-1) + np.abs(self.smear) / 2)
 
     @cached_property
     def reach(self) -> int:
@@ -79,14 +79,14 @@ class Dots:
     @cached_property
     def corner(self) -> NDArray[np.intp]:
         """First pixel of each patch (right, down), shape (dots, 2); far outside is as good as just outside."""
-        size = np.array([self.look.width, self.look.height])
+        size = np.array([self.appearance.width, self.appearance.height])
         near = np.clip(np.rint(self.centers), -self.reach - 1, size + self.reach)
         return np.asarray(near.astype(np.intp) - self.reach)
 
     @cached_property
     def _back(self) -> Array:
         """From the image to each dot's own frame, in which its radius is 1, shape (dots, 2, 2)."""
-        return np.asarray(np.linalg.inv(self.shapes) / self.look.radius)
+        return np.asarray(np.linalg.inv(self.shapes) / self.appearance.radius)
 
     @cached_property
     def inner(self) -> tuple[Patches, Patches]:
@@ -116,14 +116,14 @@ class Dots:
 
     def show_through(self, ink: NDArray[np.floating]) -> Layer:
         """How much of the gel is seen through `ink`, shape (dots, side, side), in the image: 0 to 1."""
-        margin, look = 2 * self.reach + 2, self.look
-        clear = np.ones((look.height + 2 * margin, look.width + 2 * margin))
+        margin, appearance = 2 * self.reach + 2, self.appearance
+        clear = np.ones((appearance.height + 2 * margin, appearance.width + 2 * margin))
         np.multiply.at(clear.reshape(-1), self._flat(margin), 1 - ink)
         return np.asarray(clear[margin:-margin, margin:-margin], dtype=np.float32)
 
     def inside(self) -> NDArray[np.bool_]:
         """Whether a dot is wholly in the image, shape (dots,)."""
-        last = np.array([self.look.width, self.look.height]) - 0.5
+        last = np.array([self.appearance.width, self.appearance.height]) - 0.5
         return np.asarray(((self.centers - self._half > -0.5) & (self.centers + self._half < last)).all(axis=1))
 
     def covered(self, hidden: Layer) -> Array:
@@ -134,7 +134,7 @@ class Dots:
 
     def _flat(self, margin: int) -> NDArray[np.intp]:
         steps = np.arange(2 * self.reach + 1)
-        stride = self.look.width + 2 * margin
+        stride = self.appearance.width + 2 * margin
         first = (self.corner[:, 1] + margin) * stride + self.corner[:, 0] + margin
         return np.asarray(first[:, None, None] + steps[:, None] * stride + steps)
 
@@ -142,36 +142,36 @@ class Dots:
 class Print:
     """The flaws of one print, drawn at random."""
 
-    def __init__(self, look: FlawedLook, rng: np.random.Generator) -> None:
-        self.look = look
-        markers = look.grid.rows * look.grid.cols
+    def __init__(self, appearance: DegradedGelAppearance, rng: np.random.Generator) -> None:
+        self.appearance = appearance
+        markers = appearance.grid.rows * appearance.grid.cols
         self.printed = np.ones(markers, dtype=bool)
-        self.printed[rng.permutation(markers)[: round(look.missing * markers)]] = False
+        self.printed[rng.permutation(markers)[: round(appearance.missing * markers)]] = False
         self._density = rng.normal(_DENSE, 0.03, markers).clip(0.85, 1.0)
         whole = rng.permutation(np.flatnonzero(self.printed))
-        self._damages = {int(marker): _drawn_damage(rng) for marker in whole[: round(look.damaged * markers)]}
+        self._damages = {int(marker): _drawn_damage(rng) for marker in whole[: round(appearance.damaged * markers)]}
         self._bridges = self._drawn_bridges(rng)
 
     def draw(self, centers: Array, shapes: Array, smear: Array) -> tuple[Layer, Dots]:
         """How much of the gel is seen through the print, 0 to 1, shape (height, width); and the markers' dots."""
-        look, cols = self.look, self.look.grid.cols
-        dots = Dots(look, centers, shapes, smear)
+        appearance, cols = self.appearance, self.appearance.grid.cols
+        dots = Dots(appearance, centers, shapes, smear)
         ink = dots.ink * np.where(self.printed, self._density, 0.0)[:, None, None]
         x, y = dots.inner
         for marker, damage in self._damages.items():
-            ink[marker] *= damage.left(x[marker], y[marker], SHARP / look.radius)
+            ink[marker] *= damage.left(x[marker], y[marker], SHARP / appearance.radius)
         clear = dots.show_through(ink)
-        if look.cut_row:
-            above = Dots(look, 2 * centers[:cols] - centers[cols : 2 * cols], shapes[:cols], smear[:cols])
+        if appearance.cut_row:
+            above = Dots(appearance, 2 * centers[:cols] - centers[cols : 2 * cols], shapes[:cols], smear[:cols])
             clear = clear * above.show_through(_DENSE * above.ink)
         for one, other, width in self._bridges:
-            bar = _bar(look, centers[one], centers[other], width * look.radius)
+            bar = _bar(appearance, centers[one], centers[other], width * appearance.radius)
             clear = np.minimum(clear, 1 - _DENSE * bar)
         return np.asarray(clear, dtype=np.float32), dots
 
     def _drawn_bridges(self, rng: np.random.Generator) -> list[tuple[int, int, float]]:
         """Pairs of printed neighbours, no marker in two, and the half width of the bar between them in radii."""
-        number = np.arange(self.printed.size).reshape(self.look.grid.rows, self.look.grid.cols)
+        number = np.arange(self.printed.size).reshape(self.appearance.grid.rows, self.appearance.grid.cols)
         beside = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
         below = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
         pairs = np.concatenate([beside, below])
@@ -179,15 +179,15 @@ class Print:
         free = self.printed.copy()
         for k in rng.permutation(len(pairs)):
             one, other = (int(marker) for marker in pairs[k])
-            if len(found) < self.look.bridges and free[one] and free[other]:
+            if len(found) < self.appearance.bridges and free[one] and free[other]:
                 free[[one, other]] = False
                 found.append((one, other, rng.uniform(0.4, 0.8)))
         return found
 
 
-def _bar(look: FlawedLook, start: Array, end: Array, half: float) -> Layer:
+def _bar(appearance: DegradedGelAppearance, start: Array, end: Array, half: float) -> Layer:
     """1 on the straight bar between two places [px], 0 elsewhere, shape (height, width)."""
-    right, down = places(look)
+    right, down = places(appearance)
     x, y = right - float(start[0]), down - float(start[1])
     along, across = (float(one) for one in end - start)
     share = ((x * along + y * across) / (along**2 + across**2)).clip(0, 1)

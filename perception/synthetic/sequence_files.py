@@ -28,7 +28,7 @@ class Truth:
     rows: int
     cols: int
     spacing: float  # of the markers at rest, in the image's middle [px]
-    made_from: dict[str, Any]  # the sequence's settings, and under "look" those of its look
+    made_from: dict[str, Any]  # the sequence's settings, and under "appearance" those of its appearance
 
 
 def truth_file(images: Path) -> Path:
@@ -59,9 +59,9 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
             format=FORMAT,
             position_px=np.array(position, dtype=np.float32),
             visible=np.array(visible),
-            rows=sequence.look.grid.rows,
-            cols=sequence.look.grid.cols,
-            spacing_px=sequence.look.spacing,
+            rows=sequence.appearance.grid.rows,
+            cols=sequence.appearance.grid.cols,
+            spacing_px=sequence.appearance.spacing,
             made_from=json.dumps(dataclasses.asdict(sequence)),
         )
     except OSError as error:
@@ -74,13 +74,16 @@ def read_truth(file: Path) -> Truth:
         with np.load(file) as found:
             if int(found["format"]) > FORMAT:
                 raise UsageError(f"{file} has format {int(found['format'])}, this gelflow reads up to {FORMAT}: update")
+            made_from = json.loads(str(found["made_from"]))
+            if "look" in made_from:  # name of the key in files of gelflow 0.1
+                made_from["appearance"] = made_from.pop("look")
             return Truth(
                 position=found["position_px"],
                 visible=found["visible"],
                 rows=int(found["rows"]),
                 cols=int(found["cols"]),
                 spacing=float(found["spacing_px"]),
-                made_from=json.loads(str(found["made_from"])),
+                made_from=made_from,
             )
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, UsageError):

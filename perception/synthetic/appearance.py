@@ -1,18 +1,19 @@
 """What is wrong with real tactile images, as numbers, and the named classes of images that tests and benchmarks use.
 
-`look_of("typical", blur=2.5)` is a class with one factor changed; `TruthRenderer` and `GelSequence` draw it.
+`make_appearance("typical", blur=2.5)` is an image class with one parameter changed.
 """
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.perception.synthetic.gel_image import GelLook
+
+GELSLIM_GRID = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # printed markers on the pad [mm]
 
 _RADIUS = 0.18  # of a dot, as a share of the spacing
 _MARGIN = 1.0  # between the outer markers and the image's border, as a share of the spacing
@@ -37,8 +38,64 @@ _LIMITS: dict[str, tuple[float, float]] = {
 
 
 @dataclass(frozen=True)
-class FlawedLook(GelLook):
-    """A gel's look with what real prints, lights, lenses and contacts add to it. Without arguments nothing is added.
+class GelAppearance:
+    """How a gel looks to its camera. The defaults follow published pictures of a GelSlim 3.0."""
+
+    grid: Grid = GELSLIM_GRID
+    width: int = 320  # of the image [px]
+    height: int = 427  # of the image [px]
+    pixels_per_mm: float = 15.7
+    rotation: Literal[0, 90, 180, 270] = 0  # clockwise in the image; at 0 the finger's tip is at the bottom
+    mirrored: bool = True  # the camera sees the gel from behind
+    radius: float = 4.4  # of a dot [px]
+    contrast: float = 0.62  # how much darker than its surroundings a dot is, 0 to 1
+    blur: float = 1.0  # standard deviation of the optical blur [px]
+    noise: float = 1.2  # standard deviation of the sensor noise [grey levels]
+    light: float = 125.0  # mean brightness of the gel [grey levels]
+    colour: float = 0.35  # strength of the coloured gradients, 0 (even grey) to 1
+    missing: float = 0.0  # share of the markers that are not printed, 0 to 1
+    bright: bool = False  # dots brighter than the gel
+    quality: int = 88  # of the JPEG, 1 to 100
+    seed: int = 0  # illumination, print and noise are drawn from it
+
+    def __post_init__(self) -> None:
+        if not (16 <= self.width <= 4096 and 16 <= self.height <= 4096):
+            raise UsageError(f"a gel image is 16 to 4096 px wide and high, got {self.width} × {self.height}")
+        if self.rotation not in (0, 90, 180, 270):
+            raise UsageError(f"rotation must be 0, 90, 180 or 270 degrees, got {self.rotation}")
+        for name, low, high in (
+            ("pixels_per_mm", 0.1, 1000.0),
+            ("radius", 0.5, 100.0),
+            ("contrast", 0.0, 1.0),
+            ("blur", 0.1, 20.0),
+            ("noise", 0.0, 40.0),
+            ("light", 1.0, 255.0),
+            ("colour", 0.0, 1.0),
+            ("missing", 0.0, 1.0),
+            ("quality", 1, 100),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UsageError(f"{name} of a gel appearance must be within {low} to {high}, got {value}")
+
+    def positions_mm(self) -> NDArray[np.float64]:
+        """Markers at rest in the pad's frame (x base to tip, y = z × x) [mm], shape (markers, 2), row by row."""
+        return self.grid.positions()
+
+    def to_pixels(self, positions_mm: ArrayLike) -> NDArray[np.float64]:
+        """Where places on the pad [mm], shape (n, 2), appear in the image [px], shape (n, 2): right, down."""
+        offset = np.asarray(positions_mm, dtype=float) - self.grid.center
+        # Seen from outside with the tip at the bottom, x points down and y to the right; from behind, y to the left.
+        right, down = (-offset[:, 1] if self.mirrored else offset[:, 1]), offset[:, 0]
+        for _ in range(self.rotation // 90):
+            right, down = -down, right
+        middle = ((self.width - 1) / 2, (self.height - 1) / 2)
+        return np.stack([right, down], axis=1) * self.pixels_per_mm + middle
+
+
+@dataclass(frozen=True)
+class DegradedGelAppearance(GelAppearance):
+    """A gel with imperfect print, illumination, lens and contact; the defaults add no imperfection.
 
     `missing`, `damaged` and `bridges` are of the print and move with the gel; light, `dust` and `occluders` stay with
     the camera; `shading`, `ridges` and `highlights` move with the contact. `noise` is that of the grey picture.
@@ -64,9 +121,9 @@ class FlawedLook(GelLook):
         for name, (low, high) in _LIMITS.items():
             value = getattr(self, name)
             if not low <= value <= high:
-                raise UsageError(f"{name} of a flawed look must be within {low} to {high}, got {value}")
+                raise UsageError(f"{name} of a gel appearance must be within {low} to {high}, got {value}")
         if min(self.grid.rows, self.grid.cols) < 2:
-            raise UsageError(f"a flawed look needs at least 2 × 2 markers, got {self.grid.rows} × {self.grid.cols}")
+            raise UsageError(f"a gel appearance needs at least 2 × 2 markers, got {self.grid.rows} × {self.grid.cols}")
 
     def warp(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where keystone and lens move places of the plain image [px], shape (..., 2)."""
@@ -119,7 +176,7 @@ FACTORS: dict[str, dict[str, Any]] = {
 SIZES: dict[int, tuple[int, int]] = {35: (5, 7), 63: (7, 9), 130: (10, 13), 154: (11, 14), 252: (14, 18)}
 
 
-def look_of(
+def make_appearance(
     preset: str = "typical",
     *,
     markers: int = 130,
@@ -127,8 +184,8 @@ def look_of(
     height: int = 240,
     seed: int = 0,
     **changed: Any,
-) -> FlawedLook:
-    """The look of an image class (one of `PRESETS`), with fields of `FlawedLook` changed by name.
+) -> DegradedGelAppearance:
+    """The appearance of an image class (one of `PRESETS`), with fields of `DegradedGelAppearance` changed by name.
 
     The grid of `markers` (one of `SIZES`) fills the image; a dot's radius is 0.18 of the spacing. Markers run as in
     the image: row by row from the top, each from the left. Raises UsageError for unknown names and values.
@@ -137,12 +194,12 @@ def look_of(
         raise UsageError(f"expected an image class out of {', '.join(PRESETS)}, got {preset!r}")
     if markers not in SIZES:
         raise UsageError(f"expected one of {', '.join(map(str, SIZES))} markers, got {markers}")
-    known = {field.name for field in dataclasses.fields(FlawedLook)}
+    known = {field.name for field in dataclasses.fields(DegradedGelAppearance)}
     for name in changed:
         if name not in known:
-            raise UsageError(f"a look has no {name!r}; it has {', '.join(sorted(known))}")
+            raise UsageError(f"a appearance has no {name!r}; it has {', '.join(sorted(known))}")
     rows, cols = SIZES[markers]
     spacing = min(height / (rows - 1 + 2 * _MARGIN), width / (cols - 1 + 2 * _MARGIN))
     print_ = {"grid": Grid(rows, cols, _PITCH), "pixels_per_mm": spacing / _PITCH, "radius": _RADIUS * spacing}
     camera = {"width": width, "height": height, "mirrored": False, "light": 115.0, "seed": seed}
-    return FlawedLook(**{**print_, **camera, **PRESETS[preset], **changed})
+    return DegradedGelAppearance(**{**print_, **camera, **PRESETS[preset], **changed})

@@ -1,0 +1,124 @@
+"""Pictures of a gel with printed markers, drawn from the markers' displacement: what a tactile camera would see.
+
+Speed is the point: two cameras stream these images while a simulation runs beside them. Illumination, print and a
+stock of sensor noise are drawn once for a appearance; an image then only costs its dots (small sprites at sub-pixel
+places), one multiplication and the JPEG encoder.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gelflow.errors import UsageError
+from gelflow.perception.synthetic.appearance import GelAppearance
+
+_NOISE_IMAGES = 8  # prepared pictures of the gel with sensor noise; an image takes one of them
+_PHASES = 64  # sprites per pixel and axis: a dot's place is exact to 1/128 px
+
+Image = NDArray[np.uint8]
+
+
+class FastGelRenderer:
+    """Draws one gel. The same appearance, displacement and sequence number give the same image, byte for byte."""
+
+    def __init__(self, appearance: GelAppearance | None = None) -> None:
+        self.appearance = appearance = GelAppearance() if appearance is None else appearance
+        rng = np.random.default_rng(appearance.seed)
+        light = illumination(appearance, rng)
+        markers = appearance.grid.rows * appearance.grid.cols
+        printed = np.ones(markers, dtype=bool)
+        printed[rng.permutation(markers)[: round(appearance.missing * markers)]] = False
+        sign = 1.0 if appearance.bright else -1.0
+        self._density = (sign * appearance.contrast * rng.normal(1.0, 0.04, markers).clip(0.8, 1.2)).astype(np.float32)
+        self._gels = [
+            (light + rng.normal(0, appearance.noise, light.shape)).clip(0, 255).astype(np.float32)
+            for _ in range(_NOISE_IMAGES)
+        ]
+        self._rest = appearance.positions_mm()
+        sprites, self._reach = _sprites(appearance)
+        used = (sprites > 0).any(axis=0)  # the corners of the square stay empty
+        self._sprites = np.ascontiguousarray(sprites[:, used])
+        self._margin = 2 * self._reach + 2
+        self._ink = np.ones(
+            (appearance.height + 2 * self._margin, appearance.width + 2 * self._margin), dtype=np.float32
+        )
+        # Offsets of a sprite's pixels in the flattened picture.
+        steps = np.arange(-self._reach, self._reach + 1)
+        self._steps = (steps[:, None] * self._ink.shape[1] + steps).ravel()[used]
+        # Sprites of one class never touch unless the gel folds, so that a class is drawn in one stroke.
+        row, col = np.divmod(np.arange(markers), appearance.grid.cols)
+        self._classes = [np.flatnonzero(printed & (row % 2 == i) & (col % 2 == j)) for i in (0, 1) for j in (0, 1)]
+
+    def render(self, displacement_mm: ArrayLike, *, sequence: int = 0) -> Image:
+        """The image (B G R, uint8, shape (height, width, 3)) of the gel with its markers displaced.
+
+        `displacement_mm` [mm], shape (rows * cols, 2), along the pad's x and y; `sequence` chooses the noise.
+        Raises UsageError for another shape or values that are not finite.
+        """
+        displacement = np.asarray(displacement_mm, dtype=float)
+        if displacement.shape != self._rest.shape:
+            raise UsageError(f"displacement must have shape {self._rest.shape} [mm], got {displacement.shape}")
+        if not np.isfinite(displacement).all():
+            raise UsageError("displacement of the markers must be finite")
+        factor = self._draw_dots(self.appearance.to_pixels(self._rest + displacement))
+        # Knuth's multiplicative hash: neighbours in sequence take pictures that do not follow a visible cycle.
+        gel = self._gels[(sequence * 2654435761 % 2**32) * _NOISE_IMAGES >> 32]
+        return np.asarray(cv2.multiply(gel, cv2.merge([factor] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
+
+    def encode(self, image: Image) -> bytes:
+        """`image` as JPEG."""
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.appearance.quality])
+        if not done:
+            raise UsageError(f"an image of shape {image.shape} and type {image.dtype} can not become a JPEG")
+        return data.tobytes()
+
+    def _draw_dots(self, centers: NDArray[np.float64]) -> NDArray[np.float32]:
+        """By how much the dots dim or light each pixel, shape (height, width); off the image they are cut off."""
+        appearance, margin = self.appearance, self._margin
+        self._ink[:] = 1
+        flat, stride = self._ink.reshape(-1), self._ink.shape[1]
+        # A dot far outside is moved to just outside, where nothing of it shows.
+        limit = np.array([appearance.width, appearance.height]) + self._reach
+        centers = np.clip(centers, -self._reach - 1.0, limit)
+        fine = np.round(centers * _PHASES).astype(np.intp)
+        whole, phase = fine // _PHASES, fine % _PHASES
+        first = (whole[:, 1] + margin) * stride + whole[:, 0] + margin
+        sprite = phase[:, 1] * _PHASES + phase[:, 0]
+        keep = np.maximum if appearance.bright else np.minimum
+        for markers in self._classes:
+            places = first[markers, None] + self._steps
+            flat[places] = keep(flat[places], 1 + self._density[markers, None] * self._sprites[sprite[markers]])
+        return self._ink[margin : margin + appearance.height, margin : margin + appearance.width]
+
+
+def _sprites(appearance: GelAppearance) -> tuple[NDArray[np.float32], int]:
+    """A dot's ink (0 to 1) at every phase within a pixel, shape (phases², side²), and its reach.
+
+    side is 2 reach + 1; the edge is a smooth step as wide as makes its slope's standard deviation the blur's.
+    """
+    width = np.sqrt(5) * appearance.blur  # half the step's width [px]
+    reach = int(np.ceil(appearance.radius + width)) + 1
+    steps = np.arange(-reach, reach + 1)
+    squared = (steps - np.arange(_PHASES)[:, None] / _PHASES) ** 2
+    distance = np.sqrt(squared[:, None, :, None] + squared[None, :, None, :])  # phase down, right; pixel down, right
+    edge = np.clip((appearance.radius - distance) / (2 * width) + 0.5, 0, 1)
+    sprites = (edge * edge * (3 - 2 * edge)).astype(np.float32)
+    return sprites.reshape(_PHASES**2, steps.size**2), reach
+
+
+def illumination(appearance: GelAppearance, rng: np.random.Generator) -> NDArray[np.float32]:
+    """The gel without markers: a coloured light from each side, a vignette and soft unevenness."""
+    down, right = np.meshgrid(
+        np.linspace(-1, 1, appearance.height), np.linspace(-1, 1, appearance.width), indexing="ij"
+    )
+    angle = rng.uniform(0, 2 * np.pi)
+    channels = []
+    for channel in range(3):
+        turn = angle + channel * 2 * np.pi / 3
+        side = np.cos(turn) * right + np.sin(turn) * down
+        coarse = cv2.resize(
+            rng.normal(0, 1, (5, 4)), (appearance.width, appearance.height), interpolation=cv2.INTER_CUBIC
+        )
+        glow = 1 + appearance.colour * (0.55 * side + 0.12 * coarse)
+        channels.append(appearance.light * glow * (1 - 0.18 * appearance.colour * (right**2 + down**2)))
+    return np.ascontiguousarray(np.clip(np.stack(channels, axis=-1), 8, 250), dtype=np.float32)
