@@ -101,7 +101,8 @@ def _errors(cases: Sequence[Case], options: BenchmarkOptions) -> Report:
         frames = QUICK_FRAMES if options.quick else FRAMES
         figures = {n: Figures.of(c) for n, c in case.follow(names, _fields(options), frames=frames).items()}
         looks = [(case.appearance(FIELDS.index(field)), field) for field in _fields(options)]
-        floor = np.concatenate(
+        bounds = [cramer_rao_errors(GelSequence(shown, field, frames=frames)) for shown, field in looks]
+        floor = np.concatenate(bounds)
             [cramer_rao_errors(GelSequence(appearance, field, frames=frames)) for appearance, field in looks]
         )
         own, least = figures[OWN], float(np.median(floor))
