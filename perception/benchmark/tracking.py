@@ -103,8 +103,6 @@ def _errors(cases: Sequence[Case], options: BenchmarkOptions) -> Report:
         looks = [(case.appearance(FIELDS.index(field)), field) for field in _fields(options)]
         bounds = [cramer_rao_errors(GelSequence(shown, field, frames=frames)) for shown, field in looks]
         floor = np.concatenate(bounds)
-            [cramer_rao_errors(GelSequence(appearance, field, frames=frames)) for appearance, field in looks]
-        )
         own, least = figures[OWN], float(np.median(floor))
         rows.append(
             (
