@@ -103,7 +103,7 @@ def one_term(scene: Scene, sim: Simulator) -> tuple[Array, Array, Array]:
     finger, box = poses[:, pad.body], poses[:, shape.body]
     to_finger, to_box = rotations(finger[:, 3:]), rotations(box[:, 3:])
     markers = finger[:, None, :3] + pad.positions @ np.swapaxes(to_finger, 1, 2)
-    distance, normal = box_distance((markers - box[:, None, :3]) @ to_box - shape.pose.pos, np.asarray(shape.size))
+    distance, normal = box_distance((markers - box[:, None, :3]) @ to_box - shape.pose.position, np.asarray(shape.size))
     normal = normal @ np.swapaxes(to_box, 1, 2)
     turning = np.zeros((len(poses), 1, 3))
     turning[:, 0, 2] = sim.v[:, scene.v("box_yaw")][:, 0]

@@ -22,7 +22,7 @@ from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.real.kinematics import Joints
-from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, Pace
+from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, TimeSync
 
 Rotation = Literal[0, 90, 180, 270]
 
@@ -53,9 +53,9 @@ class MockRobot:
     def __init__(self, factor: float = 1.0, config: MockRobotConfig | None = None) -> None:
         self.config = config = config or MockRobotConfig()
         self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-")
-        pace = f"{self._folder.name}/pace"
-        Pace.create(pace)
-        self.clock = clock = ScaledClock(factor, pace)
+        time_sync = f"{self._folder.name}/time_sync"
+        TimeSync.create(time_sync)
+        self.clock = clock = ScaledClock(factor, time_sync)
         self.cell = SimulatedCellProcess(clock, config.cell)
         # CommTimeout is 0.4 s in wall time: this computer's jitter does not shrink when the clock is scaled.
         timeout = 0.4 * max(1.0, clock.factor)

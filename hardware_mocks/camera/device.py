@@ -12,7 +12,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
-from gelflow.time_sync import LAG
+from gelflow.time_sync import MAX_LEAD
 
 BOUNDARY = "boundarydonotcross"
 Corruption = Literal["truncated", "garbage", "length"]
@@ -159,12 +159,12 @@ class MockMjpegCamera:
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
-            self._allow(due + LAG)
+            self._allow(due + MAX_LEAD)
             self._clock.sleep(due - self._clock.now())
 
     def _allow(self, until: float) -> None:
         if self._slot is not None:
-            self._clock.allow(self._slot, until)
+            self._clock.grant(self._slot, until)
 
     def _watch(self, change: int) -> int:
         """Count a client in or out; returns the current epoch."""

@@ -15,10 +15,10 @@ from typing import Any
 from gelflow.clock import Clock, ScaledClock, raise_priority
 from gelflow.errors import PeerError, SafetyError, UsageError
 from gelflow.geometry import PoseTuple, angle_between, compose, invert
-from gelflow.helper_process import Messages, adopted
+from gelflow.helper_process import Messages, connect_to_parent
 from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
 from gelflow.real.kinematics import HOME, Joints, forward, inverse
-from gelflow.time_sync import CONTROLLER, LAG, SHORTEST_WAIT
+from gelflow.time_sync import CONTROLLER, MAX_LEAD, MIN_WAIT
 
 _IDENTITY: PoseTuple = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
@@ -268,13 +268,13 @@ class _Loop:
     def _wait_until(self, due: float) -> None:
         """For the next cycle; robot time does not run far ahead of it, nor of a plant that owes an answer."""
         while True:
-            self._clock.allow(CONTROLLER, LAG + (due if self._asked is None else self._asked))
+            self._clock.grant(CONTROLLER, MAX_LEAD + (due if self._asked is None else self._asked))
             left = due - self._clock.now()
             if left <= 0:
                 return
             if self._asked is None:
                 self._clock.sleep(left)
-            elif select.select((self._parent,), (), (), max(self._clock.wall(left), SHORTEST_WAIT))[0]:
+            elif select.select((self._parent,), (), (), max(self._clock.wall(left), MIN_WAIT))[0]:
                 self._hear_parent()
 
     def _listen(self) -> None:
@@ -302,7 +302,7 @@ class _Loop:
 
 def main(arguments: list[str]) -> int:
     """Started by `MockEgmArm`."""
-    settings, parent, _ = adopted(arguments)
+    settings, parent, _ = connect_to_parent(arguments)
     clock = ScaledClock(*settings["clock"])
     config = MockEgmConfig(**{name: _tuple(value) for name, value in settings["config"].items()})
     controller = Controller(config, clock, _tuple(settings["pose"]))
@@ -310,7 +310,7 @@ def main(arguments: list[str]) -> int:
     gc.disable()
     with suppress(ConnectionError):
         _Loop(controller, config, clock, parent).run()
-    clock.allow(CONTROLLER, math.inf)
+    clock.grant(CONTROLLER, math.inf)
     return 0
 
 

@@ -20,7 +20,7 @@ from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
 from gelflow.geometry import PoseTuple
 from gelflow.hardware_mocks.egm.controller import MockEgmConfig, MockEgmReport, joints_of
 from gelflow.hardware_mocks.plant import ArmPlant
-from gelflow.helper_process import Child
+from gelflow.helper_process import HelperProcess
 
 _REPLY_LIMIT = 10.0  # of our own process, its start included [s, wall]
 
@@ -35,7 +35,7 @@ class MockEgmArm:
         self._plant = plant
         self._clock = clock
         self._config = config or MockEgmConfig()
-        self._child: Child | None = None
+        self._helper: HelperProcess | None = None
         self._thread: threading.Thread | None = None
         self._quit = threading.Event()
         self._replied = threading.Condition()
@@ -44,7 +44,7 @@ class MockEgmArm:
 
     def start(self) -> None:
         """Begin to send. Raises UsageError when the plant stands where the arm can't reach."""
-        if self._child is not None:
+        if self._helper is not None:
             raise UsageError("the mock EGM robot runs already")
         pose = self._pose()
         try:
@@ -53,8 +53,8 @@ class MockEgmArm:
             raise UsageError(f"the mock arm cannot start where its plant is: {error}") from None
         settings = {"clock": self._clock.settings, "config": asdict(self._config), "pose": pose}
         self._quit.clear()
-        self._child = Child.start("gelflow.hardware_mocks.egm.controller", settings)
-        self._thread = threading.Thread(target=self._serve, args=(self._child,), name="mock-egm", daemon=True)
+        self._helper = HelperProcess.start("gelflow.hardware_mocks.egm.controller", settings)
+        self._thread = threading.Thread(target=self._serve, args=(self._helper,), name="mock-egm", daemon=True)
         self._thread.start()
         try:
             self._call("report")
@@ -64,11 +64,11 @@ class MockEgmArm:
 
     def stop(self) -> None:
         """Cease sending: as if the controller were switched off."""
-        if self._child is not None and self._thread is not None:
+        if self._helper is not None and self._thread is not None:
             self._quit.set()
             self._thread.join()
-            self._child.close()
-            self._child = self._thread = None
+            self._helper.close()
+            self._helper = self._thread = None
 
     @property
     def report(self) -> MockEgmReport:
@@ -78,7 +78,7 @@ class MockEgmArm:
     @property
     def pid(self) -> int | None:
         """Of the controller's process; None when it is not running."""
-        return None if self._child is None else self._child.pid
+        return None if self._helper is None else self._helper.pid
 
     def motors(self, on: bool) -> None:
         """Switch the motors, as an emergency stop or the operator does."""
@@ -101,29 +101,29 @@ class MockEgmArm:
         self._call("silence", seconds)
 
     def _call(self, name: str, *values: Any) -> MockEgmReport:
-        child = self._child
-        if child is None:
+        helper = self._helper
+        if helper is None:
             raise UsageError("the mock EGM robot is not running; call start() first")
         with self._replied:
             self._asked += 1
             number = self._asked
             try:
-                child.messages.send(["do", number, name, *values])
+                helper.messages.send(["do", number, name, *values])
             except OSError:
-                raise PeerError(f"the mock controller's process is gone ({child.last_words()})") from None
-            self._replied.wait_for(lambda: number in self._replies or child.messages.closed, _REPLY_LIMIT)
+                raise PeerError(f"the mock controller's process is gone ({helper.exit_reason()})") from None
+            self._replied.wait_for(lambda: number in self._replies or helper.messages.closed, _REPLY_LIMIT)
             if number in self._replies:
                 return self._replies.pop(number)
-        if child.messages.closed:
-            raise PeerError(f"the mock controller's process is gone ({child.last_words()})")
+        if helper.messages.closed:
+            raise PeerError(f"the mock controller's process is gone ({helper.exit_reason()})")
         raise PeerTimeout(f"the mock controller's process did not answer within {_REPLY_LIMIT} s")
 
-    def _serve(self, child: Child) -> None:
+    def _serve(self, helper: HelperProcess) -> None:
         """The plant's side: moves it, and says where it is."""
-        while not self._quit.is_set() and not child.messages.closed:
-            select.select((child.messages,), (), (), 0.1)
+        while not self._quit.is_set() and not helper.messages.closed:
+            select.select((helper.messages,), (), (), 0.1)
             asked = False
-            for kind, *values in child.messages.read():
+            for kind, *values in helper.messages.read():
                 if kind == "cycle":
                     asked = True
                     if values[0] is not None:
@@ -132,14 +132,14 @@ class MockEgmArm:
                     with self._replied:
                         self._replies[values[0]] = MockEgmReport(**values[1])
                         self._replied.notify_all()
-            if asked and not child.messages.closed:
-                self._answer(child)
+            if asked and not helper.messages.closed:
+                self._answer(helper)
         with self._replied:
             self._replied.notify_all()
 
-    def _answer(self, child: Child) -> None:
+    def _answer(self, helper: HelperProcess) -> None:
         try:
-            child.messages.send(["pose", *self._pose()])
+            helper.messages.send(["pose", *self._pose()])
         except OSError:
             # It ended just now; the next read says so, and whoever asks it anything is told.
             return

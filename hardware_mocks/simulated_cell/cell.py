@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.geometry import Pose, rotate, yaw_quaternion
+from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
-from gelflow.observation import Grid, resampling
+from gelflow.observation import Grid, resampling_weights
 from gelflow.sim.scene.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.task import INSERTION, InsertionTask
-from gelflow.time_sync import LAG, SHORTEST_WAIT, WORLD
+from gelflow.time_sync import MAX_LEAD, MIN_WAIT, SIMULATED_CELL
 
 Array = NDArray[np.float64]
 _PARKED = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # where a part waits that is not on the scene [m], w x y z
@@ -104,7 +104,7 @@ class SimulatedCell:
         self._part = sim.joint_q("part")
         self._part_v = sim.joint_v("part")
         self._pads = [scene.markers_of("left"), scene.markers_of("right")]
-        self._weights = [resampling(grid.positions(), config.grid) for grid in scene.grids]
+        self._weights = [resampling_weights(grid.positions(), config.grid) for grid in scene.grids]
         self._u = np.zeros(sim.model.nu)
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         sim.reset()
@@ -133,11 +133,11 @@ class SimulatedCell:
         step = self.config.step
         self._time = self._clock.now()
         while not ending.is_set():
-            self._clock.settle()
-            self._clock.allow(WORLD, self._time + step + LAG)
+            self._clock.absorb_delay()
+            self._clock.grant(SIMULATED_CELL, self._time + step + MAX_LEAD)
             behind = self._clock.now() - self._time
             if behind < step:
-                ending.wait(max(self._clock.wall(step - behind), SHORTEST_WAIT))
+                ending.wait(max(self._clock.wall(step - behind), MIN_WAIT))
                 continue
             with self._lock:
                 self._step()
@@ -162,7 +162,7 @@ class SimulatedCell:
         if not (np.isfinite(pose.position).all() and np.isfinite(pose.quaternion).all()):
             raise UsageError(f"the arm can not go to {pose}")
         with self._lock:
-            if not pose.near(self._rest, *_STILL):
+            if not pose.is_near(self._rest, *_STILL):
                 self._rest, self._still_since = pose, self._time
             self._tool = pose
             self._u[self._arm_u] = self._in_scene()
@@ -206,7 +206,7 @@ class SimulatedCell:
             return {
                 "part": None if self._current is None else asdict(self._current),
                 "parts": [asdict(part) for part in self.parts],
-                "waited": self._clock.lost,
+                "waited": self._clock.delay,
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
@@ -261,7 +261,7 @@ class SimulatedCell:
     def _ready_to_load(self) -> bool:
         """The fingers are open, and the arm stands still where parts are handed over."""
         open_wide = self._grip.width() > _PART_WIDTH + 0.005
-        there = self._tool.near(self._start, 1e-3, math.radians(1.0))
+        there = self._tool.is_near(self._start, 1e-3, math.radians(1.0))
         return open_wide and there and self._time - self._still_since > 0.3
 
     def _hold_out(self) -> None:
@@ -287,7 +287,7 @@ class SimulatedCell:
         """The corners of the part's lower face in the hole's frame [m], shape (4, 3)."""
         half = (_PART_WIDTH / 2, 0.025, -_HALF_HEIGHT)
         corners = [np.array([i * half[0], j * half[1], half[2]]) for i in (-1, 1) for j in (-1, 1)]
-        return np.array([pose.position + rotate(pose.quaternion, corner) for corner in corners])
+        return pose.apply(np.array(corners))
 
     def _look(self, part: PartTruth) -> None:
         """Take the part's true pose, while it is not let go: what counts is where the robot brought it."""

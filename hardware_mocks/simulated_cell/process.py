@@ -1,31 +1,25 @@
-"""The simulated world in a process of its own, so that no camera or protocol of the mocks keeps it waiting.
+"""The simulated world in a helper process, so that neither cameras nor protocols of the mocks delay it.
 
-What changes with every step passes through shared memory; what is rarely asked through a socket, as lines of JSON. The
-process ends when its parent does: the socket closes.
+Values that change with every step pass through shared memory; rare requests pass as messages.
 """
 
-import json
 import mmap
 import os
-import pickle
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
-from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-import gelflow
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
+from gelflow.helper_process import HelperProcess, Messages, connect_to_parent
 from gelflow.observation import Grid
+from gelflow.session.records import plain, restore
 
 Array = NDArray[np.float64]
 _START_LIMIT = 30.0  # [s, wall]
@@ -80,9 +74,7 @@ class SimulatedCellProcess:
         self.config = SimulatedCellConfig() if config is None else config
         self._clock = clock
         self._shared: _Shared | None = None
-        self._process: subprocess.Popen[bytes] | None = None
-        self._link: socket.socket | None = None
-        self._complaints: IO[bytes] | None = None
+        self._helper: HelperProcess | None = None
         self._lock = threading.Lock()
         self._asking = threading.Lock()
         self._tool = self.config.start_tool()
@@ -94,44 +86,27 @@ class SimulatedCellProcess:
             os.ftruncate(file.fileno(), _Shared.size(grid))
             self._shared = _Shared(file.fileno(), grid)
             self._shared.arm.write([*self._tool[0], *self._tool[1]])
-            self._link, theirs = socket.socketpair()
-            self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (closed in stop)
-            paths = (str(Path(gelflow.__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
-            numbers = (theirs.fileno(), file.fileno())
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "gelflow.hardware_mocks.simulated_cell.process", *map(str, numbers)],
-                pass_fds=numbers,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=self._complaints,
-                # One core is enough for one cell; numerical libraries would start a thread for each.
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"},
-            )
-            theirs.close()
-        assert self._process.stdin is not None
-        with self._process.stdin as pipe:
-            pickle.dump((self.config, self._clock.settings), pipe)
+            settings = {"world": plain(self.config), "clock": self._clock.settings}
+            module = "gelflow.hardware_mocks.simulated_cell.process"
+            self._helper = HelperProcess.start(module, settings, descriptors=(file.fileno(),))
         try:
-            self._receive(_START_LIMIT)
+            self._receive(self._helper, _START_LIMIT)
         except SimulationError:
-            self.stop()
+            self._helper.close()
+            self._helper = None
             raise
         return self
 
     def stop(self) -> None:
         """End the process. Raises SimulationError when it had failed before."""
-        process, self._process = self._process, None
-        if process is None or self._link is None:
+        helper, self._helper = self._helper, None
+        if helper is None:
             return
-        self._link.close()
-        try:
-            code = process.wait(_ANSWER_LIMIT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            code = process.wait()
-        words = self._last_words()
-        if code != 0:
-            raise SimulationError(f"the simulated world failed: {words}")
+        failed = helper.stop(limit=_ANSWER_LIMIT) != 0
+        reason = helper.exit_reason()
+        helper.close()
+        if failed:
+            raise SimulationError(f"the simulated world failed: {reason}")
 
     def __enter__(self) -> Self:
         return self.start()
@@ -181,44 +156,31 @@ class SimulatedCellProcess:
 
     def _ask(self, question: dict[str, Any]) -> Any:
         with self._asking:
-            if self._link is None or self._process is None:
+            if self._helper is None:
                 raise SimulationError("the simulated world does not run")
             try:
-                self._link.sendall(json.dumps(question).encode() + b"\n")
+                self._helper.messages.send(question)
             except OSError:
-                raise SimulationError(f"the simulated world is gone: {self._last_words()}") from None
-            return self._receive(_ANSWER_LIMIT)
+                raise SimulationError(f"the simulated world is gone: {self._helper.exit_reason()}") from None
+            return self._receive(self._helper, _ANSWER_LIMIT)
 
-    def _receive(self, limit: float) -> Any:
-        """One line from the process."""
-        assert self._link is not None
-        self._link.settimeout(limit)
-        data = b""
+    @staticmethod
+    def _receive(helper: HelperProcess, limit: float) -> Any:
+        """One message from the process."""
         try:
-            while not data.endswith(b"\n"):
-                part = self._link.recv(1 << 16)
-                if not part:
-                    raise SimulationError(f"the simulated world is gone: {self._last_words()}")
-                data += part
+            values = helper.messages.wait(limit)
         except TimeoutError:
             raise SimulationError(f"the simulated world did not answer within {limit:g} s") from None
-        except ConnectionError:
-            raise SimulationError(f"the simulated world is gone: {self._last_words()}") from None
-        return json.loads(data)
-
-    def _last_words(self) -> str:
-        if self._complaints is None:
-            return "no reason known"
-        self._complaints.seek(0)
-        lines = self._complaints.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no reason given"
+        if not values:
+            raise SimulationError(f"the simulated world is gone: {helper.exit_reason()}")
+        return values[0]
 
 
 class _Service:
     """The process's side."""
 
-    def __init__(self, world: SimulatedCell, link: socket.socket, shared: _Shared) -> None:
-        self._world, self._link, self._shared = world, link, shared
+    def __init__(self, world: SimulatedCell, parent: Messages, shared: _Shared) -> None:
+        self._world, self._parent, self._shared = world, parent, shared
         self._commands = shared.command.read()[0]
         self._poses = -1
         self._steps = 0
@@ -244,31 +206,29 @@ class _Service:
     def answer(self) -> None:
         """A thread: questions of the parent, until it is gone."""
         try:
-            for line in self._link.makefile("rb"):
-                question = json.loads(line)
-                reply: Any = None
-                if question["ask"] == "truth":
-                    reply = self._world.truth()
-                else:
-                    self._world.next_seed(int(question["seed"]))
-                self._link.sendall(json.dumps(reply).encode() + b"\n")
+            while not self._parent.closed:
+                for question in self._parent.wait():
+                    reply: Any = None
+                    if question["ask"] == "truth":
+                        reply = self._world.truth()
+                    else:
+                        self._world.next_seed(int(question["seed"]))
+                    self._parent.send(reply)
         except OSError:
-            return  # the parent is gone in the middle of it
+            return  # the parent ended in the middle of an answer
         finally:
             self.ending.set()
 
 
 def main(arguments: list[str]) -> int:
-    """`arguments`: file descriptors of the socket and of the shared memory; configuration and factor on stdin."""
-    # Ctrl-C reaches the whole terminal group; what it means is for the parent to say.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    config, settings = pickle.load(sys.stdin.buffer)  # from our own parent
-    link = socket.socket(fileno=int(arguments[0]))
-    world = SimulatedCell(ScaledClock(*settings), config)
-    service = _Service(world, link, _Shared(int(arguments[1]), config.grid))
+    """Started by `SimulatedCellProcess`, with the shared memory."""
+    settings, parent, (memory,) = connect_to_parent(arguments)
+    config = restore(SimulatedCellConfig, settings["world"], what="configuration of the simulated world")
+    world = SimulatedCell(ScaledClock(*settings["clock"]), config)
+    service = _Service(world, parent, _Shared(memory, config.grid))
     threading.Thread(target=service.answer, daemon=True).start()
     service.pass_on()
-    link.sendall(b"null\n")
+    parent.send(None)
     world.run(service.ending, after_step=service.pass_on)
     return 0
 

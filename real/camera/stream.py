@@ -9,7 +9,7 @@ from typing import Self
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import CameraImage
-from gelflow.time_sync import SHORTEST_WAIT
+from gelflow.time_sync import MIN_WAIT
 
 OnImage = Callable[[CameraImage], None]
 
@@ -113,7 +113,7 @@ class StreamCamera(ABC):
         """Until `arrived` or a failure, at most `timeout` [s, robot time]; the lock is held."""
         end = self._clock.now() + timeout
         while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
-            self._changed.wait(max(self._clock.wall(left), SHORTEST_WAIT))
+            self._changed.wait(max(self._clock.wall(left), MIN_WAIT))
 
     # What a kind of camera brings
 

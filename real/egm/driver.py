@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
 from gelflow.geometry import PoseTuple
-from gelflow.helper_process import Child
+from gelflow.helper_process import HelperProcess
 from gelflow.protocols import ArmState
 from gelflow.real.egm.codec import EgmFeedback
 from gelflow.real.egm.config import EgmConfig
@@ -46,7 +46,7 @@ class EgmArm:
         self._config = config
         self._clock = clock
         self._lock = threading.RLock()
-        self._child: Child | None = None
+        self._helper: HelperProcess | None = None
         self._ring: EgmCycleLog | None = None
         self._events: list[EgmEvent] = []
         self._latched = ""
@@ -61,7 +61,7 @@ class EgmArm:
         PeerTimeout when the robot sends nothing; the process is then gone again, and `connect` may be called anew.
         """
         limit = self._config.connect_timeout if timeout is None else timeout
-        if self._child is not None:
+        if self._helper is not None:
             raise UsageError("the EGM arm is connected already; close() it first")
         try:
             self._start()
@@ -189,13 +189,13 @@ class EgmArm:
         When the EGM process does not confirm it, it is killed, which has the same effect.
         """
         with self._lock:
-            if self._child is None:
+            if self._helper is None:
                 return
             try:
                 self._send("stop", reason or "stop was called")
                 self._wait(lambda: bool(self._latched), _OBEY_LIMIT, "the EGM process did not confirm the stop")
             except PeerError:
-                self._child.kill()
+                self._helper.kill()
                 self._latched = self._latched or reason or "stop was called"
 
     def reset(self) -> None:
@@ -228,16 +228,16 @@ class EgmArm:
     @property
     def pid(self) -> int | None:
         """Of the EGM process; None when not connected."""
-        return None if self._child is None else self._child.pid
+        return None if self._helper is None else self._helper.pid
 
     def close(self) -> None:
         """Cease sending and end the process. What the log holds is gone with it: drain first."""
         with self._lock:
-            if self._child is not None:
-                self._child.close()
+            if self._helper is not None:
+                self._helper.close()
             if self._ring is not None:
                 self._ring.close()
-            self._child = self._ring = None
+            self._helper = self._ring = None
             self._latched, self._tool = "", None
 
     def __enter__(self) -> "EgmArm":
@@ -264,7 +264,9 @@ class EgmArm:
         try:
             self._ring = EgmCycleLog(descriptor, self._config.log_records)
             settings = dataclasses.asdict(self._config) | {"clock": self._clock.settings}
-            self._child = Child.start("gelflow.real.egm.process", settings, descriptors=(udp.fileno(), descriptor))
+            self._helper = HelperProcess.start(
+                "gelflow.real.egm.process", settings, descriptors=(udp.fileno(), descriptor)
+            )
         finally:
             udp.close()
             os.close(descriptor)
@@ -291,32 +293,32 @@ class EgmArm:
         if self._latched:
             raise SafetyError(f"the arm is stopped: {self._latched}; when the cause is gone, the operator may reset it")
 
-    def _linked(self) -> Child:
-        if self._child is None:
+    def _linked(self) -> HelperProcess:
+        if self._helper is None:
             raise UsageError("the EGM arm is not connected; call connect() first")
-        return self._child
+        return self._helper
 
     def _pump(self, *, tolerant: bool = False) -> None:
         """Take in what the process has said. Raises PeerError when it is gone, unless `tolerant`."""
-        child = self._linked()
-        for event in (EgmEvent(*values) for values in child.messages.read()):
+        helper = self._linked()
+        for event in (EgmEvent(*values) for values in helper.messages.read()):
             self._events.append(event)
             if event.kind == "stopped":
                 self._latched = event.text
             elif event.kind == "reset":
                 self._latched, self._tool = "", None
                 self._resets += 1
-        if child.messages.closed and not tolerant:
-            raise PeerError(f"the EGM process is gone ({child.last_words()}); nothing is sent to the robot any more")
+        if helper.messages.closed and not tolerant:
+            raise PeerError(f"the EGM process is gone ({helper.exit_reason()}); nothing is sent to the robot any more")
 
     def _send(self, *command: Any) -> None:
-        child = self._linked()
+        helper = self._linked()
         try:
-            child.messages.send(command, limit=_OBEY_LIMIT)
+            helper.messages.send(command, limit=_OBEY_LIMIT)
         except TimeoutError:
             raise PeerTimeout(f"the EGM process took no command for {_OBEY_LIMIT} s") from None
         except OSError:
-            raise PeerError(f"the EGM process is gone ({child.last_words()})") from None
+            raise PeerError(f"the EGM process is gone ({helper.exit_reason()})") from None
 
     def _wait(self, done: Callable[[], bool], wall: float, failure: str) -> None:
         """Until `done`, for at most `wall` seconds of wall time, while what the process says is taken in."""

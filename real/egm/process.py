@@ -15,7 +15,7 @@ from typing import Any
 from gelflow.clock import ScaledClock, raise_priority
 from gelflow.errors import PeerError
 from gelflow.geometry import PoseTuple
-from gelflow.helper_process import Messages, adopted
+from gelflow.helper_process import Messages, connect_to_parent
 from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_robot, encode_sensor
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog
@@ -23,7 +23,7 @@ from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag, ReferenceGen
 from gelflow.real.egm.target import Target
 
 _LARGEST_MESSAGE = 4096
-_PARENT_CHECK = 0.1  # [s, wall]: the closed link says it at once, except where another child holds the parent's end
+_PARENT_CHECK = 0.1  # [s, wall]: the closed link says it at once, except where another helper holds the parent's end
 
 
 class EgmLoop:
@@ -160,7 +160,7 @@ class EgmLoop:
 
 def main(arguments: list[str]) -> int:
     """Started by `EgmArm`, with the UDP socket and the log."""
-    settings, parent, (udp_number, ring_number) = adopted(arguments)
+    settings, parent, (udp_number, ring_number) = connect_to_parent(arguments)
     clock = ScaledClock(*settings.pop("clock"))
     config = EgmConfig(**settings)
     udp = socket.socket(fileno=udp_number)

@@ -214,7 +214,7 @@ class InsertionRunner:
         while True:
             self._motion.wait(0.0)
             images = observer.images()
-            with self._clock.urgent(RUNNER):
+            with self._clock.bounded(RUNNER):
                 reading = observer.read(images)
                 if reading is not None and reading.shear > lab.descent.stop_shear_mm:
                     self._motion.hold()

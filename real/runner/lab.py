@@ -233,12 +233,12 @@ class Lab:
     descent: DescentLab = field(default_factory=DescentLab)
     limits: LimitsLab = field(default_factory=LimitsLab)
     clock_factor: float = 1.0  # robot time over wall time: 1 for a robot, more only for a mock
-    clock_pace: str = ""  # the file with which a mock robot holds robot time back; none for a robot
+    time_sync: str = ""  # the file with which a mock robot holds robot time back; none for a robot
     format: int = FORMAT
 
     @property
     def clock(self) -> ScaledClock:
-        return ScaledClock(self.clock_factor, self.clock_pace)
+        return ScaledClock(self.clock_factor, self.time_sync)
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, for recordings."""

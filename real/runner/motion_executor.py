@@ -114,7 +114,7 @@ class MotionExecutor:
         goal = self._goal
         if goal is None:
             return False
-        return self.pose().near(goal, within, _ARRIVED[1])
+        return self.pose().is_near(goal, within, _ARRIVED[1])
 
     def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
         """Go to `target` and wait until the arm is there. Raises PeerTimeout when it takes far too long."""

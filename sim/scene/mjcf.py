@@ -4,7 +4,7 @@ MuJoCo resolves defaults, meshes and inertia; its compiled arrays are the source
 ever stepped by it. Bodies without a joint are merged into the body that carries them, mass and geometry included.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.geometry import Pose
 from gelflow.sim.scene.mesh import TriangleMesh
 from gelflow.sim.scene.mjcf_actuators import ActuatorDef as ActuatorDef
 from gelflow.sim.scene.mjcf_actuators import default_limit, joint_extra, read_actuators
@@ -21,28 +22,6 @@ from gelflow.sim.scene.mjcf_unsupported import left_out, refuse, switch_off
 Array = NDArray[np.float64]
 
 WORLD = -1
-
-
-@dataclass(frozen=True)
-class Pose:
-    """A frame in another: x_outer = pos + R(quat) x_inner."""
-
-    pos: Array = field(default_factory=lambda: np.zeros(3))  # [m]
-    quat: Array = field(default_factory=lambda: np.array([1.0, 0, 0, 0]))  # w x y z
-
-    def matrix(self) -> Array:
-        flat = np.zeros(9)
-        mujoco.mju_quat2Mat(flat, self.quat)
-        return flat.reshape(3, 3)
-
-    def points(self, points: Array) -> Array:
-        """Points of the inner frame in the outer one [m], shape (n, 3)."""
-        return points @ self.matrix().T + self.pos
-
-    def __matmul__(self, inner: "Pose") -> "Pose":
-        quat = np.zeros(4)
-        mujoco.mju_mulQuat(quat, self.quat, inner.quat)
-        return Pose(self.points(inner.pos[None])[0], quat)
 
 
 @dataclass(frozen=True)
@@ -177,10 +156,10 @@ def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[
         masses = model.body_mass[members]
         mass = float(masses.sum())
         frames = [poses[b] @ Pose(model.body_ipos[b].copy(), model.body_iquat[b].copy()) for b in members]
-        com = sum(m * frame.pos for m, frame in zip(masses, frames, strict=True)) / max(mass, 1e-300)
+        com = sum(m * frame.position for m, frame in zip(masses, frames, strict=True)) / max(mass, 1e-300)
         inertia = np.zeros((3, 3))
         for b, m, frame in zip(members, masses, frames, strict=True):
-            rotation, arm = frame.matrix(), frame.pos - com
+            rotation, arm = frame.matrix(), frame.position - com
             inertia += rotation @ np.diag(model.body_inertia[b]) @ rotation.T
             inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         parent = model.body_parentid[root]

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import Pose
 from gelflow.observation import Grid
 from gelflow.sim.scene.gel import Gel, read_gel
-from gelflow.sim.scene.mjcf import GeomDef, Mechanics, Pose
+from gelflow.sim.scene.mjcf import GeomDef, Mechanics
 from gelflow.sim.scene.sampling import (
     ENDS,
     FACES,
@@ -120,7 +121,7 @@ def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef]) -> Points
             raise UsageError(
                 f"{table.location}: without a count {geom.name!r} is one exact point, which takes geom alone"
             )
-        radius, center = float(geom.size[0]), geom.pose.pos[None]
+        radius, center = float(geom.size[0]), geom.pose.position[None]
         return PointsDef(name, geom.name, geom.body, center, np.ones((1, 3)), np.ones(1), radius, geom.pose, False)
     try:
         local, areas = _surface(table, geom)
@@ -130,7 +131,7 @@ def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef]) -> Points
         ) from None
     per_area = table.string("stiffness", "per point", choices=_PER_UNIT) == "per area"
     weights = areas.sum(1) if per_area else np.ones(len(areas))
-    return PointsDef(name, geom.name, geom.body, geom.pose.points(local), areas, weights, 0.0, geom.pose, per_area)
+    return PointsDef(name, geom.name, geom.body, geom.pose.apply(local), areas, weights, 0.0, geom.pose, per_area)
 
 
 def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
@@ -216,7 +217,7 @@ def read_pads(tables: Mapping[str, TomlTable], mechanics: Mechanics, friction: s
                 body=body,
                 shape=shape,
                 pose=frame,
-                positions=frame.points(markers.positions),
+                positions=frame.apply(markers.positions),
                 axes=frame.matrix() @ markers.axes,
                 weights=np.full(len(markers.positions), markers.area if per_area and markers.area else 1.0),
                 grid=markers.grid,

@@ -137,7 +137,9 @@ class Scene:
         spec.integrator = self.integrator
         spec.tolerance = self.tolerance
         for index, body in enumerate(self.bodies):
-            spec.add_body(body.name, body.parent, body.pose.pos, body.pose.quat, body.mass, body.com, body.inertia)
+            spec.add_body(
+                body.name, body.parent, body.pose.position, body.pose.quaternion, body.mass, body.com, body.inertia
+            )
             for joint, limit in zip(self.joints, self.limits, strict=True):
                 if joint.body == index:
                     _tell_joint(spec, joint, limit)
@@ -149,8 +151,8 @@ class Scene:
                 p.points,
                 p.weights,
                 radius=p.radius,
-                pos=p.pose.pos,
-                quat=p.pose.quat,
+                pos=p.pose.position,
+                quat=p.pose.quaternion,
                 areas=p.areas if p.per_area else None,
             )
             for p in self.points
@@ -174,8 +176,8 @@ class Scene:
                 shapes=[shapes[name] for name in pad.against],
                 law=pad.law,
                 weights=pad.weights,
-                pos=pad.pose.pos,
-                quat=pad.pose.quat,
+                pos=pad.pose.position,
+                quat=pad.pose.quaternion,
                 pushes=pad.pushes,
                 **pad.numbers,
             )
@@ -201,7 +203,7 @@ class Scene:
 
 
 def _tell_shape(spec: Any, shape: ShapeDef) -> int:
-    place = (shape.pose.pos, shape.pose.quat, shape.size)
+    place = (shape.pose.position, shape.pose.quaternion, shape.size)
     if shape.grid is None:
         return int(spec.add_shape(shape.name, shape.body, shape.kind, *place, rounding=shape.rounding))
     return int(

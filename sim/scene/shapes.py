@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import Pose
 from gelflow.sim.scene.distance_grid import DEFAULT_RESOLUTION, LEAST_RESOLUTION, DistanceGrid, distance_grid
-from gelflow.sim.scene.mjcf import GeomDef, Mechanics, Pose
+from gelflow.sim.scene.mjcf import GeomDef, Mechanics
 from gelflow.toml_tables import TomlTable, suggestion
 
 Array = NDArray[np.float64]

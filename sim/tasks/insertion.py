@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.observation import DEFAULT_FLOORS, normalize
+from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
@@ -104,7 +104,7 @@ class InsertionAttempts:
         self._corners = half * np.array([[x, y, -1.0] for x in (-1, 1) for y in (-1, 1)])
         self._face = half[2]
         right, back = shapes["wall_right"], shapes["wall_back"]
-        self._outline = np.array([right.pose.pos[0] - right.size[0], back.pose.pos[1] - back.size[1]])
+        self._outline = np.array([right.pose.position[0] - right.size[0], back.pose.position[1] - back.size[1]])
         self.pose: Array = np.zeros((num_envs, 3))
         self._noise: Array = np.zeros(num_envs)
         self._stop_shear: Array = np.full(num_envs, np.inf)
@@ -186,7 +186,7 @@ class InsertionAttempts:
                 stopped |= self._mean_shear(felt - readings[self._reference_at]) > self._stop_shear
         noisy = {step: self._with_noise(readings[step], rng) for step in sorted({self._reference_at, *self._frames})}
         stack = np.stack([noisy[step] for step in self._frames], axis=1)
-        image, divisor = normalize(stack, noisy[self._reference_at], floor=DEFAULT_FLOORS["N"])
+        image, divisor = normalize(stack, noisy[self._reference_at], min_divisor=MIN_DIVISORS["N"])
         height, inserted = self._outcome()
         failed = sim.status != 0
         inserted &= ~failed & ~stopped

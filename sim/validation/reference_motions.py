@@ -155,7 +155,7 @@ def _sag(scene: Scene) -> float:
     kn = next(c.numbers["kn"] for c in scene.contacts if c.points == "bar")
     places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
     tables = [s for s in scene.shapes if s.name.startswith("table")]
-    resting = sum(weights[(np.abs(places - t.pose.pos) <= t.size)[:, :2].all(1)].sum() for t in tables)
+    resting = sum(weights[(np.abs(places - t.pose.position) <= t.size)[:, :2].all(1)].sum() for t in tables)
     return float(-scene.gravity[2] * scene.bodies[scene.body("bar")].mass / (kn * resting))
 
 

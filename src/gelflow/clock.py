@@ -1,4 +1,4 @@
-"""The one source of time. Everything that waits or stamps takes a clock, so that tests need not be slow."""
+"""Clocks: code that waits or stamps takes a clock as an argument, so that tests can scale time."""
 
 import contextlib
 import math
@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from gelflow.errors import UsageError
-from gelflow.time_sync import LAG, SHORTEST_WAIT, Pace
+from gelflow.time_sync import MAX_LEAD, MIN_WAIT, TimeSync
 
 
 class Clock(Protocol):
-    """Robot time in seconds. Periods and time-outs are written in robot time; `wall` converts them."""
+    """Robot time in seconds. Periods and time-outs are given in robot time; `wall` converts them."""
 
     def now(self) -> float:
         """Robot time since an arbitrary start [s]; monotonic."""
@@ -24,83 +24,91 @@ class Clock(Protocol):
         ...
 
     def wall(self, seconds: float) -> float:
-        """The wall-clock length of `seconds` of robot time [s]: what a socket's time-out takes."""
+        """Wall-clock duration of `seconds` of robot time [s], for example for a socket's time-out."""
         ...
 
 
 @dataclass(frozen=True)
 class ScaledClock:
-    """Robot time runs `factor` times as fast as the wall clock (1 is real time, the only one for a robot).
+    """Robot time that runs `factor` times as fast as the wall clock. A robot requires 1, which is real time.
 
-    Two processes on one machine that are given the same factor agree on the time: both read the system's
-    monotonic clock. With the `pace` file of a mock robot they also agree on when it stands still, because this computer
-    can't simulate as fast as that: `factor` is then the most.
+    Two processes on one machine with the same factor agree on the time: both read the system's monotonic clock.
+    `time_sync` names the file of a mock robot (`gelflow.time_sync`). With it robot time also stands still while the
+    simulation is late, and `factor` is an upper bound.
+
+    Raises UsageError when `factor` is out of range or the file does not exist.
     """
 
     factor: float = field(default=1.0)
-    pace: str = ""
-    _pace: Pace | None = field(default=None, init=False, repr=False, compare=False)
+    time_sync: str = ""
+    _sync: TimeSync | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.factor <= 1000:
             raise UsageError(f"clock factor {self.factor} is outside 0.01 to 1000 (1 is real time)")
-        if self.pace:
-            object.__setattr__(self, "_pace", Pace(self.pace))
+        if self.time_sync:
+            object.__setattr__(self, "_sync", TimeSync(self.time_sync))
 
     def now(self) -> float:
-        return time.monotonic() * self.factor if self._pace is None else self._pace.now(self.factor)
+        """Robot time since an arbitrary start [s]; monotonic."""
+        return time.monotonic() * self.factor if self._sync is None else self._sync.now(self.factor)
 
     def sleep(self, seconds: float) -> None:
-        if self._pace is None:
+        """Wait for `seconds` of robot time [s]."""
+        if self._sync is None:
             if seconds > 0:
                 time.sleep(seconds / self.factor)
             return
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
-            time.sleep(max(left / self.factor, SHORTEST_WAIT))
+            time.sleep(max(left / self.factor, MIN_WAIT))
 
     def wall(self, seconds: float) -> float:
+        """Wall-clock duration of `seconds` of robot time at full speed [s]."""
         return seconds / self.factor
 
     @property
     def settings(self) -> tuple[float, str]:
-        """What another process makes the same clock of."""
-        return self.factor, self.pace
+        """Arguments that create the same clock in another process."""
+        return self.factor, self.time_sync
 
-    # For who plays the robot
+    # For the processes of a mock robot
 
     @property
-    def lost(self) -> float:
-        """How far robot time is behind `factor` times the wall clock's since the mock robot was made [s]."""
-        return 0.0 if self._pace is None else self._pace.lost
+    def delay(self) -> float:
+        """Accumulated delay of robot time against the scaled wall clock since the mock robot started [s]."""
+        return 0.0 if self._sync is None else self._sync.delay
 
-    def allow(self, slot: int, until: float) -> None:
-        """Robot time may run to `until` [s], as far as who has `slot` is concerned: see `gelflow.time_sync`."""
-        if self._pace is not None:
-            self._pace.allow(slot, max(until, self.now()))  # it never runs back
+    def grant(self, slot: int, until: float) -> None:
+        """Let robot time run to `until` [s] for `slot` of `gelflow.time_sync`."""
+        if self._sync is not None:
+            self._sync.grant(slot, max(until, self.now()))  # robot time never runs backwards
 
     @contextlib.contextmanager
-    def urgent(self, slot: int) -> Iterator[None]:
-        """What a robot's own computer does at once: robot time waits where this one is slower."""
-        self.allow(slot, self.now() + LAG)
+    def bounded(self, slot: int) -> Iterator[None]:
+        """Robot time advances by at most `MAX_LEAD` in this block.
+
+        For computations that a robot's own computer finishes at once and this computer may not.
+        """
+        self.grant(slot, self.now() + MAX_LEAD)
         try:
             yield
         finally:
-            self.allow(slot, math.inf)
+            self.grant(slot, math.inf)
 
-    def settle(self) -> None:
-        """By the world's process alone, in every step: what was held back is lost, and not made up for."""
-        if self._pace is not None:
-            self._pace.settle(self.factor)
+    def absorb_delay(self) -> None:
+        """Continue robot time from where it is held up; only the process of the simulated cell calls this."""
+        if self._sync is not None:
+            self._sync.absorb_delay(self.factor)
 
 
 def raise_priority() -> bool:
-    """Give the calling thread real-time priority where the system grants it; says whether it did.
+    """Give the calling thread real-time priority where the system allows it; return whether it did.
 
     For threads that must answer within a millisecond or two and sleep most of the time; nothing depends on it.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))  # of 1 to 99
-    except (AttributeError, OSError):  # no such thing here (macOS), or not allowed
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))  # priorities range from 1 to 99
+    except (AttributeError, OSError):  # not available on macOS, or not permitted
         return False
     return True

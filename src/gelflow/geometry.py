@@ -6,7 +6,7 @@ calls them in every 4 ms cycle, where arrays of four numbers cost much more. `Po
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +52,18 @@ def yaw_quaternion(yaw: float) -> Array:
 def rotation_columns(q: Sequence[float] | Array) -> Columns:
     """The rotation matrix of a unit quaternion, by columns."""
     w, x, y, z = q
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
     return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+        (ww + xx - yy - zz, 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), ww - xx + yy - zz, 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), ww - xx - yy + zz),
     )
+
+
+def rotation_matrix(quaternion: Array) -> Array:
+    """Rotation matrices (…, 3, 3) of unit quaternions w x y z (…, 4)."""
+    columns = rotation_columns(np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0))
+    return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
 
 
 def columns_quaternion(columns: Columns) -> Quaternion:
@@ -107,21 +114,29 @@ def invert(a: PoseTuple) -> PoseTuple:
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and orientation of a frame relative to its parent frame."""
+    """A frame relative to its parent frame: x_parent = position + R(quaternion) x."""
 
-    position: Array  # [m], shape (3,)
-    quaternion: Array  # w x y z, shape (4,), unit length
+    position: Array = field(default_factory=lambda: np.zeros(3))  # [m], shape (3,)
+    quaternion: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))  # w x y z, shape (4,), unit
+
+    def matrix(self) -> Array:
+        """The rotation matrix, shape (3, 3)."""
+        return np.array(list(zip(*rotation_columns(self.quaternion.tolist()), strict=True)))
+
+    def apply(self, points: Array) -> Array:
+        """Points of this frame, expressed in the parent frame [m], shape (n, 3)."""
+        return np.asarray(points @ self.matrix().T + self.position)
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        q = np.array(multiply(self.quaternion.tolist(), other.quaternion.tolist()))
-        return Pose(self.position + rotate(self.quaternion.tolist(), other.position.tolist()), q / math.sqrt(q @ q))
+        quaternion = multiply(self.quaternion.tolist(), other.quaternion.tolist())
+        return Pose(self.apply(other.position[None])[0], np.array(quaternion))
 
     def inverse(self) -> "Pose":
         """The parent frame relative to this one."""
         back = conjugate(self.quaternion.tolist())
         return Pose(-np.array(rotate(back, self.position.tolist())), np.array(back))
 
-    def near(self, other: "Pose", distance: float, angle: float) -> bool:
+    def is_near(self, other: "Pose", distance: float, angle: float) -> bool:
         """Whether another pose is within a distance [m] and an angle [rad]."""
         apart = math.dist(self.position.tolist(), other.position.tolist())
         return apart < distance and angle_between(self.quaternion.tolist(), other.quaternion.tolist()) < angle

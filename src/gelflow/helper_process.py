@@ -1,7 +1,7 @@
-"""A helper process of ours for what must not wait for anything else, linked to its parent by a socket pair.
+"""Helper processes for work that must not wait for the parent's threads, linked to the parent by a socket pair.
 
-It is a fresh interpreter that runs one module (nothing of the parent's `__main__` is imported again, and neither its
-threads nor its global interpreter lock stand in the way). When its parent is gone, however it went, it ends.
+A helper is a fresh interpreter that runs one module: it imports nothing of the parent's `__main__` and does not share
+its global interpreter lock. It ends when the parent's end of the socket pair closes.
 """
 
 import json
@@ -18,26 +18,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-_FAREWELL = 1.0  # how long a child may take to end, once it was told [s, wall]
+_EXIT_LIMIT = 1.0  # time from the closed link to the helper's exit [s, wall]
 
 
 class Messages:
-    """JSON values, one a line, over a connected socket that does not block."""
+    """JSON values, one per line, over a connected non-blocking socket."""
 
     def __init__(self, link: socket.socket) -> None:
         link.setblocking(False)
         self._link = link
         self._buffer = b""
         self._sending = threading.Lock()
-        self.closed = False  # the other side is gone
+        self.closed = False  # the peer closed its end
 
     def fileno(self) -> int:
+        """The socket's file descriptor, for `select`."""
         return self._link.fileno()
 
     def send(self, value: Any, *, limit: float = 1.0) -> None:
-        """Send one value, from any thread; waits up to `limit` [s, wall].
+        """Send one value; safe from any thread. Waits at most `limit` [s, wall].
 
-        Raises TimeoutError, after which the link is of no more use, or another OSError when nobody is there.
+        Raises TimeoutError, after which the link is unusable, or another OSError when the peer is gone.
         """
         data = memoryview(json.dumps(value).encode() + b"\n")
         end = time.monotonic() + limit
@@ -51,7 +52,7 @@ class Messages:
                         raise TimeoutError(f"the other process read nothing for {limit} s") from None
 
     def read(self) -> list[Any]:
-        """All values that have arrived, without waiting; sets `closed`."""
+        """All values that have arrived, without waiting; sets `closed` when the peer has closed its end."""
         while not self.closed:
             try:
                 data = self._link.recv(65536)
@@ -64,25 +65,38 @@ class Messages:
         *lines, self._buffer = self._buffer.split(b"\n")
         return [json.loads(line) for line in lines]
 
+    def wait(self, limit: float | None = None) -> list[Any]:
+        """At least one value, or an empty list when the peer closed its end.
+
+        Raises TimeoutError when nothing arrives within `limit` [s, wall]; None waits without limit.
+        """
+        end = None if limit is None else time.monotonic() + limit
+        while not (values := self.read()) and not self.closed:
+            left = None if end is None else end - time.monotonic()
+            if (left is not None and left <= 0) or not select.select((self._link,), (), (), left)[0]:
+                raise TimeoutError(f"the other process sent nothing for {limit} s")
+        return values
+
     def close(self) -> None:
+        """Close this end."""
         self._link.close()
 
 
-class Child:
-    """The parent's handle."""
+class HelperProcess:
+    """The parent's handle of a helper process."""
 
-    def __init__(self, process: "subprocess.Popen[bytes]", messages: Messages, complaints: IO[bytes]) -> None:
+    def __init__(self, process: "subprocess.Popen[bytes]", messages: Messages, errors: IO[bytes]) -> None:
         self._process = process
-        self._complaints = complaints
+        self._errors = errors  # the helper's standard error
         self.messages = messages
 
     @classmethod
-    def start(cls, module: str, settings: dict[str, Any], *, descriptors: Sequence[int] = ()) -> "Child":
-        """Run `python -m module`, which calls `adopted` and finds there `settings` and the open file descriptors."""
+    def start(cls, module: str, settings: dict[str, Any], *, descriptors: Sequence[int] = ()) -> "HelperProcess":
+        """Run `python -m module`, which obtains `settings` and the open file descriptors from `connect_to_parent`."""
         ours, theirs = socket.socketpair()
-        complaints = tempfile.TemporaryFile()  # noqa: SIM115  (closed in close)
+        errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed in close)
         numbers = (theirs.fileno(), *descriptors)
-        # The child must find the same gelflow, however this process found it.
+        # The helper imports this gelflow, wherever the parent found it.
         paths = (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
         try:
             process = subprocess.Popen(
@@ -90,52 +104,66 @@ class Child:
                 pass_fds=numbers,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=complaints,
-                # One thread: a pool for matrix products would only compete with whom it serves.
+                stderr=errors,
+                # One thread: a BLAS thread pool would compete with the parent for the cores.
                 env=os.environ
                 | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
                 | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
         except OSError:
             ours.close()
-            complaints.close()
+            errors.close()
             raise
         finally:
             theirs.close()
-        return cls(process, Messages(ours), complaints)
+        return cls(process, Messages(ours), errors)
 
     @property
     def pid(self) -> int:
+        """Process identifier."""
         return self._process.pid
 
-    def last_words(self) -> str:
-        """How a child that is gone ended: its exit status and the last line of its complaints."""
+    @property
+    def running(self) -> bool:
+        """Whether the process has not ended yet."""
+        return self._process.poll() is None
+
+    def exit_reason(self) -> str:
+        """Exit status and last line of standard error of a helper that has closed its link."""
         try:
-            code = self._process.wait(_FAREWELL)
+            code = self._process.wait(_EXIT_LIMIT)
         except subprocess.TimeoutExpired:
             return "it closed its link and hangs"
-        self._complaints.seek(0)
-        lines = self._complaints.read().decode(errors="replace").split("\n")
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").split("\n")
         return f"exit status {code}" + "".join(f": {line.strip()}" for line in lines[-2:-1])
 
     def kill(self) -> None:
+        """End the process at once (SIGKILL)."""
         self._process.kill()
 
-    def close(self) -> None:
-        """Close the link, which tells the child to end; one that does not is killed."""
+    def stop(self, *, limit: float = _EXIT_LIMIT) -> int:
+        """Close the link, which makes the helper end, and return its exit status.
+
+        A helper that does not end within `limit` [s, wall] is killed.
+        """
         self.messages.close()
         try:
-            self._process.wait(_FAREWELL)
+            return self._process.wait(limit)
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
-        self._complaints.close()
+            return self._process.wait()
+
+    def close(self) -> None:
+        """Stop the helper and release its files."""
+        self.stop()
+        self._errors.close()
 
 
-def adopted(arguments: Sequence[str]) -> tuple[dict[str, Any], Messages, list[int]]:
-    """The child's side: its settings, the link to its parent, and the file descriptors it was given.
+def connect_to_parent(arguments: Sequence[str]) -> tuple[dict[str, Any], Messages, list[int]]:
+    """The helper's side: its settings, the link to its parent, and the file descriptors that it inherited.
 
-    Ctrl-C reaches every process of the terminal; what it means is for the parent to say, so it is ignored here.
+    Ignores Ctrl-C, which reaches every process of the terminal: the parent decides when its helpers end.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link, *descriptors = map(int, arguments[1:])

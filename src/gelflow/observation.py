@@ -20,7 +20,7 @@ Unit = Literal["N", "mm", "px"]
 
 # The largest vector is never divided by less than this: a frame without contact stays near zero instead of
 # becoming a picture of its noise. About three times the noise of each kind of source.
-DEFAULT_FLOORS: Mapping[str, float] = MappingProxyType({"N": 3e-3, "mm": 0.02, "px": 0.3})
+MIN_DIVISORS: Mapping[str, float] = MappingProxyType({"N": 3e-3, "mm": 0.02, "px": 0.3})
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class TactileFrame:
             raise UsageError(f"valid must have shape {sensors_markers}, got {self.valid.shape}")
         if self.positions.shape != (sensors_markers[1], 2):
             raise UsageError(f"positions must have shape ({sensors_markers[1]}, 2), got {self.positions.shape}")
-        if self.unit not in DEFAULT_FLOORS:
-            raise UsageError(f"unit must be one of {', '.join(DEFAULT_FLOORS)}, got {self.unit!r}")
+        if self.unit not in MIN_DIVISORS:
+            raise UsageError(f"unit must be one of {', '.join(MIN_DIVISORS)}, got {self.unit!r}")
 
 
 @dataclass(frozen=True)
@@ -77,19 +77,19 @@ class FlowMap:
     filled: NDArray[np.bool_]  # (frames * sensors, rows, cols): True where a neighbour's value stands in
 
 
-def normalize(shear: Any, reference: Any, *, floor: float) -> tuple[Any, Any]:
+def normalize(shear: Any, reference: Any, *, min_divisor: float) -> tuple[Any, Any]:
     """The flow map itself: the single implementation, for NumPy arrays and torch tensors alike.
 
     Parameters
     ----------
     shear: any leading batch, then (frames, sensors, rows, cols, 2)
     reference: the frame at rest, same leading batch, (sensors, rows, cols, 2)
-    floor: smallest divisor, in the unit of shear
+    min_divisor: smallest divisor, in the unit of shear
 
     Returns
     -------
     image (…, frames * sensors * 2, rows, cols) and divisor (…), by which the difference was divided: the larger of
-    `floor` and the longest vector over all frames, sensors and markers together. Differentiable in torch.
+    `min_divisor` and the longest vector over all frames, sensors and markers together. Differentiable in torch.
     """
     flow = shear - reference[..., None, :, :, :, :]
     frames, sensors, rows, cols = flow.shape[-5:-1]
@@ -98,7 +98,7 @@ def normalize(shear: Any, reference: Any, *, floor: float) -> tuple[Any, Any]:
     # The square root is taken of something that is never zero: its gradient stays finite at rest.
     largest = squared.max(-1)
     largest = largest if isinstance(largest, np.ndarray | np.generic) else largest.values
-    divisor = largest.clip(floor * floor, None) ** 0.5
+    divisor = largest.clip(min_divisor * min_divisor, None) ** 0.5
     image = flow / divisor[..., None, None, None, None, None]
     # (…, frames, sensors, rows, cols, 2) → (…, frames, sensors, 2, rows, cols)
     order = (*range(len(lead)), *(len(lead) + axis for axis in (0, 1, 4, 2, 3)))
@@ -106,7 +106,7 @@ def normalize(shear: Any, reference: Any, *, floor: float) -> tuple[Any, Any]:
     return image.reshape(*lead, frames * sensors * 2, rows, cols), divisor
 
 
-def resampling(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
+def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
     """Weights that carry marker values to `grid`: linear between markers, nearest outside their hull.
 
     `positions` [mm], shape (markers, 2). Returns shape (rows * cols, markers); every row sums to 1. Where a grid
@@ -161,7 +161,7 @@ def flow_map(
     reference: TactileFrame,
     *,
     grid: Grid,
-    floors: Mapping[str, float] = DEFAULT_FLOORS,
+    min_divisors: Mapping[str, float] = MIN_DIVISORS,
 ) -> FlowMap:
     """The normalized flow map of `frames` against `reference`, on `grid`.
 
@@ -176,7 +176,7 @@ def flow_map(
             raise UsageError(f"a frame has shape {frame.shear.shape}, the reference {reference.shear.shape}")
         if not np.allclose(frame.positions, reference.positions, atol=1e-3):
             raise UsageError("frames and reference have their markers in different places")
-    weights = resampling(reference.positions, grid)
+    weights = resampling_weights(reference.positions, grid)
     sensors = reference.shear.shape[0]
 
     def on_grid(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -184,7 +184,7 @@ def flow_map(
         return resampled.reshape(sensors, grid.rows, grid.cols, 2)
 
     stack = np.stack([on_grid(fill_invalid(frame)) for frame in frames])
-    image, divisor = normalize(stack, on_grid(fill_invalid(reference)), floor=floors[reference.unit])
+    image, divisor = normalize(stack, on_grid(fill_invalid(reference)), min_divisor=min_divisors[reference.unit])
     touched = weights > 0
     lost = np.stack([(~(frame.valid & reference.valid))[:, None] & touched for frame in frames]).any(-1)
     filled = lost.reshape(len(frames) * sensors, grid.rows, grid.cols)

@@ -1,7 +1,8 @@
-"""What lets a scaled clock run no faster than a simulated robot can follow: some numbers in a shared file.
+"""Time synchronization of the mock robot's processes, by a small shared file.
 
-A mock robot is several processes. Who must keep up writes, again and again, how far robot time may run before the next
-step is done; robot time stops there until it is. One of them, the pacer, writes down how much was lost so.
+Robot time of a mock robot must not run faster than its simulation. Each process that has to keep up (a slot) grants
+robot time a limit, until its next step is done; robot time stops at the earliest limit. One of them, the simulated
+cell, accumulates the delay, so that robot time continues from where it stopped.
 """
 
 import math
@@ -11,16 +12,16 @@ from array import array
 
 from gelflow.errors import UsageError
 
-_SLOTS = 5  # who must keep up; the last one is the robot's user, while a frame may mean that it must stop
-WORLD, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, RUNNER = range(_SLOTS)
-LAG = 0.02  # how far robot time may run past what is due, before it waits [s]
-SHORTEST_WAIT = 2e-4  # of those who wait while robot time stands still [s, wall]
-_WORDS = 1 + 2 * _SLOTS  # time lost [s], then for each slot: wall time of its last word [s], its limit [s, robot time]
-_PATIENCE = 5.0  # who says nothing for longer is gone, and holds nobody back [s, wall]
+_SLOTS = 5  # the last slot belongs to the runner, which may have to stop the arm after a camera frame
+SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, RUNNER = range(_SLOTS)
+MAX_LEAD = 0.02  # lead of robot time over the last finished step, at most [s]
+MIN_WAIT = 2e-4  # shortest sleep while robot time stands still [s, wall]
+_WORDS = 1 + 2 * _SLOTS  # delay [s], then for each slot: wall time of its last grant [s], its limit [s, robot time]
+_SLOT_TIMEOUT = 5.0  # a slot that grants nothing for longer is taken for dead and ignored [s, wall]
 
 
-class Pace:
-    """The numbers, mapped from the file at `path`. Raises UsageError when there is no such file."""
+class TimeSync:
+    """The shared numbers, mapped from the file at `path`. Raises UsageError when there is no such file."""
 
     def __init__(self, path: str) -> None:
         try:
@@ -31,7 +32,7 @@ class Pace:
 
     @staticmethod
     def create(path: str) -> None:
-        """A new file, in which nobody holds anybody back."""
+        """Create the file, with no limit in any slot."""
         words = array("d", [0.0] * _WORDS)
         for slot in range(_SLOTS):
             words[2 + 2 * slot] = math.inf
@@ -39,33 +40,37 @@ class Pace:
             words.tofile(file)
 
     @property
-    def lost(self) -> float:
-        """How far robot time is behind what it would be if nobody had held it back [s]."""
+    def delay(self) -> float:
+        """Accumulated delay of robot time against the scaled wall clock [s]."""
         return self._words[0]
 
-    def allow(self, slot: int, until: float) -> None:
-        """The process of `slot` is alive, and robot time may run to `until` [s]."""
+    def grant(self, slot: int, until: float) -> None:
+        """Let robot time run to `until` [s] for `slot`; also marks the slot as alive."""
         self._words[1 + 2 * slot] = time.monotonic()
         self._words[2 + 2 * slot] = until
 
     def now(self, factor: float) -> float:
-        """Robot time [s] that runs at most `factor` times as fast as the wall clock."""
+        """Robot time [s], which runs at most `factor` times as fast as the wall clock."""
         return self._read(factor)[0]
 
-    def settle(self, factor: float) -> None:
-        """By the pacer alone: what is held back now is lost for good, so that robot time does not jump after it."""
+    def absorb_delay(self, factor: float) -> None:
+        """Add the present hold-up to the delay, so that robot time does not jump after it.
+
+        Only one process may call this: the simulated cell.
+        """
         now, wall = self._read(factor)
         self._words[0] = wall * factor - now
 
     def _read(self, factor: float) -> tuple[float, float]:
         """Robot time, and the wall time at which it was read [s]."""
         words = self._words
-        # In this order: who is interrupted in between ends at a limit that had been reached, and time never runs back.
+        # Limits are read before the delay: a reader that is interrupted in between returns a limit that robot time
+        # had already reached, so time never runs backwards.
         limits = [(words[2 + 2 * slot], words[1 + 2 * slot]) for slot in range(_SLOTS)]
-        lost = words[0]
+        delay = words[0]
         wall = time.monotonic()
-        now = wall * factor - lost
-        for limit, heard in limits:
+        now = wall * factor - delay
+        for limit, granted in limits:
             if now > limit:
-                now = min(now, limit + max(0.0, wall - heard - _PATIENCE) * factor)
+                now = min(now, limit + max(0.0, wall - granted - _SLOT_TIMEOUT) * factor)
         return now, wall

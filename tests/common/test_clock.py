@@ -10,20 +10,20 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.time_sync import CONTROLLER, WORLD, Pace
+from gelflow.time_sync import CONTROLLER, SIMULATED_CELL, TimeSync
 
 
 @pytest.fixture
 def paced(tmp_path: Path) -> tuple[ScaledClock, ScaledClock]:
     """The clocks of two processes of one mock robot."""
-    Pace.create(path := str(tmp_path / "pace"))
+    TimeSync.create(path := str(tmp_path / "time_sync"))
     return ScaledClock(100.0, path), ScaledClock(100.0, path)
 
 
 def test_nobody_who_must_keep_up_nothing_held_back(paced: tuple[ScaledClock, ScaledClock]) -> None:
     clock, _ = paced
     assert clock.now() == pytest.approx(ScaledClock(100.0).now(), abs=1.0)
-    assert clock.lost == 0
+    assert clock.delay == 0
 
 
 def test_robot_time_stops_at_the_nearest_limit_and_does_not_jump_after_it(
@@ -31,27 +31,27 @@ def test_robot_time_stops_at_the_nearest_limit_and_does_not_jump_after_it(
 ) -> None:
     clock, other = paced
     start = clock.now()
-    clock.allow(WORLD, start + 1.0)
-    clock.allow(CONTROLLER, start + 0.5)
+    clock.grant(SIMULATED_CELL, start + 1.0)
+    clock.grant(CONTROLLER, start + 0.5)
     time.sleep(0.02)  # two seconds of robot time
     assert clock.now() == other.now() == start + 0.5
-    clock.settle()
-    assert clock.lost > 1.4
-    clock.allow(CONTROLLER, math.inf)
-    clock.allow(WORLD, math.inf)
-    assert start + 0.5 <= other.now() < start + 0.5 + clock.lost
+    clock.absorb_delay()
+    assert clock.delay > 1.4
+    clock.grant(CONTROLLER, math.inf)
+    clock.grant(SIMULATED_CELL, math.inf)
+    assert start + 0.5 <= other.now() < start + 0.5 + clock.delay
 
 
 def test_sleep_lasts_until_robot_time_has_gone_that_far(paced: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = paced
     start = clock.now()
-    clock.allow(WORLD, start + 0.1)
+    clock.grant(SIMULATED_CELL, start + 0.1)
     sleeper = threading.Thread(target=clock.sleep, args=(1.0,))
     sleeper.start()
     sleeper.join(0.1)
     assert sleeper.is_alive()
-    other.settle()
-    other.allow(WORLD, start + 5.0)
+    other.absorb_delay()
+    other.grant(SIMULATED_CELL, start + 5.0)
     sleeper.join(10.0)
     assert not sleeper.is_alive() and clock.now() >= start + 1.0
 
@@ -61,7 +61,7 @@ def test_who_says_nothing_for_long_holds_nobody_back(
 ) -> None:
     clock, _ = paced
     limit = clock.now()
-    clock.allow(WORLD, limit)
+    clock.grant(SIMULATED_CELL, limit)
     real = time.monotonic
     monkeypatch.setattr(time, "monotonic", lambda: real() + 6.0)
     assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
@@ -74,8 +74,8 @@ def test_time_never_runs_back_whoever_writes_meanwhile(paced: tuple[ScaledClock,
     def world() -> None:
         done = other.now()
         while not ending.is_set():
-            other.settle()
-            other.allow(WORLD, done + 0.02)
+            other.absorb_delay()
+            other.grant(SIMULATED_CELL, done + 0.02)
             done = max(done, other.now())
 
     writer = threading.Thread(target=world)

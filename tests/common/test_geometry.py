@@ -1,4 +1,4 @@
-"""Poses, against SciPy's rotations."""
+"""Poses and plain-float transforms agree with SciPy's rotations."""
 
 import math
 
@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gelflow.geometry import Pose, angle_between, yaw_quaternion
+from gelflow.geometry import (
+    Pose,
+    angle_between,
+    angles_between,
+    columns_quaternion,
+    compose,
+    invert,
+    rotation_columns,
+    rotation_matrix,
+    yaw_quaternion,
+)
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -33,9 +43,25 @@ def test_composition_inverse_and_angles(seed: int) -> None:
     assert a.tilt == pytest.approx(math.acos(rotation(a).as_matrix()[2, 2]))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_plain_floats_and_arrays_agree(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = random_pose(rng), random_pose(rng)
+    one, other = ((tuple(p.position.tolist()), tuple(p.quaternion.tolist())) for p in (a, b))
+    position, turn = compose(one, other)
+    assert position == pytest.approx((a @ b).position) and turn == pytest.approx((a @ b).quaternion)
+    position, turn = invert(one)
+    assert position == pytest.approx(a.inverse().position) and turn == pytest.approx(a.inverse().quaternion)
+    both = np.stack([a.quaternion, b.quaternion])
+    np.testing.assert_allclose(rotation_matrix(both), [rotation(a).as_matrix(), rotation(b).as_matrix()], atol=1e-14)
+    np.testing.assert_allclose(a.apply(b.position[None]), [a.position + rotation(a).apply(b.position)], atol=1e-14)
+    assert angle_between(columns_quaternion(rotation_columns(a.quaternion.tolist())), a.quaternion) < 1e-7
+    assert angles_between(both[0], both[1]) == pytest.approx(angle_between(both[0], both[1]))
+
+
 def test_yaw_and_nearness() -> None:
     pose = Pose(np.array([1.0, 2.0, 3.0]), yaw_quaternion(-0.3))
     assert pose.yaw == pytest.approx(-0.3) and pose.tilt == 0
     other = Pose(np.array([1.0, 2.0, 3.001]), yaw_quaternion(-0.31))
-    assert pose.near(other, 2e-3, 0.02)
-    assert not pose.near(other, 0.5e-3, 0.02) and not pose.near(other, 2e-3, 0.005)
+    assert pose.is_near(other, 2e-3, 0.02)
+    assert not pose.is_near(other, 0.5e-3, 0.02) and not pose.is_near(other, 2e-3, 0.005)

@@ -1,4 +1,4 @@
-"""The link between a process of ours and its helper."""
+"""Helper processes: the link to the parent, and how a failed helper is reported."""
 
 import json
 import socket
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gelflow.helper_process import Child, Messages
+from gelflow.helper_process import HelperProcess, Messages
 
 
 def pair() -> tuple[Messages, socket.socket]:
@@ -15,7 +15,7 @@ def pair() -> tuple[Messages, socket.socket]:
     return Messages(ours), theirs
 
 
-def test_values_arrive_whole_however_they_are_cut() -> None:
+def test_values_split_across_packets_arrive_whole() -> None:
     messages, other = pair()
     data = b"".join(json.dumps(value).encode() + b"\n" for value in ({"a": [1.5, None]}, "x", 3))
     seen = []
@@ -29,7 +29,7 @@ def test_values_arrive_whole_however_they_are_cut() -> None:
     assert messages.closed
 
 
-def test_numbers_keep_every_bit_and_what_is_no_number_stays_so() -> None:
+def test_numbers_keep_every_bit_and_nan_stays_nan() -> None:
     ours, theirs = pair()
     other = Messages(theirs)
     ours.send([0.1 + 0.2, 1e-300, float("nan"), float("inf")])
@@ -38,7 +38,7 @@ def test_numbers_keep_every_bit_and_what_is_no_number_stays_so() -> None:
     assert c != c
 
 
-def test_a_reader_that_does_not_read_is_noticed() -> None:
+def test_sending_to_a_peer_that_reads_nothing_times_out() -> None:
     messages, other = pair()
     with pytest.raises(TimeoutError, match="read nothing for"):
         for _ in range(10_000):
@@ -48,12 +48,12 @@ def test_a_reader_that_does_not_read_is_noticed() -> None:
         messages.send("anybody?")
 
 
-def test_last_words_of_a_child_that_fails() -> None:
-    child = Child.start("gelflow.there_is_no_such_module", {})
+def test_exit_reason_of_a_helper_that_fails() -> None:
+    helper = HelperProcess.start("gelflow.there_is_no_such_module", {})
     try:
-        assert "exit status 1: " in (words := child.last_words())
+        assert "exit status 1: " in (words := helper.exit_reason())
         assert "No module named gelflow.there_is_no_such_module" in words
         assert "\n" not in words
         assert Path(sys.executable).name in words
     finally:
-        child.close()
+        helper.close()

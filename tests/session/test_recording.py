@@ -20,10 +20,11 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
+from gelflow.geometry import Pose
 from gelflow.observation import FlowMap
 from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.channels import JSON
-from gelflow.session.reader import Pose, SessionReader
+from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import Decision, describe_session, plain, restore, to_json
 from gelflow.session.recover import recover

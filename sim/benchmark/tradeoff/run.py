@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from gelflow.errors import UsageError
 from gelflow.geometry import angles_between
-from gelflow.observation import DEFAULT_FLOORS, normalize
+from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene.parts import PadDef
 from gelflow.sim.scene.scene import Scene
 from gelflow.sim.simulator import Simulator
@@ -220,9 +220,11 @@ def _flow(run: Run, truth: Run) -> Array:
     Where all forces of a scene are small, a tenth of the largest is the floor, instead of the noise of a real sensor.
     """
     shear = np.linalg.norm(truth.field[..., :2] - truth.field[0, :, :2], axis=-1)
-    floor = min(DEFAULT_FLOORS["N"], _FLOOR * float(shear.max()))
+    floor = min(MIN_DIVISORS["N"], _FLOOR * float(shear.max()))
     one = (1, -1, 1, 2)  # sensors, rows, columns: how markers are arranged makes no difference to the vectors
-    image, _ = normalize(run.field[truth.look, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), floor=floor)
+    image, _ = normalize(
+        run.field[truth.look, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), min_divisor=floor
+    )
     return np.asarray(image).reshape(2, -1).T
 
 

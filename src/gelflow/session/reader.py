@@ -18,9 +18,9 @@ from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Message
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.geometry import Pose
 from gelflow.protocols import CameraImage
 from gelflow.session.channels import JSON, PROTOBUF
 from gelflow.session.records import FORMAT, SENSORS, Decision
@@ -39,14 +39,6 @@ DAMAGE = (
     MemoryError,
     OverflowError,
 )
-
-
-@dataclass(frozen=True)
-class Pose:
-    """A recorded pose in the robot's base frame."""
-
-    position: NDArray[np.float64]  # [m], shape (3,)
-    quaternion: NDArray[np.float64]  # w x y z, shape (4,)
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,8 @@ def restore(kind: type[Record], data: Any, *, what: str) -> Record:
 
 
 def _field(wanted: Any, value: Any, what: str) -> Any:
+    if typing.get_origin(wanted) is np.ndarray:
+        return np.asarray(value)
     for kind in (wanted, *typing.get_args(wanted)):
         if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
             return restore(kind, value, what=what)

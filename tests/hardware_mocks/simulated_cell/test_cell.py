@@ -16,7 +16,7 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.task import INSERTION
-from gelflow.time_sync import Pace
+from gelflow.time_sync import TimeSync
 
 PlanarPose = tuple[float, float, float]
 
@@ -145,7 +145,7 @@ def test_the_hand_waits_until_the_gripper_is_at_rest() -> None:
 
 
 def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
-    Pace.create(path := str(tmp_path / "pace"))
+    TimeSync.create(path := str(tmp_path / "time_sync"))
     clock = ScaledClock(10.0, path)
     cell = SimulatedCell(clock, SimulatedCellConfig(seed=3))
     begun, steps = clock.now(), 0
@@ -161,7 +161,7 @@ def test_robot_time_waits_for_a_world_that_falls_behind(tmp_path: Path) -> None:
     cell.run(ending, after_step=dawdle)
     gone = clock.now() - begun
     assert 0.4 <= gone <= 0.44  # and not the 2 s of the wall clock
-    assert cell.truth()["waited"] == clock.lost > 0.5
+    assert cell.truth()["waited"] == clock.delay > 0.5
 
 
 def test_a_step_that_does_not_divide_the_arms_cycle_is_refused() -> None:
@@ -194,9 +194,9 @@ def test_the_world_in_a_process_of_its_own_does_the_same() -> None:
 
 def test_a_world_that_died_is_named() -> None:
     remote = SimulatedCellProcess(ScaledClock(4.0)).start()
-    assert remote._process is not None
+    assert remote._helper is not None
     remote.command_arm(np.array([math.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
-    wait_for(lambda: remote._process is not None and remote._process.poll() is not None)
+    wait_for(lambda: remote._helper is not None and not remote._helper.running)
     with pytest.raises(SimulationError, match="the arm can not go to"):
         remote.truth()
     with pytest.raises(SimulationError, match="failed"):

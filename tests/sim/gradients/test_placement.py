@@ -131,9 +131,9 @@ def test_every_scene_has_them(name: str) -> None:
     scene = load_scene(name)
     sim = Simulator(scene)
     for owner, pos in [
-        *((f"{shape.name}.shape", shape.pose.pos) for shape in scene.shapes),
-        *((f"{points.name}.points", points.pose.pos) for points in scene.points),
-        *((f"{pad.name}.markers", pad.pose.pos) for pad in scene.pads),
+        *((f"{shape.name}.shape", shape.pose.position) for shape in scene.shapes),
+        *((f"{points.name}.points", points.pose.position) for points in scene.points),
+        *((f"{pad.name}.markers", pad.pose.position) for pad in scene.pads),
     ]:
         np.testing.assert_array_equal([sim.param(f"{owner}.pos.{axis}")[0] for axis in "xyz"], pos)
         assert not any(sim.param(f"{owner}.turn.{axis}")[0] for axis in "xyz")

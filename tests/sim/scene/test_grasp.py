@@ -39,7 +39,7 @@ def test_the_bar_is_as_published() -> None:
     assert [g.rows * g.cols for g in scene.grids] == [130, 130]
     tables = [s for s in scene.shapes if s.name.startswith("table")]
     np.testing.assert_allclose([s.size for s in tables], [[0.025, 0.015, 0.02]] * 2)
-    np.testing.assert_allclose([s.pose.pos[1] for s in tables], [-0.1, 0.1])
+    np.testing.assert_allclose([s.pose.position[1] for s in tables], [-0.1, 0.1])
 
 
 @pytest.mark.parametrize("law", LAWS)

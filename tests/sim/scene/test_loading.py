@@ -168,7 +168,9 @@ def test_the_pads_follow_the_observation_format() -> None:
 
 def test_the_hole_is_as_published() -> None:
     scene = load_scene("insertion")
-    boxes = {s.name: (s.pose.pos - s.size, s.pose.pos + s.size) for s in scene.shapes if s.name.startswith("wall")}
+    boxes = {
+        s.name: (s.pose.position - s.size, s.pose.position + s.size) for s in scene.shapes if s.name.startswith("wall")
+    }
     assert boxes["wall_right"][0][0] - boxes["wall_left"][1][0] == pytest.approx(39.5e-3)
     assert boxes["wall_back"][0][1] - boxes["wall_front"][1][1] == pytest.approx(54.5e-3)
     assert {high[2] for _, high in boxes.values()} == {0.025}

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.observation import DEFAULT_FLOORS, TactileFrame, flow_map
+from gelflow.observation import MIN_DIVISORS, TactileFrame, flow_map
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, NOMINAL, Randomization
@@ -146,7 +146,7 @@ def test_the_observation_is_the_flow_map_of_the_frames() -> None:
         expected = flow_map([frame(last, env)], frame(attempts._held["tactile"], env), grid=grid)
         np.testing.assert_allclose(result.image[env], expected.image, atol=1e-5)
         assert result.divisor[env] == pytest.approx(expected.divisor, rel=1e-5)
-        assert result.divisor[env] > DEFAULT_FLOORS["N"]
+        assert result.divisor[env] > MIN_DIVISORS["N"]
 
 
 def test_frames_are_taken_at_the_depths_of_the_task() -> None:

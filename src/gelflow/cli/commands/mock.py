@@ -74,7 +74,7 @@ def lab_for(robot: "MockRobot") -> "Lab":
     from gelflow.real.runner import lab
 
     cell, look = robot.config.cell, robot.config.look
-    factor, pace = robot.clock.settings
+    factor, time_sync = robot.clock.settings
     # One computer plays robot and runner at once, and its jitter does not shrink when the clock is scaled: in wall time
     # the limits are twelve times those for a robot.
     scale = 12 * max(1.0, factor)
@@ -120,7 +120,7 @@ def lab_for(robot: "MockRobot") -> "Lab":
             attempt_time=60.0 * scale,
         ),
         clock_factor=factor,
-        clock_pace=pace,
+        time_sync=time_sync,
     )  # fmt: skip
 
 
