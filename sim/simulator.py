@@ -1,4 +1,4 @@
-"""The simulator's handle: N copies of a scene that step together, with NumPy arrays in and out."""
+"""Batched simulation of one scene: state and parameters as NumPy arrays, steps, rollouts and their gradients."""
 
 import os
 from collections.abc import Sequence
@@ -20,55 +20,62 @@ STATUS_MESSAGES = {
 
 
 class Buildable(Protocol):
-    """Anything that makes a core model: a `gelflow.sim.scene.scene.Scene`."""
+    """An object that builds a core model, such as `gelflow.sim.Scene`."""
 
     def build(self) -> Any: ...
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A recorded rollout; arrays have time first, then environment."""
+    """A recorded rollout. The first axis is time, the second the environment."""
 
     q: NDArray[Any]  # (steps + 1, N, nq)
     v: NDArray[Any]  # (steps + 1, N, nv)
-    anchors: NDArray[Any]  # (steps + 1, N, na, 3), in the frames of the shapes that are touched [m]
-    anchored: NDArray[np.uint8]  # (steps + 1, N, na)
-    history: NDArray[Any]  # (steps + 1, N, nh): what BDF2 remembers of the step before, see `Simulator`
+    anchors: NDArray[Any]  # (steps + 1, N, na, 3), in the frame of the shape in contact [m]
+    anchored: NDArray[np.uint8]  # (steps + 1, N, na), 1 where the anchor is set
+    history: NDArray[Any]  # (steps + 1, N, nh): previous step of BDF2, see `Simulator`
     u: NDArray[Any]  # (steps, N, nu)
     tactile: NDArray[Any]  # (reads, N, markers, 3): shear x, shear y, normal [N]
-    read_after: NDArray[np.int32]  # markers were read after that many steps
-    halvings: NDArray[np.int8]  # (steps, N): the step was taken as 2^halvings substeps
-    status: NDArray[np.int32]  # (N): 0, or why the environment stopped (`STATUS_MESSAGES`)
+    read_after: NDArray[np.int32]  # (reads): number of steps taken before each evaluation of `tactile`
+    halvings: NDArray[np.int8]  # (steps, N): the step was split into 2^halvings substeps
+    status: NDArray[np.int32]  # (N): 0, or the reason of failure (`STATUS_MESSAGES`)
 
 
 @dataclass(frozen=True)
 class TrajectoryGradient:
-    """Gradient of a scalar with respect to what a rollout was given; a quaternion's is its tangent gradient."""
+    """Gradient of a scalar with respect to the inputs of a rollout; for quaternions the tangent gradient."""
 
     u: NDArray[Any]  # (steps, N, nu)
     q: NDArray[Any]  # (N, nq)
     v: NDArray[Any]  # (N, nv)
     anchors: NDArray[Any]  # (N, na, 3)
     history: NDArray[Any]  # (N, nh)
-    params: NDArray[np.float64]  # (N, parameters), in the order of `Model.param_names`; (N, 0) where not asked for
+    params: NDArray[np.float64]  # (N, parameters), in the order of `Model.param_names`; (N, 0) unless requested
 
 
 class Simulator:
-    """N environments of one scene.
+    """A batch of N environments of one scene.
 
     Parameters
     ----------
-    scene: a `Scene` (or a core model)
-    num_envs: how many copies
-    threads: at most this many threads; all cores when None. Results do not depend on it.
-    precision: "double" or "single"; when None as the scene says, "double" for a core model
+    scene: a `Scene` or a core model
+    num_envs: number of environments N
+    threads: maximum number of threads; None uses all available cores. Results do not depend on it.
+    precision: "double" or "single"; None takes the scene's setting, and "double" for a core model
 
-    `q` (N, nq), `v` (N, nv) and `params` (N, parameters) are the simulator's own memory: write into them. So are
-    `anchors` (N, na, 3) and `anchored` (N, na), the memory of the elastic friction law, and `history` (N, nh), that of
-    BDF2: last step's displacement (nv), the velocity before it (nv), and 1 where there was one; BDF1 has none, nh = 0.
+    Attributes
+    ----------
+    q, v: positions (N, nq) and velocities (N, nv); writable views of the simulator's memory, like all state arrays
+    params: physical parameters (N, parameters), writable; see `param`
+    anchors, anchored: state of the elastic friction law, (N, na, 3) [m] and (N, na)
+    history: state of BDF2, (N, nh): displacement of the previous step (nv), velocity before it (nv), and 1 if a
+        previous step exists; nh = 0 for BDF1
+    status: (N), 0 or the reason of failure, see `STATUS_MESSAGES`
+    iterations, halved: (N), Newton iterations and steps that were split into substeps, since the last reset
 
-    In single precision the core keeps what `q` rounds away, so that small steps add up, and sees bodies from each other
-    in double; gradients are computed in double, at the states of the trajectory, but for viscous readings' share.
+    In single precision the core stores the rounding residual of `q`, so that small increments accumulate, and computes
+    relative poses of bodies in double. Gradients are computed in double at the states of the trajectory; only the
+    contribution of viscous marker forces is in single precision.
     """
 
     def __init__(
@@ -102,17 +109,17 @@ class Simulator:
         self.status: NDArray[np.int32] = self._batch.status
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
-        self._readings: NDArray[Any] | None = None  # there from the first reading on
+        self._tactile: NDArray[Any] | None = None  # created by the first call of `tactile`
 
     @cached_property
     def param_index(self) -> dict[str, int]:
-        """Which column of `params` a parameter is."""
+        """Column of `params` for each parameter name."""
         return {name: i for i, name in enumerate(self.model.param_names)}
 
     def param(self, name: str) -> NDArray[Any]:
-        """The column of one parameter, such as "pad_box.kn": a view of shape (N,) to read and write.
+        """Values of one parameter, such as "pad_box.kn": a writable view, shape (N,).
 
-        Raises UsageError for a name that the scene does not have.
+        Raises UsageError for an unknown name.
         """
         if name not in self.param_index:
             owner = name.split(".")[0]
@@ -124,53 +131,53 @@ class Simulator:
         return column
 
     def reset(self, which: ArrayLike | None = None) -> None:
-        """Reference positions, rest and no memory of contact, for environments where `which` (N,) is true, or all.
+        """Reset to the reference positions at rest, with cleared history; all environments, or those with `which` (N,).
 
         Parameters keep their values.
         """
         self._batch.reset(None if which is None else np.ascontiguousarray(which, dtype=np.uint8))
 
     def clear_history(self, which: ArrayLike | None = None) -> None:
-        """Clear what the state remembers of its past, after it was written by hand: anchors, and BDF2's history."""
+        """Clear friction anchors and the BDF2 history; required after `q` or `v` were written directly."""
         chosen = slice(None) if which is None else np.asarray(which, dtype=bool)
         self.anchored[chosen] = 0
         self.history[chosen] = 0
 
     def step(self, u: ArrayLike, steps: int = 1) -> None:
-        """Take `steps` steps under controls u (N, nu), or (nu,) for all environments alike.
+        """Take `steps` steps with controls u, shape (N, nu), or (nu,) for all environments.
 
-        An environment that fails keeps its last good state and gets a `status` other than 0 (see `STATUS_MESSAGES`); it
-        stays still until `reset`. Raises UsageError when a control or the state is not finite.
+        An environment that fails keeps its last valid state, gets a nonzero `status` (see `STATUS_MESSAGES`) and does
+        not move until `reset`. Raises UsageError when a control or the state is not finite.
         """
         try:
-            self._batch.step(self._numbers(u), steps)
+            self._batch.step(self._controls(u), steps)
         except ValueError as error:
             raise UsageError(str(error)) from None
 
-    def _numbers(self, u: ArrayLike) -> NDArray[Any]:
-        """As the core takes them, which looks at their shape and their order."""
+    def _controls(self, u: ArrayLike) -> NDArray[Any]:
+        """Controls in the simulator's precision; the core checks their shape."""
         if isinstance(u, np.ndarray) and u.dtype == self.dtype:
             return u
         try:
             return np.asarray(u, dtype=self.dtype)
         except (TypeError, ValueError) as error:
-            raise UsageError(f"u must be numbers: {error}") from None
+            raise UsageError(f"u must be numeric: {error}") from None
 
     def check(self) -> None:
-        """Raises SimulationError when an environment has failed, naming the first."""
+        """Raises SimulationError that names the first failed environment, if any."""
         failed = np.flatnonzero(self.status)
         if len(failed):
             raise SimulationError(f"environment {failed[0]}: {STATUS_MESSAGES[int(self.status[failed[0]])]}")
 
     def error_estimate(self, u: ArrayLike) -> NDArray[Any]:
-        """What one step under u would be off by: its positions less those of two half steps, (N, nv) [m, rad].
+        """Local error of one step with controls u: its positions minus those of two half steps, (N, nv) [m, rad].
 
-        Costs three steps and changes nothing. Under BDF1 it is about half of the step's own error; under BDF2, whose
-        half steps are BDF1's, it is an upper estimate. A step that has to be halved is compared with parts half as long
-        as its shortest. Raises SimulationError where a step can not be taken.
+        Costs three steps and leaves the state unchanged. For BDF1 the estimate is about half of the local error; for
+        BDF2, whose half steps use BDF1, it is an upper estimate. A step that needs substeps is compared with substeps
+        of half their length. Raises SimulationError when a step fails.
         """
         try:
-            estimate, status = self._batch.error_estimate(self._numbers(u))
+            estimate, status = self._batch.error_estimate(self._controls(u))
         except ValueError as error:
             raise UsageError(str(error)) from None
         if failed := np.flatnonzero(status).tolist():
@@ -178,44 +185,45 @@ class Simulator:
         return np.asarray(estimate)
 
     def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Marker readings now, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
+        """Marker forces at the present state, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
 
-        Without `out` the array is the simulator's own: read-only, and overwritten by the next call. Only what changes
-        is written there, which is faster where few markers touch.
+        Without `out` the result is the simulator's own array: read-only, and overwritten by the next call. Only changed
+        entries are written there, which is faster when few markers are in contact.
         """
         if out is not None:
             self._batch.tactile(out)
             return out
         self._batch.tactile()
-        if self._readings is None:
-            self._readings = self._batch.readings
-        return self._readings
+        if self._tactile is None:
+            self._tactile = self._batch.readings
+        return self._tactile
 
     def displacement(self, forces: Any = None) -> Any:
-        """How far the markers go in their gels, (…, markers, 3): along x, along y, into the pad [m].
+        """Displacement of the markers in the gel, (…, markers, 3): along x, along y, into the pad [m].
 
-        Now, (N, markers, 3), or under other `forces` [N] (…, markers, 3), such as `Trajectory.tactile`. A tensor gives
-        a tensor, with its gradient. Raises UsageError where a pad of the scene has no gel.
+        At the present state, (N, markers, 3), or for the given marker `forces` (…, markers, 3) [N], such as
+        `Trajectory.tactile`. For a torch tensor the result is a tensor and differentiable. Raises UsageError when a pad
+        of the scene has no gel.
         """
         pads = getattr(self.scene, "pads", ())
         if not pads:
             raise UsageError("displacement needs a scene with pads")
-        if bare := [pad.name for pad in pads if pad.gel is None]:
-            raise UsageError(f"pad {bare[0]!r} has no gel; give pads.{bare[0]}.gel in the scene")
-        felt = self.tactile() if forces is None else forces
-        if not hasattr(felt, "requires_grad"):
-            felt = np.asarray(felt, self.dtype)
-        if felt.ndim < 2 or tuple(felt.shape[-2:]) != (self.model.markers, 3):
-            raise UsageError(f"forces must have shape (…, {self.model.markers}, 3), got {tuple(felt.shape)}")
-        moved = [pad.gel.displacement(felt[..., self.pad(pad.name), :]) for pad in pads]
-        if isinstance(felt, np.ndarray):
-            return np.concatenate(moved, axis=-2)
-        import torch  # here: who has no tensors needs no torch
+        if without_gel := [pad.name for pad in pads if pad.gel is None]:
+            raise UsageError(f"pad {without_gel[0]!r} has no gel; give pads.{without_gel[0]}.gel in the scene")
+        values = self.tactile() if forces is None else forces
+        if not hasattr(values, "requires_grad"):
+            values = np.asarray(values, self.dtype)
+        if values.ndim < 2 or tuple(values.shape[-2:]) != (self.model.markers, 3):
+            raise UsageError(f"forces must have shape (…, {self.model.markers}, 3), got {tuple(values.shape)}")
+        displacements = [pad.gel.displacement(values[..., self.pad(pad.name), :]) for pad in pads]
+        if isinstance(values, np.ndarray):
+            return np.concatenate(displacements, axis=-2)
+        import torch  # deferred: only tensors need torch
 
-        return torch.cat(moved, dim=-2)
+        return torch.cat(displacements, dim=-2)
 
     def pad(self, name: str) -> slice:
-        """The markers of one pad, as a slice of the markers' axis."""
+        """Slice of the marker axis that belongs to one pad."""
         names = list(self.model.pad_names)
         if name not in names:
             raise UsageError(f"no pad {name!r}; there are {', '.join(names)}")
@@ -223,11 +231,11 @@ class Simulator:
         return slice(first, first + count)
 
     def joint_q(self, name: str) -> int:
-        """Index into q of a joint's first position."""
+        """Index in `q` of the first position of a joint."""
         return self._joint(name, self.model.joint_q)
 
     def joint_v(self, name: str) -> int:
-        """Index into v of a joint's first velocity."""
+        """Index in `v` of the first velocity of a joint."""
         return self._joint(name, self.model.joint_v)
 
     def _joint(self, name: str, indices: Sequence[int]) -> int:
@@ -237,31 +245,28 @@ class Simulator:
         return int(indices[names.index(name)])
 
     def poses(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Poses of the moving bodies in the world, (N, bodies, 7): position [m], quaternion w x y z.
-
-        A new array each time, or `out`.
-        """
+        """World poses of the moving bodies, (N, bodies, 7): position [m], quaternion w x y z; a new array, or `out`."""
         target = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype) if out is None else out
         self._batch.poses(target)
         return target
 
     def wrenches(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Per contact, on its first body, about the world's origin, (N, contacts, 6): moment [N m], force [N].
+        """Contact wrenches on the first body of each contact, about the world origin, (N, contacts, 6).
 
-        A new array each time, or `out`.
+        Moment [N m], then force [N]; a new array, or `out`.
         """
         target = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype) if out is None else out
         self._batch.wrenches(target)
         return target
 
     def contact_forces(self) -> NDArray[Any]:
-        """What all contacts together do to the joints now, (N, nv) [N, N m]: Jᵀ times their wrenches, as in a step."""
+        """Generalized contact forces Jᵀ f of all contacts at the present state, (N, nv) [N, N m]."""
         out = np.empty((self.num_envs, self.model.nv), self.dtype)
         self._batch.contact_forces(out)
         return out
 
     def mass_matrix(self) -> NDArray[Any]:
-        """Joint-space mass matrices M(q), (N, nv, nv)."""
+        """Joint-space mass matrix M(q), (N, nv, nv)."""
         out = np.empty((self.num_envs, self.model.nv, self.model.nv), self.dtype)
         self._batch.mass_matrix(out)
         return out
@@ -284,11 +289,11 @@ class Simulator:
         read_after: Sequence[int] = (),
         out: Trajectory | None = None,
     ) -> Trajectory:
-        """Steps under controls u (steps, N, nu), from the given state or the present one, which is not changed.
+        """Record steps with controls u (steps, N, nu), from the given or the present state; the state is not changed.
 
-        Markers are read after the steps named in `read_after` (0 = the start). `out` is an earlier trajectory of as
-        many steps and readings, whose arrays are overwritten: fresh memory for many readings takes longer than they
-        do. Raises UsageError on wrong shapes and on controls that are not finite.
+        Marker forces are evaluated after the numbers of steps in `read_after` (0 is the start). `out` is an earlier
+        trajectory of the same shape whose arrays are overwritten, which saves the allocation of large arrays. Raises
+        UsageError for wrong shapes and for values that are not finite.
         """
         controls = np.ascontiguousarray(u, dtype=self.dtype)
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
@@ -296,17 +301,17 @@ class Simulator:
         steps, n = controls.shape[0], self.num_envs
         if out is not None and (out.u.shape != controls.shape or len(out.read_after) != len(read_after)):
             raise UsageError(
-                f"out must be a trajectory of u {controls.shape} and {len(read_after)} readings, "
+                f"out must be a trajectory with u of shape {controls.shape} and {len(read_after)} tactile evaluations, "
                 f"got {out.u.shape} and {len(out.read_after)}"
             )
 
         def along_time(name: str, start: ArrayLike | None) -> NDArray[Any]:
-            own = getattr(self, name)
-            if out is None:  # of anchors only those that are set will be written
-                array: NDArray[Any] = np.zeros((steps + 1, *own.shape), own.dtype)
+            present = getattr(self, name)
+            if out is None:  # zeros: the core writes only the anchors that are set
+                array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
             else:
                 array = getattr(out, name)
-            array[0] = own if start is None else start
+            array[0] = present if start is None else start
             return array
 
         reads = np.asarray(read_after, dtype=np.int32)
@@ -333,9 +338,10 @@ class Simulator:
         return result
 
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:
-        """Signature of the branches that each step took (touching, sliding, clipped), (steps, N).
+        """Contact mode signature of each step (contact, slip and clipping of every point and actuator), (steps, N).
 
-        Two runs with equal signatures lie on one smooth piece of the dynamics; markers count where they were read.
+        Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
+        at which they were evaluated.
         """
         result: NDArray[np.uint64] = self._batch.branches(*self._arguments(trajectory))
         return result
@@ -355,9 +361,17 @@ class Simulator:
         history_end: ArrayLike | None = None,
         params: bool = False,
     ) -> TrajectoryGradient:
-        """The reverse pass: gradients with respect to the trajectory's q, v, tactile (shaped as there) in, gradients
-        with respect to controls and initial state out, and with `params` by every physical parameter, which costs
-        many times the rest. Environments that failed have gradient zero."""
+        """Reverse pass (adjoint) of a rollout.
+
+        Parameters
+        ----------
+        trajectory: result of `rollout`
+        q, v, tactile: gradients of the scalar with respect to these arrays of the trajectory, broadcast to their shape
+        anchors_end, history_end: gradients with respect to the final `anchors` and `history`
+        params: also compute the gradient with respect to all physical parameters, at many times the cost
+
+        Failed environments have gradient zero.
+        """
 
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:

@@ -1,10 +1,8 @@
-"""The simulator as a layer of a PyTorch graph (eq. 18): one step, or a whole rollout, with exact gradients.
+"""Differentiable PyTorch functions for a step and for a rollout, with exact gradients (eq. 18).
 
-Tensors are on the CPU and in the simulator's precision. The state is explicit, so that graphs may branch: nothing here
-changes the simulator's own state. A quaternion's gradient is its tangent gradient mapped back.
-
-Physical parameters may be given by name, as tensors: what they are fitted to is then a rollout away. Only those that
-require a gradient cost anything.
+Tensors are on the CPU and have the simulator's precision. The state is an explicit argument; the simulator's own state
+is not changed. The gradient of a quaternion is its tangent gradient, mapped to four components. Physical parameters can
+be passed by name as tensors; their gradient is computed only when a tensor requires it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,18 +21,18 @@ from gelflow.sim.simulator import Simulator, Trajectory
 
 @dataclass(frozen=True)
 class TorchState:
-    """State of all environments. `anchors` is the memory of the elastic friction law; empty under the viscous one."""
+    """State of all environments; see the attributes of `Simulator`."""
 
     q: torch.Tensor  # (N, nq)
     v: torch.Tensor  # (N, nv)
-    anchors: torch.Tensor  # (N, na, 3)
-    anchored: torch.Tensor  # (N, na) uint8: no gradient
-    history: torch.Tensor  # (N, nh): BDF2's, see `Simulator`; empty under BDF1
+    anchors: torch.Tensor  # (N, na, 3) [m]; empty under the viscous law
+    anchored: torch.Tensor  # (N, na) uint8; not differentiable
+    history: torch.Tensor  # (N, nh); empty under BDF1
 
 
 @dataclass(frozen=True)
 class TorchRollout:
-    """What a rollout gives back; `ok` (N) is False where an environment failed, and its gradient is then zero."""
+    """Result of `torch_rollout`. `ok` (N) is False for failed environments, whose gradient is zero."""
 
     q: torch.Tensor  # (steps + 1, N, nq)
     v: torch.Tensor  # (steps + 1, N, nv)
@@ -44,7 +42,7 @@ class TorchRollout:
 
 
 def torch_state(sim: Simulator) -> TorchState:
-    """The simulator's present state as tensors (copies)."""
+    """The present state of the simulator, copied to tensors."""
     arrays = (sim.q, sim.v, sim.anchors, sim.anchored, sim.history)
     return TorchState(*(torch.from_numpy(np.array(array)) for array in arrays))
 
@@ -57,12 +55,13 @@ def torch_rollout(
     read_after: Sequence[int] = (),
     params: Mapping[str, torch.Tensor] | None = None,
 ) -> TorchRollout:
-    """Steps under controls u (steps, N, nu) from `state`; markers are read after the steps in `read_after`.
+    """Take steps with controls u (steps, N, nu) from `state`.
 
-    `params` are used instead of the simulator's own, by name: each of shape (N,), or () for all environments alike.
+    Marker forces are evaluated after the numbers of steps in `read_after`. `params` replaces parameters of the
+    simulator by name; each has shape (N,), or () for all environments.
 
-    Differentiable in u, state.q, state.v, state.anchors, state.history and params. Raises UsageError on wrong shapes,
-    another precision than the simulator's, unknown parameters, and numbers that are not finite.
+    Differentiable with respect to u, state.q, state.v, state.anchors, state.history and params. Raises UsageError for
+    wrong shapes, a precision other than the simulator's, unknown parameters, and values that are not finite.
     """
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
@@ -77,10 +76,10 @@ def torch_rollout(
 
 
 def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """The simulator's parameters (N, parameters) with some replaced."""
+    """Parameters of the simulator with replacements, (N, parameters)."""
     numbers = torch.from_numpy(sim.params.copy())
     for name, values in params.items():
-        sim.param(name)  # raises where there is none
+        sim.param(name)  # raises for an unknown name
         if values.shape not in ((), (sim.num_envs,)):
             raise UsageError(f"{name} must have shape ({sim.num_envs},) or (), got {tuple(values.shape)}")
         if not torch.isfinite(values).all():
@@ -92,7 +91,7 @@ def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Ten
 def torch_step(
     sim: Simulator, state: TorchState, u: torch.Tensor, *, params: Mapping[str, torch.Tensor] | None = None
 ) -> tuple[TorchState, torch.Tensor]:
-    """One step under controls u (N, nu): the state after it, and what the markers then feel (N, markers, 3) [N]."""
+    """One step with controls u (N, nu): the new state and its marker forces, (N, markers, 3) [N]."""
     result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else (), params=params)
     tactile = result.tactile[0] if sim.model.markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
@@ -112,9 +111,9 @@ class _Rollout(torch.autograd.Function):
         sim: Simulator,
         read_after: tuple[int, ...],
     ) -> tuple[torch.Tensor, ...]:
-        # The reverse pass must see the parameters of the forward pass, whatever is written into them in between.
+        # The reverse pass needs the parameters of the forward pass, even if sim.params changes in between.
         ctx.params = sim.params.copy() if params is None else params.detach().numpy()
-        with nullcontext() if params is None else _using(sim, ctx.params):
+        with nullcontext() if params is None else _temporary_params(sim, ctx.params):
             trajectory = sim.rollout(
                 u.detach().numpy(),
                 q=q.detach().numpy(),
@@ -147,7 +146,7 @@ class _Rollout(torch.autograd.Function):
         sim: Simulator = ctx.sim
         trajectory: Trajectory = ctx.trajectory
         wanted = ctx.needs_input_grad[5]
-        with _using(sim, ctx.params):
+        with _temporary_params(sim, ctx.params):
             gradient = sim.rollout_gradient(
                 trajectory,
                 q=by_q.numpy(),
@@ -163,8 +162,8 @@ class _Rollout(torch.autograd.Function):
 
 
 @contextmanager
-def _using(sim: Simulator, params: NDArray[Any]) -> Iterator[None]:
-    """The simulator with other parameters, for a while."""
+def _temporary_params(sim: Simulator, params: NDArray[Any]) -> Iterator[None]:
+    """Replace the parameters of the simulator within a context."""
     kept = sim.params.copy()
     sim.params[:] = params
     try:

@@ -1,1 +1,1 @@
-"""Tasks built on the simulator."""
+"""Tasks built on the simulator: batched insertion attempts and their Gymnasium environments."""

@@ -1,15 +1,15 @@
-"""The insertion task as Gymnasium environments: `gelflow/Insertion-v0`, one part or many side by side.
+"""Gymnasium environments of the insertion task: `gelflow/Insertion-v0`, single and vectorized.
 
-An episode is one part. `reset` draws it and makes a first attempt; every `step` corrects the gripper's pose by the
-action and makes another. Starts that happen to go in at the first attempt are drawn again: there is nothing to correct.
+An episode is one part. `reset` samples the part and makes a first attempt; each `step` corrects the gripper's pose by
+the action and makes another attempt. A part that is inserted by the first attempt is sampled again.
 
-Action: (x, y, yaw) in ±1, scaled by the task, in the gripper's frame; the pose stays inside the task's workspace.
-Observation: the normalized flow map of the attempt, float32, (frames * sensors * 2, rows, cols), in ±1.
-Reward: −1e4 ‖position error [m]‖² − 20 (yaw error [rad])² after the correction, nothing else.
-Terminated: the part is in the hole. Truncated: the task's attempts, the first one included, are used up, or the
-simulator could not go on (`info["failed"]`).
-Info: `attempts` so far, `inserted`, `failed`, `pose` of the gripper in the hole's frame, `height` of the lower face's
-highest corner above the hole's floor [m], `divisor` of the flow map [N].
+Action: correction (x, y, yaw) in ±1, scaled by the task, in the gripper's frame; the pose is limited to the workspace.
+Observation: normalized flow map of the attempt, float32, shape (frames * sensors * 2, rows, cols), in ±1.
+Reward: `InsertionTask.reward` of the pose after the correction.
+Terminated: the part is inserted. Truncated: all attempts of the task (including the first) are used, or the simulation
+failed (`info["failed"]`).
+Info: number of `attempts`, `inserted`, `failed`, gripper `pose` in the hole's frame, `height` of the highest corner of
+the lower face above the hole's floor [m], `divisor` of the flow map [N].
 """
 
 from typing import Any
@@ -29,7 +29,9 @@ from gelflow.task import INSERTION, InsertionTask
 
 Observation = NDArray[np.float32]
 
-_MAX_RESET_ROUNDS = 100  # rounds of drawing until a start does not go in at once; one nearly always does
+# Rounds of sampling until a first attempt does not insert the part; one is nearly always enough.
+_MAX_RESET_ROUNDS = 100
+_NO_START = f"no valid start in {_MAX_RESET_ROUNDS} rounds: every part was inserted at the first attempt, or failed"
 
 
 def _spaces(task: InsertionTask) -> tuple[Any, Any]:
@@ -37,16 +39,16 @@ def _spaces(task: InsertionTask) -> tuple[Any, Any]:
 
 
 def _scene(task: InsertionTask, scene: Scene | None, preset: str | None) -> Scene:
-    """The scene that an environment was given, or the task's under a preset."""
+    """The given scene, or the task's scene with a preset."""
     if scene is None:
         return insertion_scene(task, preset=preset)
     if preset is not None:
-        raise UsageError(f"give a scene or a preset of the task's scene, not both; got preset {preset!r} and a scene")
+        raise UsageError(f"scene and preset exclude each other; got preset {preset!r} and a scene")
     return scene
 
 
 def _misalignment(options: dict[str, Any] | None, count: int) -> NDArray[np.float64] | None:
-    """The start that `reset` was asked for, shape (count, 3), or None."""
+    """The misalignment in the options of `reset`, shape (count, 3), or None."""
     if not options:
         return None
     if unknown := set(options) - {"misalignment"}:
@@ -69,13 +71,21 @@ def _info(result: AttemptResult, attempts: InsertionAttempts, tries: NDArray[np.
 
 
 class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One part at a time.
+    """The insertion task with one gripper.
 
-    `reset(options={"misalignment": (x, y, yaw)})` starts from a given pose [m, m, rad]; such a start is not drawn
-    again, and `info["inserted"]` says when it went in at the first attempt.
+    Parameters
+    ----------
+    task: task description
+    scene: scene to simulate; None takes `insertion_scene(task, preset=preset)`
+    preset: accuracy preset of the task's scene
+    randomization: distribution of the physical parameters
+    threads: of the simulator
+
+    `reset(options={"misalignment": (x, y, yaw)})` starts at the given gripper pose [m, m, rad]; this start is kept even
+    if the first attempt inserts the part (`info["inserted"]`).
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (as gymnasium has it)
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (declared like this by gymnasium.Env)
 
     def __init__(
         self,
@@ -95,7 +105,10 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """A new part; returns the flow map of its first attempt."""
+        """Start a new part; returns the observation and info of its first attempt.
+
+        Raises UsageError for unknown options, SimulationError when no valid start is found.
+        """
         super().reset(seed=seed)
         given = _misalignment(options, 1)
         for _ in range(_MAX_RESET_ROUNDS):
@@ -104,12 +117,12 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             if given is not None or not (result.inserted | result.failed)[0]:
                 break
         else:
-            raise SimulationError(f"{_MAX_RESET_ROUNDS} starts in a row went in at once, or failed")
+            raise SimulationError(_NO_START)
         self._tries[:] = 1
         return result.image[0], self._first(result)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Correct the pose by `action` (±1, shape (3,)) and attempt again."""
+        """Correct the pose by `action`, shape (3,) in ±1, and make an attempt."""
         attempts = self._attempts
         attempts.pose = self.task.corrected(attempts.pose, self.task.correction(np.asarray(action, dtype=float))[None])
         result = attempts.attempt(self.np_random)
@@ -123,12 +136,12 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
-    """Many parts side by side, on all cores; what training uses.
+    """The insertion task with `num_envs` grippers in one simulation batch, on all cores; used for training.
 
-    A finished environment goes on with the next part within the same step (AutoresetMode.SAME_STEP): its observation
-    is that of the new part's first attempt, `infos["final_obs"]` and `infos["final_info"]` hold the old one's last.
-    New parts come from a nursery that prepares `num_envs` of them at a time, so that a single finished environment
-    does not make the others wait.
+    Parameters are those of `InsertionEnv`. A finished environment starts its next part within the same step
+    (AutoresetMode.SAME_STEP): the observation is that of the new part's first attempt, and `infos["final_obs"]` and
+    `infos["final_info"]` hold the last ones of the finished part. A reset pool simulates the first attempts of
+    `num_envs` parts at a time, so that the reset of one environment does not need a batch of its own.
     """
 
     def __init__(
@@ -161,13 +174,13 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """New parts everywhere; returns the flow maps of their first attempts.
+        """Start new parts in all environments; returns the observations and infos of their first attempts.
 
-        One seed serves all environments. With `options={"misalignment": …}`, of shape (3,) or (num_envs, 3), starts
-        are as given and none is drawn again.
+        All environments share one generator and one seed. `options={"misalignment": …}`, of shape (3,) or
+        (num_envs, 3), sets the starts; these are kept even if the first attempt inserts the part.
         """
         if isinstance(seed, list):
-            raise UsageError("the environments draw from one generator: give one seed, not one for each")
+            raise UsageError("seed must be a single number: all environments share one random generator")
         super().reset(seed=seed)
         given = _misalignment(options, self.num_envs)
         self._tries[:] = 1
@@ -175,7 +188,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             self._attempts.draw(self.np_random, misalignment=given)
             result = self._attempts.attempt(self.np_random)
             return result.image, self._masked(_info(result, self._attempts, self._tries))
-        self._pool_rows = self._pool_rows[:0]  # what a former seed drew is forgotten
+        self._pool_rows = self._pool_rows[:0]  # discards samples of an earlier seed
         images = np.empty(self.observation_space.shape or (), np.float32)
         info = self._replace(np.ones(self.num_envs, dtype=bool), images, {})
         return images, self._masked(info)
@@ -183,7 +196,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Observation, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Correct every pose by its action (±1, shape (num_envs, 3)) and attempt again."""
+        """Correct the poses by `actions`, shape (num_envs, 3) in ±1, and make an attempt in every environment."""
         attempts = self._attempts
         wanted = np.asarray(actions, dtype=float)
         if wanted.shape != (self.num_envs, 3):
@@ -206,14 +219,14 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return images, reward, terminated, truncated, {**self._masked(self._replace(done, images, info)), **ended}
 
     def _masked(self, info: dict[str, NDArray[Any]], rows: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-        """Gymnasium's way to say for which environments an entry holds."""
+        """Info with Gymnasium's masks of valid entries, for the environments `rows` or for all."""
         mask = np.ones(self.num_envs, dtype=bool) if rows is None else rows
         return {**info, **{f"_{key}": mask.copy() for key in info}}
 
     def _replace(
         self, rows: NDArray[np.bool_], images: Observation, info: dict[str, NDArray[Any]]
     ) -> dict[str, NDArray[Any]]:
-        """Put new parts where `rows`, their flow maps into `images`; returns `info` with their entries."""
+        """Start new parts in the environments `rows`; writes their observations to `images`, returns updated info."""
         wanted = np.flatnonzero(rows)
         for _ in range(_MAX_RESET_ROUNDS):
             if not len(wanted):
@@ -232,11 +245,11 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             for key, values in pool_info.items():
                 info[key][into] = values[these]
         if len(wanted):
-            raise SimulationError(f"{_MAX_RESET_ROUNDS} rounds of starts went in at once, or failed")
+            raise SimulationError(_NO_START)
         return info
 
     def _prepare(self) -> None:
-        """Draw parts in the nursery and make their first attempts; those that are not in at once are ready."""
+        """Sample the parts of the reset pool and simulate their first attempts; valid ones are not inserted by them."""
         self._reset_pool.draw(self.np_random)
         self._pool_result = self._reset_pool.attempt(self.np_random)
         self._pool_rows = np.flatnonzero(~self._pool_result.inserted & ~self._pool_result.failed)

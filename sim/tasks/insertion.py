@@ -1,10 +1,9 @@
-"""Insertion attempts in simulation, many side by side.
+"""Batched simulation of insertion attempts.
 
-A part hangs in the gripper above a hole that it does not quite meet. An attempt lowers the gripper by the task's
-descent and reads the pads on the way; a policy then corrects the gripper's pose and tries again. The retreat is not
-simulated: each attempt starts from the part at rest in the grasp, as it was when the gripper had just closed on it,
-placed over the hole where the gripper is now. What the gripper holds does not depend on where it holds it, so that
-state is computed once per part.
+The gripper holds a part above a hole, with a misalignment. An attempt lowers the gripper by the task's descent and
+records the marker forces; then a policy corrects the gripper's pose, and the next attempt starts. The retreat is not
+simulated: each attempt starts from the grasp at rest, placed above the hole at the present gripper pose. The grasp does
+not depend on that pose, so it is simulated once per part.
 """
 
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
@@ -22,27 +22,27 @@ from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
 
-DESCENT_TIME = 0.225  # of an attempt, as published: 45 steps of 5 ms, about ten times as fast as the robot [s]
-SETTLE_TIME = 0.120  # until the part hangs still in the closed gripper [s]
+DESCENT_TIME = 0.225  # [s] of an attempt, as published: 45 steps of 5 ms, about ten times faster than the robot
+SETTLE_TIME = 0.120  # [s] until the part is at rest in the closed gripper
 ARMS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 PADS = ("left", "right")
-_CLEAR = 0.1  # height of the part where the gripper closes on it: touching nothing [m]
-_OUTLINE = 0.3e-3  # an inserted part may press this far into a wall of the hole [m]
+_CLEAR = 0.1  # [m] height of the part while the gripper closes, clear of the hole
+_OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
 
 
 @dataclass(frozen=True)
 class AttemptResult:
-    """What one attempt of every environment brought."""
+    """Results of one attempt in every environment."""
 
     image: NDArray[np.float32]  # flow maps, shape (N, frames * sensors * 2, rows, cols)
-    divisor: Array  # what each map's forces were divided by [N], shape (N,)
-    height: Array  # the highest corner of the part's lower face above the hole's floor [m], shape (N,)
-    inserted: NDArray[np.bool_]  # the lower face is in the hole, below the task's success height
-    failed: NDArray[np.bool_]  # the simulator could not take a step
+    divisor: Array  # [N], shape (N,): normalization of the flow maps
+    height: Array  # [m], shape (N,): highest corner of the part's lower face above the hole's floor
+    inserted: NDArray[np.bool_]  # shape (N,): the lower face is inside the hole, below the task's success height
+    failed: NDArray[np.bool_]  # shape (N,): a simulation step failed
 
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
-    """The insertion scene, its pads with the markers that the task's policy sees, whatever the preset."""
+    """The insertion scene with the marker grid of the task's observations; presets do not change the grid."""
     grid = task.grid
     return load_scene(
         "insertion",
@@ -58,19 +58,19 @@ def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = Non
 
 
 class InsertionAttempts:
-    """`num_envs` parts, each in its gripper, over its hole.
+    """`num_envs` grippers, each holding a part above its hole.
 
     Parameters
     ----------
-    num_envs: how many side by side
-    task: the task's description
-    scene: `insertion_scene(task)`, or one of the same make
-    randomization: from what the physics of a part is drawn
-    threads: of the simulator; all cores when None. Results do not depend on it.
-    steps: over which an attempt goes down; when None as many as 225 ms have
+    num_envs: number of environments
+    task: task description
+    scene: `insertion_scene(task)`, or a scene with the same bodies, actuators and pads
+    randomization: distribution of the physical parameters
+    threads: of the simulator; None uses all available cores. Results do not depend on it.
+    steps: simulation steps of a descent; None gives 225 ms
 
-    `pose` (N, 3) is where each gripper is: x [m], y [m], yaw [rad] in the hole's frame. Write into it between attempts.
-    Raises UsageError when task and scene do not fit together.
+    `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to it between attempts.
+    Raises UsageError when the scene does not match the task.
     """
 
     def __init__(
@@ -108,83 +108,86 @@ class InsertionAttempts:
         self.pose: Array = np.zeros((num_envs, 3))
         self._noise: Array = np.zeros(num_envs)
         self._stop_shear: Array = np.full(num_envs, np.inf)
-        # The part at rest in the grasp: state, controls, and what the pads feel then.
+        # The grasp at rest: controls, state and shear forces.
         self._u: Array = np.zeros((num_envs, self.scene.nu))
-        self._held: dict[str, NDArray[Any]] = {
+        self._grasp: dict[str, NDArray[Any]] = {
             "q": self.sim.q.copy(),
             "anchors": self.sim.anchors.copy(),
             "anchored": self.sim.anchored.copy(),
             "tactile": np.zeros((num_envs, self.scene.markers, 2)),
         }
-        # What an attempt reads lands here, and stays where a frame is due: after which step, then what was felt.
-        self._felt = np.zeros_like(self._held["tactile"])
-        self._readings = {step: np.zeros_like(self._felt) for step in (self._reference_at, *self._frames)}
+        # Shear forces of the present attempt, and their copies after the steps at which a frame is due.
+        self._shear = np.zeros_like(self._grasp["tactile"])
+        self._frame_shear = {step: np.zeros_like(self._shear) for step in (self._reference_at, *self._frames)}
 
     def _step_at(self, depth: float) -> int:
-        """After which step of an attempt the gripper's target is `depth` below its start."""
+        """Number of steps after which the gripper's target is `depth` [m] below its start."""
         if not 0 <= depth <= self.task.descent * (1 + 1e-9):
-            raise UsageError(f"a frame at depth {depth} m can't be taken: an attempt goes down {self.task.descent} m")
+            raise UsageError(f"frame depth {depth} m is outside the descent of {self.task.descent} m")
         return int(np.ceil(depth / self.task.descent * self._steps - 1e-6))
 
     def draw(self, rng: np.random.Generator, *, misalignment: Array | None = None) -> None:
-        """New parts everywhere: physics and grasp from the randomization, start from the task (or as given, (N, 3))."""
-        drawn = self.randomization.sample(rng, self.num_envs, elastic=self.scene.friction == "elastic")
-        for name, values in drawn.params.items():
+        """Start new parts in all environments.
+
+        Physics and grasp come from the randomization, `pose` from the task unless `misalignment` (N, 3) is given.
+        """
+        sampled = self.randomization.sample(rng, self.num_envs, elastic=self.scene.friction == "elastic")
+        for name, values in sampled.params.items():
             self.sim.param(name)[:] = values
-        self._noise, self._stop_shear = drawn.noise, drawn.stop_shear
+        self._noise, self._stop_shear = sampled.noise, sampled.stop_shear
         self.pose = self.task.draw_misalignment(rng, self.num_envs)
         if misalignment is not None:
             self.pose = np.array(np.broadcast_to(misalignment, self.pose.shape), dtype=float)
-        self._close(drawn.grasp_force, drawn.grasp_height)
+        self._close(sampled.grasp_force, sampled.grasp_height)
 
     def _close(self, force: Array, height: Array) -> None:
-        """Close the grippers on their parts, high above the holes, and remember the state at rest."""
+        """Close the grippers on their parts, far above the holes, and store the state at rest."""
         sim, scene = self.sim, self.scene
         sim.reset()
         sim.q[:] = scene.q0
         sim.q[:, self._part_q + 2] = _CLEAR
         sim.q[:, self._arm_q[2]] = _CLEAR + height
-        # Where the fingers stand in balance: half of a disc's points are on the face that touches.
+        # Finger positions at force equilibrium; half of a disc's points are on the face in contact.
         touching = {p.name: p.weights.sum() / 2 for p in scene.points}
         for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
             sim.q[:, scene.q(finger)] += (force / (sim.param(f"{pad}.kn") * touching[pad]))[:, None]
             self._u[:, scene.u(finger)] = force
-        # The left jaw is held where it closed; the right one follows the force alone.
+        # The left jaw holds its position; the right one is force controlled.
         self._u[:, scene.u("hold_left")] = sim.q[:, scene.q("finger_left").start]
         sim.param("hold_right.kp")[:] = 0
         sim.param("hold_right.kd")[:] = 0
         self._u[:, self._arm_u] = sim.q[:, self._arm_q]
         weight = -scene.gravity[2] * sum(sim.param(f"{body.name}.mass") for body in scene.bodies)
-        self._u[:, self._arm_u[2]] += weight / sim.param("arm_z.kp")  # feed-forward: the arm does not sag
+        self._u[:, self._arm_u[2]] += weight / sim.param("arm_z.kp")  # gravity compensation
         sim.step(self._u, self._settle_steps)
-        self._held["q"][:] = sim.q
-        self._held["anchors"][:] = sim.anchors
-        self._held["anchored"][:] = sim.anchored
-        self._held["tactile"][:] = sim.tactile()[..., :2]
+        self._grasp["q"][:] = sim.q
+        self._grasp["anchors"][:] = sim.anchors
+        self._grasp["anchored"][:] = sim.anchored
+        self._grasp["tactile"][:] = sim.tactile()[..., :2]
 
     def attempt(self, rng: np.random.Generator) -> AttemptResult:
-        """One attempt of every environment from its `pose`.
+        """Simulate one attempt in every environment, starting from `pose`.
 
-        As on the robot, touch stops the descent: frames due later are what was felt then.
+        As on the robot, contact stops the descent: later frames repeat the forces at the stop.
         """
         sim, z = self.sim, self._arm_u[2]
-        u = self._place(rng)
+        u = self._start(rng)
         start = u[:, z].copy()
-        felt = self._felt
-        felt[:] = self._held["tactile"]
-        readings = self._readings
-        if 0 in readings:
-            readings[0][:] = felt
+        shear = self._shear
+        shear[:] = self._grasp["tactile"]
+        frames = self._frame_shear
+        if 0 in frames:
+            frames[0][:] = shear
         stopped = np.zeros(self.num_envs, dtype=bool)
         for step in range(1, self._steps + 1):
             u[:, z] = start - self.task.descent * step / self._steps
             sim.step(u)
-            np.copyto(felt, sim.tactile()[..., :2], where=~stopped[:, None, None])
-            if step in readings:
-                readings[step][:] = felt
+            np.copyto(shear, sim.tactile()[..., :2], where=~stopped[:, None, None])
+            if step in frames:
+                frames[step][:] = shear
             if step > self._reference_at:
-                stopped |= self._mean_shear(felt - readings[self._reference_at]) > self._stop_shear
-        noisy = {step: self._with_noise(readings[step], rng) for step in sorted({self._reference_at, *self._frames})}
+                stopped |= self._mean_shear(shear - frames[self._reference_at]) > self._stop_shear
+        noisy = {step: self._with_noise(frames[step], rng) for step in sorted({self._reference_at, *self._frames})}
         stack = np.stack([noisy[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, noisy[self._reference_at], min_divisor=MIN_DIVISORS["N"])
         height, inserted = self._outcome()
@@ -193,43 +196,43 @@ class InsertionAttempts:
         return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed)
 
     def _mean_shear(self, change: NDArray[Any]) -> Array:
-        """Mean change of shear along the finger, of the pad where it is larger [N]; shape (N,)."""
+        """Mean change of the shear along the finger, maximum over the pads [N], shape (N,)."""
         along = change[..., 0].reshape(self.num_envs, len(PADS), -1)
         return np.asarray(np.abs(along.mean(2)).max(1))
 
-    def _place(self, rng: np.random.Generator) -> Array:
-        """Put what each gripper holds at its pose, the lower face at its start height; returns the controls there."""
+    def _start(self, rng: np.random.Generator) -> Array:
+        """Set the state to the grasp at `pose`, the lower face at its start height; returns the controls."""
         sim, at = self.sim, self._part_q
-        held = self._held["q"]
+        grasp = self._grasp["q"]
         sim.reset()
-        part = held[:, at : at + 7]
+        part = grasp[:, at : at + 7]
         jitter = rng.uniform(-1, 1, self.num_envs) * self.randomization.start_height
         lift = self.task.start_height + jitter - (part[:, 2] - self._face)
         x, y, yaw = self.pose.T
         cos, sin = np.cos(yaw), np.sin(yaw)
-        sim.q[:] = held
-        sim.q[:, self._arm_q] = np.column_stack([x, y, held[:, self._arm_q[2]] + lift, yaw])
+        sim.q[:] = grasp
+        sim.q[:, self._arm_q] = np.column_stack([x, y, grasp[:, self._arm_q[2]] + lift, yaw])
         sim.q[:, at] = x + cos * part[:, 0] - sin * part[:, 1]
         sim.q[:, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
         sim.q[:, at + 2] = part[:, 2] + lift
-        sim.q[:, at + 3 : at + 7] = _turned(part[:, 3:], yaw)
-        sim.anchors[:] = self._held["anchors"]
-        sim.anchored[:] = self._held["anchored"]
+        sim.q[:, at + 3 : at + 7] = _rotated_z(part[:, 3:], yaw)
+        sim.anchors[:] = self._grasp["anchors"]
+        sim.anchored[:] = self._grasp["anchored"]
         u = self._u.copy()
         u[:, self._arm_u] = np.column_stack([x, y, u[:, self._arm_u[2]] + lift, yaw])
         return u
 
-    def _with_noise(self, reading: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
-        noisy = reading + self._noise[:, None, None] * rng.standard_normal(reading.shape)
+    def _with_noise(self, shear: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+        noisy = shear + self._noise[:, None, None] * rng.standard_normal(shear.shape)
         grid = self.task.grid
         return noisy.reshape(self.num_envs, len(PADS), grid.rows, grid.cols, 2)
 
     def _outcome(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Height of the lower face's highest corner, and whether the whole face is in the hole."""
+        """Height of the highest corner of the part's lower face [m], and whether the face is inside the hole."""
         part = self.sim.q[:, self._part_q : self._part_q + 7]
-        corners = part[:, None, :3] + np.einsum("nij,kj->nki", _matrices(part[:, 3:]), self._corners)
+        corners = part[:, None, :3] + np.einsum("nij,kj->nki", rotation_matrices(part[:, 3:]), self._corners)
         height = corners[..., 2].max(1)
-        inside = (np.abs(corners[..., :2]) < self._outline + _OUTLINE).all((1, 2))
+        inside = (np.abs(corners[..., :2]) < self._outline + _OUTLINE_TOLERANCE).all((1, 2))
         return height, inside & (height < self.task.success_height)
 
     def reward(self) -> Array:
@@ -237,29 +240,18 @@ class InsertionAttempts:
         return self.task.reward(self.pose)
 
     def copy_parts(self, rows: NDArray[np.int64], other: "InsertionAttempts", other_rows: NDArray[np.int64]) -> None:
-        """Replace the parts of `rows` by parts of another batch: physics, grasp and pose."""
+        """Copy parts (physics, grasp and pose) from `other_rows` of another batch to `rows`."""
         self.sim.params[rows] = other.sim.params[other_rows]
         self.pose[rows] = other.pose[other_rows]
         self._noise[rows] = other._noise[other_rows]
         self._stop_shear[rows] = other._stop_shear[other_rows]
         self._u[rows] = other._u[other_rows]
-        for name, values in self._held.items():
-            values[rows] = other._held[name][other_rows]
+        for name, values in self._grasp.items():
+            values[rows] = other._grasp[name][other_rows]
 
 
-def _turned(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
-    """Quaternions (N, 4) turned about the world's z."""
+def _rotated_z(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
+    """Quaternions (N, 4) rotated by `yaw` (N,) [rad] about the world's z axis."""
     cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
     w, x, y, z = quat.T
     return np.column_stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
-
-
-def _matrices(quat: NDArray[Any]) -> NDArray[Any]:
-    """Rotation matrices (N, 3, 3) of unit quaternions (N, 4)."""
-    w, x, y, z = quat.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,7 +1,7 @@
-"""From what the physics of a simulated insertion is drawn, part by part.
+"""Domain randomization of the insertion task: distributions of the physical parameters of a part.
 
-The ranges of contact, pads and grasp are the published ones (Table 7 of the paper's appendix). Where that table has no
-entry because its simulator lacks the quantity, the choice is ours and says why.
+The ranges of contact, pad and grasp parameters are published (paper, appendix, Table 7). Quantities that the published
+simulator does not have are chosen here, with the reason beside them.
 """
 
 from dataclasses import dataclass
@@ -14,46 +14,46 @@ from gelflow.errors import UsageError
 Array = NDArray[np.float64]
 Range = tuple[float, float]
 
-# Relaxation times of the elastic law, k_v / k_s: long enough to damp, short enough that a frame taken during the
-# fast simulated descent shows what a slow robot's shows.
+# Relaxation times k_t / k_s of the elastic law: long enough to damp vibration, short enough that a frame of the fast
+# simulated descent equals one of the slow descent of the robot.
 CONTACT_RELAXATION = 10e-3  # [s]
 MARKER_RELAXATION = 5e-3  # [s]
 
 
 @dataclass(frozen=True)
 class SampledPhysics:
-    """The physics of N parts."""
+    """Physical parameters of N parts."""
 
-    params: dict[str, Array]  # simulator parameter → values, shape (N,)
+    params: dict[str, Array]  # name of the simulator parameter → values, shape (N,)
     grasp_force: Array  # of each finger [N]
-    grasp_height: Array  # of the pads' centres above the part's [m]
-    stop_shear: Array  # mean shear along the finger at which touch stops a descent [N per marker]
+    grasp_height: Array  # of the pad centres above the part's centre [m]
+    stop_shear: Array  # mean shear along the finger at which contact stops a descent [N per marker]
     noise: Array  # standard deviation of a marker's force [N]
 
 
 @dataclass(frozen=True)
 class Randomization:
-    """Ranges (low, high), per part; those marked log are drawn uniformly in the logarithm."""
+    """Ranges (low, high), sampled per part; those marked "log" are uniform in the logarithm."""
 
     grasp_force: Range = (2.5, 16.0)  # of each finger [N]
-    grasp_height: Range = (-10e-3, 5e-3)  # of the pads' centres above the part's [m]
-    start_height: float = 0.2e-3  # of the part's lower face, ± at each attempt [m]
-    pad_kn: Range = (2e3, 1.4e4)  # pad against part, per point [N/m]
+    grasp_height: Range = (-10e-3, 5e-3)  # of the pad centres above the part's centre [m]
+    start_height: float = 0.2e-3  # half-range of the lower face's start height, per attempt [m]
+    pad_kn: Range = (2e3, 1.4e4)  # contact of pad and part, per point [N/m]
     pad_mu: Range = (0.5, 2.5)
     pad_kt: Range = (20.0, 140.0)  # viscous law [N s/m]
-    pad_ks: Range = (100.0, 1000.0)  # elastic law, log [N/m]: a soft to a stiff gel
+    pad_ks: Range = (100.0, 1000.0)  # elastic law, log [N/m]: soft to stiff gels
     marker_kn: Range = (50.0, 450.0)  # [N/m]
     marker_mu: Range = (0.5, 2.5)
     marker_kd: Range = (0.0, 100.0)  # [N s/m²]
     marker_kt: Range = (0.2, 2.3)  # viscous law [N s/m]
     marker_ks: Range = (50.0, 450.0)  # elastic law, log [N/m]
-    hole_kn: Range = (2.5e3, 2e4)  # part against hole, log [N/m]: how hard both are
-    hole_mu: Range = (0.3, 1.5)  # printed plastic is smoother than the 1.5 of the published scene
-    # A servo of 200 N/m is the published arm; a robot yields hundreds of times less. Log [N/m].
+    hole_kn: Range = (2.5e3, 2e4)  # contact of part and hole, log [N/m]
+    hole_mu: Range = (0.3, 1.5)  # includes printed plastic, below the published 1.5
+    # From the published servo of 200 N/m to the stiffness of an industrial arm; log [N/m].
     arm_stiffness: Range = (200.0, 3e5)
-    # A robot stops at a displacement of the markers; how many newtons that is depends on the gel. Log [N].
+    # The robot stops at a marker displacement; the force at that displacement depends on the gel. Log [N].
     stop_shear: Range = (5e-3, 0.1)
-    noise: Range = (1e-5, 1e-3)  # of a marker's force, log [N]: from the published 1e-5 to a tracked image's
+    noise: Range = (1e-5, 1e-3)  # of a marker force, log [N]: from the published 1e-5 to the noise of image tracking
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -61,7 +61,7 @@ class Randomization:
                 raise UsageError(f"randomization: {name} must be (low, high) with low ≤ high, got {value}")
 
     def sample(self, rng: np.random.Generator, count: int, *, elastic: bool) -> SampledPhysics:
-        """The physics of `count` parts, under the elastic or the viscous law."""
+        """Sample the physics of `count` parts, for the elastic or the viscous friction law."""
 
         def uniform(limits: Range) -> Array:
             return rng.uniform(limits[0], limits[1], count)
@@ -82,7 +82,7 @@ class Randomization:
         params |= {f"{side}.{key}": values for side in ("left", "right") for key, values in marker.items()}
         walls = ("left", "right", "front", "back")
         params |= {f"part_hole/wall_{wall}.{key}": values for wall in walls for key, values in hole.items()}
-        # Damping and the yaw servo keep the published proportions to the stiffness: 1/200 s, 0.05 m².
+        # Published ratios to the stiffness: damping 1/200 s, yaw servo 0.05 m².
         for arm, scale in (("arm_x", 1.0), ("arm_y", 1.0), ("arm_z", 1.0), ("arm_yaw", 0.05)):
             params[f"{arm}.kp"] = stiffness * scale
             params[f"{arm}.kd"] = stiffness * scale / 200
@@ -93,7 +93,7 @@ class Randomization:
 
 DEFAULT_RANDOMIZATION = Randomization()
 
-# One fixed physics, as in the scene file, with an arm as stiff as a robot's: for tests and pictures.
+# Fixed parameters of the scene file, with the arm stiffness of a robot; for tests and pictures.
 NOMINAL = Randomization(
     grasp_force=(12.0, 12.0),
     grasp_height=(0.0, 0.0),

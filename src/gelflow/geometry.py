@@ -86,6 +86,17 @@ def columns_quaternion(columns: Columns) -> Quaternion:
     return q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
 
 
+def rotation_matrices(q: Array) -> Array:
+    """Rotation matrices (…, 3, 3) of unit quaternions (…, 4)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def angle_between(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
     """Angle of the rotation between two unit quaternions [rad], 0 to π."""
     w, x, y, z = multiply(conjugate(a), b)

@@ -368,7 +368,10 @@ def test_results_land_in_given_arrays(insertion: Scene) -> None:
         own = np.zeros_like(results())
         assert results(own) is own
         np.testing.assert_array_equal(own, results())
-    with pytest.raises(UsageError, match=re.escape("out must be a trajectory of u (12, 5, 8) and 1 readings, got")):
+    with pytest.raises(
+        UsageError,
+        match=re.escape("out must be a trajectory with u of shape (12, 5, 8) and 1 tactile evaluations, got"),
+    ):
         sim.rollout(u, read_after=(3,), out=other)
 
 

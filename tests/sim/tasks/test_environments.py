@@ -1,4 +1,4 @@
-"""The insertion task as Gymnasium environments, and the rule that limits corrections."""
+"""Gymnasium environments of the insertion task, and the limits of corrections."""
 
 import dataclasses
 import warnings
@@ -23,7 +23,7 @@ def vector(count: int, **options: Any) -> InsertionVectorEnv:
     return InsertionVectorEnv(count, **options)
 
 
-def test_gymnasium_finds_no_fault() -> None:
+def test_environment_passes_gymnasium_check() -> None:
     env = gymnasium.make("gelflow/Insertion-v0")
     assert env.observation_space.shape == (4, 13, 10)
     with warnings.catch_warnings():
@@ -31,7 +31,7 @@ def test_gymnasium_finds_no_fault() -> None:
         check_env(env.unwrapped)
 
 
-def test_the_vector_environment_is_registered_too() -> None:
+def test_vector_environment_is_registered() -> None:
     envs = gymnasium.make_vec("gelflow/Insertion-v0", num_envs=3, vectorization_mode="vector_entry_point")
     images, _ = envs.reset(seed=0)
     assert images.shape == (3, 4, 13, 10) and images.dtype == np.float32
@@ -40,7 +40,7 @@ def test_the_vector_environment_is_registered_too() -> None:
     envs.close()
 
 
-def test_a_perfect_correction_inserts() -> None:
+def test_exact_correction_inserts_the_part() -> None:
     env = InsertionEnv(randomization=NOMINAL)
     _, info = env.reset(options={"misalignment": (4e-3, -3e-3, np.radians(6))})
     assert not info["inserted"] and info["attempts"] == 1
@@ -55,14 +55,14 @@ def test_a_perfect_correction_inserts() -> None:
     assert info["height"] < 24.7e-3
 
 
-def test_the_reward_is_the_published_one() -> None:
+def test_reward_equals_published_formula() -> None:
     env = InsertionEnv(randomization=NOMINAL)
     env.reset(options={"misalignment": (6e-3, 0, 0.1)})
     reward = env.step(STAY)[1]
     assert reward == pytest.approx(-1e4 * 36e-6 - 20 * 0.01, rel=1e-6)
 
 
-def test_an_episode_ends_after_the_task_s_attempts() -> None:
+def test_episode_is_truncated_after_the_last_attempt() -> None:
     env = InsertionEnv(randomization=NOMINAL, task=dataclasses.replace(INSERTION, attempts=3))
     env.reset(options={"misalignment": (6e-3, 6e-3, 0)})
     assert env.step(STAY)[2:4] == (False, False)
@@ -70,7 +70,7 @@ def test_an_episode_ends_after_the_task_s_attempts() -> None:
     assert (terminated, truncated, info["attempts"]) == (False, True, 3)
 
 
-def test_a_simulator_that_fails_truncates_the_episode() -> None:
+def test_simulation_failure_truncates_the_episode() -> None:
     env = InsertionEnv(randomization=dataclasses.replace(NOMINAL, hole_kn=(1e300, 1e300)))
     observation, info = env.reset(seed=0, options={"misalignment": (6e-3, 6e-3, 0)})
     assert info["failed"] and not info["inserted"]
@@ -78,8 +78,8 @@ def test_a_simulator_that_fails_truncates_the_episode() -> None:
     assert env.step(STAY)[2:4] == (False, True)
 
 
-def test_starts_that_go_in_at_once_are_drawn_again() -> None:
-    near = dataclasses.replace(INSERTION, misalignment=(4e-3, 4e-3, 0.0))  # a third of these fit
+def test_starts_inserted_at_the_first_attempt_are_sampled_again() -> None:
+    near = dataclasses.replace(INSERTION, misalignment=(4e-3, 4e-3, 0.0))  # a third of these are inserted at once
     envs = vector(24, task=near, randomization=NOMINAL)
     _, info = envs.reset(seed=3)
     assert not info["inserted"].any()
@@ -88,7 +88,7 @@ def test_starts_that_go_in_at_once_are_drawn_again() -> None:
     assert not any(env.reset(seed=seed)[1]["inserted"] for seed in range(6))
 
 
-def test_finished_environments_go_on_in_the_same_step() -> None:
+def test_finished_environments_reset_in_the_same_step() -> None:
     envs = vector(4, randomization=NOMINAL)
     images, info = envs.reset(seed=1)
     np.testing.assert_array_equal(info["attempts"], 1)
@@ -105,15 +105,15 @@ def test_finished_environments_go_on_in_the_same_step() -> None:
     assert info["final_obs"][2].shape == (4, 13, 10) and info["final_obs"][0] is None
     assert info["final_info"]["attempts"][2] == 2 and info["final_info"]["inserted"][2]
     np.testing.assert_allclose(info["final_info"]["pose"][2], 0, atol=1e-8)
-    assert np.abs(info["pose"][2]).max() > 0  # a new part, somewhere else
+    assert np.abs(info["pose"][2]).max() > 0  # a new part at another pose
     assert (info["pose"][[0, 1, 3]] == before[[0, 1, 3]]).all()
     assert np.abs(images[2] - info["final_obs"][2]).max() > 0.1
-    # The new part goes on as any other: it stays, and its next attempt shows the same.
+    # The new part keeps its pose; a second attempt gives the same observation.
     again = envs.step(np.zeros((4, 3)))[0]
     assert np.linalg.norm(again[2] - images[2]) < 0.2 * np.linalg.norm(images[2])
 
 
-def test_a_seed_fixes_everything() -> None:
+def test_a_seed_determines_all_results() -> None:
     rng = np.random.default_rng(0)
     actions = rng.uniform(-0.4, 0.4, (6, 5, 3))
     runs = []
@@ -127,7 +127,7 @@ def test_a_seed_fixes_everything() -> None:
     assert (runs[0] == runs[1]).all()
 
 
-def test_the_vector_environment_is_the_environment_many_times() -> None:
+def test_vector_environment_equals_single_environments() -> None:
     cases = np.array([[4e-3, 1e-3, 0.1], [-2e-3, 5e-3, -0.1]])
     silent = dataclasses.replace(NOMINAL, noise=(1e-30, 1e-30))
     actions = np.array([[0.1, -0.05, 0.2], [0.0, -0.1, 0.3]], dtype=np.float32)
@@ -151,16 +151,16 @@ def test_the_vector_environment_is_the_environment_many_times() -> None:
         ({"misalignment": (0, 0, np.nan)}, "must be 3 finite numbers"),
     ],
 )
-def test_wrong_reset_options_are_refused(options: dict[str, Any], message: str) -> None:
+def test_invalid_reset_options_raise(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         InsertionEnv().reset(options=options)
     with pytest.raises(UsageError, match=message):
         vector(2).reset(options=options)
 
 
-def test_wrong_actions_and_seeds_are_refused() -> None:
+def test_invalid_actions_and_seeds_raise() -> None:
     envs = vector(2)
-    with pytest.raises(UsageError, match="one generator"):
+    with pytest.raises(UsageError, match="one random generator"):
         envs.reset(seed=[1, 2])
     envs.reset(seed=0)
     with pytest.raises(UsageError, match=r"actions must have shape \(2, 3\)"):
@@ -169,7 +169,7 @@ def test_wrong_actions_and_seeds_are_refused() -> None:
         InsertionAttempts(1, steps=0)
 
 
-def test_corrections_turn_with_the_gripper_and_stay_in_the_workspace() -> None:
+def test_corrections_rotate_with_the_gripper_and_are_limited_to_the_workspace() -> None:
     quarter = np.array([1e-3, 2e-3, np.pi / 2])
     wide = dataclasses.replace(INSERTION, workspace=(1.0, 1.0, 4.0))
     np.testing.assert_allclose(
@@ -181,7 +181,7 @@ def test_corrections_turn_with_the_gripper_and_stay_in_the_workspace() -> None:
     assert (np.abs(far) <= INSERTION.workspace).all()
 
 
-def test_misalignment_is_drawn_from_the_task() -> None:
+def test_misalignment_is_sampled_from_the_range_of_the_task() -> None:
     drawn = INSERTION.draw_misalignment(np.random.default_rng(0), 1000)
     assert drawn.shape == (1000, 3)
     limit = np.array(INSERTION.misalignment)

@@ -1,4 +1,4 @@
-"""What happens in a simulated insertion attempt."""
+"""Physics and observations of simulated insertion attempts."""
 
 import dataclasses
 from typing import Any
@@ -30,14 +30,14 @@ def attempted(misalignment: NDArray[np.float64], **options: Any) -> tuple[Insert
 
 
 def held(friction: str) -> tuple[Simulator, NDArray[np.float64], int]:
-    """A part at rest in the gripper, high above everything, the controls that hold it, and where its height stands."""
+    """A part at rest in the gripper without other contact, the holding controls, and the index of its height in q."""
     scene = insertion_scene(friction=friction)
     attempts = InsertionAttempts(1, scene=scene, randomization=SILENT)
     attempts.draw(np.random.default_rng(0))
     return attempts.sim, attempts._u.copy(), scene.q("part").start + 2
 
 
-def test_a_held_part_stays_where_it_is_under_the_elastic_law() -> None:
+def test_grasped_part_does_not_creep_under_the_elastic_law() -> None:
     sim, u, z = held("elastic")
     before = sim.q[0].copy()
     sim.step(u, 200)
@@ -46,8 +46,8 @@ def test_a_held_part_stays_where_it_is_under_the_elastic_law() -> None:
     assert (sim.status == 0).all()
 
 
-def test_a_held_part_creeps_as_the_viscous_law_says() -> None:
-    """66 points of 80 N s/m carry the weight: it sinks at m g / 5280 N s/m."""
+def test_grasped_part_creeps_at_the_predicted_rate_under_the_viscous_law() -> None:
+    """66 points of 80 N s/m carry the weight: the rate is m g / 5280 N s/m."""
     sim, u, z = held("viscous")
     before = sim.q[0, z]
     sim.step(u, 100)
@@ -63,11 +63,11 @@ def test_the_pads_carry_the_weight_and_the_grasp_force(friction: str) -> None:
     np.testing.assert_allclose(right, [12, 0, -WEIGHT / 2], atol=2e-3)
     reading = sim.tactile()[0]
     assert (reading[..., 2] > 0).all()  # pressed
-    assert (reading[..., 0] > 0).all()  # the part pulls towards the tip, which is down
+    assert (reading[..., 0] > 0).all()  # the weight acts towards the fingertip, downwards
     assert np.abs(reading[..., 1]).max() < 1e-3 * reading[..., 0].min()
 
 
-def test_an_aligned_part_goes_in_and_a_misaligned_one_does_not() -> None:
+def test_aligned_parts_are_inserted_and_misaligned_ones_are_not() -> None:
     cases = poses((0, 0, 0), (2.1, 0, 0), (0, -2.1, 0), (0, 0, 4), (2.6, 0, 0), (0, -2.6, 0), (0, 0, 8), (6, 6, 10))
     _, result = attempted(cases)
     assert result.inserted.tolist() == [True] * 4 + [False] * 4
@@ -77,7 +77,7 @@ def test_an_aligned_part_goes_in_and_a_misaligned_one_does_not() -> None:
 
 
 def test_insertion_agrees_with_geometry_under_randomized_physics() -> None:
-    """No part goes in that does not fit, beyond what the gels and walls give; every part that fits goes in."""
+    """Parts are inserted exactly when their outline fits the hole, within the compliance of gels and walls."""
     attempts = InsertionAttempts(48)
     rng = np.random.default_rng(3)
     blocked = fitting = 0
@@ -96,28 +96,30 @@ def test_insertion_agrees_with_geometry_under_randomized_physics() -> None:
     assert blocked > 30 and fitting > 8
 
 
-def test_mirrored_misalignment_gives_the_mirrored_map() -> None:
-    """x → −x swaps the fingers; on the pads, y and the columns change sign. Fails when a pad's frame is turned."""
+def test_mirrored_misalignment_gives_mirrored_flow_map() -> None:
+    """x → −x swaps the fingers; on the pads, y and the columns change sign. Detects a rotated pad frame."""
     _, result = attempted(poses((1.5, 3, 4), (-1.5, 3, -4)))
     maps = result.image.reshape(2, 2, 2, 13, 10)
     mirrored = maps[1][::-1, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
-    np.testing.assert_allclose(maps[0], mirrored, atol=0.01)  # the left jaw is held, the right one pressed
+    np.testing.assert_allclose(
+        maps[0], mirrored, atol=0.01
+    )  # the left jaw is position controlled, the right one force controlled
     assert np.abs(maps[0] - maps[1]).max() > 0.05
 
 
-def test_the_map_shows_where_the_part_is_caught() -> None:
-    """The rim pushes up: towards the base of the fingers. Caught at its back edge, the part turns under the pads."""
+def test_flow_map_shows_the_location_of_the_contact() -> None:
+    """The rim pushes upwards, towards the base of the fingers; contact at the back edge rotates the part."""
     _, result = attempted(poses((0, 4, 0), (0, -4, 0)))
     maps = result.image.reshape(2, 2, 2, 13, 10)
     assert (maps[:, :, 0].mean((2, 3)) < 0).all()
     left, right = maps[:, 0], maps[:, 1]
     top, bottom = left[:, 1, :4].mean((1, 2)), left[:, 1, -4:].mean((1, 2))
-    assert top[0] < bottom[0] and top[1] > bottom[1]  # the shear across turns with the part
+    assert top[0] < bottom[0] and top[1] > bottom[1]  # the transverse shear rotates with the part
     np.testing.assert_allclose(left[:, 1], -right[:, 1, :, ::-1], atol=0.01)
 
 
-def test_the_map_does_not_depend_on_the_speed_of_the_descent() -> None:
-    """Frames are picked by depth: a robot goes down ten times as slowly, and must see the same."""
+def test_flow_map_is_independent_of_the_descent_speed() -> None:
+    """Frames are selected by depth: a robot descends ten times more slowly and observes the same map."""
     cases = poses((3, 0, 0), (0, 4, 0), (2, 4, 8))
     _, fast = attempted(cases)
     _, slow = attempted(cases, steps=450)
@@ -125,8 +127,8 @@ def test_the_map_does_not_depend_on_the_speed_of_the_descent() -> None:
     np.testing.assert_allclose(fast.divisor, slow.divisor, rtol=0.02)
 
 
-def test_the_observation_is_the_flow_map_of_the_frames() -> None:
-    """The batch's maps are those that the robot's side makes of the same frames."""
+def test_observation_is_the_flow_map_of_the_frames() -> None:
+    """The batched maps equal those of the robot pipeline for the same frames."""
     attempts, result = attempted(poses((2, 3, 5), (-3, 1, 0)))
     grid = INSERTION.grid
 
@@ -143,25 +145,25 @@ def test_the_observation_is_the_flow_map_of_the_frames() -> None:
 
     last = attempts.sim.tactile().copy()
     for env in range(2):
-        expected = flow_map([frame(last, env)], frame(attempts._held["tactile"], env), grid=grid)
+        expected = flow_map([frame(last, env)], frame(attempts._grasp["tactile"], env), grid=grid)
         np.testing.assert_allclose(result.image[env], expected.image, atol=1e-5)
         assert result.divisor[env] == pytest.approx(expected.divisor, rel=1e-5)
         assert result.divisor[env] > MIN_DIVISORS["N"]
 
 
-def test_frames_are_taken_at_the_depths_of_the_task() -> None:
+def test_frames_are_recorded_at_the_depths_of_the_task() -> None:
     task = dataclasses.replace(INSERTION, reference_depth=0.2e-3, frame_depths=(0.6e-3, 0.8e-3, 1.1e-3))
     cases = poses((3, 0, 0), (0, 4, 0))
     _, several = attempted(cases, task=task)
     assert several.image.shape == (2, 12, 13, 10)
     strength = np.abs(several.image.reshape(2, 3, -1)).sum(2)
-    assert (np.diff(strength, axis=1) > 0).all()  # the deeper, the stronger
-    with pytest.raises(UsageError, match=r"a frame at depth 0\.002 m can't be taken"):
+    assert (np.diff(strength, axis=1) > 0).all()  # forces increase with depth
+    with pytest.raises(UsageError, match=r"frame depth 0\.002 m is outside the descent"):
         attempted(cases, task=dataclasses.replace(INSERTION, frame_depths=(2e-3,)))
 
 
-def test_touch_stops_a_descent_as_on_the_robot() -> None:
-    """The frame is then the one that was felt to be too much: less than is felt at full depth, of the same shape."""
+def test_contact_stops_the_descent() -> None:
+    """The frame is the one at the stop: weaker than at full depth, with the same pattern."""
     caught, through = (3e-3, 2e-3, 0.05), (0.0, 0.0, 0.0)
     misalignment = np.array([caught, through])
     gentle = dataclasses.replace(SILENT, stop_shear=(5e-3, 5e-3))
@@ -189,7 +191,7 @@ def test_results_depend_neither_on_the_batch_nor_on_threads() -> None:
         assert (alone.image[0] == together.image[i]).all()
 
 
-def test_a_part_can_move_to_another_batch() -> None:
+def test_parts_can_be_copied_to_another_batch() -> None:
     rng = np.random.default_rng(5)
     source, target = InsertionAttempts(3), InsertionAttempts(2)
     source.draw(rng)
@@ -205,32 +207,32 @@ def test_a_part_can_move_to_another_batch() -> None:
 
 
 @pytest.mark.parametrize("elastic", [True, False])
-def test_drawn_physics_lies_in_its_ranges(elastic: bool) -> None:
-    drawn = DEFAULT_RANDOMIZATION.sample(np.random.default_rng(0), 500, elastic=elastic)
+def test_sampled_parameters_lie_within_their_ranges(elastic: bool) -> None:
+    sampled = DEFAULT_RANDOMIZATION.sample(np.random.default_rng(0), 500, elastic=elastic)
     for name, limits in {
         "pad_left.kn": (2e3, 1.4e4),
         "right.kd": (0, 100),
         "arm_z.kp": (200, 3e5),
         "part_hole/wall_back.kn": (2.5e3, 2e4),
     }.items():
-        values = drawn.params[name]
+        values = sampled.params[name]
         assert limits[0] <= values.min() and values.max() <= limits[1]
         assert values.max() - values.min() > 0.9 * (limits[1] - limits[0])
-    assert ("pad_left.ks" in drawn.params) == elastic
-    np.testing.assert_array_equal(drawn.params["pad_left.mu"], drawn.params["pad_right.mu"])
-    assert drawn.grasp_force.min() >= 2.5 and drawn.grasp_force.max() <= 16
+    assert ("pad_left.ks" in sampled.params) == elastic
+    np.testing.assert_array_equal(sampled.params["pad_left.mu"], sampled.params["pad_right.mu"])
+    assert sampled.grasp_force.min() >= 2.5 and sampled.grasp_force.max() <= 16
     with pytest.raises(UsageError, match=r"pad_mu must be \(low, high\)"):
         Randomization(pad_mu=(2.0, 1.0))
 
 
-def test_every_drawn_parameter_exists_under_both_laws() -> None:
+def test_sampled_parameters_exist_under_both_friction_laws() -> None:
     for friction in ("viscous", "elastic"):
         attempts = InsertionAttempts(2, scene=insertion_scene(friction=friction))
         attempts.draw(np.random.default_rng(0))
         assert not attempts.attempt(np.random.default_rng(0)).failed.any()
 
 
-def test_a_scene_with_other_markers_is_refused() -> None:
+def test_scene_with_another_marker_grid_raises() -> None:
     task = dataclasses.replace(INSERTION, grid=dataclasses.replace(INSERTION.grid, rows=12))
     assert InsertionAttempts(1, task=task).attempt(np.random.default_rng(0)).image.shape == (1, 4, 12, 10)
     with pytest.raises(UsageError, match="the scene's pads must be left, right with the task's markers"):
