@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.records import plain, restore
+from gelflow.session.records import from_plain, to_plain
 
 FORMAT = 1
 
@@ -244,7 +244,7 @@ def _unfolded(fit: Calibration) -> bool:
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Writes `calibration` to a new file. Raises UsageError when there is one already, or it can't be written."""
-    text = json.dumps({"format": FORMAT, **plain(calibration)}, indent=1) + "\n"
+    text = json.dumps({"format": FORMAT, **to_plain(calibration)}, indent=1) + "\n"
     try:
         with Path(path).open("x", encoding="utf-8") as file:
             file.write(text)
@@ -267,4 +267,4 @@ def load_calibration(path: str | Path) -> Calibration:
         raise UsageError(f"{path} is no calibration: it has no format; gelflow calibrate-camera makes one")
     if written != FORMAT:
         raise UsageError(f"{path} has calibration format {written}; this gelflow reads format {FORMAT}: update gelflow")
-    return restore(Calibration, data, what=str(path))
+    return from_plain(Calibration, data, what=str(path))

@@ -19,7 +19,7 @@ from gelflow.errors import SimulationError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.helper_process import HelperProcess, Messages, connect_to_parent
 from gelflow.observation import Grid
-from gelflow.session.records import plain, restore
+from gelflow.session.records import from_plain, to_plain
 
 Array = NDArray[np.float64]
 _START_LIMIT = 30.0  # [s, wall]
@@ -86,7 +86,7 @@ class SimulatedCellProcess:
             os.ftruncate(file.fileno(), _Shared.size(grid))
             self._shared = _Shared(file.fileno(), grid)
             self._shared.arm.write([*self._tool[0], *self._tool[1]])
-            settings = {"world": plain(self.config), "clock": self._clock.settings}
+            settings = {"world": to_plain(self.config), "clock": self._clock.settings}
             module = "gelflow.hardware_mocks.simulated_cell.process"
             self._helper = HelperProcess.start(module, settings, descriptors=(file.fileno(),))
         try:
@@ -223,7 +223,7 @@ class _Service:
 def main(arguments: list[str]) -> int:
     """Started by `SimulatedCellProcess`, with the shared memory."""
     settings, parent, (memory,) = connect_to_parent(arguments)
-    config = restore(SimulatedCellConfig, settings["world"], what="configuration of the simulated world")
+    config = from_plain(SimulatedCellConfig, settings["world"], what="configuration of the simulated world")
     world = SimulatedCell(ScaledClock(*settings["clock"]), config)
     service = _Service(world, parent, _Shared(memory, config.grid))
     threading.Thread(target=service.answer, daemon=True).start()

@@ -20,7 +20,7 @@ from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import TrackingResult
 from gelflow.session.reader import SessionReader
-from gelflow.session.recover import recover
+from gelflow.session.recovery import recover
 
 MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
 LOOK = GelAppearance(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320, noise=0.5)

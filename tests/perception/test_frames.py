@@ -11,7 +11,7 @@ from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
-from gelflow.session.records import restore, to_json
+from gelflow.session.records import from_plain, to_json
 
 SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
 
@@ -61,7 +61,7 @@ def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() 
     seen = TrackingResult(position, position - rest, all_of_them, ~all_of_them, all_of_them.astype(float), 14, 18, 22.0)
     frame = tactile_frame([seen], [mount], stamp=0.0)
     assert frame.unit == "mm" and np.allclose(frame.shear, [0.3, -0.2], atol=1e-6)
-    assert restore(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
+    assert from_plain(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
     with pytest.raises(UsageError, match="not both"):
         CameraMount(rotation=270, calibration=calibration, pixels_per_mm=15.7)
     with pytest.raises(UsageError, match="calibration is of 14 lines of 18 markers"):

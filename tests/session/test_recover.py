@@ -14,7 +14,7 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.protocols import CameraImage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
-from gelflow.session.recover import recover
+from gelflow.session.recovery import recover
 
 CLOCK = ScaledClock(1.0)
 
@@ -38,16 +38,16 @@ def test_a_kill_at_message_500_loses_at_most_half_a_second(tmp_path: Path) -> No
     path = tmp_path / "killed.mcap"
     done = subprocess.run([sys.executable, "-c", KILLED, str(path)], capture_output=True, text=True, timeout=60)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    with pytest.raises(PeerError, match=r"was not finished.*gelflow recover .*killed\.mcap"):
+    with pytest.raises(PeerError, match=r"is not finished.*gelflow recover .*killed\.mcap"):
         SessionReader(path).open()
-    salvage = recover(path, tmp_path / "saved.mcap")
-    with SessionReader(salvage.path) as reader:
+    report = recover(path, tmp_path / "saved.mcap")
+    with SessionReader(report.path) as reader:
         assert reader.description()["who"] == "killed"
         images = list(reader.records(["/left/image", "/right/image"]))
     assert [record.value.sequence for record in images] == list(range(1, len(images) + 1))
     assert all(len(record.value.data) == 5000 for record in images)
     assert float(done.stdout) - images[-1].stamp <= 0.5
-    assert salvage.messages == len(images) + 1 and salvage.damaged_chunks == 0
+    assert report.messages == len(images) + 1 and report.damaged_chunks == 0
 
 
 def make(path: Path, messages: int = 40) -> Path:
@@ -66,15 +66,15 @@ def test_any_cut_leaves_a_readable_beginning(tmp_path: Path) -> None:
         cut.write_bytes(whole[:length])
         saved.unlink(missing_ok=True)
         try:
-            salvage = recover(cut, saved)
+            report = recover(cut, saved)
         except PeerError as error:
-            assert "not one whole message" in str(error)
+            assert "no complete message" in str(error)
             assert not saved.exists()
             found.append(0)
             continue
         with SessionReader(saved) as reader:
             records = list(reader.records())
-        assert len(records) == salvage.messages
+        assert len(records) == report.messages
         assert [r.value.sequence for r in records[1:]] == list(range(len(records) - 1))
         found.append(len(records))
     assert found == sorted(found) and found[0] == 0 and found[-1] == 41
@@ -89,10 +89,10 @@ def test_damage_within_a_finished_file_is_told_and_the_rest_is_salvaged(tmp_path
     with SessionReader(path) as reader, pytest.raises(PeerError, match=r"is damaged.*gelflow recover") as caught:
         list(reader.records())
     assert "\n" not in str(caught.value)
-    salvage = recover(path, tmp_path / "saved.mcap")
-    assert salvage.damaged_chunks == 1 and 25 < salvage.messages < 41
-    with SessionReader(salvage.path) as reader:
-        assert len(list(reader.records())) == salvage.messages
+    report = recover(path, tmp_path / "saved.mcap")
+    assert report.damaged_chunks == 1 and 25 < report.messages < 41
+    with SessionReader(report.path) as reader:
+        assert len(list(reader.records())) == report.messages
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -118,10 +118,10 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, seed: int) -> N
 
 def test_recover_refuses_what_needs_no_help(tmp_path: Path) -> None:
     path = make(tmp_path / "session.mcap", messages=3)
-    with pytest.raises(UsageError, match="nothing to salvage"):
+    with pytest.raises(UsageError, match="nothing to recover"):
         recover(path, tmp_path / "saved.mcap")
     (tmp_path / "saved.mcap").touch()
-    with pytest.raises(UsageError, match="--output"):
+    with pytest.raises(UsageError, match="--out"):
         recover(path, tmp_path / "saved.mcap")
     (tmp_path / "text").write_text("text")
     with pytest.raises(UsageError, match="is not an MCAP file"):
@@ -145,7 +145,7 @@ def test_a_session_in_progress_is_left_alone(tmp_path: Path) -> None:
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = make(tmp_path / "session.mcap", messages=20)
     assert main(["recover", str(path)]) == 2
-    assert "nothing to salvage" in capsys.readouterr().err
+    assert "nothing to recover" in capsys.readouterr().err
     path.write_bytes(path.read_bytes()[:-5000])
     assert main(["recover", str(path)]) == 0
     assert "21 records" in (out := capsys.readouterr().out) and "bytes" in out

@@ -20,10 +20,10 @@ from gelflow.perception.tracker import MarkerTracker
 from gelflow.policies import checkpoint
 from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
 from gelflow.protocols import CameraImage, Policy
+from gelflow.session.decision_replay import Comparison, PerceptionPipeline, difference, replay
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import Decision, describe_session
-from gelflow.session.replay import Comparison, Perception, difference, replay
 from gelflow.task import INSERTION, InsertionTask
 
 CLOCK = ScaledClock(1.0)
@@ -69,7 +69,7 @@ class EchoPolicy:
         return self.last.copy()
 
 
-PERCEPTION = Perception(SumTracker, sum_frame)
+PERCEPTION = PerceptionPipeline(SumTracker, sum_frame)
 Change = Callable[[Decision], Decision]
 
 
@@ -109,7 +109,9 @@ def run_live(recorder: SessionRecorder, *, change: Change = lambda decision: dec
             recorder.attempt_end({"insertion": insertion, "attempt": attempt})
 
 
-def replayed(path: Path, *, policy: Policy | None = None, perception: Perception = PERCEPTION) -> list[Comparison]:
+def replayed(
+    path: Path, *, policy: Policy | None = None, perception: PerceptionPipeline = PERCEPTION
+) -> list[Comparison]:
     with SessionReader(path) as session:
         return list(replay(session, perception=perception, policy=policy or EchoPolicy(), task=SMALL))
 
@@ -155,7 +157,7 @@ def test_another_policy_and_another_tracker_differ(tmp_path: Path) -> None:
         run_live(recorder)
     other = replayed(tmp_path / "a.mcap", policy=EchoPolicy(1.5))
     assert all(made.flow_difference == 0 and made.action_difference > 0 for made in other)
-    swapped = Perception(lambda sensor: SumTracker(1 - sensor), sum_frame)
+    swapped = PerceptionPipeline(lambda sensor: SumTracker(1 - sensor), sum_frame)
     assert all(made.flow_difference > 0 for made in replayed(tmp_path / "a.mcap", perception=swapped))
 
 
@@ -183,7 +185,7 @@ def test_an_image_that_the_tracker_refuses_matters_only_where_it_was_needed(tmp_
     with SessionReader(tmp_path / "a.mcap") as session:
         data = {record.value.sequence: record.value.data for record in session.records(["/left/image"])}
         first = next(session.decisions())
-    fussy = Perception(FussyTracker, sum_frame)
+    fussy = PerceptionPipeline(FussyTracker, sum_frame)
     FussyTracker.refused = data[first.tracked[0][1]]
     assert not replayed(tmp_path / "a.mcap", perception=fussy)[0].identical
     FussyTracker.refused = data[first.frames[0][0]]
@@ -295,7 +297,7 @@ def test_the_command_s_wrong_input(real_session: Path, capsys: pytest.CaptureFix
         recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
     for arguments, says in [
         ([str(tmp_path / "none.mcap")], "No such file"),
-        ([str(cut)], f"salvage it with: gelflow recover {cut}"),
+        ([str(cut)], f"recover it with: gelflow recover {cut}"),
         ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
         ([str(tmp_path / "moved.mcap")], "name the file with --checkpoint"),
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),

@@ -1,1 +1,5 @@
 """Recorded sessions: write, read, recover and replay MCAP files."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

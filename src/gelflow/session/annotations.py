@@ -1,4 +1,4 @@
-"""Tracked markers as Foxglove's annotations, which its image panel draws over the camera's image."""
+"""Tracked markers as Foxglove image annotations, which its image panel draws over the camera image."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,9 +14,9 @@ MOTION = (0.3, 0.9, 1.0)
 
 
 def annotate(values: Mapping[str, Any], nanoseconds: int) -> ImageAnnotations:
-    """White points for measured markers, orange for inferred ones, lines from where they are at rest.
+    """White points for measured markers, orange ones for inferred markers, lines from the rest positions.
 
-    `values` are the properties of `gelflow.Markers`.
+    `values` are the properties of the JSON schema `gelflow.Markers`.
     """
     position = np.asarray(values["position_px"], dtype=float) + 0.5  # Foxglove's origin is the first pixel's corner
     displacement = np.asarray(values["displacement_px"], dtype=float)

@@ -1,7 +1,7 @@
-"""The channels of a session file: topic, schema and encoding of each. The writer and the tests read this one table.
+"""Topic, schema and encoding of each channel of a session file.
 
-Images, poses and joints use Foxglove's published protobuf schemas, so that Foxglove and Rerun show them; what has no
-standard schema is JSON with a JSON schema beside it.
+Images, poses and joints use Foxglove's published protobuf schemas, so that Foxglove and Rerun display them; all other
+channels are JSON with a JSON schema.
 """
 
 import json
@@ -33,13 +33,14 @@ TOOL_FRAME = "tool"
 
 @dataclass(frozen=True)
 class JsonChannel:
-    """A channel of JSON objects with these properties; those of `required` are always there."""
+    """A channel of JSON objects; `required` names the properties that every object has."""
 
     name: str
     properties: dict[str, Any] = field(default_factory=dict)
     required: tuple[str, ...] = ()
 
     def schema(self) -> bytes:
+        """The JSON schema of the objects, as UTF-8."""
         document = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
             "title": self.name,

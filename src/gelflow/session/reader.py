@@ -1,4 +1,4 @@
-"""Reads a finished session file, record by record, in the order in which things were recorded."""
+"""Reader of finished session files: records in the order of recording."""
 
 import fcntl
 import json
@@ -25,8 +25,8 @@ from gelflow.protocols import CameraImage
 from gelflow.session.channels import JSON, PROTOBUF
 from gelflow.session.records import FORMAT, SENSORS, Decision
 
-# All that a damaged file has been seen to raise inside the libraries that read it.
-DAMAGE = (
+# Exceptions of the libraries that decode a damaged file.
+DECODE_ERRORS = (
     McapError,
     DecodeError,
     struct.error,
@@ -43,18 +43,20 @@ DAMAGE = (
 
 @dataclass(frozen=True)
 class Record:
-    """One record. `value` depends on the topic: `CameraImage`, `Pose`, `Decision`, joint angles [rad] by name
-    (dict), a table (dict) of a JSON topic, or the protobuf message of the other standard schemas.
+    """One record.
+
+    The type of `value` depends on the topic: `CameraImage`, `Pose` in the robot's base frame, `Decision`, joint angles
+    [rad] by name (dict), an object (dict) of a JSON topic, or the protobuf message of another standard schema.
     """
 
     topic: str
-    time: float  # when it was recorded, robot time [s]
-    stamp: float  # when it was measured or commanded, robot time [s]
+    time: float  # of the recording, robot time [s]
+    stamp: float  # of the measurement or command, robot time [s]
     value: Any
 
 
 class SessionReader:
-    """Reads the session at `path`; a context manager, or `open` and `close`."""
+    """Reads the session at `path`. Use it as a context manager, or call `open` and `close`."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -64,8 +66,8 @@ class SessionReader:
     def open(self) -> "SessionReader":
         """Open and check the file.
 
-        Raises UsageError when it is missing, is no gelflow session, or has a newer format, and PeerError when it
-        was not finished (`gelflow recover` then helps) or is damaged.
+        Raises UsageError when the file is missing, is not a gelflow session or has a newer format, and PeerError when
+        it is unfinished or damaged (`gelflow recover` then copies its complete records).
         """
         stream = open_recording(self.path)
         try:
@@ -73,7 +75,7 @@ class SessionReader:
                 raise PeerError(self._unfinished(stream))
             self._reader = SeekingReader(stream, validate_crcs=True)
             self._check_format(self._reader)
-        except DAMAGE as error:
+        except DECODE_ERRORS as error:
             stream.close()
             if isinstance(error, UsageError):
                 raise
@@ -96,24 +98,27 @@ class SessionReader:
         self.close()
 
     def description(self) -> dict[str, Any]:
-        """What `SessionRecorder.metadata` wrote. Raises PeerError when the session has none."""
+        """The description written by `SessionRecorder.metadata`. Raises PeerError when the session has none."""
         for record in self.records(["/session"]):
             return dict(record.value)
-        raise PeerError(f"{self.path} holds no session description; it was recorded without `metadata`")
+        raise PeerError(f"{self.path} has no session description: it was recorded without `SessionRecorder.metadata`")
 
     def counts(self) -> dict[str, int]:
-        """How many records each topic has; topics without any are left out."""
+        """Number of records per topic; topics without records are omitted."""
         summary = self._opened().get_summary()
         if summary is None or summary.statistics is None:
             return {}
-        found = summary.statistics.channel_message_counts
-        return {channel.topic: found[key] for key, channel in summary.channels.items() if found.get(key)}
+        counts = summary.statistics.channel_message_counts
+        return {channel.topic: counts[key] for key, channel in summary.channels.items() if counts.get(key)}
 
     def records(self, topics: Collection[str] | None = None) -> Iterator[Record]:
-        """All records, or those of `topics`, in the order of recording. Raises PeerError where the file is damaged."""
+        """All records, or those of `topics`, in the order of recording.
+
+        Raises UsageError for an unknown topic and PeerError where the file is damaged.
+        """
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])
-            raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; a session has {known}")
+            raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; the topics of a session are {known}")
         messages = self._opened().iter_messages(topics)
         while True:
             try:
@@ -121,12 +126,12 @@ class SessionReader:
                 value = _decode(channel.topic, message)
             except StopIteration:
                 return
-            except DAMAGE as error:
+            except DECODE_ERRORS as error:
                 raise self._damaged(error) from error
             yield Record(channel.topic, message.log_time / 1e9, message.publish_time / 1e9, value)
 
     def decisions(self) -> Iterator[Decision]:
-        """All decisions in their order."""
+        """All decisions, in order."""
         for record in self.records(["/decision"]):
             yield record.value
 
@@ -144,33 +149,33 @@ class SessionReader:
                         f"{self.path} has session format {written}; this gelflow reads format {FORMAT}: update gelflow"
                     )
                 return
-        raise UsageError(f"{self.path} is an MCAP file, but no session that gelflow recorded; name one of gelflow's")
+        raise UsageError(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
 
     def _unfinished(self, stream: BinaryIO) -> str:
         if is_being_recorded(stream):
             return f"{self.path} is still being recorded; wait until the recorder has closed it"
-        return f"{self.path} was not finished, its recorder was killed; salvage it with: gelflow recover {self.path}"
+        return f"{self.path} is not finished, its recorder was killed; recover it with: gelflow recover {self.path}"
 
     def _damaged(self, error: BaseException) -> PeerError:
         cause = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        return PeerError(f"{self.path} is damaged ({cause}); salvage what is whole with: gelflow recover {self.path}")
+        return PeerError(f"{self.path} is damaged ({cause}); recover it with: gelflow recover {self.path}")
 
 
 def open_recording(path: Path) -> BinaryIO:
-    """Open an MCAP file for reading. Raises UsageError when there is none."""
+    """Open an MCAP file for reading. Raises UsageError when the file is missing or has another format."""
     try:
         stream = path.open("rb")
     except OSError as error:
         raise UsageError(f"cannot open {path}: {error.strerror}; name a recorded session (.mcap)") from error
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
         stream.close()
-        raise UsageError(f"{path} is not an MCAP file; name a session that gelflow recorded")
+        raise UsageError(f"{path} is not an MCAP file; name a session recorded by gelflow")
     stream.seek(0)
     return stream
 
 
 def is_finished(stream: BinaryIO) -> bool:
-    """Whether an MCAP file ends as a finished one does."""
+    """Whether an MCAP file ends with the closing magic bytes."""
     size = stream.seek(0, 2)
     stream.seek(max(0, size - len(MCAP0_MAGIC)))
     finished = size > 2 * len(MCAP0_MAGIC) and stream.read() == MCAP0_MAGIC
@@ -179,7 +184,7 @@ def is_finished(stream: BinaryIO) -> bool:
 
 
 def is_being_recorded(stream: BinaryIO) -> bool:
-    """Whether a recorder lives that holds this file."""
+    """Whether a running recorder holds the lock of this file."""
     try:
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
@@ -201,6 +206,8 @@ def _decode(topic: str, message: Message) -> Any:
     if topic == "/arm/joints":
         return {joint.name: joint.position for joint in decoded.joints}
     if isinstance(decoded, PoseInFrame):
-        position, turn = decoded.pose.position, decoded.pose.orientation
-        return Pose(np.array([position.x, position.y, position.z]), np.array([turn.w, turn.x, turn.y, turn.z]))
+        position, rotation = decoded.pose.position, decoded.pose.orientation
+        return Pose(
+            np.array([position.x, position.y, position.z]), np.array([rotation.w, rotation.x, rotation.y, rotation.z])
+        )
     return decoded

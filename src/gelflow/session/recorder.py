@@ -1,4 +1,4 @@
-"""Records a session to an MCAP file: nothing is dropped in silence, and a crash loses at most half a second."""
+"""Recorder of sessions as MCAP files. It never drops a record silently; a crash loses at most half a second."""
 
 import fcntl
 import os
@@ -26,11 +26,11 @@ from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.annotations import annotate
 from gelflow.session.channels import BASE_FRAME, JSON, PROTOBUF, TOOL_FRAME
-from gelflow.session.records import FORMAT, SENSORS, Decision, plain, to_json
+from gelflow.session.records import FORMAT, SENSORS, Decision, to_json, to_plain
 
-CHUNK = 64 * 1024  # bytes; with the default of 1 MB a killed recorder loses many more records
-FLUSH_PERIOD = 0.25  # robot time [s]: half of what a crash may lose
-PATIENCE = 10.0  # wall time that the disk gets to finish [s]
+CHUNK_BYTES = 64 * 1024  # with the default of 1 MB a killed recorder loses many more records
+FLUSH_PERIOD = 0.25  # half of the largest loss by a crash [s, robot time]
+DISK_TIMEOUT = 10.0  # for the disk to store everything [s, wall]
 
 _Item = tuple[str, int, int, int, bytes]  # topic, log time [ns], publish time [ns], sequence, data
 
@@ -41,11 +41,11 @@ def nanoseconds(seconds: float) -> int:
 
 
 class SessionRecorder:
-    """Writes a session to `path`. Every method may be called from any thread and returns without waiting for the
-    disk, except `attempt_end` and `close`, which return when everything so far is safe on it.
+    """Writes a session to `path`.
 
-    When a record cannot be queued or written the call raises PeerError, and so does every later call: whoever
-    records must stop the attempt. The file is then unfinished; `gelflow recover` salvages it.
+    Every method may be called from any thread. Methods return without waiting for the disk, except `attempt_end` and
+    `close`, which return when all records are stored. When a record cannot be queued or written, the call and every
+    later one raise PeerError, and the caller must stop the attempt. `gelflow recover` recovers the unfinished file.
     """
 
     def __init__(self, path: str | Path, clock: Clock, *, queue_size: int = 4096) -> None:
@@ -65,38 +65,38 @@ class SessionRecorder:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             stream = self.path.open("xb")
         except OSError as error:
-            raise UsageError(f"cannot create {self.path}: {error.strerror}; name a file one can write") from error
-        # Held as long as the recorder lives, so that nobody takes a session in progress for a crashed one.
+            raise UsageError(f"cannot create {self.path}: {error.strerror}; use a writable folder") from error
+        # The lock distinguishes a session in progress from a crashed one.
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._thread = threading.Thread(target=self._write_all, args=(stream,), name="recorder", daemon=True)
         self._thread.start()
         return self
 
-    # What is recorded
+    # Records
 
     def metadata(self, description: Mapping[str, Any]) -> None:
-        """The session's description (`records.describe_session`); once, before anything else is of use."""
+        """Record the description of the session (`describe_session`). Raises UsageError on a second call."""
         if self._described:
-            raise UsageError("the session is described already; metadata is written once")
+            raise UsageError("the session already has a description; call metadata once")
         self._described = True
-        self._json("/session", {"format": FORMAT, **plain(description)})
+        self._json("/session", {"format": FORMAT, **to_plain(description)})
 
     def image(self, sensor: int, image: CameraImage) -> None:
-        """One camera frame as received. `sensor` 0 is the left finger."""
+        """Record a camera image as received. `sensor` 0 is the left finger."""
         name = _name(sensor)
         message = CompressedImage(frame_id=f"{name}_gel", data=image.data, format=image.encoding)
         message.timestamp.FromNanoseconds(nanoseconds(image.stamp))
         self._put(f"/{name}/image", message.SerializeToString(), stamp=image.stamp, sequence=image.sequence)
 
     def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
-        """Where the markers were in the image of that stamp: the properties of `gelflow.Markers`, but the stamp."""
+        """Record the markers of the image with that stamp; `values` are the properties of `gelflow.Markers`."""
         name = _name(sensor)
         self._json(f"/{name}/markers", {"stamp": stamp, **values}, stamp=stamp)
-        drawn = annotate(values, nanoseconds(stamp))  # for people: over the image
+        drawn = annotate(values, nanoseconds(stamp))  # for viewers
         self._put(f"/{name}/annotations", drawn.SerializeToString(), stamp=stamp)
 
     def arm_state(self, state: ArmState) -> None:
-        """Measured pose, joints and status of the arm."""
+        """Record the measured pose, joints and status of the arm."""
         self._pose("/arm/pose", state.stamp, state.position, state.quaternion)
         transform = FrameTransform(parent_frame_id=BASE_FRAME, child_frame_id=TOOL_FRAME)
         transform.timestamp.FromNanoseconds(nanoseconds(state.stamp))
@@ -112,31 +112,31 @@ class SessionRecorder:
         self._json("/arm/status", {name: getattr(state, name) for name in names}, stamp=state.stamp)
 
     def arm_command(self, stamp: float, position: ArrayLike, quaternion: ArrayLike, *, kind: str) -> None:
-        """A reference for the arm: [m] and w x y z, in the base frame.
+        """Record a reference for the arm: position [m] and quaternion w x y z in the base frame.
 
-        `kind` is "command" for what the runner asked for, "applied" for what the driver sent in the end.
+        `kind` is "command" for the runner's reference and "applied" for the reference that the driver sent.
         """
         if kind not in ("command", "applied"):
             raise UsageError(f"kind of an arm command must be 'command' or 'applied', got {kind!r}")
         self._pose(f"/arm/{kind}", stamp, position, quaternion)
 
     def gripper_state(self, state: GripperState) -> None:
-        """Measured state of the gripper."""
+        """Record the measured state of the gripper."""
         self._json("/gripper/state", state, stamp=state.stamp)
 
     def gripper_command(self, stamp: float, name: str, values: Mapping[str, Any]) -> None:
-        """A command to the gripper by name, with its arguments in SI units."""
+        """Record a command to the gripper: its name, and its arguments in SI units."""
         self._json("/gripper/command", {"stamp": stamp, "name": name, "values": values}, stamp=stamp)
 
     def decision(self, decision: Mapping[str, Any]) -> None:
-        """A decision: `Decision(...).to_json()`. Raises UsageError when a replay could not repeat it."""
+        """Record a decision, `Decision(...).to_json()`. Raises UsageError when a replay could not recompute it."""
         try:
-            checked = Decision.from_json(plain(decision))
+            checked = Decision.from_json(to_plain(decision))
         except PeerError as error:
             raise UsageError(str(error)) from error
         stamp = self._clock.now()
-        self._json("/decision", {**plain(decision), "stamp": stamp}, stamp=stamp)
-        # For people: all channels side by side. A replay reads the numbers of the decision itself.
+        self._json("/decision", {**to_plain(decision), "stamp": stamp}, stamp=stamp)
+        # For viewers: all channels side by side. A replay reads the numbers of the decision record.
         channels, rows, cols = checked.flow.shape
         picture = np.ascontiguousarray(checked.flow.transpose(1, 0, 2).reshape(rows, channels * cols), dtype="<f4")
         message = RawImage(
@@ -146,39 +146,39 @@ class SessionRecorder:
         self._put("/flow_map", message.SerializeToString(), stamp=stamp)
 
     def event(self, name: str, values: Mapping[str, Any] | None = None) -> None:
-        """Anything that happened: a grasp, a stop with its reason, an operator's word."""
+        """Record an event: a grasp, a stop with its reason, an operator's answer."""
         stamp = self._clock.now()
         self._json("/event", {"stamp": stamp, "name": name, "values": values or {}}, stamp=stamp)
 
     def attempt_end(self, attempt: Mapping[str, Any] | None = None) -> None:
-        """Record how an attempt went (insertion, attempt, outcome, whatever else is known) and make all safe.
+        """Record the result of an attempt (insertion, attempt, outcome and more) and store all records on the disk.
 
-        Returns when everything recorded so far is on the disk; raises PeerTimeout when that takes too long.
+        Returns when all records so far are stored. Raises PeerTimeout when that takes longer than `DISK_TIMEOUT`.
         """
         if attempt is not None:
             self._json("/attempt", attempt)
         done = threading.Event()
         self._enqueue(done)
-        given_up = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + DISK_TIMEOUT
         while not done.wait(0.05):
             self._check()
-            if time.monotonic() > given_up:
-                raise PeerTimeout(f"{self.path}: not stored after {PATIENCE:g} s; is the disk full or slow?")
+            if time.monotonic() > deadline:
+                raise PeerTimeout(f"{self.path}: not stored after {DISK_TIMEOUT:g} s; is the disk full or slow?")
 
     def close(self) -> None:
-        """Write the index, make all safe and close. Raises PeerError when the file could not be finished."""
+        """Write the index, store all records and close. Raises PeerError when the file cannot be finished."""
         if self._thread is None:
             return
         thread, self._thread = self._thread, None
         if self._failure is None:
             try:
-                self._queue.put(None, timeout=PATIENCE)
+                self._queue.put(None, timeout=DISK_TIMEOUT)
             except queue.Full:
                 self._fail("the disk is too slow")
-        thread.join(PATIENCE)
+        thread.join(DISK_TIMEOUT)
         self._check()
         if not self._finished:
-            raise PeerTimeout(f"{self.path}: not finished after {PATIENCE:g} s; `gelflow recover` salvages it")
+            raise PeerTimeout(f"{self.path}: not finished after {DISK_TIMEOUT:g} s; recover it with `gelflow recover`")
 
     def __enter__(self) -> "SessionRecorder":
         return self if self._thread is not None else self.open()
@@ -189,9 +189,9 @@ class SessionRecorder:
         except GelflowError as failure:
             if error is None:
                 raise
-            error.add_note(str(failure))  # the first cause is what must be seen
+            error.add_note(str(failure))  # the first error is the cause
 
-    # On its way to the disk
+    # Queue
 
     def _json(self, topic: str, values: Any, *, stamp: float | None = None) -> None:
         self._put(topic, to_json(values), stamp=stamp)
@@ -225,15 +225,15 @@ class SessionRecorder:
             raise PeerError(f"recording {self.path} failed: {self._failure}; stop, then `gelflow recover` the file")
 
     def _write_all(self, stream: BinaryIO) -> None:
-        """The writer thread: everything that touches the file."""
+        """Body of the writer thread, the only one that accesses the file."""
         try:
             with stream:
                 self._write(stream)
-        except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it, whatever it was
+        except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it
             self._fail(str(error) or type(error).__name__)
 
     def _write(self, stream: BinaryIO) -> None:
-        writer = Writer(stream, chunk_size=CHUNK)
+        writer = Writer(stream, chunk_size=CHUNK_BYTES)
         writer.start(profile="", library=f"gelflow {__version__}")
         writer.add_metadata("gelflow", {"format": str(FORMAT), "version": __version__})
         channels = _register(writer)
@@ -247,7 +247,7 @@ class SessionRecorder:
             self._finished = True
 
     def _write_queue(self, writer: Writer, channels: Mapping[str, int], syncer: "_Syncer") -> bool:
-        """Everything that is queued, until the recorder is closed (True) or fails (False)."""
+        """Write the queue until the recorder is closed (True) or fails (False)."""
         due = self._clock.now() + FLUSH_PERIOD
         dirty = False
         while self._failure is None:
@@ -273,8 +273,10 @@ class SessionRecorder:
 
 
 class _Syncer:
-    """Has the disk store what was written, in a thread of its own: a slow disk must not keep records from the file,
-    where they survive the end of this program if not that of the computer."""
+    """Calls fsync in a separate thread, so that a slow disk does not delay writes to the file.
+
+    Written records survive a crash of this program; stored ones also survive a crash of the computer.
+    """
 
     def __init__(self, descriptor: int, fail: Callable[[str], None]) -> None:
         self._descriptor = descriptor
@@ -284,7 +286,7 @@ class _Syncer:
         self._thread = threading.Thread(target=self._run, name="recorder sync", daemon=True)
 
     def request(self, done: threading.Event | None) -> None:
-        """Store all that was written; `done` is set when it is."""
+        """Store all written records, then set `done`."""
         self._requests.put(done)
 
     def __enter__(self) -> "_Syncer":

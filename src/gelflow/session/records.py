@@ -1,4 +1,4 @@
-"""What a session holds: topics, the decision record, and how our values become plain JSON and back."""
+"""Contents of a session: the decision record, the description, and conversion to and from plain JSON data."""
 
 import dataclasses
 import datetime
@@ -23,50 +23,51 @@ from gelflow.task import InsertionTask
 
 FORMAT = 1
 SENSORS = ("left", "right")  # topic names of sensor 0 and 1
-VERSIONED = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
+VERSIONED_PACKAGES = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
 Record = TypeVar("Record")
 
 
-def plain(value: Any) -> Any:
-    """`value` as data that strict JSON can hold; numbers come back bit for bit.
+def to_plain(value: Any) -> Any:
+    """`value` as plain data for strict JSON; numbers are restored bit for bit.
 
-    NaN and the infinities become the strings "NaN", "Infinity" and "-Infinity", as in protobuf's JSON form, so that
-    a bad measurement is recorded and does not make the file unreadable. Raises UsageError on other types.
+    NaN and the infinities become the strings "NaN", "Infinity" and "-Infinity", as in protobuf's JSON mapping, so that
+    an invalid measurement does not make the file unreadable. Raises UsageError for unsupported types.
     """
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return to_plain(value.tolist())
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return to_plain(value.item())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return plain({field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
+        return to_plain({field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [plain(item) for item in value]
+        return [to_plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else ("Infinity" if value > 0 else "-Infinity")
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, Path):
         return str(value)
-    raise UsageError(f"a record holds a {type(value).__name__}; it can hold numbers, text, lists, tables and arrays")
+    raise UsageError(f"a record cannot contain a {type(value).__name__}, only numbers, text, lists, tables and arrays")
 
 
 def to_json(value: Any) -> bytes:
-    """`plain` data as UTF-8 JSON. Raises UsageError on types that JSON cannot hold."""
-    return json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode()
+    """`value` as UTF-8 JSON. Raises UsageError for unsupported types."""
+    return json.dumps(to_plain(value), allow_nan=False, separators=(",", ":")).encode()
 
 
-def restore(kind: type[Record], data: Any, *, what: str) -> Record:
-    """A dataclass from its `plain` form; lists become tuples, and tables dataclasses where a field holds one.
+def from_plain(kind: type[Record], data: Any, *, what: str) -> Record:
+    """A dataclass from the result of `to_plain`; nested dataclasses and arrays are restored, lists become tuples.
 
-    Raises UsageError when `data` does not fit: it was then written by another version.
+    Raises UsageError when `data` does not match `kind`, for example because another version wrote it. `what` names
+    the data in the message.
     """
     names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     if not isinstance(data, Mapping) or set(data) - names:
         extra = f"unknown keys {sorted(set(data) - names)}" if isinstance(data, Mapping) else f"{data!r}"
         known = ", ".join(sorted(names))
-        raise UsageError(f"{what}: expected the keys {known}, got {extra}; is it of another version?")
+        raise UsageError(f"{what}: expected the keys {known}, got {extra}; was it written by another version?")
     fields = typing.get_type_hints(kind)
     try:
         return kind(**{key: _field(fields[key], value, f"{what}, {key}") for key, value in data.items()})
@@ -79,7 +80,7 @@ def _field(wanted: Any, value: Any, what: str) -> Any:
         return np.asarray(value)
     for kind in (wanted, *typing.get_args(wanted)):
         if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
-            return restore(kind, value, what=what)
+            return from_plain(kind, value, what=what)
     return _tuples(value)
 
 
@@ -89,10 +90,10 @@ def _tuples(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Decision:
-    """One decision of the policy, with everything that is needed to make it again from the recorded images.
+    """One decision of the policy, with all data that a replay needs to recompute it from the recorded images.
 
-    For each sensor a fresh tracker is started on the first image of `tracked` and given the others in their order;
-    the tactile frames made on the way are picked by `reference` and `frames`.
+    For each sensor a new tracker starts on the first image of `tracked` and then tracks the others in order;
+    `reference` and `frames` select the tactile frames of the observation.
     """
 
     insertion: int  # counts insertions from 0; the policy is reset when it changes
@@ -103,33 +104,33 @@ class Decision:
     flow: NDArray[np.float32]  # the flow map, shape (frames * sensors * 2, rows, cols)
     divisor: float  # of the flow map, in `unit`
     unit: str
-    action: NDArray[np.float64]  # what the policy said: dx [m], dy [m], dtheta [rad] in the gripper's frame
-    correction: NDArray[np.float64]  # what was sent to the arm after it: x [m], y [m], yaw [rad], base frame
+    action: NDArray[np.float64]  # output of the policy: dx [m], dy [m], dtheta [rad] in the gripper's frame
+    correction: NDArray[np.float64]  # resulting target of the arm: x [m], y [m], yaw [rad], base frame
     depths: tuple[float, ...] = ()  # depth of the reference and of each frame below the attempt's start [m]
 
     def __post_init__(self) -> None:
         sensors = len(self.tracked)
         for name, images in [("reference", self.reference), *(("frames", frame) for frame in self.frames)]:
             if len(images) != sensors:
-                raise UsageError(f"decision: {name} names {len(images)} images, but {sensors} sensors were tracked")
+                raise UsageError(f"decision: {name} has {len(images)} images, but {sensors} sensors were tracked")
             for sensor, sequence in enumerate(images):
                 if sequence not in self.tracked[sensor]:
                     raise UsageError(f"decision: image {sequence} of sensor {sensor} in {name} was never tracked")
         if not self.frames:
-            raise UsageError("decision: at least one frame is needed beside the reference")
+            raise UsageError("decision: it needs at least one frame in addition to the reference")
 
     @classmethod
     def of(cls, observation: FlowMap, **values: Any) -> "Decision":
-        """A decision about `observation`; the other fields by name."""
+        """A decision for `observation`; `values` are the other fields."""
         return cls(flow=observation.image, divisor=observation.divisor, unit=observation.unit, **values)
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, for `SessionRecorder.decision`."""
-        return {**plain(self), "flow": plain(self.flow.reshape(-1)), "flow_shape": list(self.flow.shape)}
+        return {**to_plain(self), "flow": to_plain(self.flow.reshape(-1)), "flow_shape": list(self.flow.shape)}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "Decision":
-        """The reverse of `to_json`. Raises PeerError when the record lacks something."""
+        """Inverse of `to_json`. Raises PeerError when the record is incomplete."""
         try:
             flow = np.array([float(v) for v in data["flow"]], dtype=np.float32).reshape(data["flow_shape"])
             return cls(
@@ -151,7 +152,7 @@ class Decision:
 
 
 def file_digest(path: str | Path) -> str:
-    """SHA-256 of a file's bytes, in hex: names the checkpoint in a session. Raises UsageError if unreadable."""
+    """SHA-256 of a file, in hex; identifies the checkpoint of a session. Raises UsageError if unreadable."""
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as error:
@@ -159,9 +160,9 @@ def file_digest(path: str | Path) -> str:
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what decides a replay's numbers, with the machine's kind."""
+    """Versions of the packages that affect the numbers of a replay, and the machine type."""
     versions = {"gelflow": __version__, "python": platform.python_version(), "machine": platform.machine()}
-    for package in VERSIONED:
+    for package in VERSIONED_PACKAGES:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
@@ -178,11 +179,11 @@ def describe_session(
     lab: Any = None,
     **more: Any,
 ) -> dict[str, Any]:
-    """The description that `SessionRecorder.metadata` takes: what a replay needs, and what a reader will ask for.
+    """The description of a session for `SessionRecorder.metadata`; contains all data that a replay needs.
 
-    `trackers` and `mounts` are per sensor the tracker's configuration and the camera's mount (dataclasses or plain
-    data); `checkpoint` is the policy's file, stored by path and digest; `lab` the lab configuration; anything else
-    (clock factor, seed, who presents the parts) is kept as it is.
+    `trackers` and `mounts` are the tracker configuration and the camera mount of each sensor (dataclasses or plain
+    data). `checkpoint` is the policy's file, stored as path and digest; `lab` is the lab configuration; further
+    values (clock factor, seed) are stored as given. Raises UsageError when a sensor lacks a tracker or a mount.
     """
     if not len(trackers) == len(mounts) == task.sensors:
         raise UsageError(f"expected {task.sensors} trackers and mounts, got {len(trackers)} and {len(mounts)}")
@@ -201,4 +202,4 @@ def describe_session(
         "versions": software_versions(),
         **more,
     }
-    return dict(plain(described))
+    return dict(to_plain(described))

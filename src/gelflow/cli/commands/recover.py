@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gelflow.session.recover import recover
+from gelflow.session.recovery import recover
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -15,12 +15,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     target = args.output or args.file.with_name(f"{args.file.stem}.recovered.mcap")
-    salvage = recover(args.file, target)
+    report = recover(args.file, target)
     console = Console(highlight=False)
-    console.print(f"{salvage.messages} records over {salvage.duration:.2f} s of robot time are whole", markup=False)
-    if salvage.lost_bytes:
-        console.print(f"lost: {salvage.lost_bytes} bytes of a record that was cut off at the end", markup=False)
-    if salvage.damaged_chunks:
-        console.print(f"lost: {salvage.damaged_chunks} chunks or records with damaged contents", markup=False)
-    console.print(f"written: {salvage.path}", markup=False, soft_wrap=True)
+    console.print(f"{report.messages} records over {report.duration:.2f} s of robot time are whole", markup=False)
+    if report.lost_bytes:
+        console.print(f"lost: {report.lost_bytes} bytes of a record that was cut off at the end", markup=False)
+    if report.damaged_chunks:
+        console.print(f"lost: {report.damaged_chunks} chunks or records with damaged contents", markup=False)
+    console.print(f"written: {report.path}", markup=False, soft_wrap=True)
     return 0

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
+from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import file_digest, restore, software_versions
-from gelflow.session.replay import Comparison, Perception, replay
+from gelflow.session.records import file_digest, from_plain, software_versions
 from gelflow.task import InsertionTask
 
 
@@ -42,22 +42,22 @@ def run(args: argparse.Namespace) -> int:
         return 1
     console.print(_table(comparisons))
     if args.picture:
-        from gelflow.session.picture import draw_decisions
+        from gelflow.session.decision_picture import draw_decisions
 
         draw_decisions([comparison.recorded for comparison in comparisons], task.grid, args.picture)
         console.print(f"picture: {args.picture}", markup=False, soft_wrap=True)
     return _verdict(console, comparisons)
 
 
-def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, Perception]:
+def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
     """Task and perception as the session describes them. Raises PeerError when the description lacks a part."""
     from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
     from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 
     try:
         task = InsertionTask.from_json(dict(description["task"]))
-        mounts = [restore(CameraMount, mount, what="camera mount") for mount in description["mounts"]]
-        configs = [restore(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
+        mounts = [from_plain(CameraMount, mount, what="camera mount") for mount in description["mounts"]]
+        configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
     except KeyError as error:
         raise PeerError(f"the session's description lacks {error}; record it with describe_session") from error
 
@@ -76,7 +76,7 @@ def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, Perception]:
     def frame(trackeds: Sequence[TrackingResult], stamp: float) -> TactileFrame:
         return tactile_frame(trackeds, mounts, stamp)
 
-    return task, Perception(Tracker, frame)
+    return task, PerceptionPipeline(Tracker, frame)
 
 
 def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:

@@ -1,4 +1,4 @@
-"""Salvages what a killed recorder, or a damaged disk, has left of a session: every whole record, into a new file."""
+"""Recovery of unfinished or damaged sessions: copies every complete record into a new file."""
 
 import contextlib
 import os
@@ -17,69 +17,69 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.reader import DAMAGE, SessionReader, is_being_recorded, open_recording
-from gelflow.session.recorder import CHUNK
+from gelflow.session.reader import DECODE_ERRORS, SessionReader, is_being_recorded, open_recording
+from gelflow.session.recorder import CHUNK_BYTES
 
 
 @dataclass(frozen=True)
-class Salvage:
-    """What was found in an unfinished or damaged session."""
+class RecoveryReport:
+    """Result of a recovery."""
 
-    path: Path  # of the new file
-    messages: int
-    duration: float  # from the first to the last salvaged message [s]
-    lost_bytes: int  # at the end of the file, in a record that was cut off
-    damaged_chunks: int  # whole by length, but with wrong contents: left out
+    path: Path  # the new file
+    messages: int  # number of recovered messages
+    duration: float  # from the first to the last recovered message [s]
+    lost_bytes: int  # of an incomplete record at the end of the file
+    damaged_chunks: int  # of complete length but with invalid contents; not copied
 
 
-def recover(source: str | Path, target: str | Path) -> Salvage:
-    """Copy every whole record of `source` into the finished session `target`, which must not exist.
+def recover(source: str | Path, target: str | Path) -> RecoveryReport:
+    """Copy every complete record of `source` into the finished session `target`, which must not exist.
 
-    Raises UsageError when `source` is finished and whole (nothing to salvage) or a path is wrong, and PeerError when
-    not one message is whole.
+    Raises UsageError when `source` is finished and undamaged or a path is wrong, and PeerError when `source` contains
+    no complete message.
     """
     source, target = Path(source), Path(target)
     if target.exists():
-        raise UsageError(f"{target} exists; name another file with --output")
+        raise UsageError(f"{target} exists; name another file with --out")
     partial = target.with_name(target.name + ".part")
-    _refuse_whole(source)
+    _check_not_whole(source)
     with open_recording(source) as stream:
         if is_being_recorded(stream):
             raise UsageError(f"{source} is still being recorded; wait until the recorder has closed it")
         try:
             with partial.open("wb") as out:
                 copy = _Copy(out)
-                for opcode, data in _whole_records(stream, copy):
+                for opcode, data in _complete_records(stream, copy):
                     copy.take(opcode, data)
                 copy.finish(source)
             if copy.messages == 0:
-                raise PeerError(f"{source} holds not one whole message; there is nothing to salvage")
+                raise PeerError(f"{source} contains no complete message; there is nothing to recover")
             partial.replace(target)
         except OSError as error:
-            raise UsageError(f"cannot write {target}: {error.strerror}; name a file one can write") from error
+            raise UsageError(f"cannot write {target}: {error.strerror}; use a writable folder") from error
         finally:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
     span = (copy.last - copy.first) / 1e9
-    return Salvage(target, copy.messages, span, copy.lost, copy.damaged)
+    return RecoveryReport(target, copy.messages, span, copy.lost, copy.damaged)
 
 
-def _refuse_whole(source: Path) -> None:
+def _check_not_whole(source: Path) -> None:
     try:
         with SessionReader(source) as session:
             for _ in session.records():
                 pass
     except PeerError:
         return
-    raise UsageError(f"{source} is finished and whole; there is nothing to salvage, read it as it is")
+    raise UsageError(f"{source} is finished and undamaged; there is nothing to recover")
 
 
 class _Copy:
-    """Writes salvaged records to a new file, under new channel numbers."""
+    """Writes recovered records to a new file, under new channel numbers."""
 
     def __init__(self, out: BinaryIO) -> None:
         self._out = out
-        self._writer = Writer(out, chunk_size=CHUNK)
+        self._writer = Writer(out, chunk_size=CHUNK_BYTES)
         self._writer.start(library=f"gelflow {__version__} recover")
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
@@ -87,7 +87,7 @@ class _Copy:
         self.first = self.last = 0
 
     def take(self, opcode: int, data: bytes) -> None:
-        """One top-level record. What cannot be read is counted as damaged."""
+        """Copy one top-level record; an unreadable one is counted as damaged."""
         stream = ReadDataStream(BytesIO(data))
         records: list[McapRecord] = []
         try:
@@ -104,7 +104,7 @@ class _Copy:
                 self._writer.add_metadata(metadata.name, metadata.metadata)
             for record in records:
                 self._put(record)
-        except DAMAGE:
+        except DECODE_ERRORS:
             self.damaged += 1
 
     def _put(self, record: McapRecord) -> None:
@@ -129,10 +129,10 @@ class _Copy:
         os.fsync(self._out.fileno())
 
 
-def _whole_records(stream: BinaryIO, copy: _Copy) -> Iterator[tuple[int, bytes]]:
-    """Top-level records (opcode, contents) up to the first that is cut off.
+def _complete_records(stream: BinaryIO, copy: _Copy) -> Iterator[tuple[int, bytes]]:
+    """Top-level records (opcode, contents) up to the first incomplete one.
 
-    The lengths are checked here because the library's own reader takes a short read for a short record.
+    Lengths are checked here because the library's reader takes a short read for a short record.
     """
     size = stream.seek(0, 2)
     position = stream.seek(len(MCAP0_MAGIC))

@@ -1,7 +1,7 @@
-"""Makes each recorded decision again from the recorded images, and compares.
+"""Replay of a session: recomputes each decision from the recorded images and compares it with the recorded one.
 
-The tracker, the step from tracked markers to tactile frames, and the policy are handed in: this module knows only what
-a session holds and in which order a live run used it.
+The tracker, the conversion to tactile frames and the policy are arguments. This module depends only on the contents of
+a session and on the order in which the live run used them.
 """
 
 from collections import Counter
@@ -21,7 +21,7 @@ from gelflow.task import InsertionTask
 
 
 class ImageTracker(Protocol):
-    """Follows the markers of one sensor from image to image (compressed bytes). What it returns is opaque here."""
+    """Tracks the markers of one sensor from image to image (compressed bytes). The result type is opaque here."""
 
     def start(self, data: bytes) -> Any: ...
 
@@ -29,42 +29,43 @@ class ImageTracker(Protocol):
 
 
 @dataclass(frozen=True)
-class Perception:
-    """The way from images to tactile frames, the same as in the live run."""
+class PerceptionPipeline:
+    """Conversion of images to tactile frames, the same as in the live run."""
 
-    tracker: Callable[[int], ImageTracker]  # a fresh tracker for a sensor
-    frame: Callable[[Sequence[Any], float], TactileFrame]  # tracked images of all sensors, and a stamp
+    tracker: Callable[[int], ImageTracker]  # creates a tracker for a sensor
+    frame: Callable[[Sequence[Any], float], TactileFrame]  # from the tracked images of all sensors and a stamp [s]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A decision as recorded, and as made again."""
+    """A recorded decision beside the recomputed one."""
 
     recorded: Decision
-    flow: FlowMap
-    action: NDArray[np.float64]
+    flow: FlowMap  # recomputed
+    action: NDArray[np.float64]  # recomputed, shape (3,) [m, m, rad]
 
     @property
     def action_difference(self) -> float:
-        """Largest difference of the action's components [m, m, rad]; infinite where NaN or shapes differ."""
+        """Largest difference of the action components [m, m, rad]; infinite for NaN or different shapes."""
         return difference(self.recorded.action, self.action)
 
     @property
     def flow_difference(self) -> float:
-        """Largest difference of the flow maps' values (largest vector 1), and of their divisors as a share."""
+        """Largest difference of the flow map values (longest vector 1) and relative difference of the divisors."""
         if self.flow.unit != self.recorded.unit:
             return float("inf")
         divisors = difference(np.array(self.flow.divisor), np.array(self.recorded.divisor))
-        share = divisors / max(abs(self.recorded.divisor), np.finfo(float).tiny)
-        return max(difference(self.recorded.flow, self.flow.image), share)
+        relative = divisors / max(abs(self.recorded.divisor), np.finfo(float).tiny)
+        return max(difference(self.recorded.flow, self.flow.image), relative)
 
     @property
     def identical(self) -> bool:
+        """Whether both agree in every bit."""
         return self.action_difference == 0 and self.flow_difference == 0
 
 
 def difference(one: NDArray[Any], other: NDArray[Any]) -> float:
-    """Largest absolute difference; infinite where shapes differ or one is NaN."""
+    """Largest absolute difference; infinite for NaN or different shapes."""
     if one.shape != other.shape:
         return float("inf")
     largest = float(np.abs(one.astype(float) - other.astype(float)).max(initial=0.0))
@@ -72,11 +73,11 @@ def difference(one: NDArray[Any], other: NDArray[Any]) -> float:
 
 
 def replay(
-    session: SessionReader, *, perception: Perception, policy: Policy, task: InsertionTask
+    session: SessionReader, *, perception: PerceptionPipeline, policy: Policy, task: InsertionTask
 ) -> Iterator[Comparison]:
-    """Each decision of `session` in order, made again. The policy is reset at the start of each insertion.
+    """Recompute the decisions of `session` in order. The policy is reset at the start of each insertion.
 
-    Raises PeerError when an image that a decision was made from is not in the file.
+    Raises PeerError when the file lacks an image of a decision.
     """
     needed: Counter[tuple[int, int]] = Counter()
     for decision in session.decisions():
@@ -85,7 +86,7 @@ def replay(
         needed.update(_images_of(decision))
     images: dict[tuple[int, int], CameraImage] = {}
     insertion: int | None = None
-    # One pass: images stand before the decisions made from them, and are let go after the last of these.
+    # One pass over the file: images precede their decisions and are dropped after the last one that uses them.
     for record in session.records(["/decision", *(f"/{sensor}/image" for sensor in SENSORS)]):
         if isinstance(record.value, CameraImage):
             sensor = SENSORS.index(record.topic.split("/")[1])
@@ -105,25 +106,29 @@ def replay(
 
 
 def observe(
-    decision: Decision, images: dict[tuple[int, int], CameraImage], *, perception: Perception, task: InsertionTask
+    decision: Decision,
+    images: dict[tuple[int, int], CameraImage],
+    *,
+    perception: PerceptionPipeline,
+    task: InsertionTask,
 ) -> FlowMap:
-    """The flow map of `decision` from images by (sensor, sequence), tracked as the live run tracked them."""
-    picked = {(s, sequence) for moment in (decision.reference, *decision.frames) for s, sequence in enumerate(moment)}
+    """The flow map of `decision`, from images by (sensor, sequence), tracked in the order of the live run."""
+    required = {(s, sequence) for moment in (decision.reference, *decision.frames) for s, sequence in enumerate(moment)}
     tracked: dict[tuple[int, int], Any] = {}
     for sensor, sequences in enumerate(decision.tracked):
         tracker = perception.tracker(sensor)
-        for place, sequence in enumerate(sequences):
+        for order, sequence in enumerate(sequences):
             image = images.get((sensor, sequence))
             if image is None:
                 raise PeerError(
-                    f"insertion {decision.insertion}, attempt {decision.attempt} was decided from image {sequence} of "
-                    f"sensor {sensor}, which the session lacks before it; it can not be replayed"
+                    f"insertion {decision.insertion}, attempt {decision.attempt} used image {sequence} of sensor "
+                    f"{sensor}; the session lacks it, so the decision cannot be replayed"
                 )
             try:
-                tracked[sensor, sequence] = tracker.track(image.data) if place else tracker.start(image.data)
+                tracked[sensor, sequence] = tracker.track(image.data) if order else tracker.start(image.data)
             except PeerError:
-                # The live run was told so too, and went on without this image unless it needed it.
-                if (sensor, sequence) in picked:
+                # The live run got the same error, and continued unless the decision required this image.
+                if (sensor, sequence) in required:
                     raise
 
     def at(moment: tuple[int, ...]) -> TactileFrame:

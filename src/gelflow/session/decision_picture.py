@@ -1,4 +1,4 @@
-"""A picture of what the policy saw in each attempt, and what it answered."""
+"""A picture of the policy's observations and corrections."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,18 +9,18 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.session.records import SENSORS, Decision
 
-MOST = 40  # decisions in one picture
+MAX_DECISIONS = 40  # in one picture
 
 
 def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) -> None:
-    """One line per decision: the flow map of each pad and frame as arrows, and the correction in words.
+    """Draw one row per decision: the flow map of each pad and frame as arrows, and the correction as text.
 
-    Pads are seen from outside with the fingertip down, so x points down and y to the right. At most the first 40
+    The view is from outside onto the pad, fingertip down, so x points down and y to the right. At most the first 40
     decisions are drawn. Raises UsageError when the picture cannot be written.
     """
-    from matplotlib.figure import Figure  # here: slow to import
+    from matplotlib.figure import Figure  # deferred: slow to import
 
-    shown = list(decisions[:MOST])
+    shown = list(decisions[:MAX_DECISIONS])
     columns = shown[0].flow.shape[0] // 2
     sensors = len(shown[0].tracked)
     positions = grid.positions()
@@ -41,9 +41,9 @@ def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) 
             axis.margins(0.18)
             axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=8)
         line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=8)
-        felt = f"longest arrow\n{decision.divisor:.3g} {decision.unit}"
-        said = f"{felt}\n\ncorrection\nx {dx:+.2f} mm\ny {dy:+.2f} mm\nyaw {turn:+.1f}°"
-        line[-1].text(1.06, 0.5, said, transform=line[-1].transAxes, fontsize=8, va="center")
+        scale = f"longest arrow\n{decision.divisor:.3g} {decision.unit}"
+        text = f"{scale}\n\ncorrection\nx {dx:+.2f} mm\ny {dy:+.2f} mm\nyaw {turn:+.1f}°"
+        line[-1].text(1.06, 0.5, text, transform=line[-1].transAxes, fontsize=8, va="center")
     try:
         figure.savefig(path, dpi=100)
     except (OSError, ValueError) as error:

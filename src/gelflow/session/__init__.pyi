@@ -1,0 +1,29 @@
+from .decision_picture import draw_decisions as draw_decisions
+from .decision_replay import Comparison as Comparison
+from .decision_replay import ImageTracker as ImageTracker
+from .decision_replay import PerceptionPipeline as PerceptionPipeline
+from .decision_replay import replay as replay
+from .reader import Record as Record
+from .reader import SessionReader as SessionReader
+from .recorder import SessionRecorder as SessionRecorder
+from .records import SENSORS as SENSORS
+from .records import Decision as Decision
+from .records import describe_session as describe_session
+from .recovery import RecoveryReport as RecoveryReport
+from .recovery import recover as recover
+
+__all__ = [
+    "SENSORS",
+    "Comparison",
+    "Decision",
+    "ImageTracker",
+    "PerceptionPipeline",
+    "Record",
+    "RecoveryReport",
+    "SessionReader",
+    "SessionRecorder",
+    "describe_session",
+    "draw_decisions",
+    "recover",
+    "replay",
+]
