@@ -1,5 +1,5 @@
-"""Camera images to tactile frames: detect dots, fit the grid, measure displacement."""
+"""Marker tracking: camera images to marker displacements and tactile frames, and camera calibration."""
 
-from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackerInitError, TrackingResult
+import lazy_loader as _lazy
 
-__all__ = ["MarkerTracker", "TrackerConfig", "TrackerInitError", "TrackingResult"]
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

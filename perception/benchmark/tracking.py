@@ -12,7 +12,7 @@ from gelflow.perception.benchmark.metrics import Course, Figures, follow
 from gelflow.perception.benchmark.speed import measure_speed
 from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, DegradedGelAppearance, make_appearance
 from gelflow.perception.synthetic.error_bound import cramer_rao_errors
-from gelflow.perception.synthetic.sequences import FIELDS, REST, Field, GelSequence
+from gelflow.perception.synthetic.sequences import FIELDS, INITIAL_REST, Field, GelSequence
 
 if TYPE_CHECKING:
     from gelflow.perception.benchmark.baselines import Follower
@@ -179,7 +179,7 @@ def _moved(case: Case, options: BenchmarkOptions) -> Motion:
     rest_frames = QUICK_REST_FRAMES if options.quick else REST_FRAMES
     period, after = (QUICK_DRIFT, QUICK_DRIFT) if options.quick else (DRIFT_PERIOD, DRIFT)
     still = case.follow((OWN,), ("press",), motion="rest", frames=rest_frames)[OWN][0]
-    back = case.follow((OWN,), ("shear",), frames=after + REST + 1, period=period)[OWN][0]
+    back = case.follow((OWN,), ("shear",), frames=after + INITIAL_REST + 1, period=period)[OWN][0]
     large = case.follow(tuple(FOLLOWERS), _fields(options), peak=IDENTITY, frames=16, period=12)
     return Motion(
         images=case.name,

@@ -1,8 +1,7 @@
-"""Pictures of a gel with printed markers, drawn from the markers' displacement: what a tactile camera would see.
+"""A fast renderer of undamaged gels for streaming mock cameras.
 
-Speed is the point: two cameras stream these images while a simulation runs beside them. Illumination, print and a
-stock of sensor noise are drawn once for a appearance; an image then only costs its dots (small sprites at sub-pixel
-places), one multiplication and the JPEG encoder.
+Illumination, print and several sensor noise images are drawn once per appearance. An image then costs one small
+sprite per dot at a sub-pixel position, one multiplication and the JPEG encoder.
 """
 
 import cv2
@@ -12,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.appearance import GelAppearance
 
-_NOISE_IMAGES = 8  # prepared pictures of the gel with sensor noise; an image takes one of them
-_PHASES = 64  # sprites per pixel and axis: a dot's place is exact to 1/128 px
+_NOISE_IMAGES = 8  # precomputed images of the gel with sensor noise
+_PHASES = 64  # sprites per pixel and axis: dot positions are rounded to 1/128 px
 
 Image = NDArray[np.uint8]
 
 
 class FastGelRenderer:
-    """Draws one gel. The same appearance, displacement and sequence number give the same image, byte for byte."""
+    """Renders one gel. Equal appearance, displacement and sequence number give bit-identical images."""
 
     def __init__(self, appearance: GelAppearance | None = None) -> None:
         self.appearance = appearance = GelAppearance() if appearance is None else appearance
@@ -36,24 +35,24 @@ class FastGelRenderer:
         ]
         self._rest = appearance.positions_mm()
         sprites, self._reach = _sprites(appearance)
-        used = (sprites > 0).any(axis=0)  # the corners of the square stay empty
+        used = (sprites > 0).any(axis=0)  # drops the empty corners of the square
         self._sprites = np.ascontiguousarray(sprites[:, used])
         self._margin = 2 * self._reach + 2
         self._ink = np.ones(
             (appearance.height + 2 * self._margin, appearance.width + 2 * self._margin), dtype=np.float32
         )
-        # Offsets of a sprite's pixels in the flattened picture.
+        # Offsets of the pixels of a sprite in the flattened image.
         steps = np.arange(-self._reach, self._reach + 1)
         self._steps = (steps[:, None] * self._ink.shape[1] + steps).ravel()[used]
-        # Sprites of one class never touch unless the gel folds, so that a class is drawn in one stroke.
+        # The sprites of one class do not overlap, so the dots of a class are drawn in one operation.
         row, col = np.divmod(np.arange(markers), appearance.grid.cols)
         self._classes = [np.flatnonzero(printed & (row % 2 == i) & (col % 2 == j)) for i in (0, 1) for j in (0, 1)]
 
     def render(self, displacement_mm: ArrayLike, *, sequence: int = 0) -> Image:
-        """The image (B G R, uint8, shape (height, width, 3)) of the gel with its markers displaced.
+        """The image (B G R, uint8, shape (height, width, 3)) of the gel with displaced markers.
 
-        `displacement_mm` [mm], shape (rows * cols, 2), along the pad's x and y; `sequence` chooses the noise.
-        Raises UsageError for another shape or values that are not finite.
+        `displacement_mm` [mm], shape (rows * cols, 2), is along the pad's x and y axes; `sequence` selects the noise
+        image. Raises UsageError for a wrong shape or values that are not finite.
         """
         displacement = np.asarray(displacement_mm, dtype=float)
         if displacement.shape != self._rest.shape:
@@ -61,23 +60,23 @@ class FastGelRenderer:
         if not np.isfinite(displacement).all():
             raise UsageError("displacement of the markers must be finite")
         factor = self._draw_dots(self.appearance.to_pixels(self._rest + displacement))
-        # Knuth's multiplicative hash: neighbours in sequence take pictures that do not follow a visible cycle.
+        # Knuth's multiplicative hash avoids a visible cycle of the noise images.
         gel = self._gels[(sequence * 2654435761 % 2**32) * _NOISE_IMAGES >> 32]
         return np.asarray(cv2.multiply(gel, cv2.merge([factor] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
 
     def encode(self, image: Image) -> bytes:
-        """`image` as JPEG."""
+        """`image` as JPEG. Raises UsageError when it cannot be encoded."""
         done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.appearance.quality])
         if not done:
-            raise UsageError(f"an image of shape {image.shape} and type {image.dtype} can not become a JPEG")
+            raise UsageError(f"an image of shape {image.shape} and type {image.dtype} cannot be encoded as JPEG")
         return data.tobytes()
 
     def _draw_dots(self, centers: NDArray[np.float64]) -> NDArray[np.float32]:
-        """By how much the dots dim or light each pixel, shape (height, width); off the image they are cut off."""
+        """Brightness factor of the dots at each pixel, shape (height, width)."""
         appearance, margin = self.appearance, self._margin
         self._ink[:] = 1
         flat, stride = self._ink.reshape(-1), self._ink.shape[1]
-        # A dot far outside is moved to just outside, where nothing of it shows.
+        # Dots far outside the image are moved to just outside, which keeps their index in the padded image valid.
         limit = np.array([appearance.width, appearance.height]) + self._reach
         centers = np.clip(centers, -self._reach - 1.0, limit)
         fine = np.round(centers * _PHASES).astype(np.intp)
@@ -86,17 +85,17 @@ class FastGelRenderer:
         sprite = phase[:, 1] * _PHASES + phase[:, 0]
         keep = np.maximum if appearance.bright else np.minimum
         for markers in self._classes:
-            places = first[markers, None] + self._steps
-            flat[places] = keep(flat[places], 1 + self._density[markers, None] * self._sprites[sprite[markers]])
+            pixels = first[markers, None] + self._steps
+            flat[pixels] = keep(flat[pixels], 1 + self._density[markers, None] * self._sprites[sprite[markers]])
         return self._ink[margin : margin + appearance.height, margin : margin + appearance.width]
 
 
 def _sprites(appearance: GelAppearance) -> tuple[NDArray[np.float32], int]:
-    """A dot's ink (0 to 1) at every phase within a pixel, shape (phases², side²), and its reach.
+    """Ink (0 to 1) of a dot at every sub-pixel phase, shape (phases², side²), and `reach` = (side − 1) / 2.
 
-    side is 2 reach + 1; the edge is a smooth step as wide as makes its slope's standard deviation the blur's.
+    The edge is a smoothstep whose slope has the standard deviation of the optical blur.
     """
-    width = np.sqrt(5) * appearance.blur  # half the step's width [px]
+    width = np.sqrt(5) * appearance.blur  # half the width of the step [px]
     reach = int(np.ceil(appearance.radius + width)) + 1
     steps = np.arange(-reach, reach + 1)
     squared = (steps - np.arange(_PHASES)[:, None] / _PHASES) ** 2
@@ -107,7 +106,7 @@ def _sprites(appearance: GelAppearance) -> tuple[NDArray[np.float32], int]:
 
 
 def illumination(appearance: GelAppearance, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The gel without markers: a coloured light from each side, a vignette and soft unevenness."""
+    """The gel without markers, B G R in grey levels: three coloured lights, a vignette and smooth random unevenness."""
     down, right = np.meshgrid(
         np.linspace(-1, 1, appearance.height), np.linspace(-1, 1, appearance.width), indexing="ij"
     )

@@ -1,6 +1,6 @@
-"""What lies under and over the dots of a drawn gel: its light, the contact's shading and shine, dust and occluders.
+"""Image layers of `AccurateGelRenderer` below and above the dots: illumination, shading, highlights, dust, occluders.
 
-Each function gives one layer in linear light, sharp: the optical blur comes once, over everything.
+Each function gives one sharp layer in linear light; `blurred` applies the optical blur once to the composed image.
 """
 
 import math
@@ -14,31 +14,31 @@ from scipy.special import ndtr
 from gelflow.perception.synthetic.appearance import DegradedGelAppearance
 from gelflow.perception.synthetic.fast_renderer import illumination
 
-SHARP = 0.5  # standard deviation of an edge before the optical blur: the pixel's own width and no aliasing [px]
+SHARP = 0.5  # standard deviation of edges before the optical blur [px]: about one pixel, which avoids aliasing
 
-_WRINKLE = 0.4  # from one wrinkle to the next, in spacings
+_WRINKLE = 0.4  # wavelength of the wrinkles / marker spacing
 
-Layer = NDArray[np.float32]  # shape (height, width), or (height, width, 3) where it has colour
+Layer = NDArray[np.float32]  # shape (height, width), or (height, width, 3) for coloured layers
 
 
 @dataclass(frozen=True)
 class Contact:
-    """What presses into the gel."""
+    """A contact pressed into the gel."""
 
     center: tuple[float, float]  # (right, down) in the image [px]
-    radius: float  # of the dome that it makes [px]
+    radius: float  # of the dome in the gel [px]
     depth: float  # 0 (no contact) to 1
 
 
-def places(appearance: DegradedGelAppearance) -> tuple[Layer, Layer]:
-    """Each pixel's place (right, down) [px]."""
+def pixel_coordinates(appearance: DegradedGelAppearance) -> tuple[Layer, Layer]:
+    """Coordinates (right, down) of each pixel [px], two arrays of shape (height, width)."""
     down, right = np.indices((appearance.height, appearance.width), dtype=np.float32)
     return right, down
 
 
 def light(appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
-    """The gel without markers: coloured lights from the sides, and brighter on one side than on the other."""
-    right, down = places(appearance)
+    """The gel without markers: coloured illumination with a linear brightness gradient in a random direction."""
+    right, down = pixel_coordinates(appearance)
     angle = rng.uniform(0, 2 * np.pi)
     side = np.cos(angle) * (2 * right / appearance.width - 1) + np.sin(angle) * (2 * down / appearance.height - 1)
     return np.asarray(
@@ -47,11 +47,11 @@ def light(appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
 
 
 def shading(appearance: DegradedGelAppearance, contact: Contact, angle: float) -> Layer:
-    """By how much the slopes of dome and wrinkles lighten and darken each channel.
+    """Brightness factor per channel from the slopes of dome and wrinkles.
 
-    The three lights stand 120° apart, the first at `angle`.
+    The three lights are 120° apart, the first at `angle` [rad].
     """
-    right, down = places(appearance)
+    right, down = pixel_coordinates(appearance)
     x, y = (right - contact.center[0]) / contact.radius, (down - contact.center[1]) / contact.radius
     dome = contact.depth * np.exp(-(x * x + y * y) / 2)
     across = math.cos(angle) * y - math.sin(angle) * x
@@ -59,7 +59,7 @@ def shading(appearance: DegradedGelAppearance, contact: Contact, angle: float) -
     wrinkles = contact.depth * appearance.ridges * ndtr(8 * (0.9 - np.hypot(x, y)))
     turns = 2 * math.pi * contact.radius / (_WRINKLE * appearance.spacing)
     channels = []
-    for k, tint in enumerate((0.1, -0.1, 0.3)):  # pressed gel is nearer to the lights, and redder
+    for k, tint in enumerate((0.1, -0.1, 0.3)):  # pressed gel is closer to the lights, and redder
         turn = angle + k * 2 * math.pi / 3
         slope = 0.9 * (x * math.cos(turn) + y * math.sin(turn))
         fine = 0.22 * np.sin(turns * along + 0.8 * k) if appearance.ridges else 0.0
@@ -68,11 +68,11 @@ def shading(appearance: DegradedGelAppearance, contact: Contact, angle: float) -
 
 
 def shine(appearance: DegradedGelAppearance, contact: Contact, spots: NDArray[np.float64], angle: float) -> Layer:
-    """How far pixels are saturated by light that the contact's rim and highlights throw back, 0 to 1.
+    """Saturation (0 to 1) of pixels by specular reflection at the rim of the contact and in its highlights.
 
-    `spots`, shape (highlights, 2), lie around the contact's centre in units of its radius.
+    `spots`, shape (highlights, 2), are relative to the centre of the contact in units of its radius.
     """
-    right, down = places(appearance)
+    right, down = pixel_coordinates(appearance)
     x, y = right - contact.center[0], down - contact.center[1]
     total = np.zeros_like(right)
     if appearance.ridges:
@@ -86,8 +86,8 @@ def shine(appearance: DegradedGelAppearance, contact: Contact, spots: NDArray[np
 
 
 def dust(appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
-    """What the specks leave of the light, 0 to 1."""
-    right, down = places(appearance)
+    """Transmission (0 to 1) of the dust specks on the lens."""
+    right, down = pixel_coordinates(appearance)
     left = np.ones_like(right)
     for _ in range(appearance.dust):
         place = rng.uniform((0, 0), (appearance.width, appearance.height))
@@ -98,8 +98,8 @@ def dust(appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
 
 
 def occlusion(appearance: DegradedGelAppearance, paths: NDArray[np.float64], progress: float) -> Layer:
-    """How far the occluders hide each pixel, 0 to 1, `progress` (0 to 1) of the way from start to end of `paths`."""
-    right, down = places(appearance)
+    """Opacity (0 to 1) of the occluders, at `progress` (0 to 1) along `paths`."""
+    right, down = pixel_coordinates(appearance)
     hidden = np.zeros_like(right)
     for start, end in paths:
         at = start + progress * (end - start)
@@ -110,12 +110,12 @@ def occlusion(appearance: DegradedGelAppearance, paths: NDArray[np.float64], pro
 
 
 def occluder_radius(appearance: DegradedGelAppearance) -> float:
-    """Of an occluder, on average [px]."""
+    """Mean radius of an occluder [px]."""
     return 1.3 * appearance.spacing
 
 
 def occluder_paths(appearance: DegradedGelAppearance, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Where occluders start and end, both out of sight [px], shape (occluders, 2, 2)."""
+    """Start and end of the path of each occluder, both outside the image [px], shape (occluders, 2, 2)."""
     middle = np.array([appearance.width, appearance.height]) / 2
     far = float(np.linalg.norm(middle)) + 1.3 * occluder_radius(appearance)
     first = rng.uniform(0, 2 * np.pi)
@@ -123,26 +123,27 @@ def occluder_paths(appearance: DegradedGelAppearance, rng: np.random.Generator) 
     for k in range(appearance.occluders):
         turn = first + 0.5 * np.pi * k * rng.uniform(0.6, 1.2)
         way = np.array([np.cos(turn), np.sin(turn)])
-        aside = (-1) ** k * rng.uniform(0.2, 0.6) * middle[1]  # they do not meet in the middle
+        aside = (-1) ** k * rng.uniform(0.2, 0.6) * middle[1]  # paths do not cross at the image centre
         past = middle + aside * np.array([-way[1], way[0]])
         paths.append((past - far * way, past + far * way))
     return np.array(paths).reshape(-1, 2, 2)
 
 
 def blurred(picture: Layer, appearance: DegradedGelAppearance) -> Layer:
-    """`picture` through the lens: what was sharp has the appearance's blur."""
+    """`picture` with the optical blur of the appearance; its edges are `SHARP`."""
     width = float(np.sqrt(max(appearance.blur**2 - SHARP**2, 0.0)))
     return picture if width < 0.05 else np.asarray(cv2.GaussianBlur(picture, (0, 0), width), dtype=np.float32)
 
 
 def noisy(picture: Layer, appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
-    """`picture` with sensor and shot noise, of which the channels share three quarters as one sensor's colours do.
+    """`picture` with sensor and shot noise.
 
-    The rest is each channel's own, as much as makes the grey picture's variance the appearance's.
+    Three quarters of the variance are common to the channels, as for the colours of one sensor. The independent part
+    is scaled so that the grey image has the noise variance of the appearance.
     """
     height, width = picture.shape[:2]
     deviation = np.sqrt(appearance.noise**2 + appearance.shot * picture.mean(axis=-1))
-    own = math.sqrt(0.25 / (0.114**2 + 0.587**2 + 0.299**2))  # weights of blue, green and red in grey
+    own = math.sqrt(0.25 / (0.114**2 + 0.587**2 + 0.299**2))  # luminance weights of blue, green and red
     shared = math.sqrt(0.75) * rng.standard_normal((height, width, 1), dtype=np.float32)
     noise = shared + own * rng.standard_normal((height, width, 3), dtype=np.float32)
     return np.asarray(picture + deviation[..., None] * noise, dtype=np.float32)

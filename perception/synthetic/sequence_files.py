@@ -1,4 +1,4 @@
-"""Rendered sequences as files: a folder of JPEG images or one MJPEG video, and the truth beside them."""
+"""Rendered sequences on disk: a folder of JPEG images or an MJPEG video, with a ground-truth file."""
 
 import dataclasses
 import json
@@ -15,35 +15,35 @@ from gelflow.errors import UsageError
 from gelflow.perception.synthetic.sequences import GelSequence
 
 FORMAT = 1
-TRUTH = "truth.npz"  # in a folder; the truth of a video has the video's name
-VIDEO = ".mjpeg"  # the images' JPEG one after the other: a stream that video players and FFmpeg read
+TRUTH = "truth.npz"  # ground truth of a folder; that of a video has the name of the video
+VIDEO = ".mjpeg"  # concatenated JPEG images, readable by video players and FFmpeg
 
 
 @dataclass(frozen=True)
-class Truth:
-    """What is true in a sequence's images. Markers row by row."""
+class GroundTruth:
+    """Ground truth of a rendered sequence. Markers row by row."""
 
-    position: NDArray[np.float32]  # centres of the dots (right, down) [px], shape (frames, markers, 2)
-    visible: NDArray[np.bool_]  # printed, wholly in the image and not covered, shape (frames, markers)
+    position: NDArray[np.float32]  # dot centres (right, down) [px], shape (frames, markers, 2)
+    visible: NDArray[np.bool_]  # printed, entirely in the image and not covered, shape (frames, markers)
     rows: int
     cols: int
-    spacing: float  # of the markers at rest, in the image's middle [px]
-    made_from: dict[str, Any]  # the sequence's settings, and under "appearance" those of its appearance
+    spacing: float  # marker spacing at rest at the image centre [px]
+    made_from: dict[str, Any]  # fields of the `GelSequence`; "appearance" holds those of its appearance
 
 
 def truth_file(images: Path) -> Path:
-    """Where the truth of a rendered folder or video is."""
+    """Path of the ground-truth file of a rendered folder or video."""
     return images.with_suffix(".npz") if images.suffix == VIDEO else images / TRUTH
 
 
 def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
-    """Draws `sequence` into `out`, a new folder or, where its name ends in .mjpeg, a video; yields the frames done.
+    """Renders `sequence` to `out`, a new folder or, with suffix .mjpeg, a video; yields the number of images written.
 
-    The truth is written last. Raises UsageError where something is there already, or nothing can be written.
+    The ground truth is written last. Raises UsageError when a file exists or cannot be written.
     """
     video = out.suffix == VIDEO
     if truth_file(out).exists() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
-        raise UsageError(f"{out} exists, and would be overwritten: give a new name, or delete it")
+        raise UsageError(f"{out} exists and would be overwritten: choose a new name or delete it")
     position, visible = [], []
     try:
         (out.parent if video else out).mkdir(parents=True, exist_ok=True)
@@ -65,19 +65,21 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
             made_from=json.dumps(dataclasses.asdict(sequence)),
         )
     except OSError as error:
-        raise UsageError(f"{out} can not be written: {error.strerror}") from None
+        raise UsageError(f"{out} cannot be written: {error.strerror}") from None
 
 
-def read_truth(file: Path) -> Truth:
-    """Reads what `write_sequence` wrote. Raises UsageError for other files and newer formats."""
+def read_truth(file: Path) -> GroundTruth:
+    """Reads the ground truth that `write_sequence` wrote. Raises UsageError for other files and newer formats."""
     try:
         with np.load(file) as found:
             if int(found["format"]) > FORMAT:
-                raise UsageError(f"{file} has format {int(found['format'])}, this gelflow reads up to {FORMAT}: update")
+                raise UsageError(
+                    f"{file} has format {int(found['format'])}, this gelflow reads up to {FORMAT}: update gelflow"
+                )
             made_from = json.loads(str(found["made_from"]))
             if "look" in made_from:  # name of the key in files of gelflow 0.1
                 made_from["appearance"] = made_from.pop("look")
-            return Truth(
+            return GroundTruth(
                 position=found["position_px"],
                 visible=found["visible"],
                 rows=int(found["rows"]),
@@ -88,4 +90,4 @@ def read_truth(file: Path) -> Truth:
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, UsageError):
             raise
-        raise UsageError(f"{file} is not the truth of a rendered sequence: {error}") from None
+        raise UsageError(f"{file} is not the ground truth of a rendered sequence: {error}") from None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, Frame
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, RenderedImage
 from gelflow.perception.synthetic.appearance import DegradedGelAppearance
 from gelflow.perception.synthetic.image_layers import Contact
 
@@ -17,33 +17,33 @@ Motion = Literal["smooth", "jump", "rest"]
 FIELDS: tuple[Field, ...] = get_args(Field)
 MOTIONS: tuple[Motion, ...] = get_args(Motion)
 
-REST = 3  # images of every sequence before anything moves
-_CONTACT = 0.4  # radius of the contact, as a share of the grid's shorter side
-_WANDER = 0.6  # how far the contact's centre moves about, in spacings
-_SLIP_RIM = 3.0  # width in spacings over which a slipping patch drags the gel along
+INITIAL_REST = 3  # images at rest at the start of each sequence
+_CONTACT = 0.4  # radius of the contact / shorter side of the grid
+_WANDER = 0.6  # amplitude of the motion of the contact centre / marker spacing
+_SLIP_RIM = 3.0  # width of the transition zone around a slipping patch / marker spacing
 
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class GelSequence:
-    """Images of a gel under a moving contact, drawn one by one; iterating again gives the same ones.
+    """Images of a gel under a moving contact. Each iteration renders the same images.
 
-    It starts at rest for three images. "smooth" then goes up to the peak and back to rest once every `period` images;
-    "jump" is at the peak from one image to the next and stays there; "rest" stays at rest.
+    The first three images are at rest. Motion "smooth" then rises to the peak and returns to rest once per `period`
+    images, "jump" reaches the peak within one image and stays there, "rest" stays at rest.
     """
 
     appearance: DegradedGelAppearance
     field: Field = "shear"
     frames: int = 64
-    peak: float = 0.4  # largest displacement of the gel, as a share of the spacing
+    peak: float = 0.4  # largest marker displacement / marker spacing
     motion: Motion = "smooth"
-    period: int = 60  # images of one "smooth" motion
+    period: int = 60  # images per cycle of the motion "smooth"
 
     def __post_init__(self) -> None:
         if self.field not in FIELDS or self.motion not in MOTIONS:
             raise UsageError(
-                f"expected a field out of {', '.join(FIELDS)} and a motion out of {', '.join(MOTIONS)}, "
+                f"field must be one of {', '.join(FIELDS)} and motion one of {', '.join(MOTIONS)}, "
                 f"got {self.field!r} and {self.motion!r}"
             )
         if self.frames < 1 or self.period < 2 or not 0 <= self.peak <= 2:
@@ -55,38 +55,38 @@ class GelSequence:
     def __len__(self) -> int:
         return self.frames
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[RenderedImage]:
         renderer = AccurateGelRenderer(self.appearance)
         for number in range(self.frames):
-            yield renderer.render(self.displacement(number), number=number, **self.surroundings(number))
+            yield renderer.render(self.displacement(number), number=number, **self.render_arguments(number))
 
-    def surroundings(self, number: int) -> dict[str, Any]:
-        """Contact, motion blur and occluder progress of image `number`: arguments of `AccurateGelRenderer.expose`."""
+    def render_arguments(self, number: int) -> dict[str, Any]:
+        """Contact, motion blur and occluder progress of image `number`: arguments of `AccurateGelRenderer.render`."""
         depth, radius = self._strength(number), self._radius() * self.appearance.spacing
         return {
             "contact": Contact(self._in_image(self._center(number)), radius, depth) if depth else None,
-            "smear": self._smear(number),
+            "motion_blur": self._motion_blur(number),
             "progress": number / max(self.frames - 1, 1),
         }
 
     def _strength(self, number: int) -> float:
-        """Of the motion, 0 to 1."""
-        if self.motion == "rest" or number < REST:
+        """Amplitude of the motion, 0 to 1."""
+        if self.motion == "rest" or number < INITIAL_REST:
             return 0.0
         if self.motion == "jump":
             return 1.0
-        phase = (number - REST) % self.period / self.period
-        if self.field == "slip":  # rises slowly, comes loose quickly
+        phase = (number - INITIAL_REST) % self.period / self.period
+        if self.field == "slip":  # slow rise, quick release
             phase = phase**1.7
         return float(np.sin(np.pi * phase) ** 2)
 
     def _center(self, number: float) -> Points:
-        """Of the contact, from the grid's middle in spacings (right, down)."""
+        """Centre of the contact (right, down) relative to the grid centre, in spacings."""
         turn = 2 * np.pi * number / 97 + self.appearance.seed if self.motion == "smooth" else self.appearance.seed
         return np.array([_WANDER * np.cos(turn), _WANDER * np.sin(2 * turn)])
 
     def _radius(self) -> float:
-        """Of the contact in spacings."""
+        """Radius of the contact in spacings."""
         return _CONTACT * (min(self.appearance.grid.rows, self.appearance.grid.cols) - 1)
 
     def _in_image(self, center: Points) -> tuple[float, float]:
@@ -95,7 +95,7 @@ class GelSequence:
         return float(right), float(down)
 
     def displacement(self, number: float) -> Points:
-        """Of the markers along the pad's x and y [mm], shape (markers, 2)."""
+        """Marker displacement along the pad's x and y axes in image `number` [mm], shape (markers, 2)."""
         appearance = self.appearance
         x, y = ((appearance.positions_mm() - appearance.grid.center) / appearance.grid.pitch).T
         right, down = (-y if appearance.mirrored else y), x
@@ -106,28 +106,30 @@ class GelSequence:
             * appearance.grid.pitch
         )
 
-    def _smear(self, number: int) -> Points:
-        """Way of each marker during the exposure [px], shape (markers, 2)."""
+    def _motion_blur(self, number: int) -> Points:
+        """Motion of each marker during the exposure [px], shape (markers, 2)."""
         step = self.displacement(number + 1) - self.displacement(number - 1)
         fastest = np.pi * self.peak / self.period * self.appearance.grid.pitch
         if self.motion != "smooth" or fastest == 0:
             return np.zeros_like(step)
-        plain = self.appearance.to_pixels(self.appearance.positions_mm() + step) - self.appearance.to_pixels(
-            self.appearance.positions_mm()
-        )
-        return np.asarray(self.appearance.motion_blur * plain / (2 * fastest * self.appearance.pixels_per_mm))
+        appearance, rest = self.appearance, self.appearance.positions_mm()
+        step_px = appearance.to_pixels(rest + step) - appearance.to_pixels(rest)
+        return np.asarray(appearance.motion_blur * step_px / (2 * fastest * appearance.pixels_per_mm))
 
 
 def _unit_field(field: Field, at: Points, radius: float, seed: int) -> Points:
-    """Displacement at places around the contact's centre, at most 1 long; `at` and `radius` in the same unit."""
-    far = np.linalg.norm(at, axis=1, keepdims=True) / radius
+    """Displacement field of length up to 1 at positions `at` relative to the contact centre, shape (n, 2).
+
+    `at` and `radius` have the same unit.
+    """
+    distance = np.linalg.norm(at, axis=1, keepdims=True) / radius
     if field in ("press", "twist"):
-        # Grows from the middle to the contact's rim, where it is 1, and dies away outside.
-        around = at / radius * np.exp((1 - far**2) / 2)
+        # Grows from the centre to the rim of the contact, where it is 1, and decays outside.
+        around = at / radius * np.exp((1 - distance**2) / 2)
         return around if field == "press" else np.stack([-around[:, 1], around[:, 0]], axis=1)
-    turn = 2.4 * seed  # the golden angle: other seeds go elsewhere
-    way = np.array([np.cos(turn), np.sin(turn)])
+    turn = 2.4 * seed  # the golden angle [rad] spreads the directions of successive seeds
+    direction = np.array([np.cos(turn), np.sin(turn)])
     if field == "shear":
-        return np.asarray(np.exp(-(far**2) / 3) * way)
-    ease = np.clip((1 - far) * radius / _SLIP_RIM + 0.5, 0, 1)
-    return np.asarray(ease**2 * (3 - 2 * ease) * way)
+        return np.asarray(np.exp(-(distance**2) / 3) * direction)
+    ease = np.clip((1 - distance) * radius / _SLIP_RIM + 0.5, 0, 1)
+    return np.asarray(ease**2 * (3 - 2 * ease) * direction)

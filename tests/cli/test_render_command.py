@@ -56,7 +56,7 @@ def test_wrong_input_is_told_in_one_line(
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["render", str(tmp_path), "--frames", "1"]) == 2
-    assert "exists, and would be overwritten" in capsys.readouterr().err
+    assert "exists and would be overwritten" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -65,5 +65,5 @@ def test_a_newer_or_other_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="has format 2, this gelflow reads up to 1"):
         read_truth(tmp_path / "newer.npz")
     (tmp_path / "other.npz").write_bytes(b"not an archive")
-    with pytest.raises(UsageError, match="is not the truth of a rendered sequence"):
+    with pytest.raises(UsageError, match="is not the ground truth of a rendered sequence"):
         read_truth(tmp_path / "other.npz")

@@ -8,7 +8,7 @@ from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.observation import Grid
 from gelflow.perception import MarkerTracker, TrackerConfig, TrackerInitError, TrackingResult
 from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
-from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, Frame
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, RenderedImage
 from gelflow.perception.synthetic.appearance import FACTORS, GelAppearance, make_appearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.synthetic.sequences import FIELDS, Field, GelSequence
@@ -176,7 +176,7 @@ def test_an_image_of_another_size_is_refused() -> None:
         tracker.track(image[:400])
 
 
-def through(sequence: GelSequence) -> list[tuple[Frame, TrackingResult, np.ndarray]]:
+def through(sequence: GelSequence) -> list[tuple[RenderedImage, TrackingResult, np.ndarray]]:
     """For each image after the first: the truth, what was tracked, and how far the displacements are off [px]."""
     tracker, frames = MarkerTracker(), list(sequence)
     first = tracker.start(frames[0].image)

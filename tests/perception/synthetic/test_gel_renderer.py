@@ -42,7 +42,7 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
 )
 def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
     appearance = make_appearance("typical", markers=63, seed=1, **{**EVEN, **changed})
-    exposed = AccurateGelRenderer(appearance).expose(GelSequence(appearance, "twist").displacement(20))
+    exposed = AccurateGelRenderer(appearance).render_noiseless(GelSequence(appearance, "twist").displacement(20))
     assert exposed.visible.all()
     off = centroids(exposed.picture, exposed.position, reach=12) - exposed.position
     assert np.abs(off).max() < 0.003
@@ -51,10 +51,10 @@ def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
 def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
     appearance = make_appearance("typical", markers=63, **EVEN)
     renderer, still = AccurateGelRenderer(appearance), np.zeros((63, 2))
-    smeared = renderer.expose(still, smear=np.tile([4.0, 0.0], (63, 1)))
+    smeared = renderer.render_noiseless(still, motion_blur=np.tile([4.0, 0.0], (63, 1)))
     off = centroids(smeared.picture, smeared.position, reach=12) - smeared.position
     assert np.abs(off).max() < 0.003
-    plain = renderer.expose(still).picture
+    plain = renderer.render_noiseless(still).picture
     ink = [(np.median(picture) - picture[..., 1]).clip(0) for picture in (plain, smeared.picture)]
     right = np.arange(appearance.width)
     variance = []
@@ -120,15 +120,15 @@ def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -
 
 def test_wrong_looks_and_sequences_are_refused() -> None:
     for wrong, message in (
-        ({"preset": "dirty"}, "expected an image class out of clean, typical, hard, got 'dirty'"),
-        ({"markers": 100}, "expected one of 35, 63, 130, 154, 252 markers, got 100"),
-        ({"blurr": 1.0}, "a appearance has no 'blurr'; it has barrel"),
+        ({"preset": "dirty"}, "image class must be one of clean, typical, hard, got 'dirty'"),
+        ({"markers": 100}, "markers must be one of 35, 63, 130, 154, 252, got 100"),
+        ({"blurr": 1.0}, "a gel appearance has no field 'blurr'; fields are barrel"),
         ({"damaged": 1.5}, "damaged of a gel appearance must be within 0.0 to 1.0, got 1.5"),
         ({"blur": 0.2}, "blur of a gel appearance must be within 0.5"),
     ):
         with pytest.raises(UsageError, match=message):
             make_appearance(**wrong)
-    with pytest.raises(UsageError, match="expected a field out of press, shear, twist, slip"):
+    with pytest.raises(UsageError, match="field must be one of press, shear, twist, slip"):
         GelSequence(make_appearance(), "pull")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="at least 1 frame"):
         GelSequence(make_appearance(), frames=0)

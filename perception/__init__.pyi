@@ -1,0 +1,33 @@
+from .calibration import Calibration as Calibration
+from .calibration import fit_calibration as fit_calibration
+from .calibration import load_calibration as load_calibration
+from .calibration import save_calibration as save_calibration
+from .errors import TrackerInitError as TrackerInitError
+from .frames import CameraMount as CameraMount
+from .frames import decode_image as decode_image
+from .frames import tactile_frame as tactile_frame
+from .overlay import draw_overlay as draw_overlay
+from .sources import ImageSource as ImageSource
+from .sources import SourceImage as SourceImage
+from .sources import image_source as image_source
+from .tracker import MarkerTracker as MarkerTracker
+from .tracker import TrackerConfig as TrackerConfig
+from .tracker import TrackingResult as TrackingResult
+
+__all__ = [
+    "Calibration",
+    "CameraMount",
+    "ImageSource",
+    "MarkerTracker",
+    "SourceImage",
+    "TrackerConfig",
+    "TrackerInitError",
+    "TrackingResult",
+    "decode_image",
+    "draw_overlay",
+    "fit_calibration",
+    "image_source",
+    "load_calibration",
+    "save_calibration",
+    "tactile_frame",
+]

@@ -1,0 +1,41 @@
+from .checkpoint import Checkpoint as Checkpoint
+from .checkpoint import default_checkpoint as default_checkpoint
+from .checkpoint import load_checkpoint as load_checkpoint
+from .checkpoint import load_policy as load_policy
+from .checkpoint import save_checkpoint as save_checkpoint
+from .environment import FlowMapNoise as FlowMapNoise
+from .environment import PolicyEnv as PolicyEnv
+from .environment import make_insertion_env as make_insertion_env
+from .evaluation import EvaluationResult as EvaluationResult
+from .evaluation import NetworkActor as NetworkActor
+from .evaluation import RandomActor as RandomActor
+from .evaluation import evaluate as evaluate
+from .learning_curve import LearningCurvePoint as LearningCurvePoint
+from .networks import Architecture as Architecture
+from .networks import Network as Network
+from .networks import NetworkPolicy as NetworkPolicy
+from .ppo import PPOSettings as PPOSettings
+from .ppo import TrainingResult as TrainingResult
+from .ppo import train as train
+
+__all__ = [
+    "Architecture",
+    "Checkpoint",
+    "EvaluationResult",
+    "FlowMapNoise",
+    "LearningCurvePoint",
+    "Network",
+    "NetworkActor",
+    "NetworkPolicy",
+    "PPOSettings",
+    "PolicyEnv",
+    "RandomActor",
+    "TrainingResult",
+    "default_checkpoint",
+    "evaluate",
+    "load_checkpoint",
+    "load_policy",
+    "make_insertion_env",
+    "save_checkpoint",
+    "train",
+]
