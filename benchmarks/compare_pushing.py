@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gelflow.errors import GelflowError, UsageError
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -128,9 +128,9 @@ def compare(reference: Reference) -> Comparison:
     scene = load_scene("pushing", friction="viscous")
     pad = scene.pads[0]
     sim = Simulator(scene, num_envs=len(reference.q))
-    if reference.q.shape[1:] != (scene.nq,) or reference.tactile.shape[1:] != (scene.markers, 3):
+    if reference.q.shape[1:] != (scene.nq,) or reference.tactile.shape[1:] != (scene.num_markers, 3):
         raise UsageError(
-            f"expected {scene.nq} positions and {scene.markers} markers of 3 forces, as in the scene 'pushing', got "
+            f"expected {scene.nq} positions and {scene.num_markers} markers of 3 forces, as in scene 'pushing', got "
             f"{reference.q.shape[1]} and {reference.tactile.shape[1:]}"
         )
     sim.q[:], sim.v[:] = reference.q, reference.v

@@ -23,8 +23,7 @@ from rich.table import Table
 from gelflow.errors import GelflowError
 from gelflow.measurement.machine import processor
 from gelflow.sim.benchmark import versions
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.energy import EnergyGauge, motor_forces
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
@@ -153,7 +152,7 @@ def measure(progress: Callable[[], None]) -> tuple[list[Thrown], list[Moved]]:
                 thrown.append(throw(body, law, kt, integrator, step))
                 progress()
     for name in SCENES:
-        for law in LAWS:
+        for law in FRICTION_LAWS:
             for integrator in INTEGRATORS:
                 for step in SCENE_STEPS:
                     moved.append(move(name, law, integrator, step))
@@ -166,7 +165,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "energy.json")
     args = parser.parse_args()
     console = Console(width=80)
-    whole = 2 * len(CASES) * len(STEPS) + len(LAWS) * len(INTEGRATORS) * len(SCENES) * len(SCENE_STEPS)
+    whole = 2 * len(CASES) * len(STEPS) + len(FRICTION_LAWS) * len(INTEGRATORS) * len(SCENES) * len(SCENE_STEPS)
     try:
         with Progress(console=Console(stderr=True, width=80)) as progress:
             task = progress.add_task("energy", total=whole)

@@ -26,8 +26,7 @@ from rich.table import Table
 from gelflow.measurement.machine import processor
 from gelflow.sim._core import LEVEL
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
 from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
 from gelflow.sim.validation.gradient_check import Output, RolloutLoss, compare_to_differences, compare_to_dual_numbers
 from gelflow.sim.validation.reference_motions import SCENES
@@ -107,8 +106,8 @@ def main() -> int:
     parser.add_argument("--states", type=int, default=12, metavar="N", help="states per combination (%(default)s)")
     parser.add_argument("--out", type=Path, default=FILE, help="file to write (%(default)s)")
     args = parser.parse_args()
-    rows = [Row(*names) for names in itertools.product((*SCENES, *SHAPES, FREE), LAWS, INTEGRATORS)]
-    runs = [Row(ROLLING_RUN, *names) for names in itertools.product(LAWS, INTEGRATORS)]
+    rows = [Row(*names) for names in itertools.product((*SCENES, *SHAPES, FREE), FRICTION_LAWS, INTEGRATORS)]
+    runs = [Row(ROLLING_RUN, *names) for names in itertools.product(FRICTION_LAWS, INTEGRATORS)]
     console, begin = Console(width=80), time.perf_counter()
     work = [*((row, seed) for row in rows for seed in range(args.states)), *((row, -1) for row in runs)]
     for row, seed in track(work, "checking", console=Console(stderr=True)):

@@ -32,9 +32,9 @@ from rich.table import Table
 from gelflow.errors import GelflowError
 from gelflow.measurement.machine import processor
 from gelflow.sim import _core
-from gelflow.sim.scene.distance_grid import DistanceGrid, build_grid
-from gelflow.sim.scene.mesh import TriangleMesh, nearest_points
-from gelflow.sim.scene.sampling import capsule, mesh_surface
+from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, build_grid
+from gelflow.sim.scene.geometry.mesh import TriangleMesh, nearest_points
+from gelflow.sim.scene.geometry.sampling import capsule, mesh_surface
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import reference_meshes as mesh_solids
 

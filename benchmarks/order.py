@@ -44,7 +44,7 @@ from gelflow.errors import GelflowError
 from gelflow.measurement.machine import processor
 from gelflow.sim import _core
 from gelflow.sim.benchmark import versions
-from gelflow.sim.scene.scene import INTEGRATORS, Scene, load_scene
+from gelflow.sim.scene import INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import ReferenceMotion, reference_motion
 

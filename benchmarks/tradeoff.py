@@ -23,7 +23,7 @@ from gelflow.sim.benchmark.tradeoff.picture import draw
 from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, Bounds, bounds, preset_errors
 from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff, measure
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import load_scene, scene_names
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "guide" / "tradeoff.md"

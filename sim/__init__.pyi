@@ -1,7 +1,7 @@
 from .benchmark.describe import describe as describe
+from .scene.loader import load_scene as load_scene
+from .scene.loader import scene_names as scene_names
 from .scene.scene import Scene as Scene
-from .scene.scene import load_scene as load_scene
-from .scene.scene import scene_names as scene_names
 from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
 from .simulator import Trajectory as Trajectory

@@ -19,7 +19,7 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
 from gelflow.observation import Grid, resampling_weights
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.task import INSERTION, InsertionTask
 from gelflow.time_sync import MAX_LEAD, MIN_WAIT, SIMULATED_CELL
@@ -103,7 +103,7 @@ class SimulatedCell:
         self._arm = [sim.joint_q(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         self._part = sim.joint_q("part")
         self._part_v = sim.joint_v("part")
-        self._pads = [scene.markers_of("left"), scene.markers_of("right")]
+        self._pads = [scene.marker_slice("left"), scene.marker_slice("right")]
         self._weights = [resampling_weights(grid.positions(), config.grid) for grid in scene.grids]
         self._u = np.zeros(sim.model.nu)
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 from gelflow.sim.simulator import Simulator
 
 _SATURATED = 0.9  # of the force limit: the jaws press

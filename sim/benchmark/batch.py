@@ -9,7 +9,7 @@ import numpy as np
 from gelflow.measurement.machine import cores
 from gelflow.measurement.timing import BenchmarkOptions, Report, Workload, load_note, speedup, time_interleaved
 from gelflow.sim.benchmark.runs import check_accuracy, motion_run, simulator
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
 SIZES = (1, 2, 4, 16, 64, 256, 1024)

@@ -11,9 +11,9 @@ import numpy as np
 
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.step_times import holding_controls
-from gelflow.sim.scene.mjcf import WORLD, JointDef, Mechanics, read_mechanics
-from gelflow.sim.scene.mjcf_file import compile_model, names
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
+from gelflow.sim.scene.mjcf.mechanics import WORLD, JointDef, Mechanics, read_mechanics
+from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
 from gelflow.sim.simulator import Simulator
 from gelflow.toml_tables import read_toml
 
@@ -94,7 +94,7 @@ class PadPart:
     law: str
     unit: str
     numbers: dict[str, float]
-    pushes: bool  # its markers are contact points
+    collides: bool  # its markers are contact points
     gel: str | None  # None: its markers have forces only
 
 
@@ -128,7 +128,7 @@ class Description:
     shapes: tuple[ShapePart, ...]  # meshes and rounded ones
     contacts: tuple[ContactPart, ...]
     pads: tuple[PadPart, ...]
-    left_out: tuple[str, ...]
+    not_modelled: tuple[str, ...]
     size: Size
 
 
@@ -165,13 +165,13 @@ def describe(scene: Scene) -> Description:
                 against=pad.against,
                 law=pad.law,
                 unit="per point" if (pad.weights == 1).all() else "per area",
-                numbers=dict(pad.numbers),
-                pushes=pad.pushes,
+                numbers=dict(pad.params),
+                collides=pad.collides,
                 gel=None if pad.gel is None else str(pad.gel),
             )
             for pad in scene.pads
         ),
-        left_out=(*scene.left_out, *_left_out(scene, mechanics, model, bodies)),
+        not_modelled=(*scene.not_modelled, *_not_modelled(scene, mechanics, model, bodies)),
         size=_size(scene),
     )
 
@@ -186,7 +186,7 @@ def _body_name(scene: Scene, body: int) -> str:
 
 def _bodies(scene: Scene, mechanics: Mechanics, model: Any) -> tuple[BodyPart, ...]:
     roots = [0, *np.flatnonzero(model.body_jntnum > 0)]  # of the file's bodies: the world, and those that move
-    file_names = names(model, "body", model.nbody)
+    file_names = element_names(model, "body", model.nbody)
     parts = []
     for index, root in zip(range(WORLD, len(scene.bodies)), roots, strict=True):
         welded = [int(b) for b in np.flatnonzero(model.body_weldid == root) if b != root]
@@ -224,7 +224,7 @@ def _actuators(scene: Scene, joint: JointDef) -> tuple[ActuatorPart, ...]:
         return low, high
 
     return tuple(
-        ActuatorPart(a.name, a.kind, a.gear, a.kp, a.kd, a.gain, a.bias, bounds(a.force), bounds(a.control))
+        ActuatorPart(a.name, a.kind, a.gear, a.kp, a.kd, a.gain, a.bias, bounds(a.force_range), bounds(a.ctrl_range))
         for a in scene.actuators
         if scene.joints[a.joint] is joint
     )
@@ -241,7 +241,7 @@ def _shapes(scene: Scene) -> tuple[ShapePart, ...]:
             bytes=shape.grid.nbytes if shape.grid else None,
         )
         for shape in scene.shapes
-        if not shape.sharp
+        if shape.rounding > 0 or shape.grid is not None
     )
 
 
@@ -262,13 +262,13 @@ def _contacts(scene: Scene, kinds: dict[str, str]) -> tuple[ContactPart, ...]:
                 law=first.law,
                 damping=first.damping,
                 unit="one exact point" if sampled.radius > 0 else unit,
-                numbers=dict(first.numbers),
+                numbers=dict(first.params),
             )
         )
     return tuple(parts)
 
 
-def _left_out(scene: Scene, mechanics: Mechanics, model: Any, bodies: tuple[BodyPart, ...]) -> Iterator[str]:
+def _not_modelled(scene: Scene, mechanics: Mechanics, model: Any, bodies: tuple[BodyPart, ...]) -> Iterator[str]:
     """What the scene itself does not say of what is left out."""
     for body in bodies:
         for name in body.merged:
@@ -311,7 +311,7 @@ def _size(scene: Scene) -> Size:
     reading_bytes = int(model.markers) * 3 * sim.q.itemsize
     known = state_bytes + sim.params.nbytes + reading_bytes
     sizes = {p.name: len(p.points) for p in scene.points}
-    pushing = [pad for pad in scene.pads if pad.pushes]
+    pushing = [pad for pad in scene.pads if pad.collides]
     return Size(
         nq=model.nq,
         nv=model.nv,

@@ -17,7 +17,7 @@ from gelflow.sim.benchmark.runs import (
     motion_run,
     simulator,
 )
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workloa
 from gelflow.sim.benchmark.batch import perturb_stiffness
 from gelflow.sim.benchmark.rolling import rolling_run, rolling_scene
 from gelflow.sim.benchmark.runs import AccuracyCheck, Describe, TimedRun, check_accuracy, motion_run, simulator
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 
 Array = NDArray[np.float64]
 

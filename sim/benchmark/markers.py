@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
 from gelflow.sim import _core
 from gelflow.sim.benchmark.runs import FORCE
-from gelflow.sim.scene.distance_grid import spline_grid
+from gelflow.sim.scene.geometry.distance_grid import spline_grid
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

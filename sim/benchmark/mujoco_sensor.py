@@ -12,7 +12,7 @@ import numpy as np
 
 from gelflow.measurement.timing import Workload
 from gelflow.sim.benchmark.runs import TimedRun
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 
 # With MuJoCo's usual contact the heavy pad sinks 16 mm into the light ball; so it is half a millimetre, as with ours.
 STIFF = {"solref": (0.01, 1.0), "solimp": (0.99, 0.9999, 0.001, 0.5, 2.0)}

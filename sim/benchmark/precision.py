@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from gelflow.geometry import angles_between
 from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, speedup, time_interleaved
 from gelflow.sim.benchmark.runs import HOLD, motion_run, simulator
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
@@ -30,7 +29,7 @@ class _Course:
 
 def measure_precision(options: BenchmarkOptions) -> Report:
     """The five scenes under both laws, forward and backward."""
-    cases = [(name, law) for name in SCENES for law in LAWS]
+    cases = [(name, law) for name in SCENES for law in FRICTION_LAWS]
     steps = 4 * READ_EVERY if options.quick else None
     workloads, found = [], []
     for name, law in cases:

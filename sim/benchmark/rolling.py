@@ -11,7 +11,7 @@ from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workloa
 from gelflow.sim.benchmark.mujoco_sensor import MujocoRolling
 from gelflow.sim.benchmark.paper_build import PaperRolling, unavailable_reason
 from gelflow.sim.benchmark.runs import TIMED, TimedRun, check_accuracy, simulator
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 
 # The run of the paper's appendix B.1: the force on the pad [N], and the step until which it holds.
 ROLLING_FORCES = (

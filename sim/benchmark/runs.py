@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gelflow.geometry import angles_between
 from gelflow.measurement.timing import Workload
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 

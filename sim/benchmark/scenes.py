@@ -3,8 +3,7 @@
 from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, time_interleaved
 from gelflow.sim.benchmark.rolling import rolling_scene
 from gelflow.sim.benchmark.runs import TIMED, check_accuracy, motion_run, simulator
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import FRICTION_LAWS, load_scene
 from gelflow.sim.validation.reference_motions import SCENES
 
 SIDE = 50  # of the rolling pad's grid
@@ -15,7 +14,7 @@ PAPER = {"pushing": 5400.0, "grasp": 1000.0, "insertion": 1940.0, "dclaw": 840.0
 
 def measure_scenes(options: BenchmarkOptions, *, steps: int | None = None) -> Report:
     """Time each scene's motion, or its first steps."""
-    cases = [(name, law) for name in SCENES for law in LAWS]
+    cases = [(name, law) for name in SCENES for law in FRICTION_LAWS]
     workloads, checks = [], []
     for name, law in cases:
         scene = rolling_scene(SIDE, law) if name == "rolling" else load_scene(name, friction=law)

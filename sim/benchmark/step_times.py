@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ class StepTimes:
 
 def holding_controls(scene: Scene) -> Array:
     """Controls that ask for nothing: servos hold where the scene starts, all else is 0. Shape (nu,)."""
-    lengths = [a.gear * scene.q0[scene.joints[a.joint].q] for a in scene.actuators]
+    lengths = [a.gear * scene.q0[scene.joints[a.joint].q_start] for a in scene.actuators]
     servo = [a.kind == "position" for a in scene.actuators]
     return np.where(servo, lengths, 0.0)
 

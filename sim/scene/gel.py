@@ -34,7 +34,10 @@ from gelflow.toml_tables import TomlTable
 
 Array = NDArray[np.float64]
 
-MOST_MARKERS = 1000  # of a layer: its matrix has 9 n² numbers
+MAX_MARKERS = 1000  # of a layer: its matrix has 9 n² numbers
+_SPRING_KEYS = ("compliance", "normal_compliance")
+_LAYER_KEYS = ("youngs_modulus", "poisson_ratio", "thickness")
+_RENAMED_KEYS = {"normal": "normal_compliance", "modulus": "youngs_modulus", "poisson": "poisson_ratio"}
 _REACH = 30.0  # thicknesses: further away a layer does not move [1]; the half space has no such end
 _DEEP = 20.0  # w from which a layer is a half space to rounding
 _FINEST = 100.0  # largest wave number times a round cell's radius: the rest is 1e-4 of what a marker does to itself
@@ -44,15 +47,16 @@ _FINEST = 100.0  # largest wave number times a round cell's radius: the rest is 
 class SpringGel:
     """Every marker yields for itself."""
 
-    shear: float  # [m/N]
-    normal: float  # [m/N]
+    shear_compliance: float  # [m/N]
+    normal_compliance: float  # [m/N]
 
     def __str__(self) -> str:
-        return f"yields by {self.shear * 1e3:g} mm/N in shear, {self.normal * 1e3:g} mm/N into the pad"
+        shear, normal = self.shear_compliance * 1e3, self.normal_compliance * 1e3
+        return f"compliance {shear:g} mm/N in shear, {normal:g} mm/N into the pad"
 
     def displacement(self, forces: Any) -> Any:
         """Displacements [m] of markers under forces [N], (…, markers, 3); arrays or tensors."""
-        yields = np.array([self.shear, self.shear, self.normal])
+        yields = np.array([self.shear_compliance, self.shear_compliance, self.normal_compliance])
         return forces * _like(yields, forces)
 
 
@@ -60,24 +64,28 @@ class SpringGel:
 class LayerGel:
     """An elastic layer on a rigid back; the markers' cells are squares on a grid, round elsewhere."""
 
-    modulus: float  # Young's [Pa]
-    poisson: float
+    youngs_modulus: float  # [Pa]
+    poisson_ratio: float
     thickness: float  # [m], may be infinite
     positions: Array  # of the markers on the surface [m], shape (n, 2)
-    area: float  # of a marker's cell [m²]
-    grid: tuple[int, int] | None  # rows, columns of square cells
+    cell_area: float  # of a marker's cell [m²]
+    grid_shape: tuple[int, int] | None  # rows, columns of square cells
 
     def __str__(self) -> str:
-        return f"layer of {self.thickness * 1e3:g} mm, {self.modulus:g} Pa, Poisson's ratio {self.poisson:g}"
+        return (
+            f"layer of {self.thickness * 1e3:g} mm, {self.youngs_modulus:g} Pa, Poisson's ratio {self.poisson_ratio:g}"
+        )
 
     @cached_property
     def matrix(self) -> Array:
         """The map [m/N], shape (3 n, 3 n): marker by marker x, y, into the pad. Computed on first use."""
-        if self.grid is None:
-            blocks = _round_cells(self.positions, np.sqrt(self.area / np.pi), self.poisson, self.thickness)
+        if self.grid_shape is None:
+            blocks = _round_cells(self.positions, np.sqrt(self.cell_area / np.pi), self.poisson_ratio, self.thickness)
         else:
-            blocks = _square_cells(*self.grid, np.sqrt(self.area), self.poisson, self.thickness)
-        xx, xy, yy, xz, yz, zz = blocks / (np.pi * self.modulus / (1 + self.poisson))  # 2π times the shear modulus
+            blocks = _square_cells(*self.grid_shape, np.sqrt(self.cell_area), self.poisson_ratio, self.thickness)
+        xx, xy, yy, xz, yz, zz = blocks / (
+            np.pi * self.youngs_modulus / (1 + self.poisson_ratio)
+        )  # 2π times the shear modulus
         n = len(self.positions)
         matrix = np.array([[xx, xy, xz], [xy, yy, yz], [-xz, -yz, zz]])
         return np.ascontiguousarray(matrix.transpose(2, 0, 3, 1)).reshape(3 * n, 3 * n)
@@ -111,30 +119,32 @@ def read_gel(table: TomlTable, positions: Array, axes: Array, grid: Grid | None,
     Markers as in `PadDef`: `positions` [m], (n, 3), `axes` (n, 3, 3), in one frame; `area` that each stands for [m²],
     where it is known. Raises UsageError on wrong values, and for a layer where the markers are not on one plane.
     """
-    table.check_keys(("compliance", "normal", "modulus", "poisson", "thickness"))
     if "compliance" in table.data:
-        table.check_keys(("compliance", "normal"))
+        table.check_keys(_SPRING_KEYS, renamed=_RENAMED_KEYS)
         shear = table.number("compliance", minimum=0)
-        return SpringGel(shear, table.number("normal", shear, minimum=0))
-    if "modulus" not in table.data:
-        raise UsageError(f"{table.location}: give either compliance, or modulus, poisson and thickness")
-    table.check_keys(("modulus", "poisson", "thickness"))
-    endless = table.data.get("thickness") == np.inf
-    modulus, poisson = table.number("modulus", minimum=1e-9), table.number("poisson")
-    thickness = np.inf if endless else table.number("thickness", minimum=1e-9)
-    if not -1 < poisson <= 0.5:
-        raise UsageError(f"{table.location}: poisson must be above -1 and at most 0.5, got {poisson:g}")
+        return SpringGel(shear, table.number("normal_compliance", shear, minimum=0))
+    table.check_keys((*_SPRING_KEYS, *_LAYER_KEYS), renamed=_RENAMED_KEYS)
+    if "youngs_modulus" not in table.data:
+        raise UsageError(f"{table.location}: give either compliance, or youngs_modulus, poisson_ratio and thickness")
+    table.check_keys(_LAYER_KEYS)
+    youngs_modulus, poisson_ratio = table.number("youngs_modulus", minimum=1e-9), table.number("poisson_ratio")
+    half_space = table.data.get("thickness") == np.inf
+    thickness = np.inf if half_space else table.number("thickness", minimum=1e-9)
+    if not -1 < poisson_ratio <= 0.5:
+        raise UsageError(f"{table.location}: poisson_ratio must be above -1 and at most 0.5, got {poisson_ratio:g}")
     local = (positions - positions[0]) @ axes[0]
     wide = max(float(np.ptp(local[:, :2], axis=0).max()), 1e-9)
     if np.abs(local[:, 2]).max() > 1e-6 * wide or np.abs(axes - axes[0]).max() > 1e-6:
         raise UsageError(
             f"{table.location}: a layer needs coplanar markers with the same axes; use compliance for this pad"
         )
-    if len(local) > MOST_MARKERS:
-        raise UsageError(f"{table.location}: a layer takes at most {MOST_MARKERS} markers, got {len(local)}")
+    if len(local) > MAX_MARKERS:
+        raise UsageError(f"{table.location}: a layer takes at most {MAX_MARKERS} markers, got {len(local)}")
     flat = np.ascontiguousarray(local[:, :2])
     cells = _cell_area(flat, table.location) if area is None else area
-    return LayerGel(modulus, poisson, thickness, flat, cells, None if grid is None else (grid.rows, grid.cols))
+    return LayerGel(
+        youngs_modulus, poisson_ratio, thickness, flat, cells, None if grid is None else (grid.rows, grid.cols)
+    )
 
 
 def _cell_area(flat: Array, where: str) -> float:

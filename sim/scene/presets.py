@@ -1,8 +1,8 @@
-"""Presets: how exactly a scene is simulated, chosen with one word.
+"""Presets: named settings of accuracy against speed, the tables `presets.NAME` of a scene.
 
-A scene's TOML file has them as `[presets.NAME]`: values that replace those of the file, by dotted key. Only what the
-file has can be replaced, and only what does not change the physics by itself: time step, integrator, Newton's
-tolerance, precision, and the parts' own keys, such as the number of contact points where stiffness is per area.
+A preset replaces values of the TOML file, by dotted key. It may set the keys of the solver (time step, integrator,
+tolerance, precision) and keys that the file already has in the tables of its elements, such as the number of contact
+points where stiffness is per area.
 """
 
 from collections.abc import Collection, Mapping
@@ -11,50 +11,54 @@ from typing import Any
 from gelflow.errors import UsageError
 from gelflow.toml_tables import TomlTable, set_by_path, suggestion, tables_at_path
 
-NAMES = ("fast", "balanced", "accurate")  # of the scenes that come along
+PRESET_NAMES = ("fast", "balanced", "accurate")  # presets of every scene of gelflow
 
-Presets = Mapping[str, Mapping[str, Any]]
+Presets = Mapping[str, Mapping[str, Any]]  # preset name -> dotted key -> value
 
 
-def read_presets(top: TomlTable, *, free: Collection[str], parts: Collection[str]) -> Presets:
-    """The presets of a scene's file: name → dotted key → value.
+def read_presets(top: TomlTable, *, top_level_keys: Collection[str], element_tables: Collection[str]) -> Presets:
+    """The presets of a TOML file.
 
     Parameters
     ----------
     top: the file
-    free: keys at the top that a preset may set even where the file does not
-    parts: tables at the top whose keys a preset may set where the file has them
+    top_level_keys: keys at the top level that a preset may set even if the file does not
+    element_tables: tables at the top level whose keys a preset may set if the file has them
 
     Raises UsageError, in one line, on a key that the file does not have.
     """
-    found = {name: dict(_flat(table.data)) for name, table in top.tables("presets").items()}
-    known = {key: value for key, value in top.data.items() if key in parts}
-    for name, values in found.items():
-        where = f"{top.location}, presets.{name}"
-        for dotted in values:
-            *way, last = dotted.split(".")
-            if not way and last in free:
+    presets = {name: dict(_flatten(table.data)) for name, table in top.tables("presets").items()}
+    elements = {key: value for key, value in top.data.items() if key in element_tables}
+    for name, values in presets.items():
+        location = f"{top.location}, presets.{name}"
+        for dotted_key in values:
+            *path, key = dotted_key.split(".")
+            if not path and key in top_level_keys:
                 continue
-            if not way:
-                raise UsageError(f"{where}: unknown key {last!r}; {suggestion(last, [*free, *known])}")
-            for table in tables_at_path(known, way, f"{where}: {dotted!r}"):
-                if last not in table:
-                    raise UsageError(f"{where}: {dotted!r}: unknown key {last!r}; {suggestion(last, table)}")
-    return found
+            if not path:
+                raise UsageError(f"{location}: unknown key {key!r}; {suggestion(key, [*top_level_keys, *elements])}")
+            for table in tables_at_path(elements, path, f"{location}: {dotted_key!r}"):
+                if key not in table:
+                    raise UsageError(f"{location}: {dotted_key!r}: unknown key {key!r}; {suggestion(key, table)}")
+    return presets
 
 
-def with_preset(data: dict[str, Any], presets: Presets, name: str, where: str) -> None:
-    """Put a preset's values into a scene's tables. Raises UsageError when there is no such preset."""
+def apply_preset(data: dict[str, Any], presets: Presets, name: str, location: str) -> None:
+    """Write the values of a preset into the tables of a scene. Raises UsageError on an unknown preset."""
     if name not in presets:
-        raise UsageError(f"{where}: no preset {name!r}; {suggestion(name, list(presets))}")
-    for dotted, value in presets[name].items():
-        set_by_path(data, dotted, value)
+        raise UsageError(f"{location}: no preset {name!r}; {suggestion(name, list(presets))}")
+    for dotted_key, value in presets[name].items():
+        set_by_path(data, dotted_key, value)
 
 
-def _flat(table: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Nested tables as dotted keys: TOML reads `points.tip.count = 5` as tables, and `"points.tip.count" = 5` not."""
+def _flatten(table: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Pairs of dotted key and value of nested tables.
+
+    TOML parses `points.tip.count = 5` as nested tables and `"points.tip.count" = 5` as a single key; both are equal
+    here.
+    """
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
-        inner = _flat(value) if isinstance(value, dict) else [("", value)]
-        pairs += [(f"{key}.{rest}" if rest else key, each) for rest, each in inner]
+        children = _flatten(value) if isinstance(value, dict) else [("", value)]
+        pairs += [(f"{key}.{path}" if path else key, child) for path, child in children]
     return pairs

@@ -22,7 +22,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
 from gelflow.task import INSERTION, InsertionTask

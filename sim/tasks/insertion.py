@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
 from gelflow.task import INSERTION, InsertionTask
@@ -114,7 +114,7 @@ class InsertionAttempts:
             "q": self.sim.q.copy(),
             "anchors": self.sim.anchors.copy(),
             "anchored": self.sim.anchored.copy(),
-            "tactile": np.zeros((num_envs, self.scene.markers, 2)),
+            "tactile": np.zeros((num_envs, self.scene.num_markers, 2)),
         }
         # Shear forces of the present attempt, and their copies after the steps at which a frame is due.
         self._shear = np.zeros_like(self._grasp["tactile"])

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.scene.distance_grid import DistanceGrid, spline_grid
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, spline_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_meshes import bracket_distance
 

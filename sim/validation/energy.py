@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.geometry import rotate
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import NUMBERS
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import CONTACT_PARAMS, Scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.gradient_check import quaternion_joints
 
@@ -24,7 +23,7 @@ _UNBOUNDED = 1e18  # a friction coefficient that no strain reaches
 
 
 class Describes(Protocol):
-    """Anything that tells a model builder its parts: a `gelflow.sim.scene.scene.Scene`."""
+    """Anything that tells a model builder its parts: a `gelflow.sim.scene.Scene`."""
 
     def describe_to(self, spec: Any) -> Any: ...
 
@@ -71,7 +70,7 @@ class EnergyGauge:
 
         Points stand contact by contact, in the order in which they were given.
         """
-        twin, numbers = self._twin, set(NUMBERS)
+        twin, numbers = self._twin, set(CONTACT_PARAMS)
         theirs = {name: i for i, name in enumerate(sim.model.param_names)}
         for i, name in enumerate(twin.model.param_names):
             if name in theirs and name.rsplit(".", 1)[-1] not in numbers:
@@ -110,14 +109,14 @@ def motor_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
     for i, a in enumerate(scene.actuators):
         length = a.gear * sim.q[:, sim.model.joint_q[a.joint]]
         speed = a.gear * sim.v[:, sim.model.joint_v[a.joint]]
-        control = np.clip(controls[i], *a.control)
+        control = np.clip(controls[i], *a.ctrl_range)
         pull = {
             "motor": control + 0 * length,
             "position": a.kp * (control - length) - a.kd * speed,
             "velocity": a.kd * (control - speed),
             "general": a.gain * control + a.bias - a.kp * length - a.kd * speed,
         }[a.kind]
-        forces[:, i] = a.gear * np.clip(pull, *a.force)
+        forces[:, i] = a.gear * np.clip(pull, *a.force_range)
     return forces
 
 

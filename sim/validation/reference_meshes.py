@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from gelflow.sim.scene.mesh import TriangleMesh
+from gelflow.sim.scene.geometry.mesh import TriangleMesh
 
 Array = NDArray[np.float64]
 

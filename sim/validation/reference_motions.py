@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ def _rolling(scene: Scene) -> ReferenceMotion:
     q0[scene.q("pad_z")] = -0.0145  # half a millimetre above the ball
     ball = next(b for b in scene.bodies if b.name == "ball")
     ground = next(c for c in scene.contacts if c.name == "ball_ground")
-    q0[scene.q("ball").start + 2] += scene.gravity[2] * ball.mass / ground.numbers["kn"]  # it would bounce otherwise
+    q0[scene.q("ball").start + 2] += scene.gravity[2] * ball.mass / ground.params["kn"]  # it would bounce otherwise
     tracks = {  # the pad weighs 0.245 N
         "pad_z": [(0.0, 0.18), (0.1, 0.16), (0.3, 0.16), (0.34, 0.30), (0.38, 0.30), (0.42, 0.17)],
         "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
@@ -105,7 +105,7 @@ def _insertion(scene: Scene) -> ReferenceMotion:
     for joint in ("arm_x", "part"):
         q0[scene.q(joint).start] += shift
     touching = {p.name: p.weights.sum() / 2 for p in scene.points}  # half of a disc's points are on the face
-    numbers = {c.points: c.numbers for c in scene.contacts}
+    numbers = {c.points: c.params for c in scene.contacts}
     for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
         q0[scene.q(finger)] += force / (numbers[pad]["kn"] * touching[pad])
     servo = next(a for a in scene.actuators if a.name == "arm_z")
@@ -152,7 +152,7 @@ def _grasp(scene: Scene) -> ReferenceMotion:
 def _sag(scene: Scene) -> float:
     """How far the bar sinks into its two tables [m]. If it fell there it would rattle for as long as the motion."""
     cloud = next(p for p in scene.points if p.name == "bar")
-    kn = next(c.numbers["kn"] for c in scene.contacts if c.points == "bar")
+    kn = next(c.params["kn"] for c in scene.contacts if c.points == "bar")
     places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
     tables = [s for s in scene.shapes if s.name.startswith("table")]
     resting = sum(weights[(np.abs(places - t.pose.position) <= t.size)[:, :2].all(1)].sum() for t in tables)

@@ -31,8 +31,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS, Scene, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
@@ -78,7 +77,7 @@ def stress_batches(rounds: int) -> list[StressBatch]:
     """Every scene × law × integrator `rounds` times: 2 of 10 normal, 4 with one extreme quantity, 4 with all; every
     fifth in single precision."""
     kinds = [k for i in range(len(QUANTITIES)) for k in ("all", QUANTITIES[i], "normal", QUANTITIES[i - 1], "all")]
-    combinations = list(product(SCENES, LAWS, INTEGRATORS))
+    combinations = list(product(SCENES, FRICTION_LAWS, INTEGRATORS))
     result = []
     for i in range(rounds):
         for j, (scene, law, integrator) in enumerate(combinations):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.scene.sampling import box_surface, cylinder
+from gelflow.sim.scene.geometry.sampling import box_surface, cylinder
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.energy import EnergyGauge
 

@@ -138,6 +138,12 @@ class TomlTable:
             raise UsageError(f"{self.location}: {key} must be a name or a list of names, got {value!r}")
         return tuple(value)
 
+    def lookup(self, items: Mapping[str, T], name: str, kind: str) -> T:
+        """The item with a name that this table refers to; `kind` names the items in the error message."""
+        if name not in items:
+            raise UsageError(f"{self.location}: no {kind} {name!r}; {suggestion(name, list(items))}")
+        return items[name]
+
     def as_dataclass(self, cls: type[T]) -> T:
         """An instance of a dataclass: one key per field, one subtable per field that is a dataclass.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from gelflow.sim.benchmark.tradeoff.run import Errors, compare
 from gelflow.sim.benchmark.tradeoff.sweep import reference, simulated
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 
 MARGIN = 1.5  # a bound is this many times the worst that was measured
 SCENE_DEFAULT = "default"  # the scene's own numbers, measured beside its presets

@@ -17,8 +17,7 @@ from scipy.interpolate import RegularGridInterpolator
 from gelflow.errors import UsageError
 from gelflow.geometry import angles_between
 from gelflow.observation import MIN_DIVISORS, normalize
-from gelflow.sim.scene.parts import PadDef
-from gelflow.sim.scene.scene import Scene
+from gelflow.sim.scene import PadDef, Scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 
@@ -182,8 +181,8 @@ def drawn(scene: Scene, rng: np.random.Generator) -> Scene:
     masses = [1.0 if i in with_pads else factor() for i in range(len(scene.bodies))]
     return replace(
         scene,
-        contacts=tuple(replace(c, numbers=numbers(c.numbers, *groups[c.group])) for c in scene.contacts),
-        pads=tuple(replace(p, numbers=numbers(p.numbers, *two)) for p, two in zip(scene.pads, pads, strict=True)),
+        contacts=tuple(replace(c, params=numbers(c.params, *groups[c.group])) for c in scene.contacts),
+        pads=tuple(replace(p, params=numbers(p.params, *two)) for p, two in zip(scene.pads, pads, strict=True)),
         bodies=tuple(
             replace(b, mass=b.mass * m, inertia=b.inertia * m) for b, m in zip(scene.bodies, masses, strict=True)
         ),

@@ -15,7 +15,7 @@ import numpy as np
 
 from gelflow.errors import SimulationError
 from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, Run, Task, compare, drawn
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.validation.reference_motions import reference_motion
 from gelflow.toml_tables import read_toml
 

@@ -27,7 +27,7 @@ from gelflow.sim.benchmark.paper_build import MODULE, unavailable_reason
 from gelflow.sim.benchmark.rolling import ROLLING_STEPS, RollingConfig, measure_rolling, rolling_run, rolling_scene
 from gelflow.sim.benchmark.runs import TIMED, check_accuracy, motion_run, simulator
 from gelflow.sim.benchmark.scenes import measure_scenes
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 from gelflow.sim.validation.reference_motions import SCENES
 
 ONCE = BenchmarkOptions(quick=True, repeats=1)

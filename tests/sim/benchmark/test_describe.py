@@ -12,8 +12,7 @@ from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.benchmark.step_times import holding_controls, measure, with_duplicates
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 
 MODEL = """
@@ -71,7 +70,7 @@ def words(text: str) -> str:
     return " ".join(text.translate(str.maketrans("│├└─┌┐┬┴┼┤", " " * 10)).split())
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
 def test_the_tree_holds_every_part(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
     scene = load_scene(name, friction=law)
@@ -107,7 +106,7 @@ def test_numbers_of_a_contact_and_a_joint(capsys: pytest.CaptureFixture[str]) ->
     assert "elastic per point, plain damping: k_n 1000 N/m, k_s 500 N/m, k_t 1 N s/m, k_d 0.003 N s/m, µ 0.8" in text
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
 def test_json_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(printed(capsys, name, "--friction", law, "--no-timing", "--json"))
@@ -150,7 +149,7 @@ def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None
     world, block, other = told.bodies
     assert (world.merged, block.merged, other.merged) == (("table",), ("sticker",), ())
     assert block.geometry == ("box block", "box sticker")
-    assert told.left_out == (
+    assert told.not_modelled == (
         "box top: in no contact and under no pad",
         "box sticker: in no contact and under no pad",
         "sphere other: in no contact and under no pad",
@@ -162,7 +161,7 @@ def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None
         "MuJoCo's contact and solver settings: the scene file says what touches what, and how",
     )
     text = words(printed(capsys, str(own), "--no-timing"))
-    for line in told.left_out:
+    for line in told.not_modelled:
         assert line in text
     assert "attached: sticker" in text
     assert "joint lift: slide along (0 0 1), range -1 to 1 m (stop 100 N/m), damping 3 N s/m" in text
@@ -175,7 +174,7 @@ def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None
 def test_an_elastic_pad_is_not_left_out(own: Path) -> None:
     scene = load_scene(own, overrides={"pads.pad.law": "elastic", "pads.pad.ks": 1.0})
     told = describe(scene)
-    assert not any(line.startswith("pad pad") for line in told.left_out)
+    assert not any(line.startswith("pad pad") for line in told.not_modelled)
     assert told.size.anchors == 12
     assert [name for name, _ in with_duplicates(scene)] == ["contact stand", "pad pad: memory of its markers"]
 
@@ -186,7 +185,7 @@ def test_viscous_markers_are_free_until_they_are_read() -> None:
     assert describe(few).size.state_bytes == describe(many).size.state_bytes
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
 def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
     """What is timed with a part twice takes the very steps and Newton iterations that the scene takes."""

@@ -24,8 +24,7 @@ from gelflow.sim.benchmark.tradeoff.sweep import (
     settings,
     simulated,
 )
-from gelflow.sim.scene.presets import NAMES
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import PRESET_NAMES, load_scene, scene_names
 
 
 def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -35,7 +34,7 @@ def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str],
     assert picture.stat().st_size > 10_000
     measurements = {measurement["setting"]["name"]: measurement for measurement in found["measurements"]}
     assert set(measurements) | set(found["failed"]) >= {s.name for s in settings("pushing", quick=True)}
-    assert {name for measurement in measurements.values() for name in measurement["presets"]} == set(NAMES)
+    assert {name for measurement in measurements.values() for name in measurement["presets"]} == set(PRESET_NAMES)
     assert all(measurement["dominated_by"] in (None, *measurements) for measurement in measurements.values())
     assert any(measurement["dominated_by"] for measurement in measurements.values())
     # Finer steps are closer to the reference, which moved much less than they are off.
@@ -81,7 +80,7 @@ def test_settings_are_of_the_scene_and_differ(name: str) -> None:
     assert {"default", "step", "tolerance", "combined", "single", "reads", "contacts"} <= {s.group for s in found}
     own = load_scene(name)
     scenes = [load_scene(name, overrides=s.overrides) for s in found]
-    assert [s for s, scene in zip(found, scenes, strict=True) if scene.markers != own.markers] == [
+    assert [s for s, scene in zip(found, scenes, strict=True) if scene.num_markers != own.num_markers] == [
         s for s in found if s.group == "markers"
     ]
     for scene in scenes:
@@ -101,9 +100,9 @@ def test_other_densities_of_points_are_as_stiff_in_all(name: str) -> None:
         weights = {p.name: p.weights.sum() for p in scene.points}
         for contact, before in zip(scene.contacts, own.contacts, strict=True):
             for number in ("kn", "kt", "kd", "ks"):
-                stiffness = contact.numbers[number] * weights[contact.points]
-                assert stiffness == pytest.approx(before.numbers[number] * total[before.points])
-            assert contact.numbers["mu"] == before.numbers["mu"]
+                stiffness = contact.params[number] * weights[contact.points]
+                assert stiffness == pytest.approx(before.params[number] * total[before.points])
+            assert contact.params["mu"] == before.params["mu"]
 
 
 def test_coarser_markers_stay_in_place() -> None:
@@ -192,16 +191,16 @@ def test_a_draw_is_the_same_for_every_step_and_changes_the_physics() -> None:
     fine = drawn(load_scene("grasp", preset="accurate"), np.random.default_rng(1))
     own = load_scene("grasp")
     for scene in (again, fine):
-        assert [c.numbers for c in scene.contacts] == [c.numbers for c in first.contacts]
+        assert [c.params for c in scene.contacts] == [c.params for c in first.contacts]
         assert [b.mass for b in scene.bodies] == [b.mass for b in first.bodies]
-    assert first.contacts[0].numbers != other.contacts[0].numbers
+    assert first.contacts[0].params != other.contacts[0].params
     for body, before in zip(first.bodies, own.bodies, strict=True):
         assert body.name.startswith("finger") == (body.mass == before.mass)
         np.testing.assert_allclose(body.inertia / before.mass, before.inertia * body.mass / before.mass**2)
     for contact, before_contact in zip(first.contacts, own.contacts, strict=True):
-        ratio = contact.numbers["kn"] / before_contact.numbers["kn"]
+        ratio = contact.params["kn"] / before_contact.params["kn"]
         assert 1 / 1.5 <= ratio <= 1.5
-        assert contact.numbers["ks"] == pytest.approx(ratio * before_contact.numbers["ks"])
+        assert contact.params["ks"] == pytest.approx(ratio * before_contact.params["ks"])
 
 
 def test_the_bar_of_grasp_starts_at_rest() -> None:

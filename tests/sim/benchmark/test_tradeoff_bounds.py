@@ -6,8 +6,7 @@ import pytest
 
 from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, preset_errors
 from gelflow.sim.benchmark.tradeoff.run import Errors
-from gelflow.sim.scene.presets import NAMES
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import PRESET_NAMES, load_scene, scene_names
 
 PAGE = Path(__file__).parents[3] / "docs" / "guide" / "tradeoff.md"
 SEEDS = (1001, 1002, 1003)  # the page's draws have seeds from 0 on
@@ -28,7 +27,7 @@ def promised() -> dict[tuple[str, str], tuple[str, Errors]]:
 
 def test_the_page_has_every_preset_as_it_is() -> None:
     found = promised()
-    assert set(found) == {(scene, name) for scene in scene_names() for name in (*NAMES, SCENE_DEFAULT)}
+    assert set(found) == {(scene, name) for scene in scene_names() for name in (*PRESET_NAMES, SCENE_DEFAULT)}
     for (scene, name), (how, _) in found.items():
         way = load_scene(scene, preset=None if name == SCENE_DEFAULT else name)
         integrator, step, tolerance = how.split(", ")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 
@@ -318,7 +318,7 @@ BUILDS = """
 import sys
 import numpy as np
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
 assert _core.LEVEL == "base"

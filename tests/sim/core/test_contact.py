@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene import FRICTION_LAWS
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def settle(sim: Simulator, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("damping", ["depth", "plain"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_a_block_at_rest_carries_its_weight(law: str, damping: str) -> None:
     sim = block_on_plane(law, damping=damping, kd=20.0 if damping == "plain" else 2e4)
     settle(sim, 2.0)
@@ -91,7 +91,7 @@ def test_a_block_that_the_elastic_law_holds_stays() -> None:
     assert sim.q[0, 0] == pytest.approx(rest, abs=1e-8)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_a_block_that_slips_is_braked_by_mu_n(law: str) -> None:
     slope, mu = 0.3, 0.1
     sim = block_on_plane(law, slope=slope, mu=mu)
@@ -104,7 +104,7 @@ def test_a_block_that_slips_is_braked_by_mu_n(law: str) -> None:
     assert abs(friction[0]) == pytest.approx(mu * friction[2], rel=1e-9)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("slope", [0.3, 0.9])
 def test_markers_at_the_contact_points_add_up_to_what_the_solver_applied(law: str, slope: float) -> None:
     """With the law of the contact: holding and slipping, forces on the body by both ways."""
@@ -143,7 +143,7 @@ def two_blocks(law: str) -> Simulator:
     return sim
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_forces_of_a_pair_are_equal_and_opposite(law: str) -> None:
     """What each body's momentum gains in a step is the contact's impulse, and its reverse on the other body."""
     sim = two_blocks(law)
@@ -171,7 +171,7 @@ def test_forces_of_a_pair_are_equal_and_opposite(law: str) -> None:
     np.testing.assert_allclose(momentum, MASS * np.array([0.3, 0.05, 0]) + 0.1 * np.array([-0.2, 0, 0.1]), atol=1e-12)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_contact_takes_energy_and_never_gives_any(law: str) -> None:
     sim = two_blocks(law)
     masses = np.repeat([MASS, 0.1], 6) * np.tile([1, 1, 1, *[(2 * HALF) ** 2 / 6] * 3], 2)

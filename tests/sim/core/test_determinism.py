@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gelflow.sim.scene.scene import Scene, load_scene, scene_names
+from gelflow.sim.scene import Scene, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.energy import EnergyGauge, motor_forces
 from gelflow.sim.validation.reference_motions import reference_motion
@@ -53,7 +52,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.parametrize(
-    ("kind", "law"), [(kind, law) for kind in KINDS for law in LAWS if (kind, law) != ("sphere", "elastic")]
+    ("kind", "law"), [(kind, law) for kind in KINDS for law in FRICTION_LAWS if (kind, law) != ("sphere", "elastic")]
 )
 def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
     """Not in one step, halved or not; a sphere's moving point keeps no anchor, so that its friction is viscous."""

@@ -10,9 +10,8 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.scene.distance_grid import spline_grid
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import FRICTION_LAWS, load_scene
+from gelflow.sim.scene.geometry.distance_grid import spline_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import SHAPES, pressed_cloud
@@ -22,7 +21,7 @@ from gelflow.sim.validation.stress import Precision, StressBatch, StressTest
 # Elastic friction and BDF2 are the longer ways; the others take part in single precision.
 WAYS: tuple[tuple[str, str, Precision], ...] = (("elastic", "bdf2", "double"), ("viscous", "bdf1", "single"))
 FEW: dict[str, dict[str, Any]] = {
-    "rolling": {"pads.pad.rows": 8, "pads.pad.cols": 8, "points.pad.resolution": [8, 8, 2], "pads.pad.pushes": True},
+    "rolling": {"pads.pad.rows": 8, "pads.pad.cols": 8, "points.pad.resolution": [8, 8, 2], "pads.pad.collides": True},
     "pushing": {"pads.pad.rows": 8, "pads.pad.cols": 8},
     "insertion": {"pads.*.rows": 6, "pads.*.cols": 5},
 }
@@ -57,7 +56,7 @@ def test_scene(name: str, law: str, integrator: str, precision: Precision) -> No
     sim.reset([True, False, True])
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", SHAPES)
 def test_shape(kind: str, law: str) -> None:
     rng = np.random.default_rng(1)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.scene.distance_grid import DistanceGrid, spline_grid
+from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, spline_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation import reference_meshes as mesh_solids

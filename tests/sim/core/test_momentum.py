@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import load_scene, scene_names
+from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 SHORT, LONG = 200, 400  # steps; the pad is on the ball after the short run

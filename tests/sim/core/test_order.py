@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, load_scene
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.validation.reference_motions import SCENES
 from gelflow.sim.validation.stress import Precision, StepStatistics, StressBatch, StressTest, stress_batches
@@ -16,7 +15,7 @@ BOTH: tuple[Precision, ...] = ("double", "single")
 
 @pytest.mark.parametrize("precision", BOTH)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("scene", SCENES)
 def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision: Precision) -> None:
     sim, u = StressTest(envs=24, steps=20, threads=1, seed=3).start(
@@ -37,7 +36,7 @@ def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision:
 @pytest.mark.parametrize("scene", SCENES)
 def test_nothing_fails_in_the_normal_range(scene: str, precision: Precision) -> None:
     extremes = StressTest(envs=24, steps=20, threads=1, seed=4)
-    for law in LAWS:
+    for law in FRICTION_LAWS:
         for integrator in INTEGRATORS:
             statistics = extremes.run(StressBatch(scene, law, integrator, "normal", precision))
             assert statistics.failed == 0 and statistics.steps == 24 * 20
@@ -66,7 +65,7 @@ def test_a_step_that_must_be_halved_tells_its_error() -> None:
     assert halved > 5
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_what_lies_stays(law: str) -> None:
     """A box at rest on the ground for a million steps, 83 minutes: as it lay, so it lies."""
     sim = Simulator(load_scene("pushing", friction=law), threads=1)

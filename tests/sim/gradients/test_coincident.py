@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gelflow.geometry import rotate
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene import FRICTION_LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.gradient_check import RolloutLoss, compare_to_dual_numbers
 
@@ -52,7 +52,7 @@ def reading_by_q(sim: Simulator) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", SIZES)
 def test_a_marker_on_an_edge_feels_nothing_yet(kind: str, law: str, precision: str) -> None:
     """As on the outside: force and gradient vanish, and so they do a little further out."""
@@ -64,7 +64,7 @@ def test_a_marker_on_an_edge_feels_nothing_yet(kind: str, law: str, precision: s
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize(("kind", "at"), [("box", (12, 0, 4)), ("cylinder", (4, 0, 12))])
 def test_a_marker_equally_near_to_both_faces_of_an_edge_takes_one(
     kind: str, at: tuple[float, float, float], law: str, precision: str
@@ -121,7 +121,7 @@ HOLE = {  # as wide, long and deep as the cube
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
 def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precision: str) -> None:
     """Unloaded, nothing moves by a bit; gradients are those of the free side, up and out."""
@@ -147,7 +147,7 @@ def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precisi
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
 def test_a_load_on_coincident_faces_is_carried_straight_down(boxes: dict[str, Any], law: str, precision: str) -> None:
     """On the box of its size by the nine points inside its face, as those on its edges stay on its edges; in the hole
@@ -193,7 +193,7 @@ def hanging_over(law: str, precision: Any) -> Simulator:
 
 
 @pytest.mark.parametrize("precision", PRECISIONS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_a_pad_half_off_a_body(law: str, precision: str) -> None:
     """Only the markers over it feel it, UNIT deep, and together they feel the contact's wrench; the one on its edge
     feels nothing."""

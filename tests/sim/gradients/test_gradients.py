@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from gelflow.sim.benchmark.rolling import ROLLING_FORCES
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
 from gelflow.sim.validation.reference_motions import SCENES
@@ -15,7 +14,7 @@ OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", SCENES)
 def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> None:
     for seed in range(2):
@@ -28,11 +27,11 @@ def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> Non
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", SCENES)
 def test_right_against_central_differences(name: str, law: str, integrator: str) -> None:
     """By controls and state for every output; by the parameters, which take most of the time, for one, in turn."""
-    agreements, with_params = [], (LAWS.index(law) + 2 * INTEGRATORS.index(integrator)) % len(OUTPUTS)
+    agreements, with_params = [], (FRICTION_LAWS.index(law) + 2 * INTEGRATORS.index(integrator)) % len(OUTPUTS)
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(100 + seed)
         sim, u = scene_in_contact(name, law, integrator, rng)
@@ -45,7 +44,7 @@ def test_right_against_central_differences(name: str, law: str, integrator: str)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", [*SHAPES, FREE])
 def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
     """Pressed onto it; a free body that spins on a plane, and so takes the way by arcs (arc_correction.hpp)."""
@@ -63,7 +62,7 @@ def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_the_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> None:
     """Down onto the ball for 100 steps, then rolling: the end's positions, and a loss of all its marker readings."""
     (down, push), (_, roll) = ROLLING_FORCES[:2]

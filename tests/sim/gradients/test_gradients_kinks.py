@@ -13,8 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import INTEGRATORS
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
 from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 from gelflow.sim.validation.gradient_check import RolloutLoss, compare_to_dual_numbers
 
@@ -96,7 +95,7 @@ KINKS: dict[str, Kink] = {
         f"{kind}, {where}, {law}": place(kind, where, law)
         for kind, many in PLACES.items()
         for where in many
-        for law in LAWS
+        for law in FRICTION_LAWS
     },
     "just touching, at rest": lambda i: probe(i, slides="xyz"),
     "just touching, elastic": lambda i: probe(i, slides="xyz", law="elastic"),

@@ -6,7 +6,7 @@ import torch
 
 from gelflow.errors import UsageError
 from gelflow.sim import torch_layer
-from gelflow.sim.scene.parts import LAWS
+from gelflow.sim.scene import FRICTION_LAWS
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import converged_simulator, scene_in_contact
@@ -21,7 +21,7 @@ def rollout_loss(sim: Simulator, u: torch.Tensor, q: torch.Tensor, v: torch.Tens
     return (run.q[-1] ** 2).sum() + (run.v**2).mean() + 10 * (run.tactile**2).sum()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", ("rolling", "insertion"))
 def test_hundred_steps_through_torch(name: str, law: str) -> None:
     """dL/du, dL/dq0 and dL/dv0 of a loss with tactile terms, against central differences along random directions.

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gelflow.sim import _core
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.sampling import box_surface, capsule
-from gelflow.sim.scene.scene import INTEGRATORS, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, load_scene
+from gelflow.sim.scene.geometry.sampling import box_surface, capsule
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import SCENES
 
@@ -64,7 +63,7 @@ def move(sim: Simulator, owner: str, names: tuple[str, ...]) -> None:
             sim.param(f"{owner}.{name}.{axis}")[:] += value - (name == "scale")
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("what", ["shape", "points", "markers"])
 def test_a_parameter_moves_as_if_built_there(what: str, law: str) -> None:
     places = {"shape": "as built", "points": "as built", "markers": "as built"}

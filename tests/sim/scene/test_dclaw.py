@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 
@@ -28,12 +27,12 @@ def closed(sim: Simulator, scene: Scene) -> np.ndarray:
 
 def pressures(sim: Simulator, scene: Scene) -> np.ndarray:
     """Sum of the normal forces that each fingertip's markers feel [N]."""
-    return np.array([sim.tactile()[0, scene.markers_of(f"tip{i}"), 2].sum() for i in (1, 2, 3)])
+    return np.array([sim.tactile()[0, scene.marker_slice(f"tip{i}"), 2].sum() for i in (1, 2, 3)])
 
 
 def test_the_hand_is_as_published() -> None:
     scene = load_scene("dclaw")
-    assert (scene.nq, scene.nu, scene.markers) == (10, 9, 3 * 302)
+    assert (scene.nq, scene.nu, scene.num_markers) == (10, 9, 3 * 302)
     assert [a.name for a in scene.actuators] == [j.name for j in scene.joints[:9]]
     cap = next(shape for shape in scene.shapes if shape.name == "cap")
     assert cap.kind == "cylinder" and 2 * cap.size[1] == pytest.approx(0.03)
@@ -76,7 +75,7 @@ def test_the_tips_reach_every_cap(distance: float) -> None:
     assert 0 < turned < 1.2  # the markers' half of the tip looks at the cap
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_the_fingers_close_and_turn_the_cap(law: str) -> None:
     scene = load_scene("dclaw", friction=law)
     sim = Simulator(scene)
@@ -92,7 +91,7 @@ def test_the_fingers_close_and_turn_the_cap(law: str) -> None:
     assert sim.q[0, scene.q("cap")][0] > 0.15
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_one_joint_turns_the_cap_either_way(law: str) -> None:
     scene = load_scene("dclaw", friction=law)
     angles = []

@@ -11,9 +11,9 @@ import torch
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.sim.benchmark.describe import describe
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.scene.gel import LayerGel, SpringGel, half_space_response, layer_response
-from gelflow.sim.scene.sampling import disc_lattice
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene.geometry.sampling import disc_lattice
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.torch_layer import torch_rollout, torch_state
 
@@ -69,7 +69,7 @@ def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
     np.testing.assert_allclose(far, point, rtol=1e-3, atol=1e-18)
     # A round cell: the mean distance⁻¹ of two points of a disc is 16 / (3 π a).
     disc = scattered(50, np.inf)
-    own = 16 / (3 * np.pi * np.sqrt(disc.area / np.pi)) / (2 * np.pi * G)
+    own = 16 / (3 * np.pi * np.sqrt(disc.cell_area / np.pi)) / (2 * np.pi * G)
     assert disc.matrix[2, 2] == pytest.approx((1 - NU) * own, rel=1e-4)
 
 
@@ -82,12 +82,12 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
     shear_modulus = E / (2 + 2 * nu)
     for axis, yields in ((0, 1.0), (1, 1.0), (2, (1 - 2 * nu) / (2 - 2 * nu))):
         forces = np.zeros((21 * 21, 3))
-        forces[:, axis] = stress * gel.area
+        forces[:, axis] = stress * gel.cell_area
         expected = np.zeros(3)
         expected[axis] = stress * thickness / shear_modulus * yields
         np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=2e-5 * stress * thickness / G)
     if thickness < 1e-4:  # a marker alone: all of its own cell, nothing of the others but at the cells' borders
-        alone = gel.matrix[::3, 3 * middle] * shear_modulus * gel.area / thickness
+        alone = gel.matrix[::3, 3 * middle] * shear_modulus * gel.cell_area / thickness
         assert alone[middle] == pytest.approx(1, abs=0.1)
         assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 21, middle + 21])).max() < 1e-3
 
@@ -129,7 +129,7 @@ def test_per_area_loads_converge_as_the_grid_is_refined() -> None:
     def middle(cells: int) -> Any:
         gel = on_grid(cells, cells, 0.015 / cells, 4e-3)
         bell = np.exp(-(gel.positions**2).sum(1) / 0.003**2)[:, None] * [1000.0, 0.0, 2000.0]
-        return gel.displacement(bell * gel.area)[cells * cells // 2]
+        return gel.displacement(bell * gel.cell_area)[cells * cells // 2]
 
     coarse, medium, fine = middle(11), middle(17), middle(27)
     expected = (11**-2 - 17**-2) / (17**-2 - 27**-2)
@@ -153,7 +153,7 @@ def test_a_turned_pad_and_one_seen_from_its_side() -> None:
 
 def test_round_cells_do_nearly_what_square_ones_do() -> None:
     square = on_grid(6, 5, 1.5e-3, 4e-3)
-    disc = replace(square, grid=None)
+    disc = replace(square, grid_shape=None)
     assert np.abs(disc.matrix - square.matrix).max() < 0.015 * square.matrix.max()
     far = np.abs(square.positions - square.positions[0]).max(1) > 4e-3
     difference = (disc.matrix - square.matrix).reshape(30, 3, 30, 3)[far, :, 0]
@@ -183,7 +183,7 @@ mu = 1.0
 kd = 1.0
 """
 RECTANGLE = "rows = 4\ncols = 3\npitch = 1e-3\n"
-LAYER = "gel = { modulus = 1e5, poisson = 0.45, thickness = 3e-3 }"
+LAYER = "gel = { youngs_modulus = 1e5, poisson_ratio = 0.45, thickness = 3e-3 }"
 
 
 def scene_with(folder: Path, **pads: str) -> Scene:
@@ -198,7 +198,7 @@ def test_displacements_of_all_pads(tmp_path: Path) -> None:
         tmp_path,
         layer=RECTANGLE + LAYER,
         springs=RECTANGLE + "gel = { compliance = 0.01 }",
-        both='shape = "disc"\nradius = 2e-3\ncount = 9\ngel = { compliance = 0.01, normal = 0.002 }',
+        both='shape = "disc"\nradius = 2e-3\ncount = 9\ngel = { compliance = 0.01, normal_compliance = 0.002 }',
     )
     sim = Simulator(scene, num_envs=3)
     sim.q[:, 1] = [0, 1e-4, 2e-4]
@@ -206,7 +206,7 @@ def test_displacements_of_all_pads(tmp_path: Path) -> None:
     forces, moved = sim.tactile().copy(), sim.displacement()
     assert moved.shape == (3, 33, 3) and np.abs(forces).max() > 0
     layer = scene.pads[0].gel
-    assert isinstance(layer, LayerGel) and layer.grid == (4, 3) and layer.area == pytest.approx(1e-6)
+    assert isinstance(layer, LayerGel) and layer.grid_shape == (4, 3) and layer.cell_area == pytest.approx(1e-6)
     expected = forces[:, :12].reshape(3, 36) @ layer.matrix
     np.testing.assert_allclose(moved[:, :12], expected.reshape(3, 12, 3), atol=1e-15)
     np.testing.assert_allclose(moved[:, 12:24], 0.01 * forces[:, 12:24])
@@ -250,21 +250,26 @@ def test_given_markers_on_any_plane(tmp_path: Path) -> None:
     text = 'shape = "points"\npositions = {}\nnormals = {}\nx_axes = {}\n'
     shape = text.format(slanted.tolist(), [z.tolist()] * 12, [x.tolist()] * 12)
     gel = scene_with(tmp_path, pad=shape + LAYER).pads[0].gel
-    assert isinstance(gel, LayerGel) and gel.grid is None
-    assert gel.area == pytest.approx(1e-6)
+    assert isinstance(gel, LayerGel) and gel.grid_shape is None
+    assert gel.cell_area == pytest.approx(1e-6)
     np.testing.assert_allclose(gel.positions, flat[:, :2], atol=1e-15)
 
 
 HEMISPHERE = 'shape = "hemisphere"\nradius = 5e-3\ncount = 20\n'
 REFUSED = {
-    "gel = {}": "either compliance, or modulus, poisson and thickness",
+    "gel = {}": "either compliance, or youngs_modulus, poisson_ratio and thickness",
     "gel = { complience = 1.0 }": "unknown key 'complience'; did you mean 'compliance'",
-    "gel = { compliance = 1.0, modulus = 1.0 }": "unknown key 'modulus'",
+    "gel = { compliance = 1.0, youngs_modulus = 1.0 }": "unknown key 'youngs_modulus'",
     "gel = { compliance = -1.0 }": "compliance must be a finite number ≥ 0",
-    "gel = { modulus = 1e5, thickness = 1.0 }": "poisson is missing",
-    "gel = { modulus = 1e5, poisson = 0.51, thickness = 1.0 }": "poisson must be above -1 and at most 0.5, got 0.51",
-    "gel = { modulus = 1e5, poisson = 0.4, thickness = 0 }": "thickness must be a finite number ≥ 1e-09, got 0",
-    "gel = { modulus = inf, poisson = 0.4, thickness = 1.0 }": "modulus must be a finite number",
+    "gel = { youngs_modulus = 1e5, thickness = 1.0 }": "poisson_ratio is missing",
+    "gel = { youngs_modulus = 1e5, poisson_ratio = 0.51, thickness = 1 }": (
+        "poisson_ratio must be above -1 and at most 0.5, got 0.51"
+    ),
+    "gel = { youngs_modulus = 1, poisson_ratio = 0, thickness = 0}": "thickness must be a finite number ≥ 1e-09, got 0",
+    "gel = { youngs_modulus = inf, poisson_ratio = 0.4, thickness = 1.0 }": "youngs_modulus must be a finite number",
+    "gel = { modulus = 1e5 }": "unknown key 'modulus'; it is now called 'youngs_modulus'",
+    "gel = { poisson = 0.4 }": "unknown key 'poisson'; it is now called 'poisson_ratio'",
+    "gel = { compliance = 1.0, normal = 1.0 }": "unknown key 'normal'; it is now called 'normal_compliance'",
     "gel = 3": "gel must be a table",
 }
 
@@ -302,7 +307,7 @@ def test_who_has_no_gel_has_no_displacement(tmp_path: Path) -> None:
         Simulator(scene).displacement()
     with pytest.raises(UsageError, match="needs a scene with pads"):
         Simulator(scene.build()).displacement()
-    endless = scene_with(tmp_path, pad=RECTANGLE + "gel = { modulus = 1.0, poisson = 0, thickness = inf }")
+    endless = scene_with(tmp_path, pad=RECTANGLE + "gel = { youngs_modulus = 1.0, poisson_ratio = 0, thickness = inf }")
     assert isinstance(endless.pads[0].gel, LayerGel) and endless.pads[0].gel.thickness == np.inf
     with pytest.raises(UsageError, match=r"forces must have shape \(…, 12, 3\), got \(12, 2\)"):
         Simulator(endless).displacement(np.zeros((12, 2)))
@@ -310,8 +315,8 @@ def test_who_has_no_gel_has_no_displacement(tmp_path: Path) -> None:
 
 def test_insertions_gel_is_told(tmp_path: Path) -> None:
     told = describe(load_scene("insertion")).pads
-    assert [pad.gel for pad in told] == ["yields by 10 mm/N in shear, 10 mm/N into the pad"] * 2
-    layer = {"modulus": 1e5, "poisson": 0.45, "thickness": 3e-3}
+    assert [pad.gel for pad in told] == ["compliance 10 mm/N in shear, 10 mm/N into the pad"] * 2
+    layer = {"youngs_modulus": 1e5, "poisson_ratio": 0.45, "thickness": 3e-3}
     told = describe(load_scene("insertion", overrides={"pads.*.gel": layer})).pads
     assert told[1].gel == "layer of 3 mm, 100000 Pa, Poisson's ratio 0.45"
     assert describe(load_scene("rolling")).pads[0].gel is None

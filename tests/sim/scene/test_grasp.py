@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import FRICTION_LAWS, load_scene
 from gelflow.sim.simulator import Simulator
 
 GRAVITY = 9.8
@@ -42,7 +41,7 @@ def test_the_bar_is_as_published() -> None:
     np.testing.assert_allclose([s.pose.position[1] for s in tables], [-0.1, 0.1])
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_a_bar_at_rest_stays_on_its_tables(law: str) -> None:
     scene = load_scene("grasp", friction=law)
     sim = Simulator(scene)
@@ -52,7 +51,7 @@ def test_a_bar_at_rest_stays_on_its_tables(law: str) -> None:
     np.testing.assert_allclose(sim.q[0, scene.q("bar")], scene.q0[scene.q("bar")], atol=1e-4)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_the_gripper_lifts_the_bar(law: str) -> None:
     sim = Simulator(load_scene("grasp", friction=law))
     lift(sim, closed(sim), 70)
@@ -74,8 +73,8 @@ def test_the_markers_show_the_weight(mass: float) -> None:
     np.testing.assert_allclose(reading[:130], reading[130:] * [1, -1, 1], atol=1e-9)  # of two hands, y mirrored
     below_top = sim.poses()[0, scene.body("bar"), 2] + 0.0125 - sim.q[0, sim.joint_q("arm_z")]
     points = scene.points[0].points  # of a pad's two faces only one touches
-    touching = 2 * ((points[:, 2] < below_top) & (points[:, 0] > -1e-9)).sum() * scene.contacts[0].numbers["ks"]
-    feeling = (reading[:, 2] > 0).sum() * scene.pads[0].numbers["ks"]
+    touching = 2 * ((points[:, 2] < below_top) & (points[:, 0] > -1e-9)).sum() * scene.contacts[0].params["ks"]
+    feeling = (reading[:, 2] > 0).sum() * scene.pads[0].params["ks"]
     assert reading[:, 0].sum() * touching / feeling == pytest.approx(mass * GRAVITY, rel=0.02)
     assert abs(reading[:, 1].sum()) < 1e-6
 

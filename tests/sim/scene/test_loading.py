@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.scene import Scene, load_scene, scene_names
+from gelflow.sim.scene import Scene, load_scene, scene_names
 
 SHIPPED = ("dclaw", "grasp", "insertion", "pushing", "rolling")
 
@@ -163,7 +163,7 @@ def test_the_pads_follow_the_observation_format() -> None:
         place = data.site_xpos[model.site(f"pad_{pad.name}").id]
         np.testing.assert_allclose(place, [-outward * 0.0175, 0, 0.0555], atol=1e-12)  # on the part's face
     assert scene.pads[0].name == "left"
-    assert scene.markers_of("right") == slice(130, 260)
+    assert scene.marker_slice("right") == slice(130, 260)
 
 
 def test_the_hole_is_as_published() -> None:
@@ -191,7 +191,7 @@ def test_only_what_the_scene_requires_is_passed_on(tmp_path: Path) -> None:
     write(tmp_path, BLOCKS)
     scene = load_scene(tmp_path / "s.toml")
     assert [shape.name for shape in scene.shapes] == ["ground"]
-    assert any("ornament" in line for line in scene.left_out)
+    assert any("ornament" in line for line in scene.not_modelled)
 
 
 def test_names_and_indices() -> None:
@@ -211,8 +211,8 @@ def test_names_and_indices() -> None:
 def test_the_law_chooses_its_own_numbers() -> None:
     viscous = load_scene("insertion", friction="viscous")
     elastic = load_scene("insertion", friction="elastic")
-    assert viscous.contacts[0].numbers == {"kn": 8e3, "kt": 80.0, "mu": 1.5, "kd": 1e3, "ks": 0.0}
-    assert elastic.contacts[0].law == "elastic" and elastic.contacts[0].numbers["ks"] > 0
+    assert viscous.contacts[0].params == {"kn": 8e3, "kt": 80.0, "mu": 1.5, "kd": 1e3, "ks": 0.0}
+    assert elastic.contacts[0].law == "elastic" and elastic.contacts[0].params["ks"] > 0
     assert viscous.pads[0].law == "viscous" and elastic.pads[0].law == "elastic"
     rolling = load_scene("rolling", friction="elastic")
     assert {c.name: c.law for c in rolling.contacts} == {"pad_ball": "elastic", "ball_ground": "viscous"}
@@ -227,12 +227,12 @@ def test_a_rolling_point_keeps_no_anchor() -> None:
 
 def test_overrides_replace_values_and_are_checked() -> None:
     scene = load_scene("rolling", overrides={"pads.pad.rows": 50, "pads.pad.cols": 50, "step": 1e-3})
-    assert scene.markers == 2500
+    assert scene.num_markers == 2500
     assert scene.step == 1e-3
     assert scene.grids[0].pitch == pytest.approx(1.0)
     assert np.abs(scene.pads[0].positions[:, :2]).max() == pytest.approx(0.0245)
     both = load_scene("insertion", overrides={"pads.*.rows": 18, "pads.*.cols": 14})
-    assert both.markers == 2 * 18 * 14
+    assert both.num_markers == 2 * 18 * 14
     for key, message in [
         ("pads.pad.row", "unknown key 'row'; did you mean 'rows'"),
         ("pads.pda.rows", "no table 'pda'; did you mean 'pad'"),
@@ -317,7 +317,7 @@ TOML_FAULTS = [
     (
         'geom = "block"',
         'geom = "ground"',
-        "plane 'ground' can't be sampled; box, cylinder, sphere, capsule, ellipsoid, mesh can",
+        "plane 'ground' cannot be sampled; supported: box, cylinder, sphere, capsule, ellipsoid, mesh",
     ),
     ('geom = "block"', 'geom = "ornament"', "unknown key 'resolution'; valid names: count, faces, geom, stiffness"),
     ('against = "ground"', 'against = "top"', "on one body"),

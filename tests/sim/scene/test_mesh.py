@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
-from gelflow.sim.scene.distance_grid import build_grid, cache_folder, distance_grid
-from gelflow.sim.scene.mesh import TriangleMesh, closed_mesh, signed_distances
-from gelflow.sim.scene.sampling import mesh_surface
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.geometry.distance_grid import build_grid, cache_folder, distance_grid
+from gelflow.sim.scene.geometry.mesh import TriangleMesh, closed_mesh, signed_distances
+from gelflow.sim.scene.geometry.sampling import mesh_surface
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import reference_meshes as mesh_solids
 
@@ -144,7 +144,7 @@ def test_where_nothing_can_be_kept_the_grid_is_built(tmp_path: Path, monkeypatch
 def test_without_libigl_the_error_says_what_to_install(tmp_path: Path) -> None:
     path = write(tmp_path)
     code = (
-        "import sys\nsys.modules['igl'] = None\nfrom gelflow.sim.scene.scene import load_scene\n"
+        "import sys\nsys.modules['igl'] = None\nfrom gelflow.sim.scene import load_scene\n"
         f"try:\n    load_scene({str(path)!r})\nexcept Exception as error:\n    print(type(error).__name__, error)"
     )
     env = {**os.environ, "GELFLOW_CACHE": str(tmp_path / "none")}
@@ -233,7 +233,7 @@ def test_boxes_and_cylinders_are_rounded(tmp_path: Path) -> None:
         assert "unknown key 'resolution'" in refused(tmp_path / "s.toml")
     xml = MODEL.replace('type="mesh" mesh="table"', 'type="sphere" size="0.1"')
     write(tmp_path, SCENE.replace("resolution = 20", "rounding = 0.003"), xml)
-    assert "a sphere takes no keys here; box, cylinder, mesh do" in refused(tmp_path / "s.toml")
+    assert "a sphere has no options; box, cylinder, mesh have" in refused(tmp_path / "s.toml")
 
 
 def test_a_rounded_mesh_is_the_exact_rounded_solid_at_the_nodes() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -201,7 +201,7 @@ def follow_mujoco(scene: Scene, twin: Any, steps: int = 20, seed: int = 0) -> No
         force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
         force -= twin.dof_frictionloss * np.clip(v / 1e-3, -1, 1)
         for motor, control in zip(motors, u, strict=bool(motors)):
-            force[scene.joints[motor.joint].v] += np.clip(control, *motor.force)
+            force[scene.joints[motor.joint].v_start] += np.clip(control, *motor.force_range)
         inertia = full @ (v - before) / scene.step
         np.testing.assert_allclose(inertia, force, rtol=1e-6, atol=1e-6 * np.abs(force).max())
     assert sim.halved[0] == 0
@@ -213,11 +213,11 @@ def test_an_arm_with_classes_meshes_and_servos(tmp_path: Path) -> None:
     scene = load(tmp_path)
     assert [a.kind for a in scene.actuators] == ["position"] * 6
     assert [(a.kp, a.kd) for a in scene.actuators[:3]] == [(2000, 400)] * 3
-    assert scene.actuators[3].kd > 0 and scene.actuators[3].control == (-6.2831, 6.2831)
+    assert scene.actuators[3].kd > 0 and scene.actuators[3].ctrl_range == (-6.2831, 6.2831)
     assert [a.name for a in scene.actuators][-1] == "actuator5"  # made up
     assert scene.q0[0] == -1.5708  # the keyframe "home"
-    assert any("exclude" in line for line in scene.left_out)
-    assert any(line.startswith("mesh geom") for line in scene.left_out)
+    assert any("exclude" in line for line in scene.not_modelled)
+    assert any(line.startswith("mesh geom") for line in scene.not_modelled)
     follow_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
 
 
@@ -246,7 +246,7 @@ def test_a_urdf_arm_with_a_mesh_of_its_package(tmp_path: Path) -> None:
         ("lift", "hinge", 0),
         ("slide", "slide", 0),
     ]
-    assert [(a.name, a.kind, a.force) for a in scene.actuators] == [
+    assert [(a.name, a.kind, a.force_range) for a in scene.actuators] == [
         ("turn", "motor", (-10, 10)),
         ("lift", "motor", (-5, 5)),
         ("slide", "motor", (-np.inf, np.inf)),
@@ -334,7 +334,7 @@ def test_what_has_no_effect_is_left_out(tmp_path: Path) -> None:
         '<equality><joint joint1="j" active="false"/></equality><actuator>',
     )
     scene = load(write(tmp_path, {"scene.xml": text}))
-    assert [line.split(":")[0] for line in scene.left_out[:2]] == ["1 tendons", "1 equality constraints"]
+    assert [line.split(":")[0] for line in scene.not_modelled[:2]] == ["1 tendons", "1 equality constraints"]
 
 
 LIMITS = [  # (attributes of the joint, actuator, what the stiffness must be, without the inertia's part)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.scene import load_scene
+from gelflow.sim.scene import load_scene
 
 MODEL = """<mujoco>
   <worldbody>

@@ -8,7 +8,7 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 MODEL = """<mujoco>
@@ -79,7 +79,7 @@ def test_a_disc(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pad.positions[:, 2], 0)
     np.testing.assert_allclose(pad.axes, np.tile(np.diag([1.0, -1, -1]), (130, 1, 1)), atol=1e-12)
     assert pad.weights.sum() == pytest.approx(np.pi * 0.018**2)
-    with pytest.raises(UsageError, match="pad 'pad' is no rectangle; its markers have no rows and columns"):
+    with pytest.raises(UsageError, match="pad 'pad' is not a rectangle and has no marker grid"):
         _ = scene.grids
     told = describe(scene).pads[0]
     assert (told.shape, told.markers, told.rows, told.pitch) == ("disc", 130, None, None)
@@ -158,12 +158,12 @@ def test_markers_feel_every_shape(kind: str, ends: tuple[float, float, float], t
     ("kind", "text", "message"),
     [
         ("sphere", "count = 20", ""),
-        ("sphere", 'faces = ["+z"]', "without a count 'cap' is one exact point, which takes geom alone"),
+        ("sphere", 'faces = ["+z"]', "without a count 'cap' is one exact contact point, which takes no other keys"),
         ("capsule", 'count = 20\nfaces = ["wall"]', "faces of a capsule are -z and +z, once each, got ['wall']"),
         ("ellipsoid", "count = 20", ""),
         ("ellipsoid", "", "count is missing"),
         ("cylinder", 'faces = ["-z", "+z", "wall"]\nheights = 4', ""),
-        ("cylinder", "heights = 4", 'heights are those of the wall; add faces = ["-z", "+z", "wall"]'),
+        ("cylinder", "heights = 4", 'heights apply to the wall; add faces = ["-z", "+z", "wall"]'),
     ],
 )
 def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Path) -> None:
@@ -190,23 +190,23 @@ def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Pa
         ('shape = "hemisphere"\nradius = 0.01', "count is missing"),
         ('shape = "disc"\nradius = -1\ncount = 3', "radius must be a finite number ≥"),
         ('shape = "points"', "needs either positions or a file"),
-        ('shape = "points"\nfile = "no.csv"', "no.csv: no such file beside the scene"),
+        ('shape = "points"\nfile = "no.csv"', "no.csv: no such file in the folder of the scene"),
         ('shape = "points"\nfile = "s.toml"', "a file of markers must be .csv or .npz"),
-        ('shape = "points"\nfile = "a.csv"\nnormals = [[0, 0, 1]]', "normals must stand in the file"),
+        ('shape = "points"\nfile = "a.csv"\nnormals = [[0, 0, 1]]', "normals must be in the file"),
         ('shape = "points"\nfile = "two.csv"', "expected 3, 6 or 9 columns (position, normal, x axis), got 2"),
-        ('shape = "points"\nfile = "words.csv"', "words.csv can't be read"),
-        ('shape = "points"\nfile = "words.npz"', "words.npz can't be read"),
+        ('shape = "points"\nfile = "words.csv"', "words.csv cannot be read"),
+        ('shape = "points"\nfile = "words.npz"', "words.npz cannot be read"),
         ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; valid names: positions, normals, x_axes"),
         ('shape = "points"\npositions = [[0, 0]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = [[0, 0, nan]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = "tip"', "positions must be a list of [x, y, z], all finite"),
         (
             'shape = "points"\npositions = [[0, 0, 0]]\nnormals = [[0, 0, 1], [0, 0, 1]]',
-            "as many as positions, 1, got 2",
+            "must have one entry per position, 1, got 2",
         ),
-        ('shape = "points"\npositions = [[0, 0, 0]]\nnormals = [[0, 0, 0]]', "normals[0] has no direction"),
-        ('shape = "points"\npositions = [[0, 0, 0]]\nx_axes = [[0, 0, 1]]', "x_axes[0] is along the normal"),
-        ('shape = "points"\npositions = [[0, 0, 0]]\nstiffness = "per area"', "set stiffness per point"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nnormals = [[0, 0, 0]]', "normals[0] has length 0"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nx_axes = [[0, 0, 1]]', "x_axes[0] is parallel to the normal"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\nstiffness = "per area"', 'set stiffness = "per point"'),
     ],
 )
 def test_a_wrong_pad_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:

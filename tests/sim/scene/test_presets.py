@@ -10,8 +10,7 @@ from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, preset_config
-from gelflow.sim.scene.presets import NAMES
-from gelflow.sim.scene.scene import TOLERANCE, load_scene, scene_names
+from gelflow.sim.scene import DEFAULT_TOLERANCE, PRESET_NAMES, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
@@ -46,15 +45,15 @@ def write(folder: Path, presets: str) -> Path:
 @pytest.mark.parametrize("name", scene_names())
 def test_every_scene_has_three_that_leave_alone_what_is_seen(name: str) -> None:
     own = load_scene(name)
-    assert tuple(own.presets) == NAMES
-    assert (own.tolerance, own.precision, own.step, own.integrator) == (TOLERANCE, "double", 5e-3, "bdf1")
+    assert tuple(own.presets) == PRESET_NAMES
+    assert (own.tolerance, own.precision, own.step, own.integrator) == (DEFAULT_TOLERANCE, "double", 5e-3, "bdf1")
     steps = []
-    for preset in NAMES:
+    for preset in PRESET_NAMES:
         scene = load_scene(name, preset=preset)
         steps.append(scene.step)
-        assert scene.markers == own.markers and scene.friction == own.friction and scene.precision == "double"
+        assert scene.num_markers == own.num_markers and scene.friction == own.friction and scene.precision == "double"
         assert [p.grid for p in scene.pads] == [p.grid for p in own.pads]
-        assert [c.numbers for c in scene.contacts] == [c.numbers for c in own.contacts]
+        assert [c.params for c in scene.contacts] == [c.params for c in own.contacts]
         np.testing.assert_array_equal(scene.q0, own.q0)
     assert steps == sorted(steps, reverse=True) and len(set(steps)) == 3
 
@@ -129,7 +128,7 @@ def test_attempts_take_the_same_time_and_see_the_same_grid() -> None:
 
 def test_flow_maps_under_presets_are_alike() -> None:
     images = []
-    for preset in (None, *NAMES):
+    for preset in (None, *PRESET_NAMES):
         env = InsertionVectorEnv(1, preset=preset, randomization=NOMINAL)
         image, _ = env.reset(seed=1, options={"misalignment": (4e-3, 2e-3, 0.05)})
         images.append(image)
@@ -145,7 +144,7 @@ def test_environments_take_a_scene_or_a_preset() -> None:
         InsertionVectorEnv(1, preset="quick")
 
 
-@pytest.mark.parametrize("preset", NAMES)
+@pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_the_mock_s_world_steps_in_parts_of_4_ms(preset: str) -> None:
     config = preset_config(preset, seed=3)
     assert config.step <= load_scene("insertion", preset=preset).step

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
+from gelflow.sim.scene.geometry.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
 
 
 def test_the_rolling_pad_has_as_many_points_as_published() -> None:

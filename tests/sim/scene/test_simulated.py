@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gelflow.sim.scene.scene import Scene, load_scene, scene_names
+from gelflow.sim.scene import Scene, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 
 
@@ -60,11 +60,11 @@ def test_marker_forces_agree_with_an_independent_simulator() -> None:
         normal = normal @ box.T
         turning = np.cross([0, 0, sim.v[env, 6]], depth[:, None] * normal)
         turning -= (turning * normal).sum(1)[:, None] * normal
-        shift = pad.numbers["kt"] * np.where(depth < 0, 1, 0)[:, None] * turning @ finger @ pad.axes[0]
+        shift = pad.params["kt"] * np.where(depth < 0, 1, 0)[:, None] * turning @ finger @ pad.axes[0]
         shift[:, 2] *= -1
         force = (expected * [1, 1, -1]) @ (finger @ pad.axes[0]).T
         pressure = np.abs((force * normal).sum(1))
-        stuck = np.sqrt(np.maximum((force**2).sum(1) - pressure**2, 0)) < 0.999 * pad.numbers["mu"] * pressure
+        stuck = np.sqrt(np.maximum((force**2).sum(1) - pressure**2, 0)) < 0.999 * pad.params["mu"] * pressure
         stuck_markers += stuck.sum()
         np.testing.assert_allclose((got[env] - shift)[stuck], expected[stuck], rtol=0, atol=1e-13)
         np.testing.assert_allclose((got[env] - shift)[:, 2], expected[:, 2], rtol=0, atol=2e-8)

@@ -9,22 +9,21 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.benchmark.describe import describe
-from gelflow.sim.scene.parts import LAWS
-from gelflow.sim.scene.scene import Scene, load_scene
+from gelflow.sim.scene import FRICTION_LAWS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.energy import EnergyGauge
 from gelflow.sim.validation.reference_motions import reference_motion
 
-PUSHING: dict[str, dict[str, Any]] = {
-    "rolling": {"pads.pad.pushes": True, "pads.pad.rows": 20, "pads.pad.cols": 20, "pads.pad.size": [0.04, 0.04]},
-    "insertion": {"pads.*.pushes": True},
-    "dclaw": {"pads.*.pushes": True},
+COLLIDING: dict[str, dict[str, Any]] = {
+    "rolling": {"pads.pad.collides": True, "pads.pad.rows": 20, "pads.pad.cols": 20, "pads.pad.size": [0.04, 0.04]},
+    "insertion": {"pads.*.collides": True},
+    "dclaw": {"pads.*.collides": True},
 }
 
 
 def pushed(name: str, law: str, **more: Any) -> Scene:
-    return load_scene(name, friction=law, overrides={**PUSHING[name], **more})
+    return load_scene(name, friction=law, overrides={**COLLIDING[name], **more})
 
 
 def in_world(sim: Simulator, scene: Scene, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -40,8 +39,8 @@ def in_world(sim: Simulator, scene: Scene, index: int) -> tuple[NDArray[Any], ND
     return np.einsum("mij,mj->mi", axes, readings) @ turn.T, places @ turn.T + body[:3]
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("name", PUSHING)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
+@pytest.mark.parametrize("name", COLLIDING)
 def test_markers_add_up_to_the_wrench(name: str, law: str) -> None:
     """After every step of a motion that touches, sticks, slips and lets go."""
     scene = pushed(name, law)
@@ -63,7 +62,7 @@ def test_markers_add_up_to_the_wrench(name: str, law: str) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_gradients(law: str, integrator: str) -> None:
     scene = pushed("rolling", law, integrator=integrator)
     spec = scene.describe_to(_core.ModelSpec())
@@ -113,7 +112,9 @@ def test_one_set_of_numbers_and_anchors() -> None:
 
 def test_describe_and_refusal() -> None:
     described = describe(pushed("insertion", "viscous"))
-    assert all(pad.pushes for pad in described.pads)
+    assert all(pad.collides for pad in described.pads)
     assert described.size.contact_pairs > describe(load_scene("insertion")).size.contact_pairs
-    with pytest.raises(UsageError, match="pushes must be true or false"):
-        load_scene("insertion", overrides={"pads.*.pushes": 1})
+    with pytest.raises(UsageError, match="collides must be true or false"):
+        load_scene("insertion", overrides={"pads.*.collides": 1})
+    with pytest.raises(UsageError, match="unknown key 'pushes'; it is now called 'collides'"):
+        load_scene("insertion", overrides={"pads.*.pushes": True})

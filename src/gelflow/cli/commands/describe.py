@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         Size,
     )
     from gelflow.sim.benchmark.step_times import StepTimes
-    from gelflow.sim.scene.scene import Scene
+    from gelflow.sim.scene import Scene
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     if args.repeats < 1:
         raise UsageError(f"--repeats must be at least 1, got {args.repeats}")
     from gelflow.sim.benchmark.describe import describe
-    from gelflow.sim.scene.scene import load_scene
+    from gelflow.sim.scene import load_scene
 
     scene = load_scene(args.scene, preset=args.preset, friction=args.friction)
     description = describe(scene)
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(dataclasses.asdict(description) | {"times": times}, indent=2, allow_nan=False))
         return 0
     console = Console(highlight=False)
-    console.print(tree(description), _left_out(description), _size(description.size))
+    console.print(tree(description), _not_modelled(description), _size(description.size))
     if not args.no_timing:
         console.print(_times(_measured(scene, args.repeats)))
     return 0
@@ -168,7 +168,7 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
     else:
         markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart"
     text = f"{markers}, on {pad.body} against {', '.join(pad.against)}"
-    text += ", which they push" if pad.pushes else ""
+    text += ", which they push" if pad.collides else ""
     branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")
     branch.add(_law(pad.law, pad.unit, pad.numbers, "", damped_by_depth=True))
     if pad.gel is not None:
@@ -188,9 +188,9 @@ def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_
     return f"{law}{of}{more}: {', '.join(words)}"
 
 
-def _left_out(d: "Description") -> Tree:
+def _not_modelled(d: "Description") -> Tree:
     root = Tree("[bold]left out, and why[/bold]")
-    for line in d.left_out:
+    for line in d.not_modelled:
         root.add(escape(line))
     return root
 

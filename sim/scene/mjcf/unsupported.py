@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mjcf_file import names
+from gelflow.sim.scene.mjcf.model_file import element_names
 
 Problem = tuple[str, str]  # what is not modelled, and what to do
 
@@ -33,7 +33,7 @@ _PULLS = {
 _TURNING = {int(mujoco.mjtJoint.mjJNT_FREE): "free", int(mujoco.mjtJoint.mjJNT_BALL): "ball"}
 
 
-def switch_off(model: Any) -> None:
+def apply_disable_flags(model: Any) -> None:
     """Do what the file's flags say: what is switched off there becomes 0 here."""
     flags = model.opt.disableflags
     for flag, fields in _FLAGS.items():
@@ -45,7 +45,7 @@ def switch_off(model: Any) -> None:
         model.opt.gravity[:] = 0
 
 
-def refuse(model: Any, where: str) -> None:
+def check_supported(model: Any, where: str) -> None:
     """Raise UsageError, in one line, when the model holds what is not modelled."""
     problems = [*_elements(model), *_options(model), *_joints(model), *_actuators(model)]
     if not problems:
@@ -55,7 +55,7 @@ def refuse(model: Any, where: str) -> None:
     raise UsageError(f"{where}: {what} is not modelled: {advice}{more}")
 
 
-def left_out(model: Any) -> tuple[str, ...]:
+def not_modelled(model: Any) -> tuple[str, ...]:
     """What the file has besides, that changes no motion here."""
     parts = []
     if model.npair or model.nexclude:
@@ -85,7 +85,7 @@ def _nonzero(model: Any, prefix: str, *fields: str) -> list[int]:
 
 
 def _elements(model: Any) -> Iterator[Problem]:
-    tendons, bodies = names(model, "tendon", model.ntendon), names(model, "body", model.nbody)
+    tendons, bodies = element_names(model, "tendon", model.ntendon), element_names(model, "body", model.nbody)
     pulled = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0].tolist()
     stiff = _nonzero(
         model, "tendon_", "stiffness", "stiffnesspoly", "damping", "dampingpoly", "frictionloss", "limited", "armature"
@@ -129,7 +129,7 @@ def _options(model: Any) -> Iterator[Problem]:
 def _joints(model: Any) -> Iterator[Problem]:
     driven = np.bincount(model.actuator_trnid[_on_joint(model), 0], minlength=model.njnt)
     curved = _nonzero(model, "jnt_", "stiffnesspoly"), _nonzero(model, "dof_", "dampingpoly")
-    for j, joint in enumerate(names(model, "joint", model.njnt)):
+    for j, joint in enumerate(element_names(model, "joint", model.njnt)):
         turns = _TURNING.get(int(model.jnt_type[j]))
         if turns == "ball" and model.jnt_limited[j]:
             yield f"range of ball joint {joint!r}", "remove it, or build the joint from three hinges"
@@ -148,11 +148,11 @@ def _on_joint(model: Any) -> Any:
 
 
 def _actuators(model: Any) -> Iterator[Problem]:
-    for a, name in enumerate(names(model, "actuator", len(model.actuator_trntype))):
+    for a, name in enumerate(element_names(model, "actuator", len(model.actuator_trntype))):
         if found := _actuator(model, a):
             yield f"actuator {name!r} {found[0]}", found[1]
     for a in _nonzero(model, "actuator_", "dampingpoly"):
-        yield f"polynomial damping of actuator {names(model, 'actuator', a + 1)[a]!r}", "give one number"
+        yield f"polynomial damping of actuator {element_names(model, 'actuator', a + 1)[a]!r}", "give one number"
 
 
 def _actuator(model: Any, a: int) -> Problem | None:

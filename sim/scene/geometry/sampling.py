@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.special import elliprg
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mesh import TriangleMesh
+from gelflow.sim.scene.geometry.mesh import TriangleMesh
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 ENDS = ("-z", "+z")
@@ -229,7 +229,7 @@ def disc_lattice(radius: float, count: int) -> Array:
     return radius * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * _spiral(count)
 
 
-def turned_frames(normals: Array) -> Array:
+def shortest_rotations(normals: Array) -> Array:
     """Axes x y z turned the shortest way until z is each of these unit normals: columns, shape (n, 3, 3).
 
     Where a normal is −z, they are turned about y.

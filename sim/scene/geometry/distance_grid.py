@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mesh import TriangleMesh, closed_mesh, nearest_points, signed_distances
+from gelflow.sim.scene.geometry.mesh import TriangleMesh, closed_mesh, nearest_points, signed_distances
 
 Array = NDArray[np.float64]
 
 DEFAULT_RESOLUTION = 64
-LEAST_RESOLUTION, MOST_RESOLUTION = 4, 512
+MIN_RESOLUTION, MAX_RESOLUTION = 4, 512
 CELLS_PER_ROUNDING = 2  # at least
 
 _VERSION = 1  # of how a grid is built: with it old grids in the cache are passed over
@@ -70,8 +70,8 @@ def distance_grid(
     Raises UsageError when the mesh is not closed, is rounded to nothing or too finely for its cells, or when libigl
     is needed and not installed.
     """
-    if not LEAST_RESOLUTION <= resolution <= MOST_RESOLUTION:
-        raise UsageError(f"resolution must be from {LEAST_RESOLUTION} to {MOST_RESOLUTION} cells, got {resolution}")
+    if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
+        raise UsageError(f"resolution must be from {MIN_RESOLUTION} to {MAX_RESOLUTION} cells, got {resolution}")
     file = cache_folder() / f"{_key(mesh, resolution, rounding)}.npz"
     if (found := _read(file)) is not None:
         return found

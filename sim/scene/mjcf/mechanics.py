@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import Pose
-from gelflow.sim.scene.mesh import TriangleMesh
-from gelflow.sim.scene.mjcf_actuators import ActuatorDef as ActuatorDef
-from gelflow.sim.scene.mjcf_actuators import default_limit, joint_extra, read_actuators
-from gelflow.sim.scene.mjcf_file import compile_model, names
-from gelflow.sim.scene.mjcf_unsupported import left_out, refuse, switch_off
+from gelflow.sim.scene.geometry.mesh import TriangleMesh
+from gelflow.sim.scene.mjcf.actuators import ActuatorDef, default_limit, joint_extra, read_actuators
+from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
+from gelflow.sim.scene.mjcf.unsupported import apply_disable_flags, check_supported, not_modelled
 
 Array = NDArray[np.float64]
 
@@ -43,8 +42,8 @@ class JointDef:
     type: str  # "slide", "hinge", "ball" or "free"
     pos: Array  # in the body's frame [m]
     axis: Array
-    q: int  # first position
-    v: int  # first velocity
+    q_start: int  # index of the first position in q
+    v_start: int  # index of the first velocity in v
     damping: float
     armature: float
     stiffness: float
@@ -86,7 +85,7 @@ class Mechanics:
     actuators: tuple[ActuatorDef, ...]
     gravity: Array
     q0: Array
-    left_out: tuple[str, ...]
+    not_modelled: tuple[str, ...]
 
 
 _JOINTS = {
@@ -103,16 +102,16 @@ def read_mechanics(path: Path) -> Mechanics:
     Raises UsageError, in one line, when a file is missing or unreadable, or holds what the simulator does not model.
     """
     model, urdf = compile_model(path)
-    switch_off(model)
-    refuse(model, path.name)
+    apply_disable_flags(model)
+    check_supported(model, path.name)
     carrier, poses = _merge(model)
     actuators = read_actuators(model, path.name)
     sites = {
         name: (int(carrier[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
-        for i, (name, b) in enumerate(zip(names(model, "site", model.nsite), model.site_bodyid, strict=True))
+        for i, (name, b) in enumerate(zip(element_names(model, "site", model.nsite), model.site_bodyid, strict=True))
     }
     if urdf:  # it has no sites: the frames of its links serve as such
-        sites = {name: (int(carrier[b]), poses[b]) for b, name in enumerate(names(model, "body", model.nbody))}
+        sites = {name: (int(carrier[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))}
     return Mechanics(
         bodies=_bodies(model, carrier, poses),
         joints=_joints(model, carrier, actuators),
@@ -121,7 +120,7 @@ def read_mechanics(path: Path) -> Mechanics:
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
         q0=_start(model),
-        left_out=left_out(model),
+        not_modelled=not_modelled(model),
     )
 
 
@@ -150,7 +149,7 @@ def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
 
 def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[BodyDef, ...]:
     bodies = []
-    body_names = names(model, "body", model.nbody)
+    body_names = element_names(model, "body", model.nbody)
     for root in np.flatnonzero(model.body_jntnum > 0):
         members = np.flatnonzero(carrier == carrier[root])
         masses = model.body_mass[members]
@@ -171,7 +170,7 @@ def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[
 
 def _joints(model: Any, carrier: NDArray[np.int64], actuators: tuple[ActuatorDef, ...]) -> tuple[JointDef, ...]:
     joints = []
-    for j, name in enumerate(names(model, "joint", model.njnt)):
+    for j, name in enumerate(element_names(model, "joint", model.njnt)):
         kind = _JOINTS[int(model.jnt_type[j])]
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
         turns = kind in ("ball", "free")
@@ -184,8 +183,8 @@ def _joints(model: Any, carrier: NDArray[np.int64], actuators: tuple[ActuatorDef
                 type=kind,
                 pos=model.jnt_pos[j].copy(),
                 axis=model.jnt_axis[j].copy(),
-                q=q,
-                v=v,
+                q_start=q,
+                v_start=v,
                 damping=float(model.dof_damping[v]) + joint_extra(model, j, "damping"),
                 armature=float(model.dof_armature[v]) + joint_extra(model, j, "armature"),
                 stiffness=float(model.jnt_stiffness[j]),
@@ -201,7 +200,7 @@ def _joints(model: Any, carrier: NDArray[np.int64], actuators: tuple[ActuatorDef
 
 def _geoms(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[GeomDef, ...]:
     geoms = []
-    for g, name in enumerate(names(model, "geom", model.ngeom)):
+    for g, name in enumerate(element_names(model, "geom", model.ngeom)):
         b = model.geom_bodyid[g]
         pose = poses[b] @ Pose(model.geom_pos[g].copy(), model.geom_quat[g].copy())
         kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()

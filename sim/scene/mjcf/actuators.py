@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mjcf_file import names
+from gelflow.sim.scene.mjcf.model_file import element_names
 
 INF = float("inf")
 
@@ -28,16 +28,16 @@ class ActuatorDef:
     gear: float
     kp: float  # [N/m] or [N m/rad]
     kd: float  # [N s/m] or [N m s/rad]
-    force: tuple[float, float]  # what the force is clipped to, before the gear
-    control: tuple[float, float] = (-INF, INF)  # what the control is clipped to
+    force_range: tuple[float, float]  # what the force is clipped to, before the gear
+    ctrl_range: tuple[float, float] = (-INF, INF)  # what the control is clipped to
     gain: float = 1.0  # of a "general" actuator: force = gain u + bias − kp l − kd l̇
     bias: float = 0.0
 
-    def peak(self) -> float:
+    def peak_force(self) -> float:
         """The largest force on the joint at rest [N] or [N m]; infinite for a servo whose force is not limited."""
-        largest = max(abs(x) for x in self.force)
+        largest = max(abs(x) for x in self.force_range)
         if not np.isfinite(largest) and self.kp == 0:
-            reach = max(abs(x) for x in self.control)
+            reach = max(abs(x) for x in self.ctrl_range)
             gain = {"velocity": self.kd, "general": self.gain}.get(self.kind, 1.0)
             largest = abs(gain) * reach + abs(self.bias) if gain else abs(self.bias)
         return abs(self.gear) * largest if self.gear else 0.0
@@ -46,7 +46,7 @@ class ActuatorDef:
 def read_actuators(model: Any, where: str) -> tuple[ActuatorDef, ...]:
     """The actuators, all of them on slide and hinge joints. Raises UsageError when force ranges contradict."""
     actuators = []
-    for a, name in enumerate(names(model, "actuator", len(model.actuator_trntype))):
+    for a, name in enumerate(element_names(model, "actuator", len(model.actuator_trntype))):
         gear, gain = float(model.actuator_gear[a, 0]), float(model.actuator_gainprm[a, 0])
         affine = model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE
         b0, b1, b2 = (float(b) if affine else 0.0 for b in model.actuator_biasprm[a, :3])
@@ -61,8 +61,8 @@ def read_actuators(model: Any, where: str) -> tuple[ActuatorDef, ...]:
                 gear=gear,
                 kp=kp,
                 kd=kd,
-                force=_force_range(model, a, gear, joint, f"{where}: actuator {name!r}"),
-                control=_range(model.actuator_ctrllimited[a], model.actuator_ctrlrange[a]),
+                force_range=_force_range(model, a, gear, joint, f"{where}: actuator {name!r}"),
+                ctrl_range=_range(model.actuator_ctrllimited[a], model.actuator_ctrlrange[a]),
                 gain=gain if plain else 1.0,
                 bias=b0 if plain else 0.0,
             )
@@ -114,7 +114,7 @@ def default_limit(kind: str, inertia: float, actuators: list[ActuatorDef]) -> tu
     stiffness = inertia / LIMIT_TIME**2
     motors = 0.0
     for actuator in actuators:
-        peak = actuator.peak()
+        peak = actuator.peak_force()
         motors += (
             peak / LIMIT_YIELD[kind] if np.isfinite(peak) else LIMIT_SERVO * actuator.gear**2 * max(actuator.kp, 0)
         )

@@ -30,7 +30,7 @@ def compile_model(path: Path) -> tuple[Any, bool]:
         raise UsageError(f"{path}: {_explained(' '.join(str(error).split()), spec)}") from None
 
 
-def names(model: Any, kind: str, count: int) -> list[str]:
+def element_names(model: Any, kind: str, count: int) -> list[str]:
     """Names of a model's elements, by MuJoCo's accessor ("body", "joint", …); those without one get one made up."""
     given = [getattr(model, kind)(i).name for i in range(count)]
     taken = set(given)

@@ -1,0 +1,1 @@
+"""Meshes, signed distance grids and surface sampling."""

@@ -1,0 +1,114 @@
+"""Loading of scenes from a TOML file and the MJCF or URDF file that it names (docs/guide/scenes.md)."""
+
+import copy
+from collections.abc import Mapping
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, cast
+
+from gelflow.errors import UsageError
+from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points
+from gelflow.sim.scene.joint_limits import read_limits
+from gelflow.sim.scene.mjcf.mechanics import read_mechanics
+from gelflow.sim.scene.pads import read_pads
+from gelflow.sim.scene.presets import Presets, apply_preset, read_presets
+from gelflow.sim.scene.scene import Precision, Scene
+from gelflow.sim.scene.shapes import used_shapes
+from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
+
+INTEGRATORS = ("bdf1", "bdf2")
+PRECISIONS: tuple[Precision, ...] = ("double", "single")
+DEFAULT_TOLERANCE = 1e-7  # of Newton's method
+
+_SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
+_ELEMENT_TABLES = ("joints", "shapes", "points", "contacts", "pads")
+_KEYS = ("format", "model", *_SOLVER_KEYS, "friction", *_ELEMENT_TABLES, "presets")
+
+
+def scene_names() -> tuple[str, ...]:
+    """Names of the scenes that are part of gelflow."""
+    names = (file.name for file in _shipped_scenes().iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
+
+
+def load_scene(
+    scene: str | Path,
+    *,
+    preset: str | None = None,
+    friction: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Scene:
+    """Load a scene.
+
+    Parameters
+    ----------
+    scene: name of a scene of gelflow, or path of a TOML file
+    preset: name of a preset of the file, such as "fast", which trades accuracy for speed
+    friction: "viscous" or "elastic", instead of the default friction law of the file
+    overrides: values that replace those of the file and of the preset, by dotted key, such as {"pads.pad.rows": 50};
+        `*` matches every table at its level. Keys and values are checked like those of the file.
+
+    Raises UsageError, in one line, on an unknown key or name, a missing file, or an element that is not supported.
+    """
+    path = _find(scene)
+    data = copy.deepcopy(read_toml(path))
+    presets = read_presets(TomlTable(data, str(path)), top_level_keys=_SOLVER_KEYS, element_tables=_ELEMENT_TABLES)
+    if preset is not None:
+        apply_preset(data, presets, preset, str(path))
+    for key, value in (overrides or {}).items():
+        set_by_path(data, key, value)
+    if friction is not None:
+        data["friction"] = friction
+    return _read_scene(path, TomlTable(data, str(path)), presets)
+
+
+def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
+    if (version := top.integer("format")) > 1:
+        raise UsageError(f"{path}: format is {version}; this gelflow reads format 1")
+    top.check_keys(_KEYS)
+    friction = top.string("friction", "viscous", choices=FRICTION_LAWS)
+    mechanics = read_mechanics(path.parent / top.string("model"))
+    points = read_points(top.tables("points"), mechanics)
+    contacts = read_contacts(top.tables("contacts"), points, mechanics, friction)
+    pads = read_pads(top.tables("pads"), mechanics, friction, path.parent)
+    shape_names = {contact.shape for contact in contacts} | {name for pad in pads for name in pad.against}
+    point_names = {contact.points for contact in contacts}
+    sampled_geoms = {points[name].geom for name in point_names}
+    shapes, unused_geoms = used_shapes(mechanics, top.tables("shapes"), shape_names, sampled_geoms)
+    unused_points = tuple(f"points {name}: in no contact" for name in points if name not in point_names)
+    return Scene(
+        name=path.stem,
+        path=path,
+        step=top.number("step", minimum=1e-6),
+        integrator=top.string("integrator", "bdf1", choices=INTEGRATORS),
+        tolerance=top.number("tolerance", DEFAULT_TOLERANCE, minimum=1e-15),
+        precision=cast("Precision", top.string("precision", "double", choices=PRECISIONS)),
+        friction=friction,
+        gravity=mechanics.gravity,
+        bodies=mechanics.bodies,
+        joints=mechanics.joints,
+        limits=read_limits(top.tables("joints"), mechanics, top.location),
+        actuators=mechanics.actuators,
+        shapes=shapes,
+        points=tuple(p for p in points.values() if p.name in point_names),
+        contacts=contacts,
+        pads=pads,
+        q0=mechanics.q0,
+        not_modelled=(*mechanics.not_modelled, *unused_geoms, *unused_points),
+        presets=presets,
+    )
+
+
+def _find(scene: str | Path) -> Path:
+    path = Path(scene)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    shipped = Path(str(_shipped_scenes())) / f"{scene}.toml"
+    if not shipped.is_file():
+        raise UsageError(f"no scene {str(scene)!r}; {suggestion(str(scene), scene_names())} (or give a .toml file)")
+    return shipped
+
+
+def _shipped_scenes() -> Traversable:
+    return resources.files("gelflow.sim") / "scenes"

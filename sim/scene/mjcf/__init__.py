@@ -1,0 +1,1 @@
+"""Model files (MJCF, URDF), parsed and compiled by MuJoCo."""
