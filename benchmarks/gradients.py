@@ -25,11 +25,10 @@ from rich.table import Table
 
 from gelflow.measurement.machine import processor
 from gelflow.sim._core import LEVEL
-from gelflow.sim.benchmark.rolling import ROLLING_FORCES
 from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
 from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
 from gelflow.sim.validation.gradient_check import Output, RolloutLoss, compare_to_differences, compare_to_dual_numbers
-from gelflow.sim.validation.reference_motions import SCENES
+from gelflow.sim.validation.reference_motions import PUBLISHED_ROLLING_FORCES, SCENES
 
 FILE = Path(__file__).parent / "results" / "gradients.json"
 OUTPUTS: tuple[Output, ...] = ("q", "v", "tactile")
@@ -75,7 +74,7 @@ def check(row: Row, seed: int) -> None:
 
 def check_rolling_run(row: Row) -> None:
     """The published run's first 110 steps, with a loss of all marker readings at the end, and positions there."""
-    (down, push), (_, roll) = ROLLING_FORCES[:2]
+    (down, push), (_, roll) = PUBLISHED_ROLLING_FORCES[:2]
     sim, rng = converged_simulator("rolling", row.law, row.integrator), np.random.default_rng(0)
     u = np.array([push] * down + [roll] * (110 - down))
     reading = sim.rollout(u[:, None], read_after=(len(u),)).tactile[0, 0]

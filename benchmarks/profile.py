@@ -21,7 +21,7 @@ from rich.table import Table
 
 from gelflow.measurement.machine import processor
 from gelflow.sim.benchmark import versions
-from gelflow.sim.benchmark.runs import HOLD
+from gelflow.sim.benchmark.speed.timed_run import HOLD
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion

@@ -16,6 +16,15 @@ from gelflow.sim.scene import Scene
 
 Array = NDArray[np.float64]
 
+# The published ball rolling run (paper, appendix B.1): last step of a phase, and the force on the pad during it [N].
+PUBLISHED_ROLLING_FORCES = (
+    (100, (0.0, 0.0, 0.2)),
+    (150, (0.1, 0.0, 0.2)),
+    (200, (-0.2, 0.0, 0.2)),
+    (250, (0.0, 0.1, 0.2)),
+    (350, (0.0, -0.2, 0.2)),
+)
+
 
 @dataclass(frozen=True)
 class ReferenceMotion:

@@ -1,7 +1,8 @@
-"""The one way in which things are timed: in turn, again and again, so that a disturbance of the machine hits all alike.
+"""Timing of workloads: interleaved repeats, medians, and reports.
 
-Figures are medians over the repeats. How many times as fast one thing is as another is the median of the repeats' own
-ratios: the two of a pair ran within moments of each other.
+Workloads are run in turn, repeat after repeat, so that a disturbance of the machine affects all of them. Results are
+medians over the repeats. A speed-up is the median of the ratios within each repeat, because the two runs of a pair
+follow each other closely.
 """
 
 import math
@@ -15,23 +16,23 @@ import numpy as np
 
 from gelflow.errors import UsageError
 
-MIN_RUN_SECONDS = 5e-3  # what takes less [s] is run several times in one repeat: clocks and interrupts are coarse
+MIN_RUN_SECONDS = 5e-3  # shorter workloads run several times per repeat: clocks and interrupts are coarse [s]
 QUICK_REPEATS, REPEATS = 5, 15
-IDLE_CPU_SHARE = 0.95  # share of a core that a thread gets on a machine that does nothing else, at least
+IDLE_CPU_SHARE = 0.95  # minimum share of a core that a thread gets on an otherwise idle machine
 
 
 class ProgressReporter(Protocol):
-    """Is told how far a measurement is."""
+    """Receives the progress of a measurement."""
 
     def begin(self, what: str, total: int) -> None:
-        """`what` is being measured; `advance` will be called `total` times."""
+        """A measurement `what` with `total` parts starts."""
 
     def advance(self) -> None:
-        """One part of it is done."""
+        """One part is done."""
 
 
 class SilentProgress:
-    """A watch that nobody looks at."""
+    """A progress reporter without output."""
 
     def begin(self, what: str, total: int) -> None: ...
 
@@ -40,7 +41,7 @@ class SilentProgress:
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """How long a measurement may take."""
+    """Extent of a measurement. Raises UsageError when `repeats` is below 1."""
 
     quick: bool = False  # fewer sizes and shorter runs
     repeats: int = REPEATS
@@ -53,65 +54,66 @@ class BenchmarkOptions:
 
 @dataclass(frozen=True)
 class Report:
-    """A measurement: a table for the terminal, and all of it for a file."""
+    """Result of a measurement: a table for the terminal, and records for a file."""
 
     name: str
     title: str
     columns: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     note: str
-    results: list[dict[str, Any]]  # what JSON can hold
-    violations: list[str]  # runs that were off by more than allowed, a line each
+    results: list[dict[str, Any]]  # JSON data
+    violations: list[str]  # one line for each run whose error exceeds its bound
 
-    def plain(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
+        """JSON data of the report."""
         return {"title": self.title, "note": self.note, "outside": self.violations, "results": self.results}
 
 
 @dataclass(frozen=True)
 class Workload:
-    """Something to time."""
+    """A function to time."""
 
     run: Callable[[], object]
-    units: int  # steps, markers, … that one run does
-    prepare: Callable[[], object] = lambda: None  # before each run, not timed
+    units: int  # units of work (steps, markers, …) in one run
+    prepare: Callable[[], object] = lambda: None  # called before each run, not timed
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What a unit of a work took in each repeat [s]."""
+    """Seconds per unit of a workload, one entry per repeat."""
 
-    seconds: tuple[float, ...]  # by the clock on the wall
-    cpu_seconds: tuple[float, ...]  # of all threads: tells a load_note machine from a slow one
+    seconds: tuple[float, ...]  # wall-clock time
+    cpu_seconds: tuple[float, ...]  # processor time of all threads; less than wall-clock time on a busy machine
 
     @property
     def median(self) -> float:
-        """Seconds per unit."""
+        """Median wall-clock seconds per unit."""
         return statistics.median(self.seconds)
 
     @property
     def rate(self) -> float:
-        """Units per second."""
+        """Median rate, units per second."""
         return 1 / self.median
 
     @property
     def quartiles(self) -> tuple[float, float]:
-        """Units per second: a quarter of the repeats was slower, a quarter faster."""
+        """Lower and upper quartile of the rate, units per second."""
         slow, fast = np.percentile(self.seconds, (75, 25))
         return float(1 / slow), float(1 / fast)
 
     @property
     def spread(self) -> str:
-        """Half of what lies between the quartiles, beside the median."""
+        """Half of the interquartile range, relative to the median."""
         slow, fast = self.quartiles
         return f"{(fast - slow) / 2 / self.rate:.0%}"
 
     @property
     def cpu_share(self) -> float:
-        """Processor seconds per second."""
+        """Processor seconds per wall-clock second."""
         return statistics.median(cpu / wall for cpu, wall in zip(self.cpu_seconds, self.seconds, strict=True))
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
+    def to_dict(self) -> dict[str, Any]:
+        """JSON data of the timing."""
         return {
             "per_second": self.rate,
             "quartiles": self.quartiles,
@@ -121,34 +123,37 @@ class Timing:
 
 
 def load_note(timings: Sequence[Timing]) -> str:
-    """What to add to the note under workloads of one thread, where others used the machine; usually nothing."""
-    share = statistics.median(times.cpu_share for times in timings)
+    """Warning for the note of single-thread timings taken on a busy machine; empty on an idle one."""
+    share = statistics.median(timing.cpu_share for timing in timings)
     return "" if share > IDLE_CPU_SHARE else f" The machine was busy, runs had {share:.0%} of a core: rough figures."
 
 
 def speedup(one: Timing, other: Timing) -> float:
-    """How many times as fast `one` was as `other`, of the same `time_interleaved` run."""
+    """Rate of `one` relative to `other`, for timings of the same `time_interleaved` call."""
     return statistics.median(b / a for a, b in zip(one.seconds, other.seconds, strict=True))
 
 
 def time_interleaved(workloads: Sequence[Workload], options: BenchmarkOptions) -> list[Timing]:
-    """Time workloads in turn, each `options.repeats` times after once untimed; advances
-    `options.progress` (repeats + 1) × workloads times."""
+    """Time workloads in turn: one untimed run of each, then `options.repeats` timed rounds.
+
+    Advances `options.progress` by (repeats + 1) × workloads.
+    """
     loops = []
-    for work in workloads:
-        loops.append(math.ceil(MIN_RUN_SECONDS / max(_once(work)[0], 1e-9)))
+    for workload in workloads:
+        loops.append(math.ceil(MIN_RUN_SECONDS / max(_run_once(workload)[0], 1e-9)))
         options.progress.advance()
-    timings: list[list[tuple[float, float]]] = [[] for _ in workloads]
+    samples: list[list[tuple[float, float]]] = [[] for _ in workloads]
     for _ in range(options.repeats):
-        for work, count, own in zip(workloads, loops, timings, strict=True):
-            wall, cpu = np.sum([_once(work) for _ in range(count)], axis=0) / (count * work.units)
+        for workload, count, own in zip(workloads, loops, samples, strict=True):
+            wall, cpu = np.sum([_run_once(workload) for _ in range(count)], axis=0) / (count * workload.units)
             own.append((float(wall), float(cpu)))
             options.progress.advance()
-    return [Timing(*(tuple(values) for values in zip(*own, strict=True))) for own in timings]
+    return [Timing(*(tuple(values) for values in zip(*own, strict=True))) for own in samples]
 
 
-def _once(work: Workload) -> tuple[float, float]:
-    work.prepare()
+def _run_once(workload: Workload) -> tuple[float, float]:
+    """Wall-clock and processor time of one run [s]."""
+    workload.prepare()
     wall, cpu = time.perf_counter(), time.process_time()
-    work.run()
+    workload.run()
     return time.perf_counter() - wall, time.process_time() - cpu

@@ -4,11 +4,10 @@ right by central differences. `python benchmarks/gradients.py` does the same wit
 import numpy as np
 import pytest
 
-from gelflow.sim.benchmark.rolling import ROLLING_FORCES
 from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import FREE, SHAPES, cloud_on_shape, converged_simulator, scene_in_contact
-from gelflow.sim.validation.reference_motions import SCENES
+from gelflow.sim.validation.reference_motions import PUBLISHED_ROLLING_FORCES, SCENES
 
 OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 
@@ -65,7 +64,7 @@ def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_the_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> None:
     """Down onto the ball for 100 steps, then rolling: the end's positions, and a loss of all its marker readings."""
-    (down, push), (_, roll) = ROLLING_FORCES[:2]
+    (down, push), (_, roll) = PUBLISHED_ROLLING_FORCES[:2]
     sim = converged_simulator("rolling", law, integrator)
     u = np.array([push] * down + [roll] * (110 - down))
     reading = sim.rollout(u[:, None], read_after=(len(u),)).tactile[0, 0]

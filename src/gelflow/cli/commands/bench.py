@@ -92,36 +92,36 @@ def conclude(reports: "Sequence[Report]") -> int:
 
 def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -> "list[Report]":
     if name == "rolling":
-        from gelflow.sim.benchmark.rolling import measure_rolling
+        from gelflow.sim.benchmark.speed.rolling import measure_rolling
 
         return [measure_rolling(options, paper_model=args.paper_model)]
     if name == "scenes":
-        from gelflow.sim.benchmark.scenes import measure_scenes
+        from gelflow.sim.benchmark.speed.scenes import measure_scenes
 
         return [measure_scenes(options)]
     if name == "gradients":
-        from gelflow.sim.benchmark.gradients import measure_gradients
+        from gelflow.sim.benchmark.speed.gradients import measure_gradients
 
         return [measure_gradients(options)]
     if name == "batch":
-        from gelflow.sim.benchmark.batch import measure_batch
+        from gelflow.sim.benchmark.speed.batch import measure_batch
 
         return [measure_batch(options)]
     if name == "markers":
-        from gelflow.sim.benchmark.markers import measure_markers
+        from gelflow.sim.benchmark.speed.markers import measure_markers
 
         return [measure_markers(options)]
     if name == "precision":
-        from gelflow.sim.benchmark.precision import measure_precision
+        from gelflow.sim.benchmark.speed.precision import measure_precision
 
         return [measure_precision(options)]
     if name == "tracking":
         return _measure_tracking(options, args.picture)
-    from gelflow.sim.benchmark.growth import measure_growth
+    from gelflow.sim.benchmark.speed.growth import measure_growth
 
     report, found = measure_growth(options)
     if args.picture is not None:
-        from gelflow.sim.benchmark.growth_picture import draw
+        from gelflow.sim.benchmark.speed.growth_picture import draw
 
         draw(found, args.picture)
     return [report]
@@ -161,7 +161,7 @@ def _write(file: Path, reports: "Sequence[Report]", *, quick: bool, repeats: int
 
     version = versions() | {"opencv-contrib-python-headless": metadata.version("opencv-contrib-python-headless")}
     record = {"format": 1, "processor": processor(), "versions": version, "quick": quick, "repeats": repeats}
-    record |= {report.name: report.plain() for report in reports}
+    record |= {report.name: report.to_dict() for report in reports}
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 

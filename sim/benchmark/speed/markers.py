@@ -1,4 +1,4 @@
-"""What a marker costs: reading a pad of which every marker touches, and the reading's reverse pass."""
+"""Cost of a marker: evaluation of tactile forces with all markers in contact, and its reverse pass."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
 from gelflow.sim import _core
-from gelflow.sim.benchmark.runs import FORCE
+from gelflow.sim.benchmark.speed.timed_run import FORCE
 from gelflow.sim.scene.geometry.distance_grid import spline_grid
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
 
-# kind → sizes [m], and what lies above its middle [m]. The pad is pressed into its top.
+# kind → sizes [m], and height of the top above the centre [m]. The pad is pressed into the top.
 SHAPES: dict[str, tuple[tuple[float, float, float], float]] = {
     "sphere": ((0.02, 0.0, 0.0), 0.02),
     "plane": ((0.0, 0.0, 0.0), 0.0),
@@ -28,15 +28,15 @@ SHAPES: dict[str, tuple[tuple[float, float, float], float]] = {
     "grid": ((1.0, 1.0, 1.0), 0.02),
 }
 ROUNDING = 2e-3  # [m]
-CELLS = 64  # of the grid along the ball in it
+CELLS = 64  # of the distance grid along the diameter of its ball
 SIDE, QUICK_SIDE = 200, 50
-PAD, DEPTH = 4e-3, 1e-3  # the pad's side, and how deep its middle is [m]
+PAD, DEPTH = 4e-3, 1e-3  # side of the pad, depth of its centre [m]
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
-GRADIENT = 1e-3  # how far single precision's gradient may be from double's, relative
+GRADIENT = 1e-3  # largest relative difference between the gradients in single and double precision
 
 
 def ball_grid(radius: float) -> dict[str, Any]:
-    """The grid of a ball's signed distance, as `add_shape` takes it."""
+    """Signed distance grid of a ball, as arguments of `add_shape`."""
     spacing = 2 * radius / CELLS
     nodes = spacing * np.arange(-CELLS // 2 - 3, CELLS // 2 + 4)
     distances = np.sqrt(sum(np.meshgrid(nodes**2, nodes**2, nodes**2, indexing="ij"))) - radius
@@ -45,7 +45,7 @@ def ball_grid(radius: float) -> dict[str, Any]:
 
 
 def pressed_pad(kind: str, side: int) -> _core.Model:
-    """A model: a square pad of side × side markers, on slides along x and z, pressed into the top of a shape."""
+    """Model of a square pad with side × side markers, on slides along x and z, pressed into the top of a shape."""
     spec = _core.ModelSpec()
     size, top = SHAPES[kind]
     extra: dict[str, Any] = {"rounding": ROUNDING} if kind == "rounded box" else {}
@@ -64,22 +64,22 @@ def pressed_pad(kind: str, side: int) -> _core.Model:
 
 
 @dataclass
-class _Reading:
-    """The pad on one shape in one precision."""
+class _PressedPad:
+    """The pad on one shape, in one precision."""
 
     kind: str
     precision: Precision
     sim: Simulator
 
     def __post_init__(self) -> None:
-        self.sim.v[:] = 0.01  # the markers slide, and go deeper
+        self.sim.v[:] = 0.01  # the markers slide and move inwards
         rng = np.random.default_rng(0)
         self.forces = self.sim.tactile()
         self._still = self.sim.rollout(np.zeros((0, 1, self.sim.model.nu)), read_after=(0,))
         self._by = rng.normal(size=self._still.tactile.shape).astype(self.sim.dtype)
 
     def gradient(self) -> Array:
-        """Of the readings' sum with random weights, by positions and velocities, (4,)."""
+        """Gradient of a randomly weighted sum of the forces with respect to positions and velocities, (4,)."""
         found = self.sim.rollout_gradient(self._still, tactile=self._by)
         return np.concatenate([found.q[0], found.v[0]]).astype(float)
 
@@ -90,37 +90,37 @@ class _Reading:
 
 
 def measure_markers(options: BenchmarkOptions, *, side: int | None = None) -> Report:
-    """Time readings with all of side × side markers in the shape, for every shape in both precisions."""
+    """Time the forces of side × side markers, all in contact, on every shape and in both precisions."""
     side = side or (QUICK_SIDE if options.quick else SIDE)
     models = {kind: pressed_pad(kind, side) for kind in SHAPES}
-    readings = [
-        _Reading(kind, precision, Simulator(model, threads=1, precision=precision))
+    pads = [
+        _PressedPad(kind, precision, Simulator(model, threads=1, precision=precision))
         for kind, model in models.items()
         for precision in PRECISIONS
     ]
-    workloads = [work for reading in readings for work in reading.workloads()]
+    workloads = [work for pad in pads for work in pad.workloads()]
     options.progress.begin("markers", len(workloads) * (options.repeats + 1))
     timings = time_interleaved(workloads, options)
     rows, results, violations = [], [], []
     for i, kind in enumerate(SHAPES):
-        double, single = readings[2 * i : 2 * i + 2]
+        double, single = pads[2 * i : 2 * i + 2]
         times = dict(zip(("double", "double_gradient", "single", "single_gradient"), timings[4 * i :], strict=False))
-        result = _compared(double, single) | {name: time.plain() for name, time in times.items()}
+        result = _compared(double, single) | {name: time.to_dict() for name, time in times.items()}
         results.append({"shape": kind, "markers": side**2} | result)
         rows.append((kind, *_nanoseconds(times), f"{result['touching']:.0%}"))
         if result["touching"] < 1 or not result["force_off"] <= FORCE or not result["gradient_off"] <= GRADIENT:
             violations.append(
-                f"markers, {kind}: {result['touching']:.1%} touch, single precision is {result['force_off']:.1e} off "
-                f"double in the forces and {result['gradient_off']:.1e} in the gradient; allowed are 100 %, {FORCE:g} "
-                f"and {GRADIENT:g}"
+                f"markers, {kind}: {result['touching']:.1%} in contact; single precision differs from double by "
+                f"{result['force_off']:.1e} in the forces and {result['gradient_off']:.1e} in the gradient; allowed: "
+                f"100 %, {FORCE:g} and {GRADIENT:g}"
             )
     return Report(
         name="markers",
-        title=f"Reading {side} × {side} markers, all of them touching: ns per marker",
-        columns=("shape", "double", "+ gradient", "ratio", "single", "+ gradient", "ratio", "touch"),
+        title=f"Tactile forces of {side} × {side} markers, all in contact: ns per marker",
+        columns=("shape", "double", "+ gradient", "ratio", "single", "+ gradient", "ratio", "contact"),
         rows=rows,
-        note="One thread, viscous friction. + gradient: the reading and its reverse pass. ratio: of the two."
-        + load_note(timings),
+        note="One thread, viscous friction. + gradient: with the reverse pass. ratio: of the two. contact: share of "
+        "markers in contact." + load_note(timings),
         results=results,
         violations=violations,
     )
@@ -132,8 +132,8 @@ def _nanoseconds(times: dict[str, Timing]) -> Iterator[str]:
         yield from (f"{value * 1e9:.2f}", f"{(value + gradient) * 1e9:.2f}", f"{(value + gradient) / value:.1f}")
 
 
-def _compared(double: _Reading, single: _Reading) -> dict[str, Any]:
-    """How many markers touch, what they feel in all, and how far single precision is off."""
+def _compared(double: _PressedPad, single: _PressedPad) -> dict[str, Any]:
+    """Share of markers in contact, total force, and relative differences between the precisions."""
     apart = [
         float(np.linalg.norm(one - other) / np.linalg.norm(other))
         for one, other in ((single.forces, double.forces), (single.gradient(), double.gradient()))

@@ -1,4 +1,4 @@
-"""How a step's time grows with what there is in a scene: bodies, touching points, markers, environments."""
+"""Scaling of the step time with the numbers of bodies, contact points, markers and environments."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,25 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
-from gelflow.sim.benchmark.batch import perturb_stiffness
-from gelflow.sim.benchmark.rolling import rolling_run, rolling_scene
-from gelflow.sim.benchmark.runs import AccuracyCheck, Describe, TimedRun, check_accuracy, motion_run, simulator
+from gelflow.sim.benchmark.speed.batch import perturb_stiffness
+from gelflow.sim.benchmark.speed.rolling import rolling_run, rolling_scene
+from gelflow.sim.benchmark.speed.timed_run import (
+    AccuracyCheck,
+    Describe,
+    TimedRun,
+    check_accuracy,
+    motion_run,
+    simulator,
+)
 from gelflow.sim.scene import load_scene
 
 Array = NDArray[np.float64]
 
 STEPS = 40
 ONE_THREAD = "one thread"
-UPPER = 0.5  # the exponent is fitted over this share of the sizes, the largest: below, what does not grow counts
-RADIUS = 0.01  # of the balls that are the bodies [m]
+UPPER = 0.5  # the exponent is fitted over this share of the sizes, the largest ones: constant costs dominate below
+RADIUS = 0.01  # [m] of the balls
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """One thing that grows."""
+    """A quantity that is varied."""
 
     name: str
-    unit: str  # of the horizontal axis
+    unit: str  # label of the horizontal axis
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
     prepare: Callable[[int], tuple[Workload, AccuracyCheck]]
@@ -35,28 +42,28 @@ class Sweep:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What a sweep came to."""
+    """Timings of a sweep."""
 
     sweep: Sweep
     sizes: tuple[int, ...]
-    times: list[Timing]  # of a step of everything
+    times: list[Timing]  # of one step of the whole batch
     checks: list[AccuracyCheck]
     exponent: float
 
     @property
     def rates(self) -> list[float]:
-        """Steps of everything per second."""
+        """Steps of the whole batch per second."""
         return [times.rate for times in self.times]
 
 
 def exponent(sizes: Sequence[int], seconds: Sequence[float]) -> float:
-    """The slope of log time over log size: 1 where time is in proportion to size. Over the largest sizes, at least 2"""
+    """Slope of log time over log size for the largest sizes (at least 2): 1 for time proportional to size."""
     count = max(2, round(UPPER * len(sizes)))
     return float(np.polyfit(np.log(sizes[-count:]), np.log(seconds[-count:]), 1)[0])
 
 
 def balls(count: int) -> Describe:
-    """Balls side by side, each on a slide of its own, at rest on the ground."""
+    """Independent balls at rest on the ground, each on its own slide joint."""
 
     def describe(spec: Any) -> Any:
         ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
@@ -71,7 +78,7 @@ def balls(count: int) -> Describe:
 
 
 def chain(count: int) -> Describe:
-    """A chain of balls that hangs from the ceiling by hinges and swings; its end drags over a wall."""
+    """A swinging chain of balls on hinge joints whose last ball slides on a wall."""
 
     def describe(spec: Any) -> Any:
         wall = spec.add_shape("wall", -1, "plane", (-1e-4, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0), (0, 0, 0))
@@ -87,7 +94,7 @@ def chain(count: int) -> Describe:
 
 
 def plate(count: int) -> Describe:
-    """A plate that lies on the ground with so many points, and slides."""
+    """A plate that slides on the ground, with `count` contact points."""
 
     def describe(spec: Any) -> Any:
         ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
@@ -111,8 +118,8 @@ def _body(spec: Any, name: str, parent: int, pos: tuple[float, float, float]) ->
     return int(spec.add_body(name, parent, pos, (1, 0, 0, 0), 0.01, (0, 0, 0), (inertia,) * 3 + (0, 0, 0)))
 
 
-def _own(describe: Describe, push: float) -> tuple[Workload, AccuracyCheck]:
-    """A model of ours, all of its actuators pushing, so many newtons."""
+def _pushed(describe: Describe, push: float) -> tuple[Workload, AccuracyCheck]:
+    """A model whose actuators all apply `push` [N]."""
     sim = simulator(describe)
     q0 = sim.q[0].copy()
     q0[0] += 0.02 if sim.model.joint_names[0] == "hinge0" else 0.0
@@ -121,19 +128,19 @@ def _own(describe: Describe, push: float) -> tuple[Workload, AccuracyCheck]:
 
 
 def _bodies(count: int) -> tuple[Workload, AccuracyCheck]:
-    return _own(balls(count), 0.0)
+    return _pushed(balls(count), 0.0)
 
 
 def _links(count: int) -> tuple[Workload, AccuracyCheck]:
-    return _own(chain(count), 0.0)
+    return _pushed(chain(count), 0.0)
 
 
 def _points(count: int) -> tuple[Workload, AccuracyCheck]:
-    return _own(plate(count), 0.02)
+    return _pushed(plate(count), 0.02)
 
 
 def _markers(count: int) -> tuple[Workload, AccuracyCheck]:
-    """The ball rolling run; markers are read every 5 steps."""
+    """The ball rolling run; tactile forces are evaluated every 5 steps."""
     scene = rolling_scene(round(count**0.5))
     run, sim = rolling_run(scene, 5), simulator(scene.describe_to)
     return run.workload(sim), check_accuracy(run, sim, scene.describe_to)
@@ -150,16 +157,16 @@ def _environments(count: int) -> tuple[Workload, AccuracyCheck]:
 
 
 SWEEPS = (
-    Sweep("bodies", "bodies side by side", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _bodies),
-    Sweep("chain", "bodies in one chain", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _links),
-    Sweep("contacts", "touching points", (1, 10, 100, 1000, 3000, 10_000, 30_000, 100_000), (1, 100, 1000), _points),
+    Sweep("bodies", "independent bodies", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _bodies),
+    Sweep("chain", "bodies in a chain", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _links),
+    Sweep("contacts", "contact points", (1, 10, 100, 1000, 3000, 10_000, 30_000, 100_000), (1, 100, 1000), _points),
     Sweep("markers", "markers", (100, 1024, 10_000, 30_625, 99_856, 300_304, 1_000_000), (100, 1024, 10_000), _markers),
     Sweep("environments", "environments", (1, 4, 16, 64, 256, 1024, 4096), (1, 4, 16), _environments, "all cores"),
 )
 
 
-def grow(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
-    """Time one sweep."""
+def measure_sweep(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
+    """Time a sweep."""
     sizes = sweep.quick if options.quick else sweep.sizes
     options.progress.begin(f"growth: {sweep.unit}", len(sizes) * (options.repeats + 2))
     workloads, checks = [], []
@@ -173,40 +180,40 @@ def grow(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
 
 
 def measure_growth(options: BenchmarkOptions) -> tuple[Report, list[SweepResult]]:
-    """Time all sweeps; the report, and what `growth_picture.draw` draws."""
-    found = [grow(sweep, options) for sweep in SWEEPS]
-    rows, results, violations = [], [], []
-    for grown in found:
-        name, sizes = grown.sweep.name, grown.sizes
+    """Time all sweeps; returns the report, and the data of `growth_picture.draw`."""
+    sweeps = [measure_sweep(sweep, options) for sweep in SWEEPS]
+    rows, records, violations = [], [], []
+    for result in sweeps:
+        name, sizes = result.sweep.name, result.sizes
         rows.append(
             (
-                *(grown.sweep.unit, f"{sizes[0]} - {sizes[-1]}"),
-                *(f"{grown.rates[i]:.0f}" for i in (0, len(sizes) // 2, -1)),
-                f"{grown.exponent:.2f}",
+                *(result.sweep.unit, f"{sizes[0]} - {sizes[-1]}"),
+                *(f"{result.rates[i]:.0f}" for i in (0, len(sizes) // 2, -1)),
+                f"{result.exponent:.2f}",
             )
         )
-        results.append(
+        records.append(
             {
                 "of": name,
-                "exponent": grown.exponent,
-                "threads": grown.sweep.threads,
+                "exponent": result.exponent,
+                "threads": result.sweep.threads,
                 "sizes": [
-                    {"size": size, **times.plain(), "check": accuracy.plain()}
-                    for size, times, accuracy in zip(sizes, grown.times, grown.checks, strict=True)
+                    {"size": size, **times.to_dict(), "check": accuracy.to_dict()}
+                    for size, times, accuracy in zip(sizes, result.times, result.checks, strict=True)
                 ],
             }
         )
-        for size, accuracy in zip(sizes, grown.checks, strict=True):
+        for size, accuracy in zip(sizes, result.checks, strict=True):
             violations += accuracy.violations(f"growth, {size} {name}")
     report = Report(
         name="growth",
         title="Growth: steps per second",
-        columns=("number of", "from - to", "at first", "half way", "at last", "time ~ n^"),
+        columns=("number of", "from - to", "first", "middle", "last", "time ~ n^"),
         rows=rows,
-        note="One thread; environments: all cores, and a step is one of all of them. The exponent of time is fitted "
-        "over the larger half of the sizes. For one chain a dense matrix is solved: up to n³."
-        + load_note([times for grown in found for times in grown.times if grown.sweep.threads == ONE_THREAD]),
-        results=results,
+        note="One thread; environments: all cores, one step of the whole batch. The exponent is fitted over the "
+        "larger half of the sizes. A chain has a dense mass matrix: up to n³."
+        + load_note([times for result in sweeps for times in result.times if result.sweep.threads == ONE_THREAD]),
+        results=records,
         violations=violations,
     )
-    return report, found
+    return report, sweeps

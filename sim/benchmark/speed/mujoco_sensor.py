@@ -1,8 +1,8 @@
-"""The ball rolling run in MuJoCo with its own tactile sensor: what another fast simulator takes for about the same.
+"""The ball rolling run in MuJoCo with its tactile sensor, for comparison.
 
-The same bodies, joints and forces, and a taxel where each marker is. MuJoCo's contact is rigid (as rigid as the step
-allows), nothing is differentiable, and a taxel gives its depth in the other body and two sliding speeds instead of a
-force. It is the one place where MuJoCo takes steps.
+Bodies, joints and forces are the same, with a taxel at each marker. MuJoCo's contact is rigid (as far as the step
+allows) and not differentiable, and a taxel gives depth and two sliding speeds instead of a force. This is the only
+module in which MuJoCo takes steps.
 """
 
 from typing import Any
@@ -11,17 +11,17 @@ import mujoco
 import numpy as np
 
 from gelflow.measurement.timing import Workload
-from gelflow.sim.benchmark.runs import TimedRun
+from gelflow.sim.benchmark.speed.timed_run import TimedRun
 from gelflow.sim.scene import Scene
 
-# With MuJoCo's usual contact the heavy pad sinks 16 mm into the light ball; so it is half a millimetre, as with ours.
+# With MuJoCo's default contact the heavy pad sinks 16 mm into the light ball; with this one 0.5 mm, as in gelflow.
 STIFF = {"solref": (0.01, 1.0), "solimp": (0.99, 0.9999, 0.001, 0.5, 2.0)}
 
 
 class MujocoRolling:
-    """The run, on a scene `rolling` with a square grid of markers.
+    """The rolling run in MuJoCo, for a scene `rolling` with a square marker grid.
 
-    `readings` (3, markers), MuJoCo's own memory, are what the taxels gave at the last reading.
+    `readings` (3, markers) is a view of the sensor data of the last evaluation: depth and two sliding speeds.
     """
 
     def __init__(self, scene: Scene, run: TimedRun) -> None:
@@ -32,13 +32,13 @@ class MujocoRolling:
         self._run = run
         self._off = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
-    def place(self) -> None:
-        """Put everything at the start."""
+    def start(self) -> None:
+        """Reset to the start of the run."""
         mujoco.mj_resetData(self.model, self.data)
         self.model.opt.disableflags |= self._off
 
-    def go(self) -> None:
-        """The run; sensors are off except where they are read."""
+    def execute(self) -> None:
+        """Execute the run; the sensor is enabled only where it is evaluated."""
         model, data, off = self.model, self.data, self._off
         for steps, u, read in self._run.blocks:
             data.ctrl[:] = u
@@ -48,13 +48,13 @@ class MujocoRolling:
                 mujoco.mj_sensorVel(model, data)
                 model.opt.disableflags |= off
 
-    def work(self) -> Workload:
-        """To time it."""
-        return Workload(self.go, self._run.steps, self.place)
+    def workload(self) -> Workload:
+        """The run as a workload; a unit is a step."""
+        return Workload(self.execute, self._run.steps, self.start)
 
 
 def _model(scene: Scene, taxels: Any) -> Any:
-    """The scene's own model file with a tactile sensor: its taxels are the corners of a mesh that is not drawn."""
+    """The scene's MJCF model with a tactile sensor; its taxels are the vertices of a hidden mesh."""
     spec = mujoco.MjSpec.from_file(str(scene.path.with_name("rolling.xml")))
     spec.option.timestep = scene.step
     for geom in spec.geoms:
@@ -78,7 +78,7 @@ def _model(scene: Scene, taxels: Any) -> Any:
         refname="pad",
     )
     model = spec.compile()
-    # The compiler moved the mesh into its own principal axes, but the sensor takes it to be in those of the pad.
+    # The compiler rotates the mesh to its principal axes; the sensor expects the vertices in the frame of the pad.
     turn = np.empty(9)
     mujoco.mju_quat2Mat(turn, model.mesh_quat[0])
     model.mesh_vert[:] = taxels

@@ -1,4 +1,4 @@
-"""What gradients cost: a recorded run forwards, and forwards and backwards."""
+"""Speed of gradients: rollouts without and with the reverse pass."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.measurement.timing import BenchmarkOptions, Report, Workload, load_note, speedup, time_interleaved
-from gelflow.sim.benchmark.rolling import rolling_scene
-from gelflow.sim.benchmark.runs import (
+from gelflow.sim.benchmark.speed.rolling import rolling_scene
+from gelflow.sim.benchmark.speed.timed_run import (
     AccuracyCheck,
     TimedRun,
     check_accuracy,
@@ -22,37 +22,37 @@ from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]
 
-START = 30  # steps of the motion before the ones that count: in the middle of contact
-GRADIENT = 1e-4  # how far the gradient may be from its converged reference's, relative
+START = 30  # steps before the recorded ones, so that these are in the middle of contact
+GRADIENT = 1e-4  # largest relative difference to the gradient of the converged reference
 
 
 @dataclass(frozen=True)
-class Case:
-    """Steps whose end state, or whose readings after every step, are differentiated by the controls and the start."""
+class GradientBenchmark:
+    """A rollout whose final state, or whose marker forces after every step, are differentiated."""
 
     scene: str
-    side: int | None  # of the rolling pad's grid
+    side: int | None  # markers along each side of the rolling pad
     read: bool
-    paper: tuple[float, float] | None = None  # forward and backward by the paper's simulator [µs per step]
+    paper: tuple[float, float] | None = None  # forward and backward times of the published simulator [µs per step]
 
     @property
     def name(self) -> str:
         return self.scene + (f" {self.side} × {self.side}" if self.side else "")
 
 
-CASES = (
-    Case("rolling", 10, read=False),
-    Case("pushing", None, read=False),
-    Case("insertion", None, read=False),
-    Case("pushing", None, read=True, paper=(556.0, 7.0)),
-    Case("rolling", 200, read=True, paper=(49_200.0, 1268.0)),
+BENCHMARKS = (
+    GradientBenchmark("rolling", 10, read=False),
+    GradientBenchmark("pushing", None, read=False),
+    GradientBenchmark("insertion", None, read=False),
+    GradientBenchmark("pushing", None, read=True, paper=(556.0, 7.0)),
+    GradientBenchmark("rolling", 200, read=True, paper=(49_200.0, 1268.0)),
 )
 
 
-class _Subject:
-    """A case with a simulator at the start of its steps, and a random weight for each number of its result."""
+class _Setup:
+    """A benchmark with its simulator, recorded controls, and random weights of the differentiated scalar."""
 
-    def __init__(self, case: Case, steps: int) -> None:
+    def __init__(self, case: GradientBenchmark, steps: int) -> None:
         self.scene: Scene = rolling_scene(case.side) if case.side else load_scene(case.scene, friction="viscous")
         self.run: TimedRun = motion_run(self.scene, steps=START + steps)
         self.sim = simulator(self.scene.describe_to)
@@ -87,11 +87,11 @@ class _Subject:
         return self.backward(self.sim, self.forward(self.sim, self.trajectory))
 
     def workloads(self) -> list[Workload]:
-        """Forwards, and forwards and backwards."""
+        """The rollout alone, and the rollout with its reverse pass."""
         return [Workload(partial(self.forward, self.sim, self.trajectory), self.steps), Workload(self.both, self.steps)]
 
     def checks(self) -> tuple[AccuracyCheck, float]:
-        """The run's, and how far the gradient is from the converged reference's, relative."""
+        """Accuracy of the run, and relative difference of the gradient to that of the converged reference."""
         reference = converged_reference(self.sim, self.scene.describe_to)
         accuracy = check_accuracy(self.run, simulator(self.scene.describe_to), self.scene.describe_to)
         self.start(reference)
@@ -102,20 +102,20 @@ class _Subject:
 
 
 def measure_gradients(options: BenchmarkOptions, *, steps: int | None = None) -> Report:
-    """Time recorded steps in the middle of contact, and those with the reverse pass."""
+    """Time rollouts in the middle of contact, without and with the reverse pass."""
     steps = steps or (10 if options.quick else 50)
-    subjects = [_Subject(case, steps) for case in CASES]
-    checks = [subject.checks() for subject in subjects]
-    options.progress.begin("gradients", 2 * len(subjects) * (options.repeats + 1))
-    timings = time_interleaved([work for subject in subjects for work in subject.workloads()], options)
+    setups = [_Setup(case, steps) for case in BENCHMARKS]
+    checks = [setup.checks() for setup in setups]
+    options.progress.begin("gradients", 2 * len(setups) * (options.repeats + 1))
+    timings = time_interleaved([work for setup in setups for work in setup.workloads()], options)
     rows, results, violations = [], [], []
-    for case, forward, both, (accuracy, off) in zip(CASES, timings[::2], timings[1::2], checks, strict=True):
+    for case, forward, both, (accuracy, off) in zip(BENCHMARKS, timings[::2], timings[1::2], checks, strict=True):
         ratio = speedup(forward, both)
-        what = "each reading" if case.read else "end state"
+        output = "each reading" if case.read else "end state"
         paper = sum(case.paper) if case.paper else None
         rows.append(
             (
-                *(case.name, what, f"{forward.median * 1e6:.1f}", f"{both.median * 1e6:.1f}", f"{ratio:.2f}"),
+                *(case.name, output, f"{forward.median * 1e6:.1f}", f"{both.median * 1e6:.1f}", f"{ratio:.2f}"),
                 *(f"{case.paper[0]:.0f} + {case.paper[1]:.0f}" if case.paper else "",),
                 f"{paper / (both.median * 1e6):.0f}" if paper else "",
             )
@@ -124,28 +124,28 @@ def measure_gradients(options: BenchmarkOptions, *, steps: int | None = None) ->
             {
                 "scene": case.scene,
                 "side": case.side,
-                "of": what,
-                "forward": forward.plain(),
-                "forward_and_backward": both.plain(),
+                "of": output,
+                "forward": forward.to_dict(),
+                "forward_and_backward": both.to_dict(),
                 "ratio": ratio,
                 "paper_us": case.paper,
-                "check": accuracy.plain(),
+                "check": accuracy.to_dict(),
                 "gradient_off": off,
             }
         )
         violations += accuracy.violations(f"gradients, {case.name}")
         if not off <= GRADIENT:
             violations.append(
-                f"gradients, {case.name}: {off:.1e} from the converged reference's; allowed is {GRADIENT:g}"
+                f"gradients, {case.name}: {off:.1e} from the converged reference; allowed is {GRADIENT:g}"
             )
     return Report(
         name="gradients",
         title="Gradients: µs per step of one thread",
         columns=("scene", "of", "forward", "+ back", "ratio", "paper", "× paper"),
         rows=rows,
-        note=f"of: what is differentiated, by all controls and the start. {steps} recorded steps in the middle of "
-        "contact, viscous friction. + back: forward and backward; ratio: that to forward. paper: its simulator, "
-        "forward + backward; pushing has 130 markers." + load_note(timings),
+        note=f"of: differentiated output, with respect to all controls and the start. {steps} recorded steps in the "
+        "middle of contact, viscous friction. + back: forward and backward; ratio: relative to forward. paper: "
+        "published simulator, forward + backward; pushing has 130 markers." + load_note(timings),
         results=results,
         violations=violations,
     )

@@ -1,4 +1,4 @@
-"""Runs to time, and how each checks itself: against its fully converged reference, step by step."""
+"""Runs to time, and their accuracy relative to a fully converged reference."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -15,44 +15,44 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
-Describe = Callable[[Any], Any]  # tells a model builder what there is, such as `Scene.describe_to`
+Describe = Callable[[Any], Any]  # adds all parts to a ModelSpec, such as `Scene.describe_to`
 
-CONVERGED = 1e-12  # tolerance of a reference's Newton iterations
-# And of runs that are timed beside other simulators, by law of friction: what they may be off by asks for no more.
+CONVERGED = 1e-12  # Newton tolerance of the reference
+# Newton tolerances of runs timed against other simulators: the loosest ones that meet the bounds below.
 TIMED = {"viscous": 2e-4, "elastic": 2e-5}
-POSITION, ROTATION, FORCE = 1e-6, 1e-6, 1e-4  # how far from its reference a run may be: [m], [rad], relative
-HOLD = 5  # steps that a motion's controls are held for, and after which markers are read
+POSITION, ROTATION, FORCE = 1e-6, 1e-6, 1e-4  # largest differences to the reference: [m], [rad], relative
+HOLD = 5  # steps with the same controls, after which tactile forces are evaluated
 
 
 @dataclass(frozen=True)
 class TimedRun:
-    """Steps from a start, in blocks of the same controls."""
+    """Steps from a start configuration, in blocks of constant controls."""
 
     q0: Array  # (nq,)
-    blocks: tuple[tuple[int, Array, bool], ...]  # how many steps, controls (nu,), whether to read the markers then
+    blocks: tuple[tuple[int, Array, bool], ...]  # steps, controls (nu,), evaluate tactile forces after the block
 
     @property
     def steps(self) -> int:
         return sum(block[0] for block in self.blocks)
 
     def start(self, sim: Simulator) -> None:
-        """Put all environments at the start."""
+        """Reset all environments to the start."""
         sim.reset()
         sim.q[:] = self.q0
 
     def execute(self, sim: Simulator) -> None:
-        """As a user would: readings land in the simulator's own array."""
+        """Execute the run; tactile forces are written to the simulator's own array."""
         for steps, u, read in self.blocks:
             sim.step(u, steps)
             if read:
                 sim.tactile()
 
     def workload(self, sim: Simulator) -> Workload:
-        """To time it; a unit is a step of one environment."""
+        """The run as a workload; a unit is a step of one environment."""
         return Workload(lambda: self.execute(sim), self.steps * sim.num_envs, lambda: self.start(sim))
 
     def rollout_workload(self, sim: Simulator) -> Workload:
-        """To time it in one call, without Python between steps; readings land in the arrays of a first one."""
+        """The run as one rollout call that reuses the arrays of a first call; a unit is a step of one environment."""
         controls = np.concatenate([np.tile(u, (steps, 1)) for steps, u, _ in self.blocks])
         u = np.repeat(controls[:, None], sim.num_envs, axis=1)
         ends = np.cumsum([steps for steps, _, _ in self.blocks])
@@ -63,7 +63,7 @@ class TimedRun:
 
 
 def motion_run(scene: Scene, *, steps: int | None = None) -> TimedRun:
-    """The scene's own motion, or its first steps, controls held and markers read every `HOLD` steps."""
+    """The reference motion of a scene, or its first `steps`, in blocks of `HOLD` steps."""
     moves = reference_motion(scene)
     u = moves.step_controls(scene.step)[:steps]
     ends = range(HOLD, len(u) + 1, HOLD)
@@ -78,7 +78,7 @@ def simulator(
     tolerance: float | None = None,
     precision: Literal["double", "single"] = "double",
 ) -> Simulator:
-    """A simulator of what `describe` tells, solved to the usual tolerance or to another."""
+    """Simulator of the parts that `describe` adds, with the default Newton tolerance or another one."""
     spec = describe(_core.ModelSpec())
     if tolerance is not None:
         spec.tolerance = tolerance
@@ -86,7 +86,7 @@ def simulator(
 
 
 def converged_reference(sim: Simulator, describe: Describe) -> Simulator:
-    """A fully converged copy, with the same parameters."""
+    """A copy of the simulator with the same parameters and a fully converged solver."""
     reference = simulator(describe, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
     reference.params[:] = sim.params
     return reference
@@ -94,36 +94,36 @@ def converged_reference(sim: Simulator, describe: Describe) -> Simulator:
 
 @dataclass(frozen=True)
 class AccuracyCheck:
-    """What a run came to, and how far it was from its reference."""
+    """Results of a run and its differences to the converged reference."""
 
-    position: float  # largest distance of a body from the reference's, at any reading or change of controls [m]
-    turn: float  # largest angle between the two [rad]
-    force: float  # largest norm of the difference of readings over the largest norm of the reference's reading
-    iterations: float  # of Newton's method, per step
-    halved: int  # steps that were taken as substeps
+    position: float  # largest position difference of a body after any block [m]
+    turn: float  # largest rotation difference [rad]
+    force: float  # largest norm of a difference of tactile forces over their largest norm
+    iterations: float  # Newton iterations per step
+    halved: int  # steps that were split into substeps
     end: tuple[float, ...]  # q of the first environment at the end
-    force_sum: tuple[float, ...]  # of its markers (shear x, shear y, normal), where normal is largest [N]
+    force_sum: tuple[float, ...]  # sum over its markers (shear x, shear y, normal) where normal is largest [N]
 
     @property
     def holds(self) -> bool:
         return self.position <= POSITION and self.turn <= ROTATION and self.force <= FORCE
 
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
+    def to_dict(self) -> dict[str, Any]:
+        """JSON data of the check."""
         return asdict(self) | {"holds": self.holds}
 
     def violations(self, name: str) -> list[str]:
-        """A line where it does not hold."""
+        """A message if a difference exceeds its bound, else nothing."""
         if self.holds:
             return []
         return [
             f"{name}: {self.position:.1e} m, {self.turn:.1e} rad, {self.force:.1e} of the marker forces away from "
-            f"its converged reference; allowed are {POSITION:g} m, {ROTATION:g} rad, {FORCE:g}"
+            f"the converged reference; allowed are {POSITION:g} m, {ROTATION:g} rad, {FORCE:g}"
         ]
 
 
 def check_accuracy(run: TimedRun, sim: Simulator, describe: Describe) -> AccuracyCheck:
-    """Take the run with its reference beside it. Raises SimulationError where a step cannot be taken."""
+    """Execute the run together with its reference. Raises SimulationError when a step fails."""
     reference = converged_reference(sim, describe)
     position = turn = difference = largest = 0.0
     force_sum: Array = np.zeros(3)
@@ -136,10 +136,10 @@ def check_accuracy(run: TimedRun, sim: Simulator, describe: Describe) -> Accurac
         position = max(position, float(np.linalg.norm(here[..., :3] - there[..., :3], axis=-1).max()))
         turn = max(turn, float(angles_between(here[..., 3:], there[..., 3:]).max()))
         if read:
-            felt, right = sim.tactile(), reference.tactile()
-            difference = max(difference, float(np.linalg.norm(felt - right, axis=(1, 2)).max()))
-            largest = max(largest, float(np.linalg.norm(right, axis=(1, 2)).max()))
-            total = felt[0].sum(0)
+            forces, exact = sim.tactile(), reference.tactile()
+            difference = max(difference, float(np.linalg.norm(forces - exact, axis=(1, 2)).max()))
+            largest = max(largest, float(np.linalg.norm(exact, axis=(1, 2)).max()))
+            total = forces[0].sum(0)
             force_sum = max(force_sum, total, key=lambda forces: float(forces[2]))
     for one in (sim, reference):
         one.check()

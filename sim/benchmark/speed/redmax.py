@@ -1,4 +1,4 @@
-"""The paper's own simulator in the same run, where a user has built it: its public Python module, `redmax_py`."""
+"""The ball rolling run in the published simulator (DiffRedMax), if its Python module `redmax_py` is installed."""
 
 import importlib
 import importlib.util
@@ -8,26 +8,24 @@ from pathlib import Path
 
 from gelflow.errors import UsageError
 from gelflow.measurement.timing import Workload
-from gelflow.sim.benchmark.runs import TimedRun
+from gelflow.sim.benchmark.speed.timed_run import TimedRun
 
 MODULE = "redmax_py"
 
 
 def unavailable_reason(model: Path | None) -> str | None:
-    """Why it is not timed, in one line; None where it is. Raises UsageError where the model file can't be read."""
+    """Reason why the simulator cannot be timed, or None. Raises UsageError for a missing model file."""
     if importlib.util.find_spec(MODULE) is None:
-        return f"The paper's simulator is not timed: no Python module {MODULE} here."
+        return f"The paper's simulator is not timed: the Python module {MODULE} is not installed."
     if model is None:
-        return (
-            f"The paper's simulator is not timed: give its rolling scene, --paper-model …/tactile_pad.xml, to {MODULE}."
-        )
+        return f"The paper's simulator is not timed: {MODULE} needs its rolling scene, --paper-model …/tactile_pad.xml."
     if not model.is_file():
         raise UsageError(f"--paper-model must be the paper's tactile_pad.xml, but there is no file {model}")
     return None
 
 
-class PaperRolling:
-    """The run on the paper's `tactile_pad.xml`, with side × side markers."""
+class RedMaxRolling:
+    """The rolling run on the published `tactile_pad.xml`, with side × side markers."""
 
     def __init__(self, model: Path, side: int, run: TimedRun) -> None:
         text, changed = re.subn(r'(<tactile [^>]*resolution=)"[^"]*"', rf'\1"{side} {side}"', model.read_text("utf-8"))
@@ -39,14 +37,14 @@ class PaperRolling:
             self._sim = importlib.import_module(MODULE).Simulation(str(file))
         self._run = run
 
-    def go(self) -> None:
-        """The run, as the paper's own examples step and read it."""
+    def execute(self) -> None:
+        """Execute the run with the calls of the published examples."""
         for steps, u, read in self._run.blocks:
             self._sim.set_u(u)
             self._sim.forward(steps, verbose=False, test_derivatives=False)
             if read:
                 self._sim.get_tactile_force_vector()
 
-    def work(self) -> Workload:
-        """To time it."""
-        return Workload(self.go, self._run.steps, lambda: self._sim.reset(backward_flag=False))
+    def workload(self) -> Workload:
+        """The run as a workload; a unit is a step."""
+        return Workload(self.execute, self._run.steps, lambda: self._sim.reset(backward_flag=False))

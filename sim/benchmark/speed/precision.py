@@ -1,4 +1,4 @@
-"""Single precision beside double: how far off whole motions, readings and gradients are, and what it saves."""
+"""Single against double precision: errors of motions, tactile forces and gradients, and the speed-up."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.geometry import angles_between
 from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, speedup, time_interleaved
-from gelflow.sim.benchmark.runs import HOLD, motion_run, simulator
+from gelflow.sim.benchmark.speed.timed_run import HOLD, motion_run, simulator
 from gelflow.sim.scene import FRICTION_LAWS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
@@ -19,24 +19,24 @@ READ_EVERY = 4 * HOLD  # steps
 
 
 @dataclass(frozen=True)
-class _Course:
-    """A motion as one precision runs it."""
+class _Motion:
+    """A recorded motion."""
 
-    poses: Array  # (readings, bodies, 7)
-    tactile: Array  # (readings, markers, 3)
-    gradient: Array  # of all readings with random weights, by the controls (steps, nu)
+    poses: Array  # (reads, bodies, 7)
+    tactile: Array  # (reads, markers, 3)
+    gradient: Array  # of all forces with random weights, with respect to the controls (steps, nu)
 
 
 def measure_precision(options: BenchmarkOptions) -> Report:
-    """The five scenes under both laws, forward and backward."""
+    """Compare precisions on all scenes and friction laws, forward and backward."""
     cases = [(name, law) for name in SCENES for law in FRICTION_LAWS]
     steps = 4 * READ_EVERY if options.quick else None
     workloads, found = [], []
     for name, law in cases:
         scene = load_scene(name, friction=law)
         run = motion_run(scene, steps=steps)
-        double, single = (_course(scene, precision, steps) for precision in ("double", "single"))
-        found.append(_apart(single, double))
+        double, single = (_record(scene, precision, steps) for precision in ("double", "single"))
+        found.append(_differences(single, double))
         for precision in ("double", "single"):
             workloads.append(run.workload(simulator(scene.describe_to, precision=precision)))
     options.progress.begin("precision", len(workloads) * (options.repeats + 1))
@@ -46,22 +46,24 @@ def measure_precision(options: BenchmarkOptions) -> Report:
         ratio = speedup(single_times, double_times)
         errors = (f"{value:.0e}" for value in apart.values())
         rows.append((name, law, *errors, f"{single_times.rate:.0f}", f"{ratio:.2f}"))
-        results.append({"scene": name, "friction": law, **apart, "single": single_times.plain(), "times_double": ratio})
+        results.append(
+            {"scene": name, "friction": law, **apart, "single": single_times.to_dict(), "times_double": ratio}
+        )
     return Report(
         name="precision",
-        title="Single precision beside double: a whole motion",
+        title="Single against double precision: a whole motion",
         columns=("scene", "friction", "m", "rad", "readings", "gradient", "steps/s", "× double"),
         rows=rows,
-        note="m, rad: largest difference of a body's place and turn. readings: largest norm of a difference over the "
-        f"largest norm. gradient: of readings every {READ_EVERY} steps with random weights, by all controls, relative. "
-        "Gradients are computed in double, at the states of single precision, but for viscous readings' share."
-        + load_note(timings),
+        note="m, rad: largest difference of a body's position and orientation. readings: largest norm of a difference "
+        f"of tactile forces over their largest norm. gradient: of the forces every {READ_EVERY} steps with random "
+        "weights, with respect to all controls, relative. Gradients are computed in double, at the states of single "
+        "precision, except for the share of viscous marker forces." + load_note(timings),
         results=results,
         violations=[],
     )
 
 
-def _course(scene: Scene, precision: Any, steps: int | None) -> _Course:
+def _record(scene: Scene, precision: Any, steps: int | None) -> _Motion:
     moves, sim = reference_motion(scene), Simulator(scene, threads=1, precision=precision)
     u = moves.step_controls(scene.step)[:steps]
     sim.q[:] = moves.q0
@@ -72,11 +74,11 @@ def _course(scene: Scene, precision: Any, steps: int | None) -> _Course:
     for at in run.read_after:
         sim.q[:] = run.q[at]
         poses.append(sim.poses()[0].astype(float))
-    return _Course(np.array(poses), run.tactile[:, 0].astype(float), gradient.astype(float))
+    return _Motion(np.array(poses), run.tactile[:, 0].astype(float), gradient.astype(float))
 
 
-def _apart(single: _Course, double: _Course) -> dict[str, float]:
-    """Largest differences: places [m], turns [rad], and, relative, readings and the gradient."""
+def _differences(single: _Motion, double: _Motion) -> dict[str, float]:
+    """Largest differences: positions [m], rotations [rad], and relative ones of tactile forces and gradient."""
     norms = np.linalg.norm(double.tactile, axis=(1, 2))
     return {
         "position": float(np.linalg.norm(single.poses[..., :3] - double.poses[..., :3], axis=-1).max()),

@@ -1,19 +1,19 @@
-"""The five scenes that come along, each on its own motion, under both friction laws."""
+"""Speed of the included scenes on their reference motions, with both friction laws."""
 
 from gelflow.measurement.timing import BenchmarkOptions, Report, load_note, time_interleaved
-from gelflow.sim.benchmark.rolling import rolling_scene
-from gelflow.sim.benchmark.runs import TIMED, check_accuracy, motion_run, simulator
+from gelflow.sim.benchmark.speed.rolling import rolling_scene
+from gelflow.sim.benchmark.speed.timed_run import TIMED, check_accuracy, motion_run, simulator
 from gelflow.sim.scene import FRICTION_LAWS, load_scene
 from gelflow.sim.validation.reference_motions import SCENES
 
-SIDE = 50  # of the rolling pad's grid
+SIDE = 50  # markers along each side of the rolling pad
 
-# The paper's own simulator, its best build on one core of a recent server [steps/s]; its law is the viscous one.
+# Published simulator, fastest build on one core of a recent server, viscous law [steps/s].
 PAPER = {"pushing": 5400.0, "grasp": 1000.0, "insertion": 1940.0, "dclaw": 840.0}
 
 
 def measure_scenes(options: BenchmarkOptions, *, steps: int | None = None) -> Report:
-    """Time each scene's motion, or its first steps."""
+    """Time the reference motion of each scene, or its first `steps`."""
     cases = [(name, law) for name in SCENES for law in FRICTION_LAWS]
     workloads, checks = [], []
     for name, law in cases:
@@ -41,22 +41,22 @@ def measure_scenes(options: BenchmarkOptions, *, steps: int | None = None) -> Re
             {
                 "scene": name,
                 "friction": law,
-                "gelflow": times.plain(),
+                "gelflow": times.to_dict(),
                 "paper": published,
                 "times_the_paper": ratio,
-                "check": accuracy.plain(),
+                "check": accuracy.to_dict(),
             }
         )
         violations += accuracy.violations(f"{name}, {law}")
     return Report(
         name="scenes",
-        title="Scenes on their motions: steps per second of one thread",
+        title="Scenes: steps per second of one thread",
         columns=("scene", "friction", "steps/s", "±", "µs", "Newton", "paper", "× paper"),
         rows=rows,
-        note="Steps of 5 ms; controls change and markers are read every 5. ±: half of what lies between the "
-        f"quartiles. µs: per step, readings included. Newton: iterations per step, to {TIMED['viscous']:g} (viscous) "
-        f"or {TIMED['elastic']:g} of the forces. paper: its simulator's best build on a comparable core, "
-        "whose friction is viscous." + load_note(timings),
+        note="Steps of 5 ms; controls change and tactile forces are evaluated every 5. ±: half the interquartile range."
+        " µs: per step, tactile forces included. Newton: iterations per step, with tolerance "
+        f"{TIMED['viscous']:g} (viscous) or {TIMED['elastic']:g}. paper: published simulator, fastest build on a "
+        "comparable core, viscous friction." + load_note(timings),
         results=results,
         violations=violations,
     )
