@@ -1,7 +1,7 @@
-"""Byte transports for devices that speak over a stream: a serial line (or pty) and TCP.
+"""Byte transports for stream devices: serial lines (or ptys) and TCP connections.
 
-Each operation has a time-out in robot time. A transport never connects again by itself: what was sent before a
-break must not be sent twice, so a new connection is the caller's decision. Every frame goes out in one write.
+Each operation has a time-out in robot time. A transport never reconnects by itself, because a command sent before a
+break must not be repeated: the caller decides. Every packet is sent in one write.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import serial
 from gelflow.clock import Clock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
 
-# A peer on the same machine with a fast clock still needs the scheduler's time: no wait is shorter than this.
+# Lower bound of every wait: with a fast clock, a peer on the same machine still needs time from the scheduler.
 SHORTEST_WALL_TIMEOUT = 0.5  # [s]
 _READ_SIZE = 4096  # bytes
 
@@ -25,19 +25,19 @@ class Transport(Protocol):
 
     @property
     def address(self) -> str:
-        """Where the peer is, for messages."""
+        """Address of the peer, for messages."""
         ...
 
     def open(self) -> None:
-        """Connect. Raises PeerTimeout or PeerError when nobody answers."""
+        """Connect. Raises PeerTimeout or PeerError when the peer does not answer."""
         ...
 
     def read(self, timeout: float) -> bytes:
-        """Bytes that came within `timeout` [s, robot time], empty when none did. Raises PeerError on a broken link."""
+        """Bytes received within `timeout` [s, robot time], empty if none. Raises PeerError on a broken connection."""
         ...
 
     def write(self, data: bytes) -> None:
-        """Send all of `data` in one write. Raises PeerTimeout when the peer takes nothing, PeerError on a break."""
+        """Send all of `data` in one write. Raises PeerTimeout when the peer accepts no data, PeerError on a break."""
         ...
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class TcpTransport:
             connection = socket.create_connection(self._peer, _wall(self._clock, self._connect_timeout))
         except TimeoutError:
             raise PeerTimeout(
-                f"nothing answered at {self.address} within {self._connect_timeout} s: is it on, is the address right?"
+                f"no answer from {self.address} within {self._connect_timeout} s: is it on, is the address right?"
             ) from None
         except OSError as error:
             raise PeerError(
@@ -95,14 +95,14 @@ class TcpTransport:
     def write(self, data: bytes) -> None:
         connection = self._connected()
         try:
-            # Reader and writer are different threads that share the socket's time-out: poll instead of setting it.
+            # Reader and writer threads share the socket's time-out: poll instead of setting it.
             deadline = time.monotonic() + _wall(self._clock, self._write_timeout)
             view = memoryview(data)
             while view:
                 sent = _send_some(connection, view)
                 view = view[sent:]
                 if view and time.monotonic() > deadline:
-                    raise PeerTimeout(f"{self.address} took no data for {self._write_timeout} s")
+                    raise PeerTimeout(f"{self.address} accepted no data for {self._write_timeout} s")
                 if not sent:
                     time.sleep(1e-3)
         except OSError as error:
@@ -122,7 +122,7 @@ class TcpTransport:
 
 
 class SerialTransport:
-    """A serial line, 8N1, or the path of a pty."""
+    """A serial line (8N1) or a pty."""
 
     def __init__(self, path: str, *, clock: Clock, baudrate: int = 115200, write_timeout: float = 0.5) -> None:
         if not path or baudrate <= 0:
@@ -141,13 +141,13 @@ class SerialTransport:
         if self._serial is not None:
             raise UsageError(f"{self.address} is already open")
         try:
-            # Opening also throws away what the line holds from before.
+            # Opening also discards buffered bytes of an earlier session.
             self._serial = serial.Serial(
                 self._path,
                 self._baudrate,
                 timeout=0.05,
                 write_timeout=_wall(self._clock, self._write_timeout),
-                exclusive=True,  # two programs on one line would read each other's replies
+                exclusive=True,  # two programs on one line read each other's replies
             )
         except (serial.SerialException, OSError, ValueError) as error:
             raise PeerError(f"no connection to {self._path} ({_serial_reason(error)})") from None
@@ -156,7 +156,7 @@ class SerialTransport:
         line = self._connected()
         try:
             wall = max(self._clock.wall(timeout), 1e-3)
-            if line.timeout != wall:  # setting it configures the whole port again
+            if line.timeout != wall:  # setting it reconfigures the whole port
                 line.timeout = wall
             return bytes(line.read(1)) + bytes(line.read(line.in_waiting))
         except (serial.SerialException, OSError, TypeError) as error:
@@ -167,7 +167,7 @@ class SerialTransport:
         try:
             line.write(data)
         except serial.SerialTimeoutException:
-            raise PeerTimeout(f"{self._path} took no data for {self._write_timeout} s") from None
+            raise PeerTimeout(f"{self._path} accepted no data for {self._write_timeout} s") from None
         except (serial.SerialException, OSError, TypeError) as error:
             raise PeerError(f"the line {self._path} broke ({_serial_reason(error)})") from None
 
@@ -184,7 +184,7 @@ class SerialTransport:
 
 
 def transport_for(address: str, *, clock: Clock, baudrate: int = 115200) -> Transport:
-    """The transport of an address: `tcp:HOST:PORT`, or `serial:PATH` such as serial:/dev/ttyUSB0.
+    """The transport for an address: `tcp:HOST:PORT` or `serial:PATH` such as serial:/dev/ttyUSB0.
 
     Raises UsageError when the address is neither.
     """
@@ -209,10 +209,10 @@ def _send_some(connection: socket.socket, data: memoryview) -> int:
 
 
 def _serial_reason(error: Exception) -> str:
-    """One line of what went wrong, without pyserial's nesting."""
+    """The cause in one line, without pyserial's nesting."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        return "there is no such device: is it plugged in?"
+        return "no such device: is it plugged in?"
     if number == errno.EACCES:
         return "permission denied: is this user in the group of serial devices (dialout)?"
     if number in (errno.EAGAIN, errno.EBUSY):

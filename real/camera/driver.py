@@ -13,16 +13,15 @@ from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.real.camera import codec
 from gelflow.real.camera.stream import OnImage, StreamCamera
-
-FRESH = 0.25  # how old a frame may be before it is stale [s]
+from gelflow.real.limits import LIMITS
 
 
 def open_camera(
-    source: str, name: str, clock: Clock, *, timeout: float = FRESH, on_image: OnImage | None = None
+    source: str, name: str, clock: Clock, *, timeout: float = LIMITS.image_age, on_image: OnImage | None = None
 ) -> StreamCamera:
-    """The camera at `source`, opened: "http://HOST:PORT/?action=stream", or "uvc:INDEX" or "uvc:/dev/videoN".
+    """Open the camera at `source`: "http://HOST:PORT/?action=stream", "uvc:INDEX" or "uvc:/dev/videoN".
 
-    Raises UsageError for another kind of source, and what opening raises.
+    Raises UsageError for any other source, and PeerError when the camera cannot be opened.
     """
     if source.startswith("http://"):
         return MjpegCamera(source, name, clock, timeout=timeout, on_image=on_image).open()
@@ -34,10 +33,10 @@ def open_camera(
 
 
 class MjpegCamera(StreamCamera):
-    """An MJPEG stream over HTTP. The JPEG bytes are handed on as they were received.
+    """An MJPEG stream over HTTP. The JPEG bytes are passed on as received.
 
-    `connect_timeout` [s, robot time] bounds connecting and the answer's head together. A stall leaves the connection
-    as it is: should frames come again they are taken.
+    `connect_timeout` [s, robot time] bounds the connection and the head of the response together. A stall does not
+    close the connection: images that arrive later are used.
     """
 
     def __init__(
@@ -46,7 +45,7 @@ class MjpegCamera(StreamCamera):
         name: str,
         clock: Clock,
         *,
-        timeout: float = FRESH,
+        timeout: float = LIMITS.image_age,
         connect_timeout: float = 3.0,
         on_image: OnImage | None = None,
     ) -> None:
@@ -65,10 +64,11 @@ class MjpegCamera(StreamCamera):
         self._connect_timeout = connect_timeout
         self._socket: socket.socket | None = None
         self._parser: codec.MultipartParser | None = None
-        self._early = b""  # what came together with the head
+        self._early = b""  # stream data received together with the head
 
     @property
     def damaged(self) -> int:
+        """Number of damaged images that were skipped since the stream was opened."""
         return self._parser.damaged if self._parser else 0
 
     def _connect(self) -> None:
@@ -87,11 +87,11 @@ class MjpegCamera(StreamCamera):
                 link.settimeout(self._left(deadline))
                 received = link.recv(65536)
                 if not received:
-                    raise PeerError("closed the connection before it answered")
+                    raise PeerError("the server closed the connection before it answered")
                 data += received
             self._parser = codec.MultipartParser(head[0].boundary())
             self._early = head[1]
-            # The thread wakes this often to see whether it shall end; a stall is measured by whoever waits for frames.
+            # Period at which the reader thread checks whether it should end; callers measure the age of images.
             link.settimeout(0.2)
         except TimeoutError as error:
             link.close()
@@ -118,11 +118,11 @@ class MjpegCamera(StreamCamera):
     def _disconnect(self) -> None:
         link, self._socket = self._socket, None
         if link is not None:
-            with contextlib.suppress(OSError):  # it may be gone already
+            with contextlib.suppress(OSError):  # the peer may have closed it
                 link.shutdown(socket.SHUT_RDWR)
             link.close()
 
-    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
         link, parser = self._socket, self._parser
         assert link is not None and parser is not None
         data = self._early
@@ -138,7 +138,7 @@ class MjpegCamera(StreamCamera):
                 continue
             except OSError as error:
                 raise PeerError(
-                    f"camera {self.name}: {self.source} broke off: {error.strerror or error}; look at it, reconnect"
+                    f"camera {self.name}: connection to {self.source} broke: {error.strerror or error}; reconnect"
                 ) from error
             if not data:
                 return
@@ -147,8 +147,8 @@ class MjpegCamera(StreamCamera):
 class UvcCamera(StreamCamera):
     """A UVC device by index or path, read with OpenCV.
 
-    The device is asked for MJPEG, whose bytes are handed on as received. Where a driver gives pixels instead, they are
-    stored as PNG, so that a replay decodes what was seen. `size` is (width, height) [px] to ask the device for.
+    MJPEG is requested, and its bytes are passed on as received. If the system's driver delivers pixels instead, they
+    are stored as PNG, so that a replay decodes identical pixels. `size` is the requested (width, height) [px].
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class UvcCamera(StreamCamera):
         name: str,
         clock: Clock,
         *,
-        timeout: float = FRESH,
+        timeout: float = LIMITS.image_age,
         size: tuple[int, int] | None = None,
         on_image: OnImage | None = None,
     ) -> None:
@@ -169,31 +169,31 @@ class UvcCamera(StreamCamera):
         self._capture: Any = None
 
     def _connect(self) -> None:
-        import cv2  # here: a stream over HTTP needs no OpenCV
+        import cv2  # a stream over HTTP does not need OpenCV
 
         with _quiet(cv2):
             capture = cv2.VideoCapture(self._device)
         if not capture.isOpened():
             raise PeerError(f"camera {self.name}: cannot open {self.source}; is it plugged in and free?")
-        wanted = cv2.VideoWriter.fourcc(*"MJPG")
-        capture.set(cv2.CAP_PROP_FOURCC, wanted)
+        mjpeg = cv2.VideoWriter.fourcc(*"MJPG")
+        capture.set(cv2.CAP_PROP_FOURCC, mjpeg)
         if self._size is not None:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self._size[0])
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self._size[1])
-        if capture.getBackendName() == "V4L2" and int(capture.get(cv2.CAP_PROP_FOURCC)) == wanted:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # hand out the JPEG, not its pixels
+        if capture.getBackendName() == "V4L2" and int(capture.get(cv2.CAP_PROP_FOURCC)) == mjpeg:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)  # deliver the JPEG instead of its pixels
         self._capture = capture
 
     def _disconnect(self) -> None:
-        """Nothing: OpenCV can not be woken from a read, and the thread that reads releases the device."""
+        """No effect: OpenCV's read cannot be interrupted, and the reader thread releases the device."""
 
-    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
         capture, self._capture = self._capture, None
         try:
             while not closing.is_set():
                 read, pixels = capture.read()
                 if not read:
-                    raise PeerError(f"camera {self.name}: {self.source} gave no frame; is it plugged in? reconnect")
+                    raise PeerError(f"camera {self.name}: {self.source} sent no image; is it plugged in? reconnect")
                 yield self._encode(pixels)
         finally:
             capture.release()
@@ -201,21 +201,21 @@ class UvcCamera(StreamCamera):
     def _encode(self, pixels: Any) -> tuple[bytes, str]:
         import cv2
 
-        if 1 in pixels.shape[:2]:  # one line of bytes: the JPEG itself
+        if 1 in pixels.shape[:2]:  # one row of bytes: the JPEG itself
             data = pixels.tobytes()
-            end = data.rfind(b"\xff\xd9")  # buffers are longer than the image in them
+            end = data.rfind(b"\xff\xd9")  # the buffer is longer than the image
             if data.startswith(b"\xff\xd8") and end > 0:
                 return data[: end + 2], "jpeg"
-            raise PeerError(f"camera {self.name}: {self.source} sent {len(data)} bytes that are no JPEG")
+            raise PeerError(f"camera {self.name}: {self.source} sent {len(data)} bytes that are not a JPEG")
         done, png = cv2.imencode(".png", pixels)
         if not done:
-            raise PeerError(f"camera {self.name}: {self.source} sent pixels of shape {pixels.shape} that are no image")
+            raise PeerError(f"camera {self.name}: {self.source} sent pixels of the invalid shape {pixels.shape}")
         return png.tobytes(), "png"
 
 
 @contextlib.contextmanager
 def _quiet(cv2: Any) -> Iterator[None]:
-    """OpenCV prints warnings about a missing device; our own error says it."""
+    """Suppress OpenCV's warnings about a missing device, for which the driver raises an error."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:

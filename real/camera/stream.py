@@ -1,4 +1,4 @@
-"""What all streaming cameras share: a reader thread, the newest frame, waiting with time-outs, errors that stay."""
+"""Base class of streaming cameras: reader thread, newest image, waiting with time-outs, persistent errors."""
 
 import threading
 from abc import ABC, abstractmethod
@@ -15,11 +15,11 @@ OnImage = Callable[[CameraImage], None]
 
 
 class StreamCamera(ABC):
-    """A camera whose frames a thread receives; only the newest is kept (`gelflow.protocols.Camera`).
+    """A `gelflow.protocols.Camera` whose images a thread receives; only the newest image is kept.
 
-    `on_image` gets every frame in the reader thread, before anybody else can see it: so a recording holds each
-    frame earlier than any decision made from it. What it raises ends the stream and is raised to the camera's user.
-    Once a stream has ended (closed by its server, failed, or closed here) it stays so until `reconnect`.
+    `on_image` is called with every image in the reader thread, before the image is available to callers: a recording
+    therefore holds each image before any decision based on it. An exception of `on_image` ends the stream and is
+    raised to the callers. A stream that has ended (closed by the server, failed, or closed here) needs `reconnect`.
     """
 
     def __init__(
@@ -27,25 +27,25 @@ class StreamCamera(ABC):
     ) -> None:
         if not timeout > 0:
             raise UsageError(f"camera {name}: timeout must be above 0 s, got {timeout}")
-        self.source = source  # what messages call it
+        self.source = source  # for messages
         self.name = name
-        self.timeout = timeout  # robot time without a frame after which `latest` complains [s]
+        self.timeout = timeout  # largest age of the image that `latest` returns [s, robot time]
         self._clock = clock
         self._on_image = on_image
         self._changed = threading.Condition()
         self._newest: CameraImage | None = None
-        self._count = 0  # goes on over a reconnect, so that a sequence number names one frame of a session
+        self._count = 0  # continues after a reconnect, so that a sequence number is unique within a session
         self._failure: GelflowError | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
 
     @property
     def damaged(self) -> int:
-        """How many frames arrived broken and were left out since the stream was opened."""
+        """Number of damaged images that were skipped since the stream was opened."""
         return 0
 
     def open(self) -> Self:
-        """Connect and start to receive. Raises a PeerError when the camera cannot be reached or sends no stream."""
+        """Connect and start the reader thread. Raises PeerError when the camera is unreachable or sends no stream."""
         if self._thread is not None:
             raise UsageError(f"camera {self.name}: already open")
         self._connect()
@@ -60,7 +60,7 @@ class StreamCamera(ABC):
         return self
 
     def reconnect(self) -> None:
-        """Close and open again: the only way on after a failure."""
+        """Close and open again; required after a failure."""
         self.close()
         self.open()
 
@@ -83,7 +83,7 @@ class StreamCamera(ABC):
         self.close()
 
     def latest(self) -> CameraImage:
-        """The newest frame, at most `timeout` old; right after opening it waits that long for the first one.
+        """The newest image, at most `timeout` old; directly after opening, waits up to `timeout` for the first image.
 
         Raises PeerTimeout when there is none, PeerError when the stream has ended.
         """
@@ -93,13 +93,13 @@ class StreamCamera(ABC):
                 self._wait_for(lambda: self._newest is not None, self.timeout)
             self._raise_failure()
             if self._newest is None or self._clock.now() - self._newest.stamp > self.timeout:
-                raise self._silent(self.timeout)
+                raise self._no_image(self.timeout)
             return self._newest
 
     def next(self, after: int, timeout: float) -> CameraImage:
-        """The newest frame once its `sequence` is greater than `after`; waits up to `timeout` [s, robot time].
+        """The newest image with a `sequence` above `after`; waits up to `timeout` [s, robot time].
 
-        Frames that came and were replaced between two calls are skipped. Raises as `latest` does.
+        Images that were replaced by newer ones between two calls are skipped. Raises as `latest` does.
         """
         with self._changed:
             self._raise_unopened()
@@ -107,40 +107,42 @@ class StreamCamera(ABC):
             if self._newest is not None and self._newest.sequence > after:
                 return self._newest
             self._raise_failure()
-            raise self._silent(timeout)
+            raise self._no_image(timeout)
 
     def _wait_for(self, arrived: Callable[[], bool], timeout: float) -> None:
-        """Until `arrived` or a failure, at most `timeout` [s, robot time]; the lock is held."""
+        """Wait until `arrived` or a failure, at most `timeout` [s, robot time]; the caller holds the lock."""
         end = self._clock.now() + timeout
         while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
             self._changed.wait(max(self._clock.wall(left), MIN_WAIT))
 
-    # What a kind of camera brings
+    # Implemented by each camera class
 
     @abstractmethod
     def _connect(self) -> None:
-        """Reach the camera, or raise a GelflowError. Called before the thread starts."""
+        """Connect to the camera. Raises GelflowError. Called before the thread starts."""
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Let go of the camera and wake the thread if it waits. May be called twice, from any thread."""
+        """Disconnect and wake the reader thread. May be called twice, from any thread."""
 
     @abstractmethod
-    def _frames(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
-        """Frames (bytes, encoding) until `closing` is set or the stream ends; raises a GelflowError when it fails."""
+    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+        """Images (bytes, encoding) until `closing` is set or the stream ends. Raises GelflowError when it fails."""
 
-    # The reader thread
+    # Reader thread
 
     def _receive(self, closing: threading.Event) -> None:
-        failure: GelflowError = PeerError(f"camera {self.name}: {self.source} closed the stream; look at it, reconnect")
+        failure: GelflowError = PeerError(
+            f"camera {self.name}: {self.source} closed the stream; check it and reconnect"
+        )
         try:
-            for data, encoding in self._frames(closing):
+            for data, encoding in self._images(closing):
                 if closing.is_set():
                     break
                 self._accept(CameraImage(data, self._clock.now(), self._count, encoding))
         except GelflowError as error:
             failure = error
-        except Exception as error:  # noqa: BLE001 - a thread has no caller: it is raised to the camera's user
+        except Exception as error:  # noqa: BLE001 - a thread has no caller: raised by the next call of `latest` or `next`
             failure = PeerError(f"camera {self.name}: {self.source} failed: {type(error).__name__}: {error}")
         if not closing.is_set():
             with self._changed:
@@ -158,17 +160,17 @@ class StreamCamera(ABC):
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
-            # A new exception each time: one instance raised from two threads would share its traceback.
+            # A new exception each time, because one instance raised from two threads shares its traceback.
             raise type(self._failure)(*self._failure.args) from self._failure
 
     def _raise_unopened(self) -> None:
         if self._thread is None and self._failure is None:
             raise UsageError(f"camera {self.name}: open it first")
 
-    def _silent(self, waited: float) -> PeerTimeout:
+    def _no_image(self, waited: float) -> PeerTimeout:
         last = "none so far"
         if self._newest is not None:
             last = f"the last {self._clock.now() - self._newest.stamp:.2f} s ago"
-        broken = f", {self.damaged} damaged" if self.damaged else ""
-        came = f"no new frame from {self.source} within {waited:g} s ({last}{broken})"
-        return PeerTimeout(f"camera {self.name}: {came}; look at the camera")
+        damaged = f", {self.damaged} damaged" if self.damaged else ""
+        reason = f"no new image from {self.source} within {waited:g} s ({last}{damaged})"
+        return PeerTimeout(f"camera {self.name}: {reason}; check the camera")

@@ -1,7 +1,7 @@
-"""EGM messages: bytes ↔ frozen dataclasses. The wire has mm, degrees and ms; everything here has m, rad and s.
+"""EGM messages: bytes ↔ frozen dataclasses. Units on the wire are mm, degrees and ms; here m, rad and s. No I/O.
 
-The message layer is the schema of the ABBRobotEGM package. A second copy of it in one process clashes in protobuf, so
-nothing else in gelflow may import another one (abb_robot_client brings its own). No I/O.
+The schema is that of the ABBRobotEGM package. protobuf rejects a second copy of a schema in one process, so no other
+EGM package (such as abb_robot_client) may be imported.
 """
 
 import math
@@ -16,10 +16,10 @@ from gelflow.real.kinematics import Joints
 
 try:
     from ABBRobotEGM._egm_protobuf import egm_pb2
-except TypeError as error:  # what protobuf raises for a second schema
+except TypeError as error:  # raised by protobuf for a second schema
     raise UsageError(
-        "expected to be the only EGM schema in this process, got another one; "
-        f"do not import another EGM package (such as abb_robot_client) beside gelflow ({error})"
+        "expected one EGM schema in this process, got a second one; "
+        f"do not import another EGM package (such as abb_robot_client) together with gelflow ({error})"
     ) from None
 
 _DATA = egm_pb2.EgmHeader.MSGTYPE_DATA
@@ -28,27 +28,26 @@ _COUNTER = 0xFFFFFFFF  # seqno and tm are unsigned 32-bit
 _MOTORS = ("undefined", "on", "off")
 _MCI = ("undefined", "error", "stopped", "running")
 _RAPID = ("undefined", "stopped", "running")
-# A quaternion on the wire may be rounded, but not be another kind of thing.
-_NORM_SLACK = 1e-2
+_NORM_TOLERANCE = 1e-2  # rounding of a unit quaternion on the wire
 
 
 @dataclass(frozen=True, slots=True)
 class EgmFeedback:
-    """What the robot says every 4 ms (EgmRobot, type 2)."""
+    """Feedback of the robot, sent every 4 ms (EgmRobot, type 2)."""
 
-    sequence: int  # counts messages
-    time: float  # the controller's clock [s], to the millisecond
+    sequence: int  # message counter
+    time: float  # the controller's clock [s], rounded to milliseconds
     position: Vector  # of the tool in the work object [m]
     quaternion: Quaternion  # w x y z
     joints: Joints  # [rad]
     motors: str = "on"  # undefined, on, off
-    mci: str = "running"  # the motion interpreter: undefined, error, stopped, running
-    rapid: str = "running"  # undefined (a known fault of the controller after its restart), stopped, running
+    mci: str = "running"  # motion control interface: undefined, error, stopped, running
+    rapid: str = "running"  # undefined (a known defect of the controller after its restart), stopped, running
     converged: bool = False  # EGM's own convergence condition is met
 
     @property
-    def trouble(self) -> str:
-        """Why references are not followed, in a few words; empty when they are."""
+    def stop_reason(self) -> str:
+        """The reason why references are not followed; empty when they are."""
         if self.motors != "on":
             return f"motors {self.motors}"
         if self.rapid == "stopped":
@@ -60,10 +59,10 @@ class EgmFeedback:
 
 @dataclass(frozen=True, slots=True)
 class EgmReference:
-    """What the robot is told to follow (EgmSensor, type 3)."""
+    """Reference pose for the robot (EgmSensor, type 3)."""
 
     sequence: int
-    time: float  # our clock [s], to the millisecond
+    time: float  # this computer's robot time [s], rounded to milliseconds
     position: Vector  # [m]
     quaternion: Quaternion  # w x y z
 
@@ -75,7 +74,7 @@ def _fill_pose(pose: Any, position: Vector, quaternion: Quaternion) -> None:
 
 
 def encode_robot(feedback: EgmFeedback) -> bytes:
-    """An EgmRobot message. Measured and planned values are the same, as Euler angles too, as a controller sends."""
+    """An EgmRobot message with equal measured and planned values, and Euler angles as sent by a controller."""
     message = egm_pb2.EgmRobot()
     header = message.header
     header.seqno, header.tm, header.mtype = feedback.sequence & _COUNTER, _milliseconds(feedback.time), _DATA
@@ -94,7 +93,7 @@ def encode_robot(feedback: EgmFeedback) -> bytes:
 
 
 def decode_robot(data: bytes) -> EgmFeedback:
-    """Parse an EgmRobot message. Raises PeerError when it is not one, or has no finite pose and six joints."""
+    """Parse an EgmRobot message. Raises PeerError for other data, or without a finite pose and six finite joints."""
     try:
         message = egm_pb2.EgmRobot.FromString(data)
     except DecodeError:
@@ -129,7 +128,7 @@ def decode_robot(data: bytes) -> EgmFeedback:
 
 
 def encode_sensor(reference: EgmReference) -> bytes:
-    """An EgmSensor message with a pose to follow."""
+    """An EgmSensor message with a reference pose."""
     message = egm_pb2.EgmSensor()
     header = message.header
     header.seqno, header.tm, header.mtype = reference.sequence & _COUNTER, _milliseconds(reference.time), _CORRECTION
@@ -138,7 +137,7 @@ def encode_sensor(reference: EgmReference) -> bytes:
 
 
 def decode_sensor(data: bytes) -> EgmReference:
-    """Parse an EgmSensor message. Raises PeerError when it is not one, or carries no finite pose."""
+    """Parse an EgmSensor message. Raises PeerError for other data, or without a finite pose."""
     try:
         message = egm_pb2.EgmSensor.FromString(data)
     except DecodeError:
@@ -148,27 +147,27 @@ def decode_sensor(data: bytes) -> EgmReference:
         raise PeerError(f"expected an EgmSensor message of type {_CORRECTION} (correction), got type {header.mtype}")
     if not message.planned.HasField("cartesian"):
         raise PeerError("expected an EgmSensor message with a planned pose, got none")
-    # Here Euler angles override the quaternion, as on the controller.
+    # Euler angles override the quaternion, as on the controller.
     position, quaternion = _pose(message.planned.cartesian, not message.planned.cartesian.HasField("euler"))
     return EgmReference(sequence=header.seqno, time=header.tm * 1e-3, position=position, quaternion=quaternion)
 
 
 def _pose(pose: Any, by_quaternion: bool) -> tuple[Vector, Quaternion]:
     if not pose.HasField("pos") or not (pose.HasField("orient") or pose.HasField("euler")):
-        raise PeerError("expected a pose with position and orientation, got a part of it")
+        raise PeerError("expected a pose with position and orientation, got an incomplete pose")
     pos, orient = pose.pos, pose.orient
     position = (pos.x * 1e-3, pos.y * 1e-3, pos.z * 1e-3)
     quaternion = (orient.u0, orient.u1, orient.u2, orient.u3) if by_quaternion else _from_euler(pose.euler)
     w, x, y, z = quaternion
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    # Not a number fails this comparison too.
-    if not abs(norm - 1) < _NORM_SLACK or not math.isfinite(position[0] + position[1] + position[2]):
+    # The comparison is false for NaN.
+    if not abs(norm - 1) < _NORM_TOLERANCE or not math.isfinite(position[0] + position[1] + position[2]):
         raise PeerError(f"expected a finite pose with a unit quaternion, got {position} m and {quaternion}")
     return position, (w / norm, x / norm, y / norm, z / norm)
 
 
 def _to_euler(q: Quaternion) -> Vector:
-    """Angles about x, y, z [rad] of R = Rz Ry Rx."""
+    """Angles about x, y, z [rad] with R = Rz Ry Rx."""
     w, x, y, z = q
     sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
     return (

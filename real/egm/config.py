@@ -5,32 +5,33 @@ from dataclasses import dataclass
 
 from gelflow.errors import UsageError
 from gelflow.geometry import Vector
+from gelflow.real.limits import LIMITS
 
 DEFAULT_PORT = 6510
 
 
 @dataclass(frozen=True)
 class EgmConfig:
-    """An ABB IRB 120 that follows references over EGM. Times are robot time."""
+    """An ABB IRB 120 that follows references over EGM. Times are in robot time."""
 
-    workspace_min: Vector  # lowest position a target may have, in the robot's base frame [m]
-    workspace_max: Vector  # highest [m]
-    port: int = DEFAULT_PORT  # UDP port on which this computer listens; 0 takes any free one
+    workspace_min: Vector  # lowest target position in the robot's base frame [m]
+    workspace_max: Vector  # highest target position [m]
+    port: int = DEFAULT_PORT  # UDP port on which this computer listens; 0 takes any free port
     host: str = "0.0.0.0"  # address of this computer to listen on
-    robot: str = ""  # the controller's IP address; empty: whoever sends first
-    max_speed: float = 0.02  # of the reference [m/s]
-    max_turn_speed: float = math.radians(10)  # of the reference [rad/s]
+    robot: str = ""  # IP address of the controller; empty: the first sender
+    max_speed: float = LIMITS.tool_speed  # of the reference [m/s]
+    max_turn_speed: float = math.radians(LIMITS.tool_turn_speed_deg)  # of the reference [rad/s]
     ramp_time: float = 0.1  # from rest to full speed [s]
-    max_step: float = 0.05  # farthest a target may lie from the reference [m]
-    max_turn: float = math.radians(20)  # largest turn from the reference to a target [rad]
-    max_lead: float = 2e-3  # the reference waits when it is this far ahead of the robot [m]
-    max_turn_lead: float = math.radians(1)  # and this [rad]
-    max_lifetime: float = 1.0  # of a target [s]
-    cycle: float = 0.004  # EGM's period [s]
-    stale: float = 0.020  # feedback older than this: hold [s]
-    silence: float = 0.100  # feedback older than this: stop [s]
-    connect_timeout: float = 2.0  # how long to wait for the robot's first message [s]
-    log_records: int = 65536  # room of the log; a full log stops the arm
+    max_step: float = LIMITS.target_distance  # from the reference to a target [m]
+    max_turn: float = math.radians(LIMITS.target_turn_driver_deg)  # from the reference to a target [rad]
+    max_lead: float = LIMITS.reference_lead  # the reference waits when it is farther ahead of the robot [m]
+    max_turn_lead: float = math.radians(LIMITS.reference_turn_lead_deg)  # the same as an angle [rad]
+    max_lifetime: float = LIMITS.longest_target_lifetime  # of a target [s]
+    cycle: float = 0.004  # period of EGM [s]
+    stale: float = LIMITS.pose_age  # feedback older than this: hold [s]
+    silence: float = LIMITS.pose_silence  # feedback older than this: stop [s]
+    connect_timeout: float = 2.0  # for the first message of the robot [s]
+    log_records: int = 65536  # capacity of the cycle log; a full log stops the arm
     dry_run: bool = False  # listen and check targets, but send nothing
 
     def __post_init__(self) -> None:

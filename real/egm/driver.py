@@ -1,7 +1,8 @@
-"""An ABB arm over EGM (externally guided motion): the `Arm` of the robot runner.
+"""Driver of an ABB arm over EGM (externally guided motion).
 
-EGM runs in a process of its own (`gelflow.real.egm.process`); this side checks targets, posts them, and reads what
-happened from shared memory. This is no safety-rated function: the robot's own safety system must stand behind it.
+EGM runs in a helper process (`gelflow.real.egm.process`). The driver checks targets, sends them to that process, and
+reads the cycle log from shared memory. This is not a safety-rated function: the safety system of the robot must be
+sufficient without it.
 """
 
 import dataclasses
@@ -27,17 +28,17 @@ from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog, MessageCounts
 from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag
 from gelflow.real.egm.target import Target, check_target, tool_frame
 
-# Wall-clock limits on our own process, which owes nothing to the robot's clock [s].
-_START_LIMIT = 30.0
-_OBEY_LIMIT = 1.0
+# Time-outs of the helper process, independent of the robot's clock [s, wall].
+_START_TIMEOUT = 30.0
+_COMMAND_TIMEOUT = 1.0
 _POLL = 0.002
 
 
 class EgmArm:
-    """An ABB IRB 120 that follows references over EGM, checked and bounded.
+    """An ABB IRB 120 as a `gelflow.protocols.Arm`: it follows checked targets in bounded steps over EGM.
 
-    Nothing is opened before `connect`. Whoever connects must fetch the log with `drain_log` from time to time: a full
-    log stops the arm, no cycle is ever left out.
+    Nothing is opened before `connect`. The caller must fetch the cycle log with `drain_log` regularly: a full log
+    stops the arm, because no cycle may be lost.
     """
 
     abortable = True
@@ -47,26 +48,26 @@ class EgmArm:
         self._clock = clock
         self._lock = threading.RLock()
         self._helper: HelperProcess | None = None
-        self._ring: EgmCycleLog | None = None
+        self._cycles: EgmCycleLog | None = None
         self._events: list[EgmEvent] = []
         self._latched = ""
         self._resets = 0
         self._tool: PoseTuple | None = None
-        self.port = config.port  # the UDP port in use: with port 0 known after `connect`
+        self.port = config.port  # the UDP port in use; for port 0 it is known after `connect`
 
     def connect(self, timeout: float | None = None) -> None:
-        """Start the EGM process and wait for the robot's first message.
+        """Start the EGM process and wait for the first message of the robot.
 
-        `timeout` [s, robot time]; None takes the configuration's. Raises UsageError when the port is taken, and
-        PeerTimeout when the robot sends nothing; the process is then gone again, and `connect` may be called anew.
+        `timeout` [s, robot time]; None: that of the configuration. Raises UsageError when the port is in use, and
+        PeerTimeout when the robot sends nothing; the process has ended then, and `connect` may be called again.
         """
         limit = self._config.connect_timeout if timeout is None else timeout
         if self._helper is not None:
             raise UsageError("the EGM arm is connected already; close() it first")
         try:
             self._start()
-            failure = f"the EGM process did not start in {_START_LIMIT} s"
-            self._wait(lambda: self._heard("listening"), _START_LIMIT, failure)
+            failure = f"the EGM process did not start in {_START_TIMEOUT} s"
+            self._wait(lambda: self._heard("listening"), _START_TIMEOUT, failure)
             self._wait(
                 lambda: self._opened().latest() is not None,
                 self._clock.wall(limit),
@@ -78,9 +79,9 @@ class EgmArm:
             raise
 
     def wait_following(self, timeout: float) -> None:
-        """Wait until the controller follows references, for at most `timeout` [s, robot time].
+        """Wait at most `timeout` [s, robot time] until the controller follows references.
 
-        Raises PeerTimeout with the controller's state, and SafetyError when the arm is stopped.
+        Raises PeerTimeout with the state of the controller, and SafetyError when the arm is stopped.
         """
         try:
             self._wait(lambda: self._running() or bool(self._latched), self._clock.wall(timeout), "")
@@ -93,10 +94,10 @@ class EgmArm:
         self._refuse_when_latched()
 
     def state(self) -> ArmState:
-        """The newest feedback. `operating_mode` is unknown: EGM does not carry it.
+        """The newest feedback. `operating_mode` is unknown, because EGM does not transmit it.
 
         Raises PeerTimeout when the newest feedback is older than the configuration's `silence`, and PeerError when the
-        EGM process is gone. While latched the last feedback is returned, with the reason as `fault`.
+        EGM process has ended. While latched, returns the last feedback with the reason as `fault`.
         """
         with self._lock:
             self._pump()
@@ -117,13 +118,13 @@ class EgmArm:
             )
 
     def reference(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What was last sent to the robot: position [m], shape (3,); quaternion w x y z, shape (4,).
+        """The last reference sent to the robot: position [m], shape (3,); quaternion w x y z, shape (4,).
 
-        Raises PeerError when nothing was answered yet.
+        Raises PeerError when none was sent.
         """
         record = self._latest()
         if record.applied is None:
-            raise PeerError("no reference was sent with the newest EGM message: the arm is stopped or in a dry run")
+            raise PeerError("no reference was sent for the newest EGM message: the arm is stopped or in a dry run")
         return np.array(record.applied[0]), np.array(record.applied[1])
 
     def target(
@@ -135,18 +136,18 @@ class EgmArm:
         speed: float | None = None,
         turn_speed: float | None = None,
     ) -> None:
-        """Go straight to a pose of the controller's tool, for at most `lifetime` seconds; then hold.
+        """Move in a straight line to a pose of the controller's tool, for at most `lifetime` seconds; then hold.
 
         Parameters
         ----------
         position: [m], shape (3,), in the robot's base frame
         quaternion: w x y z, shape (4,)
-        lifetime: [s, robot time]; renew the target before it is over
-        speed, turn_speed: of the reference, at most [m/s, rad/s]; None takes the configuration's, which may not be
-            exceeded
+        lifetime: [s, robot time]; the target must be renewed before it expires
+        speed, turn_speed: largest speeds of the reference [m/s, rad/s], at most those of the configuration;
+            None: those of the configuration
 
         Raises SafetyError when the target is refused or the arm is stopped, PeerTimeout on stale feedback. In a dry run
-        the target is checked and goes nowhere.
+        the target is checked and not sent.
         """
         if np.shape(position) != (3,) or np.shape(quaternion) != (4,):
             shapes = f"{np.shape(position)} and {np.shape(quaternion)}"
@@ -179,37 +180,37 @@ class EgmArm:
                 self._send("target", *dataclasses.astuple(target))
 
     def hold(self) -> None:
-        """Freeze the reference where it is, within one cycle."""
+        """Freeze the reference within one cycle."""
         with self._lock:
             self._send("hold", "hold was called")
 
     def stop(self, reason: str) -> None:
-        """Cease sending; the controller's CommTimeout ends EGM. Latches until `reset`.
+        """Send no more references; the controller's CommTimeout ends EGM. Latches until `reset`.
 
-        When the EGM process does not confirm it, it is killed, which has the same effect.
+        An EGM process that does not confirm the stop is killed, which has the same effect.
         """
         with self._lock:
             if self._helper is None:
                 return
             try:
                 self._send("stop", reason or "stop was called")
-                self._wait(lambda: bool(self._latched), _OBEY_LIMIT, "the EGM process did not confirm the stop")
+                self._wait(lambda: bool(self._latched), _COMMAND_TIMEOUT, "the EGM process did not confirm the stop")
             except PeerError:
                 self._helper.kill()
                 self._latched = self._latched or reason or "stop was called"
 
     def reset(self) -> None:
-        """The operator's word that motion may go on after a stop. The reference starts over at the feedback.
+        """Allow motion again after a stop, on the operator's command. The reference restarts at the feedback.
 
-        Raises PeerTimeout when the EGM process does not confirm. A cause that still stands stops the arm again.
+        Raises PeerTimeout when the EGM process does not confirm. A cause that persists stops the arm again.
         """
         with self._lock:
             before = self._resets
             self._send("reset")
-            self._wait(lambda: self._resets > before, _OBEY_LIMIT, "the EGM process did not confirm the reset")
+            self._wait(lambda: self._resets > before, _COMMAND_TIMEOUT, "the EGM process did not confirm the reset")
 
     def drain_log(self) -> list[EgmCycle]:
-        """Every cycle since the last call: commanded, applied, measured, and what the cycle was like."""
+        """All cycles since the last call."""
         with self._lock:
             return self._opened().drain()
 
@@ -222,22 +223,22 @@ class EgmArm:
 
     @property
     def counts(self) -> MessageCounts:
-        """Messages that came in and were not followed."""
+        """Counts of ignored messages."""
         return self._opened().counts
 
     @property
     def pid(self) -> int | None:
-        """Of the EGM process; None when not connected."""
+        """Process id of the EGM process; None when not connected."""
         return None if self._helper is None else self._helper.pid
 
     def close(self) -> None:
-        """Cease sending and end the process. What the log holds is gone with it: drain first."""
+        """End the EGM process. Cycles that were not fetched with `drain_log` are lost."""
         with self._lock:
             if self._helper is not None:
                 self._helper.close()
-            if self._ring is not None:
-                self._ring.close()
-            self._helper = self._ring = None
+            if self._cycles is not None:
+                self._cycles.close()
+            self._helper = self._cycles = None
             self._latched, self._tool = "", None
 
     def __enter__(self) -> "EgmArm":
@@ -262,7 +263,7 @@ class EgmArm:
         self._events = []
         descriptor = EgmCycleLog.create(self._config.log_records)
         try:
-            self._ring = EgmCycleLog(descriptor, self._config.log_records)
+            self._cycles = EgmCycleLog(descriptor, self._config.log_records)
             settings = dataclasses.asdict(self._config) | {"clock": self._clock.settings}
             self._helper = HelperProcess.start(
                 "gelflow.real.egm.process", settings, descriptors=(udp.fileno(), descriptor)
@@ -272,9 +273,9 @@ class EgmArm:
             os.close(descriptor)
 
     def _opened(self) -> EgmCycleLog:
-        if self._ring is None:
+        if self._cycles is None:
             raise UsageError("the EGM arm is not connected; call connect() first")
-        return self._ring
+        return self._cycles
 
     def _latest(self) -> EgmCycle:
         record = self._opened().latest()
@@ -291,7 +292,9 @@ class EgmArm:
 
     def _refuse_when_latched(self) -> None:
         if self._latched:
-            raise SafetyError(f"the arm is stopped: {self._latched}; when the cause is gone, the operator may reset it")
+            raise SafetyError(
+                f"the arm is stopped: {self._latched}; after the cause is removed, an operator may reset it"
+            )
 
     def _linked(self) -> HelperProcess:
         if self._helper is None:
@@ -299,7 +302,7 @@ class EgmArm:
         return self._helper
 
     def _pump(self, *, tolerant: bool = False) -> None:
-        """Take in what the process has said. Raises PeerError when it is gone, unless `tolerant`."""
+        """Process the events of the EGM process. Raises PeerError when it has ended, unless `tolerant`."""
         helper = self._linked()
         for event in (EgmEvent(*values) for values in helper.messages.read()):
             self._events.append(event)
@@ -309,19 +312,21 @@ class EgmArm:
                 self._latched, self._tool = "", None
                 self._resets += 1
         if helper.messages.closed and not tolerant:
-            raise PeerError(f"the EGM process is gone ({helper.exit_reason()}); nothing is sent to the robot any more")
+            raise PeerError(
+                f"the EGM process has ended ({helper.exit_reason()}); nothing is sent to the robot any more"
+            )
 
     def _send(self, *command: Any) -> None:
         helper = self._linked()
         try:
-            helper.messages.send(command, limit=_OBEY_LIMIT)
+            helper.messages.send(command, limit=_COMMAND_TIMEOUT)
         except TimeoutError:
-            raise PeerTimeout(f"the EGM process took no command for {_OBEY_LIMIT} s") from None
+            raise PeerTimeout(f"the EGM process accepted no command for {_COMMAND_TIMEOUT} s") from None
         except OSError:
-            raise PeerError(f"the EGM process is gone ({helper.exit_reason()})") from None
+            raise PeerError(f"the EGM process has ended ({helper.exit_reason()})") from None
 
     def _wait(self, done: Callable[[], bool], wall: float, failure: str) -> None:
-        """Until `done`, for at most `wall` seconds of wall time, while what the process says is taken in."""
+        """Process events until `done`, for at most `wall` [s, wall]; then raise PeerTimeout with `failure`."""
         deadline = ScaledClock()
         end = deadline.now() + wall
         while True:
@@ -335,7 +340,7 @@ class EgmArm:
 
 
 def _unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    """Rounding taken out; what is no unit quaternion stays as it is and is refused by the check."""
+    """`q` normalized when it is a unit quaternion up to rounding; otherwise unchanged, and the check refuses it."""
     norm = math.sqrt(sum(c * c for c in q))
     if not abs(norm - 1) < 1e-3:
         return q

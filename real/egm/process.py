@@ -1,6 +1,6 @@
-"""The process that talks EGM to the robot: `python -m gelflow.real.egm.process`, started by `EgmArm` only.
+"""Helper process that exchanges EGM messages with the robot; started by `EgmArm` only.
 
-It has nothing else to do, so that no camera, policy or recorder can delay an answer. It ends when its parent does.
+It runs nothing else, so that no camera, policy or recorder delays an answer, and it ends when its parent ends.
 """
 
 import gc
@@ -23,24 +23,26 @@ from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag, ReferenceGen
 from gelflow.real.egm.target import Target
 
 _LARGEST_MESSAGE = 4096
-_PARENT_CHECK = 0.1  # [s, wall]: the closed link says it at once, except where another helper holds the parent's end
+# Period of the check that the parent still runs [s, wall]: the closed link does not show it while another process holds
+# the parent's end of the link.
+_PARENT_CHECK = 0.1
 
 
 class EgmLoop:
-    """Waits for the robot's messages and the parent's commands, and answers each message once."""
+    """Waits for messages of the robot and commands of the parent, and answers each message once."""
 
-    def __init__(self, config: EgmConfig, clock: ScaledClock, udp: socket.socket, parent: Messages, ring: EgmCycleLog):
+    def __init__(self, config: EgmConfig, clock: ScaledClock, udp: socket.socket, parent: Messages, log: EgmCycleLog):
         self._config = config
         self._clock = clock
         self._udp = udp
         self._parent = parent
-        self._ring = ring
-        self._follower = ReferenceGenerator(config)
+        self._cycles = log
+        self._generator = ReferenceGenerator(config)
         self._robot: tuple[str, int] | None = None
         self._sent = 0
 
     def run(self) -> None:
-        """Until the parent is gone or says so. A failure here ends the process: nothing is sent any more."""
+        """Run until the parent ends. An exception ends the process, and nothing is sent to the robot any more."""
         parent = os.getppid()
         sources: list[socket.socket | Messages] = [self._udp, self._parent]
         self._flush()
@@ -51,32 +53,32 @@ class EgmLoop:
             readable, _, _ = select.select(sources, (), (), wait)
             if self._parent in readable:
                 for command in self._parent.read():
-                    self._obey(*command)
+                    self._execute(*command)
             if self._udp in readable:
                 self._answer()
-            self._follower.check_age(self._clock.now())
+            self._generator.check_age(self._clock.now())
 
     def _flush(self) -> None:
-        """Messages that came while this process was starting are history."""
+        """Discard messages that arrived while this process was starting."""
         with suppress(BlockingIOError):
             while True:
                 self._udp.recvfrom(_LARGEST_MESSAGE)
 
-    def _obey(self, kind: str, *values: Any) -> None:
+    def _execute(self, kind: str, *values: Any) -> None:
         now = self._clock.now()
         if kind == "target":
             position, quaternion, expires, speed, turn_speed = values
-            self._follower.post(Target(tuple(position), tuple(quaternion), expires, speed, turn_speed), now)
+            self._generator.post(Target(tuple(position), tuple(quaternion), expires, speed, turn_speed), now)
         elif kind == "hold":
-            self._follower.hold(now, values[0])
+            self._generator.hold(now, values[0])
         elif kind == "stop":
-            self._follower.latch(values[0], now)
+            self._generator.latch(values[0], now)
         elif kind == "reset":
             self._robot = None
-            self._follower.reset(now)
+            self._generator.reset(now)
 
     def _receive(self, stamp: float) -> list[EgmFeedback]:
-        """All waiting messages of the robot that are new."""
+        """All pending messages of the robot that are new."""
         messages: list[EgmFeedback] = []
         while True:
             try:
@@ -84,35 +86,35 @@ class EgmLoop:
             except BlockingIOError:
                 return messages
             if sender != self._robot and (self._robot or (self._config.robot and sender[0] != self._config.robot)):
-                self._ring.count(foreign=1)
+                self._cycles.count(foreign=1)
                 continue
             try:
                 feedback = decode_robot(data)
             except PeerError as error:
-                self._ring.count(malformed=1)
-                if self._ring.counts.malformed == 1:
+                self._cycles.count(malformed=1)
+                if self._cycles.counts.malformed == 1:
                     self._event("malformed", f"from {sender[0]}:{sender[1]}: {error}")
                 continue
             if self._robot is None:
                 self._robot = sender
                 self._event("first message", f"from {sender[0]}:{sender[1]}")
-            if self._follower.observe(feedback, stamp):
+            if self._generator.observe(feedback, stamp):
                 messages.append(feedback)
             else:
-                self._ring.count(duplicates=1)
+                self._cycles.count(duplicates=1)
 
     def _answer(self) -> None:
         stamp = self._clock.now()
         messages = self._receive(stamp)
-        # Only the newest is answered: a burst of answers would move the reference by several cycles at once.
+        # Answer the newest only: a burst of answers would move the reference by several cycles at once.
         for feedback in messages[:-1]:
-            self._log(feedback, stamp, None, self._follower.flags | EgmFlag.UNANSWERED, math.nan)
+            self._log(feedback, stamp, None, self._generator.flags | EgmFlag.UNANSWERED, math.nan)
         for feedback in messages[-1:]:
-            if self._ring.full:
-                self._follower.latch(
+            if self._cycles.full:
+                self._generator.latch(
                     f"the log is full: {self._config.log_records} cycles were not fetched with drain_log()", stamp
                 )
-            reference, flags = self._follower.advance(stamp)
+            reference, flags = self._generator.advance(stamp)
             answered = math.nan
             if reference is not None and not self._config.dry_run:
                 answered = self._send(EgmReference(self._sent, stamp, *reference))
@@ -124,7 +126,7 @@ class EgmLoop:
         try:
             self._udp.sendto(encode_sensor(reference), self._robot)
         except OSError as error:
-            self._follower.latch(f"cannot send to {self._robot[0]}:{self._robot[1]}: {error.strerror}", reference.time)
+            self._generator.latch(f"cannot send to {self._robot[0]}:{self._robot[1]}: {error.strerror}", reference.time)
             return math.nan
         self._sent += 1
         return self._clock.now()
@@ -132,7 +134,7 @@ class EgmLoop:
     def _log(
         self, feedback: EgmFeedback, stamp: float, applied: PoseTuple | None, flags: EgmFlag, answered: float
     ) -> None:
-        target = self._follower.target
+        target = self._generator.target
         record = EgmCycle(
             stamp=stamp,
             commanded=(target.position, target.quaternion) if target else None,
@@ -144,32 +146,32 @@ class EgmLoop:
             controller_time=feedback.time,
             answered=answered,
         )
-        # Events first: who sees a record in which something has changed, can ask what. Of a full log they have told.
+        # Events go first, so that a reader of a record can already fetch the event that explains it.
         self._report()
-        self._ring.append(record)
+        self._cycles.append(record)
 
     def _event(self, kind: str, text: str) -> None:
-        self._follower.events.append(EgmEvent(self._clock.now(), kind, text))
+        self._generator.events.append(EgmEvent(self._clock.now(), kind, text))
 
     def _report(self) -> None:
-        for event in self._follower.events:
-            # A parent that reads nothing for a second while thousands of events lie there is as good as gone.
+        for event in self._generator.events:
+            # Raises after a second in which the parent reads nothing and the socket's buffer is full: treated as ended.
             self._parent.send(event)
-        self._follower.events.clear()
+        self._generator.events.clear()
 
 
 def main(arguments: list[str]) -> int:
-    """Started by `EgmArm`, with the UDP socket and the log."""
-    settings, parent, (udp_number, ring_number) = connect_to_parent(arguments)
+    """Entry point; `EgmArm` passes the descriptors of the UDP socket and of the cycle log."""
+    settings, parent, (udp_number, log_number) = connect_to_parent(arguments)
     clock = ScaledClock(*settings.pop("clock"))
     config = EgmConfig(**settings)
     udp = socket.socket(fileno=udp_number)
     udp.setblocking(False)
-    ring = EgmCycleLog(ring_number, config.log_records)
-    # Nothing here makes cycles of references; a collection would only delay an answer.
+    log = EgmCycleLog(log_number, config.log_records)
+    # No reference cycles are created here; a garbage collection would only delay an answer.
     gc.disable()
     with suppress(ConnectionError):
-        EgmLoop(config, clock, udp, parent, ring).run()
+        EgmLoop(config, clock, udp, parent, log).run()
     return 0
 
 

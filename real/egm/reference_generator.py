@@ -1,8 +1,8 @@
-"""What is sent to the robot, cycle by cycle: a state machine without I/O.
+"""Generates the reference pose of every EGM cycle: a state machine without I/O.
 
-Waiting: the reference is the feedback, so that nothing moves when the controller starts to follow. Following: the
-reference goes straight to the newest target, bounded in every cycle, and is frozen when there is none. Latched: nothing
-is sent, whatever comes, until `reset`.
+Waiting: the reference equals the feedback, so that nothing moves when the controller starts to follow. Following: the
+reference moves in a straight line to the newest target with bounded steps, and is frozen without a target. Latched:
+nothing is sent until `reset`.
 """
 
 import math
@@ -15,20 +15,20 @@ from gelflow.real.egm.codec import EgmFeedback
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.target import Target, check_target, tool_frame
 
-# UDP may swap neighbours; a message this far back is no late one, the controller has started to count anew.
+# UDP may reorder messages by a few; a larger step back means that the controller restarted its counter.
 _REORDERED = 10
 
 
 class EgmFlag(IntFlag):
-    """What a cycle was like."""
+    """Conditions of one cycle."""
 
     MOTORS_ON = 1
     FOLLOWING = 2  # the controller follows references
-    CONVERGED = 4  # the controller's own convergence condition
+    CONVERGED = 4  # the controller's convergence condition is met
     HOLD = 8  # no target: the reference is frozen
     WAITING = 16  # the reference waits for the robot to catch up
-    LOST = 32  # feedback is missing before this one
-    UNANSWERED = 64  # a newer message was there already, and was answered instead
+    LOST = 32  # messages before this one are missing
+    UNANSWERED = 64  # a newer message had arrived and was answered instead
     LATCHED = 128  # stopped: nothing is sent
 
 
@@ -41,20 +41,20 @@ class EgmEvent(NamedTuple):
 
 
 class ReferenceGenerator:
-    """Turns feedback and targets into references. `now` is robot time [s] throughout."""
+    """Computes references from feedback and targets. `now` is robot time [s]."""
 
     def __init__(self, config: EgmConfig) -> None:
         self._config = config
         self._feedback: EgmFeedback | None = None
-        self._heard = -math.inf
+        self._received = -math.inf  # robot time of the newest feedback [s]
         self._tool: PoseTuple | None = None
         self._reference: PoseTuple | None = None
         self._target: Target | None = None
-        self._rate = 0.0  # of the target's speed, 0 to 1
+        self._rate = 0.0  # fraction of the target's speed, 0 to 1
         self._following = False
         self._flags = EgmFlag(0)
         self.latched = ""
-        self.events: list[EgmEvent] = []  # taken out by whoever drives this
+        self.events: list[EgmEvent] = []  # removed by the caller
 
     @property
     def target(self) -> Target | None:
@@ -62,11 +62,11 @@ class ReferenceGenerator:
 
     @property
     def flags(self) -> EgmFlag:
-        """Of the newest feedback."""
+        """Flags of the newest feedback."""
         return self._flags
 
     def observe(self, feedback: EgmFeedback, now: float) -> bool:
-        """Take a message in. False: it is a duplicate or came late, and is neither answered nor used."""
+        """Process a message. False: it is a duplicate or late, and is neither used nor answered."""
         last = self._feedback
         flags = EgmFlag(0)
         if last is not None:
@@ -78,14 +78,14 @@ class ReferenceGenerator:
             elif behind < -1:
                 flags |= EgmFlag.LOST
             self.check_age(now)
-        self._feedback, self._heard = feedback, now
-        trouble = feedback.trouble
+        self._feedback, self._received = feedback, now
+        stop_reason = feedback.stop_reason
         if self._reference is None or not self._following:
-            # Not followed until now: start from where the robot is, however it got there.
+            # Until the controller follows, the reference equals the measured pose.
             self._reference = (feedback.position, feedback.quaternion)
-        if self._following and trouble:
-            self.latch(trouble, now)
-        elif not self._following and not trouble and not self.latched:
+        if self._following and stop_reason:
+            self.latch(stop_reason, now)
+        elif not self._following and not stop_reason and not self.latched:
             self._following = True
             self._tool = tool_frame(feedback)
             self._event(now, "following", "the controller follows references")
@@ -99,7 +99,7 @@ class ReferenceGenerator:
         return True
 
     def advance(self, now: float) -> tuple[PoseTuple | None, EgmFlag]:
-        """The reference that answers the newest feedback, one cycle on; None: nothing may be sent."""
+        """The reference of the next cycle, in answer to the newest feedback; None: nothing may be sent."""
         if self.latched or self._reference is None:
             return None, self._flags | EgmFlag.LATCHED
         if self._target is not None and now >= self._target.expires:
@@ -113,7 +113,7 @@ class ReferenceGenerator:
         return self._reference, self._flags
 
     def post(self, target: Target, now: float) -> None:
-        """Follow `target` from now on; a wrong one is refused and the arm holds."""
+        """Follow `target` from now on; an invalid target is refused and the arm holds."""
         if self.latched:
             return
         if self._feedback is None or self._reference is None or self._tool is None or not self._following:
@@ -128,32 +128,32 @@ class ReferenceGenerator:
         self._target = target
 
     def hold(self, now: float, reason: str) -> None:
-        """Freeze the reference where it is."""
+        """Freeze the reference."""
         if self._target is not None:
             self._event(now, "hold", reason)
         self._target = None
         self._rate = 0.0
 
     def latch(self, reason: str, now: float) -> None:
-        """Stop: nothing is sent any more until `reset`. The first reason stays."""
+        """Stop: nothing is sent until `reset`. The first reason is kept."""
         if not self.latched:
             self.latched = reason
             self._event(now, "stopped", reason)
         self._target, self._rate, self._following = None, 0.0, False
 
     def reset(self, now: float) -> None:
-        """The operator's word: start over as if the robot had never been heard of."""
+        """Return to the initial state, on the operator's command."""
         self.latched = ""
-        self._feedback, self._heard = None, -math.inf
+        self._feedback, self._received = None, -math.inf
         self._tool = self._reference = self._target = None
         self._rate, self._following, self._flags = 0.0, False, EgmFlag(0)
         self._event(now, "reset", "latch cleared by the operator")
 
     def check_age(self, now: float) -> None:
-        """Hold, then stop, when feedback stays out while the controller follows."""
+        """Hold, then stop, when no feedback arrives while the controller follows."""
         if not self._following or self.latched:
             return
-        age = now - self._heard
+        age = now - self._received
         if age > self._config.silence:
             self.latch(f"no EGM message for {age:.3f} s, at most {self._config.silence} s is allowed", now)
         elif age > self._config.stale:
@@ -181,10 +181,10 @@ class ReferenceGenerator:
         return lead > self._config.max_lead or turn > self._config.max_turn_lead
 
     def _step(self, reference: PoseTuple, target: Target) -> PoseTuple:
-        """One cycle along the straight line and the shorter turn, both ending together; slower near both ends."""
+        """One cycle along the straight line and the shorter rotation, both ending together, with ramps at both ends."""
         move, turn = _difference(reference, target)
         duration = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
-        # From rest to full rate in ramp_time, and back to rest at the target with the same deceleration.
+        # Accelerate from rest to full rate in ramp_time; decelerate equally to rest at the target.
         ramp = self._config.ramp_time
         self._rate = min(1.0, self._rate + self._config.cycle / ramp, math.sqrt(2 * duration / ramp))
         distance = self._rate * self._config.cycle
@@ -196,7 +196,7 @@ class ReferenceGenerator:
         return position, _turned(quaternion, turn, share)
 
     def _kept_rate(self, target: Target) -> float:
-        """How much of the rate a new target may keep: the part of the motion that goes on in the same direction."""
+        """Fraction of the rate that a new target keeps: the part of the motion that continues in the same direction."""
         assert self._reference is not None
         old = self._target
         if old is None:
@@ -213,19 +213,20 @@ class ReferenceGenerator:
 
 
 def _difference(reference: PoseTuple, target: Target) -> tuple[Vector, Vector]:
-    """The way to the target: displacement [m], and turn as a rotation vector [rad] in the reference's frame."""
+    """Displacement [m] and rotation vector [rad], in the reference's frame, from the reference to the target."""
     (px, py, pz), (rw, rx, ry, rz) = reference
     x, y, z = target.position
     w, i, j, k = multiply((rw, -rx, -ry, -rz), target.quaternion)
     if w < 0:
         w, i, j, k = -w, -i, -j, -k
     sine = math.sqrt(i * i + j * j + k * k)
-    # The limit of angle / sine is 2; below this the quotient is only rounding.
+    # The limit of angle / sine is 2; for smaller sines the quotient is dominated by rounding.
     scale = 2 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
     return (x - px, y - py, z - pz), (i * scale, j * scale, k * scale)
 
 
 def _turned(quaternion: Quaternion, turn: Vector, share: float) -> Quaternion:
+    """`quaternion` rotated by the fraction `share` of the rotation vector `turn` [rad]."""
     angle = _length(turn)
     if angle == 0.0:
         return quaternion

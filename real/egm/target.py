@@ -1,6 +1,6 @@
-"""What an EGM arm may be told: the settings, and the checks of a target. A wrong target is refused, never clamped.
+"""Targets of the EGM arm and their checks. An invalid target is refused, never clamped.
 
-The same checks run twice: in the caller before a target is posted, and in the process that talks to the robot.
+The same checks run twice: in the caller before a target is sent to the EGM process, and in the EGM process.
 """
 
 import math
@@ -12,34 +12,35 @@ from gelflow.real.egm.codec import EgmFeedback
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.kinematics import forward, inverse
 
-# The controller's pose and the kinematics of its joints must tell the same story, or joint ranges can't be checked.
-_FRAME_SLACK = (5e-3, math.radians(1.0))
-# A target is near; when a joint would have to turn this far for it, the arm would have to turn over [rad].
+# Largest difference between the controller's pose and the forward kinematics of its joints [m, rad]: joint ranges can
+# only be checked when the two agree.
+_POSE_TOLERANCE = (5e-3, math.radians(1.0))
+# Targets are near: a larger joint motion means another arm configuration [rad].
 _SAME_CONFIGURATION = math.pi / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where to go, until when."""
+    """A pose to move to, with speeds and an expiry time."""
 
     position: Vector  # of the controller's tool in the robot's base frame [m]
     quaternion: Quaternion  # w x y z, unit length
-    expires: float  # robot time after which it is no longer followed [s]
-    speed: float  # of the reference, at most [m/s]
-    turn_speed: float  # [rad/s]
+    expires: float  # robot time at which the target expires [s]
+    speed: float  # largest speed of the reference [m/s]
+    turn_speed: float  # largest angular speed of the reference [rad/s]
 
 
 def tool_frame(feedback: EgmFeedback) -> PoseTuple:
-    """The controller's tool in the flange, as its own feedback says: pose and joints come in the same message."""
+    """Pose of the controller's tool in the flange frame, from pose and joints of one feedback message."""
     return compose(invert(forward(feedback.joints)), (feedback.position, feedback.quaternion))
 
 
 def check_target(
     config: EgmConfig, target: Target, *, reference: PoseTuple, tool: PoseTuple, feedback: EgmFeedback
 ) -> None:
-    """Raise SafetyError, with what was expected and got, when `target` must not be followed.
+    """Raise SafetyError, with expected and actual values, when `target` must not be followed.
 
-    `reference` is what the robot follows now, `tool` the tool frame found when EGM started.
+    `reference` is the pose that the robot follows now, `tool` the tool frame determined when EGM started.
     """
     numbers = (*target.position, *target.quaternion, target.speed, target.turn_speed, target.expires)
     if not all(map(math.isfinite, numbers)):
@@ -71,10 +72,10 @@ def _check_joints(target: Target, tool: PoseTuple, feedback: EgmFeedback) -> Non
     expected = compose(forward(feedback.joints), tool)
     off = math.dist(expected[0], feedback.position)
     turned = angle_between(expected[1], feedback.quaternion)
-    if off > _FRAME_SLACK[0] or turned > _FRAME_SLACK[1]:
+    if off > _POSE_TOLERANCE[0] or turned > _POSE_TOLERANCE[1]:
         raise SafetyError(
-            f"target refused: the controller's pose is {off * 1e3:.1f} mm and {math.degrees(turned):.1f}° from what "
-            "its joints say: EGM must run in wobj0, and the tool must not change while it runs"
+            f"target refused: the controller's pose is {off * 1e3:.1f} mm and {math.degrees(turned):.1f}° from the "
+            "forward kinematics of its joints: EGM must run in wobj0, and the tool must not change while it runs"
         )
     position, quaternion = compose((target.position, target.quaternion), invert(tool))
     try:
@@ -86,6 +87,7 @@ def _check_joints(target: Target, tool: PoseTuple, feedback: EgmFeedback) -> Non
     )
     if change > _SAME_CONFIGURATION:
         raise SafetyError(
-            f"target refused: in range it is reached only with joint {number} at {math.degrees(angle):.1f}°, "
-            f"{math.degrees(change):.1f}° from where it is; EGM does not turn over to another configuration"
+            f"target refused: within the joint ranges it is reached only with joint {number} at "
+            f"{math.degrees(angle):.1f}°, {math.degrees(change):.1f}° from its angle now; EGM must not change the arm "
+            "configuration"
         )

@@ -1,4 +1,4 @@
-"""One robot cell, opened from a lab file and closed in the right order; each value is recorded on its way."""
+"""A robot cell that a lab file describes: connects all devices, records their data, disconnects in a safe order."""
 
 import contextlib
 import itertools
@@ -17,13 +17,15 @@ from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
+from gelflow.real.limits import LIMITS
 from gelflow.real.runner.lab import Lab
 from gelflow.real.transport import transport_for
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
 
-_MARGIN = 2e-3  # the arm's own box around the workspace is this much larger: the finer check is the supervisor's [m]
+# The EGM driver's workspace box is larger than the workspace by this margin [m]; the supervisor's check is tighter.
+_MARGIN = 2e-3
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,10 @@ class Cell:
 
 @contextlib.contextmanager
 def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> Iterator[Cell]:
-    """Connect cameras, gripper and arm; on the way out the arm stops first, then the gripper is told, then the rest.
+    """Connect cameras, gripper and arm; at the exit, stop the arm, then disconnect the gripper, then the cameras.
 
-    `recorder` is open already and stays so. Raises the driver's error when something can not be reached; what was
-    open is closed again.
+    `recorder` must be open and is not closed. Raises PeerError or UsageError of the driver when a device cannot be
+    reached; the devices opened before are closed again.
     """
     clock = lab.clock
     with contextlib.ExitStack() as stack:
@@ -64,7 +66,7 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
                 stale_after=lab.limits.stale_gripper,
                 reply_timeout=lab.limits.gripper_reply,
                 move_timeout=lab.limits.gripper_motion,
-                home_timeout=max(4.0, lab.limits.gripper_motion),
+                home_timeout=max(LIMITS.gripper_home_time, lab.limits.gripper_motion),
                 dry_run=dry_run,
             ),
             on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
@@ -79,18 +81,18 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
 
 
 def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
-    """The arm driver's own limits: the box that the lab's workspace covers, and the lab's speeds and times."""
+    """Configuration of the EGM driver: the bounding box of the lab's workspace, and the lab's speeds and times."""
     space = lab.workspace
     yaw = math.radians(space.yaw_deg)
     corners = itertools.product(
         (-space.x, space.x), (-space.y, space.y), (space.height_min, space.height_max), (-yaw, 0.0, yaw)
     )
     height = lab.part.grasp_height
-    places = [
+    positions = [
         lab.tool_pose(lab.hole.pose @ Pose(np.array([x, y, z + height]), yaw_quaternion(turn))).position
         for x, y, z, turn in corners
     ]
-    low, high = np.min(places, axis=0) - _MARGIN, np.max(places, axis=0) + _MARGIN
+    low, high = np.min(positions, axis=0) - _MARGIN, np.max(positions, axis=0) + _MARGIN
     stale = lab.limits.stale_pose
     return EgmConfig(
         workspace_min=(float(low[0]), float(low[1]), float(low[2])),
@@ -104,24 +106,24 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
         max_turn=math.radians(space.max_turn_deg),
         stale=stale,
         silence=5 * stale,
-        max_lifetime=max(1.0, lab.limits.target_lifetime),
+        max_lifetime=max(LIMITS.longest_target_lifetime, lab.limits.target_lifetime),
         connect_timeout=lab.arm.connect_timeout,
         dry_run=dry_run,
     )
 
 
 class _StopArm:
-    """On the way out: stops the arm and says why, whatever ended the run."""
+    """Context manager that stops the arm at the exit and records the reason."""
 
     def __init__(self, arm: EgmArm, recorder: SessionRecorder) -> None:
         self._arm = arm
         self._recorder = recorder
 
     def __enter__(self) -> None:
-        """Nothing to do before the run."""
+        """No action at the start of the run."""
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        reason = "the run is over" if kind is None else f"{kind.__name__}: {error}"
+        reason = "the run has ended" if kind is None else f"{kind.__name__}: {error}"
         with contextlib.suppress(GelflowError):
             self._arm.hold()
         self._arm.stop(reason)

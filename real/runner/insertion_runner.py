@@ -1,7 +1,7 @@
-"""The insertion runner: grasp, descend, feel, correct, again, until the part is in the hole.
+"""The insertion runner: grasp a part, then repeat descent, tactile observation and correction until it is inserted.
 
-It knows the robot by its drivers only. The order of an attempt, what is recorded, and what ends it stand here; motion
-and its watchdog are in `runner_motion`, frames and tracking in `runner_touch`, limits in `supervisor`.
+This module contains the sequence of an attempt, its stop conditions and its records. `motion_executor` executes and
+monitors the motions, `tactile_observer` tracks the images, `supervisor` checks the targets.
 """
 
 import math
@@ -24,36 +24,36 @@ from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 from gelflow.time_sync import RUNNER
 
-PlanarPose = tuple[float, float, float]  # of the gripper about the taught hole: x, y [m], yaw [rad]
-_REST = 0.1  # until the arm and the cameras' newest frames are at rest after a hold [s]
-_AT_DEPTH = 0.02e-3  # this near its end a descent is over [m]
+PlanarPose = tuple[float, float, float]  # of the gripper relative to the taught hole: x, y [m], yaw [rad]
+_REST = 0.1  # from a hold until the arm and the newest images are at rest [s]
+_AT_DEPTH = 0.02e-3  # distance from its end at which a descent is complete [m]
 
 
 class Operator(Protocol):
-    """Who hands parts over: a person who is asked, or a fixture that is waited for."""
+    """Hands parts over: a person who confirms, or a feeder with a fixed time."""
 
     def present(self, number: int) -> None:
         """Return when part `number` is between the open fingers."""
         ...
 
     def take(self, number: int) -> None:
-        """Return when somebody is ready to take part `number`, which could not be inserted, from the fingers."""
+        """Return when the operator is ready to take part `number`, which was not inserted, from the fingers."""
         ...
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One lowering, and what came of it."""
+    """One descent and its result."""
 
     number: int
-    planar_pose: PlanarPose  # where it was made
-    depth: float  # how deep the gripper came below the start [m]
-    shear: float  # felt at the deepest frame: mean shear along the finger [mm]
-    contact: bool  # the part touched something
-    stopped_by_contact: bool  # the descent was stopped by touch
-    inserted: bool  # as the robot sees it
+    planar_pose: PlanarPose  # during the descent
+    depth: float  # reached below the start [m]
+    shear: float  # mean shear along the finger at the deepest reading [mm]
+    contact: bool  # the shear exceeded contact_shear_mm
+    stopped_by_contact: bool  # the shear exceeded stop_shear_mm and stopped the descent
+    inserted: bool  # as decided from pose and shear
     duration: float  # [s]
-    observation: FlowMap | None = None  # None where the policy was not asked
+    observation: FlowMap | None = None  # None when the policy was not evaluated
     action: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
     reference: TactileReading | None = None
     deepest: TactileReading | None = None
@@ -61,21 +61,22 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Insertion:
-    """One part, from grasp to release."""
+    """The attempts on one part, from grasp to release."""
 
     number: int
-    outcome: str  # inserted, not inserted, part lost, or what went wrong
-    planar_pose: PlanarPose  # the last one
+    outcome: str  # inserted, not inserted, part lost, or the error
+    planar_pose: PlanarPose  # of the last attempt
     duration: float  # [s]
     attempts: tuple[Attempt, ...] = field(default=())
 
     @property
     def inserted(self) -> bool:
+        """Whether the part was inserted."""
         return self.outcome == "inserted"
 
 
 class InsertionRunner:
-    """Runs insertions on an open cell. `run` may be called once; use as a context manager around the motion."""
+    """Inserts parts in a connected cell. The thread of `motion` must be running."""
 
     def __init__(
         self,
@@ -97,7 +98,7 @@ class InsertionRunner:
         self.mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
 
     def insert(self, number: int) -> Insertion:
-        """Insert one part; returns how it went. Raises what makes going on unsafe (a stale feed, a fault, a latch)."""
+        """Insert one part; returns the result. Raises errors after which continuing is unsafe (stale data, a fault)."""
         start = self._clock.now()
         attempts: list[Attempt] = []
         planar_pose: PlanarPose = (0.0, 0.0, 0.0)
@@ -106,14 +107,14 @@ class InsertionRunner:
         try:
             self._load(number)
             outcome = "not inserted"
-            for attempt in range(self._task.attempts):
-                made = self._attempt_with_retries(number, attempt, planar_pose)
-                attempts.append(made)
-                self._on_attempt(number, made)
-                if made.inserted:
+            for index in range(self._task.attempts):
+                attempt = self._attempt_with_retries(number, index, planar_pose)
+                attempts.append(attempt)
+                self._on_attempt(number, attempt)
+                if attempt.inserted:
                     outcome = "inserted"
                     break
-                planar_pose = self._next_pose(planar_pose, made)
+                planar_pose = self._next_pose(planar_pose, attempt)
             self._finish(number, planar_pose, inserted=outcome == "inserted")
         except PartLost:
             outcome = "part lost"
@@ -130,7 +131,7 @@ class InsertionRunner:
         return result
 
     def check_plan(self, supervisor: Supervisor) -> list[str]:
-        """The first targets of a run, checked one from the other as they would be sent; nothing moves."""
+        """Check the first targets of a run, each relative to the one before; returns them as text. Nothing moves."""
         lab, task = self._lab, self._task
         state = self._cell.arm.state()
         before = lab.gripper_pose(state.position, state.quaternion)
@@ -149,7 +150,7 @@ class InsertionRunner:
             before = target
         return checked
 
-    # The steps of an insertion
+    # Steps of an insertion
 
     def pose(self, planar_pose: PlanarPose, height: float) -> Pose:
         """Gripper pose in the base frame from a planar pose about the taught hole and the lower face's `height` [m]."""
@@ -158,7 +159,7 @@ class InsertionRunner:
         return self._lab.hole.pose @ Pose(above, yaw_quaternion(yaw))
 
     def _load(self, number: int) -> None:
-        """Above the hole, take a part."""
+        """Move above the hole, wait for a part and grasp it."""
         part, lab = self._lab.part, self._lab.gripper
         self._motion.expect_part(False)
         self._motion.move(self.pose((0.0, 0.0, 0.0), part.load_height))
@@ -198,15 +199,15 @@ class InsertionRunner:
             observation = observer.observe(frames, self._task)
             action = np.asarray(self._policy.act(observation), dtype=float)
             self._record_decision(number, attempt, planar_pose, observer, frames, observation, action)
-        made = Attempt(
+        result = Attempt(
             attempt, planar_pose, deepest.depth, deepest.shear, contact, stopped, inserted,
             self._clock.now() - begun, observation, action, reference, deepest,
         )  # fmt: skip
-        self._recorder.attempt_end(_summary(number, made))
-        return made
+        self._recorder.attempt_end(_summary(number, result))
+        return result
 
     def _descend(self, planar_pose: PlanarPose, observer: TactileObserver, begun: float) -> bool:
-        """Lower the gripper while feeling; True when touch stopped it."""
+        """Lower the gripper while the shear is monitored; True when contact stopped it."""
         lab = self._lab
         start = self._height()
         self._motion.go(self.pose(planar_pose, self._task.start_height - self._task.descent), speed=lab.descent.speed)
@@ -221,49 +222,49 @@ class InsertionRunner:
             now = self._clock.now()
             if now - begun > lab.limits.attempt_time:
                 self._motion.hold()
-                raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; is the arm following?")
+                raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; does the arm follow?")
             if reading is not None:
                 depth = self._keep(observer, reading, start)
                 if reading.shear > lab.descent.stop_shear_mm:
                     self._recorder.event("stopped by contact", {"shear_mm": reading.shear, "depth": depth})
-                    self._look_at_rest(observer, start)
+                    self._read_at_rest(observer, start)
                     return True
-                # Only frames that were taken at the end are the end's.
+                # The descent ends with a pair of images that were both received at its end.
                 if min(image.stamp for image in images) > arrived:
                     return False
             if start - self._height() > lab.descent.max_depth:
                 self._motion.hold()
-                raise SafetyError(f"the gripper went deeper than max_depth ({1e3 * lab.descent.max_depth:g} mm)")
+                raise SafetyError(f"the gripper is deeper than max_depth ({1e3 * lab.descent.max_depth:g} mm)")
             if arrived == math.inf and self._motion.arrived(within=_AT_DEPTH):
                 arrived = now
 
-    def _look_at_rest(self, observer: TactileObserver, start: float) -> None:
-        """Once more where touch stopped a descent: cameras have no common beat, and pads in motion don't compare."""
+    def _read_at_rest(self, observer: TactileObserver, start: float) -> None:
+        """Add a reading at rest after contact: the cameras are not synchronized, so pads in motion are inconsistent."""
         self._motion.wait(_REST)
         reading = observer.read(observer.images(self._clock.now()))
         if reading is not None:
             self._keep(observer, reading, start)
 
     def _keep(self, observer: TactileObserver, reading: TactileReading, start: float) -> float:
-        """Add a reading to the attempt's; returns its depth below `start` [m]."""
+        """Add a reading to those of the attempt; returns its depth below `start` [m]."""
         depth = start - self._motion.height_at(reading.frame.stamp)
         observer.keep(replace(reading, depth=depth))
         return depth
 
     def _lower(self, planar_pose: PlanarPose, observer: TactileObserver) -> bool:
-        """Nothing was felt where the rim would be: go on down. False when something is met after all."""
+        """Continue into the hole when the rim caused no contact. False after a contact below the rim."""
         stop = self._lab.descent.stop_shear_mm
 
-        def feel() -> None:
+        def check_contact() -> None:
             reading = observer.next()
             if reading is not None and reading.shear > stop:
                 self._motion.hold()
-                self._recorder.event("met something below the rim", {"shear_mm": reading.shear})
-                raise _Met
+                self._recorder.event("contact below the rim", {"shear_mm": reading.shear})
+                raise _ContactError
 
         try:
-            self._motion.move(self.pose(planar_pose, self._lab.part.insert_to), while_moving=feel)
-        except _Met:
+            self._motion.move(self.pose(planar_pose, self._lab.part.insert_to), while_moving=check_contact)
+        except _ContactError:
             self._motion.move(self.pose(planar_pose, self._task.start_height))
             return False
         return True
@@ -293,24 +294,24 @@ class InsertionRunner:
         )
         self._recorder.decision(decision.to_json())
 
-    def _next_pose(self, planar_pose: PlanarPose, made: Attempt) -> PlanarPose:
-        assert made.action is not None
+    def _next_pose(self, planar_pose: PlanarPose, attempt: Attempt) -> PlanarPose:
+        assert attempt.action is not None
         self._motion.move(self.pose(planar_pose, self._task.start_height))
-        return self._corrected(planar_pose, made.action)
+        return self._corrected(planar_pose, attempt.action)
 
     def _corrected(self, planar_pose: PlanarPose, action: NDArray[np.float64]) -> PlanarPose:
-        """Where a correction leads, inside the task's workspace by the rule that the simulated environment has too.
+        """The planar pose after a correction, limited to the task's workspace as in the simulated environment.
 
-        That rule is part of what an action means; the target made from it is then checked by the supervisor, which
+        This limit is part of the definition of an action; the supervisor then checks the resulting target, which it
         refuses and never clamps. Raises SafetyError when the policy's output is not three finite numbers.
         """
         if action.shape != (3,) or not np.isfinite(action).all():
-            raise SafetyError(f"correction refused: the policy said {action.tolist()}, expected three finite numbers")
+            raise SafetyError(f"correction refused: the policy gave {action.tolist()}, expected three finite numbers")
         x, y, yaw = (float(v) for v in self._task.corrected(np.array(planar_pose), action))
         return x, y, yaw
 
     def _finish(self, number: int, planar_pose: PlanarPose, *, inserted: bool) -> None:
-        """Let the part go: in the hole, or into somebody's hand."""
+        """Release the part: in the hole, or above it to the operator."""
         part, lab = self._lab.part, self._lab.gripper
         if not inserted:
             self._motion.move(self.pose((0.0, 0.0, 0.0), part.load_height))
@@ -322,7 +323,7 @@ class InsertionRunner:
             self._motion.move(self.pose(planar_pose, part.load_height))
 
     def _give_up(self, planar_pose: PlanarPose) -> None:
-        """The part is gone or was never held: up and away from it, fingers as they are."""
+        """Without a held part: move up, with the fingers unchanged."""
         self._motion.expect_part(False)
         self._motion.move(self.pose(planar_pose, self._lab.part.load_height))
 
@@ -331,23 +332,23 @@ class InsertionRunner:
 
 
 class NotGrasped(PeerRefused):
-    """The gripper closed and holds nothing: this insertion ends, the next one may be tried."""
+    """The gripper closed and holds no part: the insertion ends, and the next one may start."""
 
 
-class _Met(Exception):
-    """Something was met below the rim: how the feeling callback ends a move."""
+class _ContactError(Exception):
+    """Contact below the rim; raised by a callback to end a move."""
 
 
-def _summary(number: int, made: Attempt) -> dict[str, Any]:
-    """How an attempt went, for the recording."""
+def _summary(number: int, attempt: Attempt) -> dict[str, Any]:
+    """The result of an attempt, for the recording."""
     return {
         "insertion": number,
-        "attempt": made.number,
-        "outcome": "inserted" if made.inserted else "not inserted",
-        "planar_pose": made.planar_pose,
-        "depth": made.depth,
-        "shear_mm": made.shear,
-        "contact": made.contact,
-        "stopped_by_contact": made.stopped_by_contact,
-        "duration": made.duration,
+        "attempt": attempt.number,
+        "outcome": "inserted" if attempt.inserted else "not inserted",
+        "planar_pose": attempt.planar_pose,
+        "depth": attempt.depth,
+        "shear_mm": attempt.shear,
+        "contact": attempt.contact,
+        "stopped_by_contact": attempt.stopped_by_contact,
+        "duration": attempt.duration,
     }

@@ -20,7 +20,7 @@ def load_lab(path: str | Path) -> Lab:
 
 
 def _with_calibrations(lab: Lab, path: Path) -> Lab:
-    """`lab` with full paths of its cameras' calibrations, each of which is read once: an error shows at once."""
+    """`lab` with absolute paths of the camera calibrations; reads each of them once, so that errors show early."""
     cameras = {}
     for name in ("left", "right"):
         camera = getattr(lab.cameras, name)
@@ -35,7 +35,7 @@ def _with_calibrations(lab: Lab, path: Path) -> Lab:
 
 
 def save_lab(lab: Lab, path: str | Path, *, title: str) -> None:
-    """Write a lab file with every key; it appears whole or not at all. Raises UsageError when it can't be written."""
+    """Write a lab file with every key, atomically. Raises UsageError when it cannot be written."""
     path = Path(path)
     lines = [f"# {title}", ""]
     tables: list[tuple[str, Any]] = [("", lab)]
@@ -48,7 +48,7 @@ def save_lab(lab: Lab, path: str | Path, *, title: str) -> None:
             if dataclasses.is_dataclass(value):
                 tables.append((f"{name}.{field.name}" if name else field.name, value))
             else:
-                # JSON's texts, numbers, truth values and lists are TOML's too.
+                # JSON strings, numbers, booleans and lists are valid TOML.
                 lines.append(f"{field.name} = {json.dumps(value)}")
     partial = path.with_name(path.name + ".part")
     try:

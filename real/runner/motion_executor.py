@@ -1,4 +1,4 @@
-"""Motion of the runner: one thread that renews the arm's target and watches that everything it relies on is fresh."""
+"""Executes motions: a thread renews the arm's target and monitors the age of all data that motion relies on."""
 
 import contextlib
 import math
@@ -19,21 +19,21 @@ from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.session.recorder import SessionRecorder
 
-RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, every change of a cycle's kind besides
-_HISTORY = 8192  # measured heights kept, one a cycle: 32 s
-_ARRIVED = (0.1e-3, math.radians(0.1))  # a move has ended when the arm is this near its target [m, rad]
+RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
+_HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
+_ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
 
 
 class PartLost(PeerError):
-    """The part slipped out of the fingers: the attempt ends."""
+    """The gripper lost the part: the attempt ends."""
 
 
 class MotionExecutor:
-    """Moves the gripper frame. A thread posts the newest target again and again; each posting lives only shortly, so
-    that whatever becomes of this program, the arm holds.
+    """Moves the gripper frame to targets.
 
-    The first thing that goes wrong (a stale pose, frame or gripper state, a controller that stopped, a refused
-    target) makes the arm hold, then stop; `failure` keeps it, and every call raises it from then on.
+    A thread renews the target of the arm, whose lifetime is short: if this program stops working, the arm holds. On
+    the first failure (a stale pose, image or gripper state, a stopped controller, a refused target) the arm holds,
+    then stops; `failure` stores the error, and every later call raises it.
     """
 
     def __init__(
@@ -54,14 +54,14 @@ class MotionExecutor:
         self._lock = threading.Lock()
         self._goal: Pose | None = None
         self._speeds = (lab.arm.max_speed, math.radians(lab.arm.max_turn_speed_deg))
-        self._holding = False
-        self._lost = False
+        self._part_expected = False
+        self._part_lost = False
         self._ending = threading.Event()
         self._heights: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
         self._cycles = 0
         self._flags = EgmFlag(0)
         self.failure: GelflowError | None = None
-        self._thread = threading.Thread(target=self._run, name="motion", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="motion executor", daemon=True)
 
     def __enter__(self) -> "MotionExecutor":
         self._thread.start()
@@ -75,18 +75,19 @@ class MotionExecutor:
             self._arm.hold()
             self._log()
 
-    # For the runner's thread
+    # Called from the runner's thread
 
     def pose(self) -> Pose:
-        """Where the gripper frame is in the base, as measured."""
+        """Measured pose of the gripper frame in the base frame."""
         self._raise_failure()
         state = self._arm.state()
         return self._lab.gripper_pose(state.position, state.quaternion)
 
     def go(self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None) -> None:
-        """Start to move the gripper frame straight to `target` and return; speeds [m/s], [rad/s], None: the lab's.
+        """Start a straight motion of the gripper frame to `target` and return.
 
-        Raises SafetyError when the supervisor refuses the target; the arm then holds.
+        Speeds [m/s], [rad/s]; None: those of the lab file. Raises SafetyError when the supervisor refuses the target;
+        the arm then holds.
         """
         self._raise_failure()
         fastest = (self._lab.arm.max_speed, math.radians(self._lab.arm.max_turn_speed_deg))
@@ -104,7 +105,7 @@ class MotionExecutor:
         self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
 
     def hold(self) -> None:
-        """Freeze the reference where it is."""
+        """Freeze the reference."""
         with self._lock:
             self._goal = None
             self._arm.hold()
@@ -117,12 +118,12 @@ class MotionExecutor:
         return self.pose().is_near(goal, within, _ARRIVED[1])
 
     def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
-        """Go to `target` and wait until the arm is there. Raises PeerTimeout when it takes far too long."""
+        """Move to `target` and wait for the arrival. Raises PeerTimeout after twice the expected time plus 3 s."""
         start = self.pose()
         self.go(target, speed=speed)
-        way = float(np.linalg.norm(target.position - start.position)) / self._speeds[0]
-        turn = angle_between(start.quaternion, target.quaternion) / self._speeds[1]
-        limit = 2 * max(way, turn) + 3.0
+        linear = float(np.linalg.norm(target.position - start.position)) / self._speeds[0]
+        angular = angle_between(start.quaternion, target.quaternion) / self._speeds[1]
+        limit = 2 * max(linear, angular) + 3.0
         end = self._clock.now() + limit
         while not self.arrived():
             if while_moving is not None:
@@ -134,29 +135,29 @@ class MotionExecutor:
             self.wait(0.02)
 
     def wait(self, seconds: float) -> None:
-        """Let `seconds` of robot time pass; raises what goes wrong meanwhile."""
+        """Wait for `seconds` of robot time. Raises the failure of the thread, or PartLost."""
         self._clock.sleep(seconds)
         self._raise_failure()
-        if self._lost:
+        if self._part_lost:
             raise PartLost("the gripper reports that the part was lost")
 
     def expect_part(self, held: bool) -> None:
-        """Whether the gripper holds a part from now on; losing it raises PartLost in `wait` and stops the arm."""
-        self._lost = False
-        self._holding = held
+        """Set whether a part is held from now on. When it is lost, the arm holds and `wait` raises PartLost."""
+        self._part_lost = False
+        self._part_expected = held
 
     def height_at(self, stamp: float) -> float:
-        """Measured height of the gripper frame in the base at a robot time [m]."""
+        """Measured height of the gripper frame in the base frame at a robot time [m]."""
         now = self._arm.state()
         with self._lock:
             history = list(self._heights)
-        # The thread fetches measured poses now and then; what came since is between the last of them and the newest.
+        # Interpolate between the last cycle fetched by the thread and the newest feedback.
         if not history or history[-1][0] < now.stamp:
             history.append((now.stamp, float(self._lab.gripper_pose(now.position, now.quaternion).position[2])))
         times, heights = zip(*history, strict=True)
         return float(np.interp(stamp, times, heights))
 
-    # The thread
+    # Thread
 
     def _run(self) -> None:
         period = self._lab.limits.target_lifetime / 4
@@ -168,7 +169,7 @@ class MotionExecutor:
                     if goal is not None:
                         self._post(goal, speeds)
                 self._log()
-            except Exception as error:  # noqa: BLE001 - a thread has no caller: kept, and raised by the next call
+            except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it
                 self._fail(error)
                 return
             self._ending.wait(self._clock.wall(period))
@@ -181,7 +182,7 @@ class MotionExecutor:
         self._arm.target(tool.position, tool.quaternion, lifetime=lifetime, speed=speeds[0], turn_speed=speeds[1])
 
     def _watch(self) -> None:
-        """Raise when something that motion relies on is stale or wrong."""
+        """Raise when data that motion relies on is stale, or a device reports a fault."""
         state = self._arm.state()
         self.supervisor.watch(state)
         self._check_age("pose", state, self._lab.limits.stale_pose)
@@ -189,9 +190,9 @@ class MotionExecutor:
             camera.latest()
         gripper = self._gripper.state()
         if gripper.fault:
-            raise PeerError(f"the gripper reports {gripper.fault}; look at it before anything moves again")
-        if self._holding and gripper.grasp in ("part lost", "no part") and not self._lost:
-            self._lost = True
+            raise PeerError(f"the gripper reports {gripper.fault}; inspect it before anything moves again")
+        if self._part_expected and gripper.grasp in ("part lost", "no part") and not self._part_lost:
+            self._part_lost = True
             self.hold()
             self._recorder.event("part lost", {"grasp": gripper.grasp, "width": gripper.width})
 
@@ -213,7 +214,7 @@ class MotionExecutor:
             self._recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
 
     def _gripper_heights(self, records: Sequence[EgmCycle]) -> list[float]:
-        """Measured heights of the gripper frame in the base [m]: the third row of R t + p, for all records at once."""
+        """Measured heights of the gripper frame in the base frame [m]: the third row of R t + p, vectorized."""
         if not records:
             return []
         w, x, y, z = np.array([record.measured[1] for record in records]).T
@@ -236,15 +237,15 @@ class MotionExecutor:
             self._recorder.arm_command(record.stamp, record.applied[0], record.applied[1], kind="applied")
 
     def _fail(self, error: Exception) -> None:
-        """Hold within this cycle, then stop for good. Nothing is dropped and no power is cut: the grip stays."""
+        """Hold within this cycle, then stop. The gripper is not opened and no power is cut, so the part stays held."""
         known = isinstance(error, GelflowError)
         self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
         self._goal = None
         self.supervisor.latch(str(self.failure))
-        for end in (self._arm.hold, lambda: self._arm.stop(str(self.failure)), self._log):
-            # The first failure is the one to be seen; the other ends are still tried.
+        for action in (self._arm.hold, lambda: self._arm.stop(str(self.failure)), self._log):
+            # The first failure is reported; errors of the remaining actions are not.
             with contextlib.suppress(GelflowError):
-                end()
+                action()
         with contextlib.suppress(GelflowError):
             self._recorder.event("stopped", {"reason": str(self.failure), "expected": known})
 

@@ -1,4 +1,4 @@
-"""What must hold before anything moves. Every item is looked at, so that one refusal names all that is wrong."""
+"""Preflight: checks all devices before any motion, and reports all failed checks together."""
 
 import math
 from collections.abc import Callable
@@ -8,25 +8,25 @@ from gelflow.errors import GelflowError, PeerError, SafetyError
 from gelflow.perception.frames import CameraMount, decode_image
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.real.runner.cell import Cell
-from gelflow.real.runner.supervisor import Supervisor, unfit
+from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 
-_FEWEST = 0.8  # of the markers must be seen at rest
+_VISIBLE_FRACTION = 0.8  # of the markers, at rest
 _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
 
 
 @dataclass(frozen=True)
 class PreflightItem:
-    """One thing that was checked."""
+    """The result of one check."""
 
     name: str
     good: bool
-    text: str  # what was found, or what is wrong
+    text: str  # the measured state, or the error
 
 
 def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
-    """Check cameras, gripper and arm; homes the gripper outwards where the lab allows it, otherwise nothing moves.
+    """Check cameras, arm and gripper. Homes the gripper outwards if the lab file allows it; nothing else moves.
 
-    Returns all items. Raises SafetyError, naming each that failed.
+    Returns all results. Raises SafetyError, which names every failed check.
     """
     lab = cell.lab
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
@@ -37,14 +37,14 @@ def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
         ("pose", lambda: _pose(cell, supervisor)),
         ("gripper", lambda: _gripper(cell)),
     ]
-    items = [_look(name, check) for name, check in checks]
+    items = [_result(name, check) for name, check in checks]
     cell.recorder.event("preflight", {item.name: {"good": item.good, "text": item.text} for item in items})
-    if wrong := [f"{item.name}: {item.text}" for item in items if not item.good]:
-        raise SafetyError(f"preflight refused: {'; '.join(wrong)}")
+    if failed := [f"{item.name}: {item.text}" for item in items if not item.good]:
+        raise SafetyError(f"preflight failed: {'; '.join(failed)}")
     return items
 
 
-def _look(name: str, check: Callable[[], str]) -> PreflightItem:
+def _result(name: str, check: Callable[[], str]) -> PreflightItem:
     try:
         return PreflightItem(name, True, check())
     except GelflowError as error:
@@ -57,11 +57,11 @@ def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     if mount.calibration is not None:
         mount.calibration.check_size(picture)
     tracked = MarkerTracker(mount.tracker_config()).start(picture)
-    seen, total = int(tracked.valid.sum()), mount.rows * mount.cols
-    if seen < _FEWEST * total:
-        raise PeerError(f"{seen} of {total} markers are seen; look at the gel, its light and the camera")
+    visible, total = int(tracked.valid.sum()), mount.rows * mount.cols
+    if visible < _VISIBLE_FRACTION * total:
+        raise PeerError(f"{visible} of {total} markers are visible; check the gel, its light and the camera")
     age = cell.clock.now() - image.stamp
-    return f"{seen} of {total} markers, {mount.rows} × {mount.cols}; newest frame {1e3 * age:.0f} ms old"
+    return f"{visible} of {total} markers, {mount.rows} × {mount.cols}; newest image {1e3 * age:.0f} ms old"
 
 
 def _arm(cell: Cell) -> str:
@@ -71,8 +71,8 @@ def _arm(cell: Cell) -> str:
     age = cell.clock.now() - state.stamp
     if age > cell.lab.limits.stale_pose:
         raise PeerError(f"the newest pose is {1e3 * age:.0f} ms old")
-    # In a dry run nothing is answered, so the controller does not follow yet; the rest must hold.
-    if (reason := unfit(state)) and not (cell.dry_run and state.motors_on and not state.fault):
+    # In a dry run no message is answered, so the controller does not follow; all other conditions must hold.
+    if (reason := not_ready_reason(state)) and not (cell.dry_run and state.motors_on and not state.fault):
         raise SafetyError(reason)
     return f"motors on, mode {state.operating_mode}, {'following' if state.running else 'not following (dry run)'}"
 
@@ -92,14 +92,14 @@ def _pose(cell: Cell, supervisor: Supervisor) -> str:
 def _gripper(cell: Cell) -> str:
     state = cell.gripper.state()
     if state.fault:
-        raise PeerError(f"it reports {state.fault}; look at it and acknowledge")
+        raise PeerError(f"it reports {state.fault}; inspect it and acknowledge the fault")
     if not state.referenced and cell.lab.gripper.home_at_start:
         if cell.dry_run:
-            return "not homed: a run would home it outwards first"
+            return "not homed: a run homes it outwards first"
         cell.gripper.home()
         state = cell.gripper.state()
     if not state.referenced:
         raise SafetyError("it is not homed: home it outwards, or set home_at_start in the lab file")
     if state.grasp == "holding":
-        raise SafetyError("it holds a part already; take it out")
+        raise SafetyError("it holds a part; remove the part")
     return f"homed, {state.grasp}, {1e3 * state.width:.1f} mm open"

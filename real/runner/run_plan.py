@@ -1,4 +1,4 @@
-"""A whole run, as the command line and the demo call it: open, preflight, insert, record, close; or a dry run."""
+"""Runs of several insertions: open the cell, preflight, insert, record, close; and dry runs."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from gelflow.task import InsertionTask
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What to run, and who wants to hear of it."""
+    """The parameters of a run and its callbacks."""
 
     lab: Lab
     policy: Policy
@@ -32,7 +32,7 @@ class RunPlan:
     session: Path  # the recording, a new file
     checkpoint: Path | None = None  # of the policy, for the recording
     insertions: int = 1
-    operator: Callable[[MotionExecutor], Operator] | None = None  # None: the lab's waiting time
+    operator: Callable[[MotionExecutor], Operator] | None = None  # None: wait for the lab file's load_wait
     on_preflight: Callable[[list[PreflightItem]], None] = lambda items: None
     on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
     on_insertion: Callable[[Insertion], None] = lambda insertion: None
@@ -40,7 +40,7 @@ class RunPlan:
 
 
 class WaitingOperator:
-    """A fixture or a robot-side feeder: the part is there after a while."""
+    """An operator or feeder that presents each part within a fixed time."""
 
     def __init__(self, motion: MotionExecutor, seconds: float) -> None:
         self._motion, self._seconds = motion, seconds
@@ -54,19 +54,19 @@ class WaitingOperator:
 
 @dataclass(frozen=True)
 class DryRun:
-    """What a run would have started with; nothing moved."""
+    """Result of a dry run, in which nothing moved."""
 
     items: list[PreflightItem]
-    targets: list[str]  # the first targets, as the supervisor saw them
-    observation: FlowMap  # of two frames at rest: what the pads show without contact
-    action: NDArray[np.float64]  # what the policy says to it
+    targets: list[str]  # the first targets, after the supervisor's check
+    observation: FlowMap  # from two pairs of images at rest, without contact
+    action: NDArray[np.float64]  # the policy's action for this observation
 
 
 def run_insertions(plan: RunPlan) -> list[Insertion]:
-    """Run the plan's insertions and record everything. Raises the first error that makes going on unsafe."""
+    """Run and record the insertions of a plan. Raises the first error after which continuing is unsafe."""
     results = []
     with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
-        supervisor, motion = runner_parts(cell)
+        supervisor, motion = create_motion(cell)
         plan.on_preflight(run_preflight(cell, supervisor))
         operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
         with motion:
@@ -81,9 +81,9 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
 
 
 def dry_run(plan: RunPlan) -> DryRun:
-    """Everything up to the first motion: connect, preflight, check the first targets, read the pads, ask the policy."""
+    """Connect, preflight, check the first targets, read the pads and evaluate the policy, without motion."""
     with _recording(plan, dry_run=True) as recorder, open_cell(plan.lab, recorder, dry_run=True) as cell:
-        supervisor, motion = runner_parts(cell)
+        supervisor, motion = create_motion(cell)
         items = run_preflight(cell, supervisor)
         runner = InsertionRunner(
             cell, plan.policy, task=plan.task, motion=motion, operator=WaitingOperator(motion, plan.lab.part.load_wait)
@@ -100,8 +100,8 @@ def dry_run(plan: RunPlan) -> DryRun:
         return DryRun(items, runner.check_plan(supervisor), observation, action)
 
 
-def runner_parts(cell: Cell) -> tuple[Supervisor, MotionExecutor]:
-    """The supervisor and the motion of a cell; the motion's thread is started by `with`."""
+def create_motion(cell: Cell) -> tuple[Supervisor, MotionExecutor]:
+    """The supervisor and the motion executor of a cell; `with` starts the executor's thread."""
     supervisor = Supervisor(cell.lab)
     motion = MotionExecutor(
         cell.arm,

@@ -1,7 +1,7 @@
-"""The last check before a target leaves for the arm: refused, never clamped. Not a safety-rated function.
+"""Supervisor: checks every target before it is sent to the arm, and latches stops. Not a safety-rated function.
 
-The supervisor also keeps the latch: after an emergency stop, motors off, a stopped program or a stale feed nothing
-moves again in this run, whatever the rest of the program thinks. An operator starts the next run.
+An invalid target is refused, never clamped. After an emergency stop, motors off, a stopped program or stale data,
+nothing moves for the rest of the run; an operator starts the next run.
 """
 
 import math
@@ -15,7 +15,7 @@ from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
 
-_SLACK = 1e-6  # rounding on a bound is not beyond it
+_TOLERANCE = 1e-6  # rounding at a bound
 
 
 class Supervisor:
@@ -29,7 +29,7 @@ class Supervisor:
 
     @property
     def latched(self) -> str:
-        """Why nothing may move any more; empty while motion is allowed."""
+        """The reason why motion is forbidden; empty while motion is allowed."""
         return self._latched
 
     def latch(self, reason: str) -> None:
@@ -39,32 +39,32 @@ class Supervisor:
 
     def watch(self, state: ArmState) -> None:
         """Latch, and raise SafetyError, when the controller is not ready to move."""
-        reason = unfit(state)
+        reason = not_ready_reason(state)
         if reason:
             self.latch(reason)
-            raise SafetyError(f"the arm stopped: {reason}; look at the robot, then start a new run")
+            raise SafetyError(f"the arm stopped: {reason}; inspect the robot, then start a new run")
 
     def check(self, target: Pose, previous: Pose, *, speed: float, turn_speed: float) -> Pose:
-        """The pose to send to the controller for the gripper frame to be at `target`.
+        """Check a target of the gripper frame; returns the tool pose to send to the controller.
 
         Parameters
         ----------
-        target: of the gripper frame in the base
-        previous: where the arm is now
-        speed, turn_speed: with which the arm shall go there [m/s], [rad/s]
+        target: gripper frame in the base frame
+        previous: present pose of the gripper frame in the base frame
+        speed, turn_speed: speeds of the motion [m/s], [rad/s]
 
-        Raises SafetyError when the target is not finite, leaves the workspace, is too far from where the arm is, or too
-        fast; and always after a latch. Joint ranges are checked by the arm's driver, which knows the controller's tool.
+        Raises SafetyError when the target is not finite, outside the workspace, too far from the present pose or too
+        fast, and always after a latch. The arm's driver checks joint ranges, because it knows the controller's tool.
         """
         if self._latched:
-            raise SafetyError(f"motion is latched: {self._latched}; look at the robot, then start a new run")
+            raise SafetyError(f"motion is latched: {self._latched}; inspect the robot, then start a new run")
         self._check_numbers(target)
-        self._check_place(target)
+        self._check_workspace(target)
         self._check_change(target, previous, speed, turn_speed)
         return self._lab.tool_pose(target)
 
     def hole_coordinates(self, target: Pose) -> tuple[float, float, float, float]:
-        """Where a gripper pose is about the taught hole: x, y [m], yaw [rad], height of the lower face [m]."""
+        """Gripper pose relative to the taught hole: x, y [m], yaw [rad], height of the part's lower face [m]."""
         local = self._base_to_hole @ target
         x, y, z = (float(c) for c in local.position)
         return x, y, local.yaw, z - self._lab.part.grasp_height
@@ -73,11 +73,11 @@ class Supervisor:
     def _check_numbers(target: Pose) -> None:
         values = np.concatenate([target.position, target.quaternion])
         if not np.isfinite(values).all():
-            raise SafetyError(f"target refused: it holds a number that is not finite: {_row(values)}")
+            raise SafetyError(f"target refused: it contains a number that is not finite: {_row(values)}")
         if abs(float(np.linalg.norm(target.quaternion)) - 1) > 1e-6:
             raise SafetyError(f"target refused: its quaternion {_row(target.quaternion)} does not have length 1")
 
-    def _check_place(self, target: Pose) -> None:
+    def _check_workspace(self, target: Pose) -> None:
         space = self._lab.workspace
         x, y, yaw, height = self.hole_coordinates(target)
         local = self._base_to_hole @ target
@@ -88,9 +88,9 @@ class Supervisor:
             ("tilt", math.degrees(local.tilt), space.tilt_deg, "°"),
         )
         for name, value, limit, unit in bounds:
-            if not value <= limit + _SLACK:
+            if not value <= limit + _TOLERANCE:
                 raise SafetyError(f"target refused: |{name}| = {value:.2f} {unit} is outside ±{limit:g} {unit}")
-        if not space.height_min - _SLACK <= height <= space.height_max + _SLACK:
+        if not space.height_min - _TOLERANCE <= height <= space.height_max + _TOLERANCE:
             low, high = 1e3 * space.height_min, 1e3 * space.height_max
             raise SafetyError(f"target refused: height {1e3 * height:.2f} mm is outside {low:g} to {high:g} mm")
 
@@ -105,15 +105,15 @@ class Supervisor:
             ("turning speed", math.degrees(turn_speed), arm.max_turn_speed_deg, "°/s"),
         )
         for name, value, limit, unit in bounds:
-            # Written so that NaN fails.
-            if not value <= limit * (1 + _SLACK):
+            # The comparison is false for NaN.
+            if not value <= limit * (1 + _TOLERANCE):
                 raise SafetyError(f"target refused: {name} {value:.4g} {unit} is more than {limit:.4g} {unit}")
         if not (speed > 0 and turn_speed > 0):
             raise SafetyError(f"target refused: speeds must be above 0, got {speed:g} m/s and {turn_speed:g} rad/s")
 
 
-def unfit(state: ArmState) -> str:
-    """Why the arm must not be moved, in words; empty when it may."""
+def not_ready_reason(state: ArmState) -> str:
+    """The reason why the arm must not be moved; empty when it may be moved."""
     if state.fault:
         return state.fault
     if not state.motors_on:

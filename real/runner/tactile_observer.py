@@ -1,4 +1,4 @@
-"""What the runner feels: frames of both cameras, tracked from an attempt's reference on, each with its depth."""
+"""Tactile observation of an attempt: tracks the images of both cameras relative to a reference, each with its depth."""
 
 import math
 from collections.abc import Sequence
@@ -14,29 +14,30 @@ from gelflow.perception.tracker import MarkerTracker, TrackingResult
 from gelflow.protocols import Camera, CameraImage
 from gelflow.task import InsertionTask
 
-_FEWEST = 0.6  # of a pad's markers must be seen: below this a frame says nothing
+_VISIBLE_FRACTION = 0.6  # of a pad's markers; a frame with fewer visible markers is rejected
 
 
 class MarkersUnreadable(PeerError):
-    """Frames came, but no markers could be read from them: the attempt may be tried again."""
+    """Images arrived, but their markers could not be tracked: the attempt may be repeated."""
 
 
 @dataclass(frozen=True)
 class TactileReading:
-    """One moment as both pads felt it."""
+    """The tactile frame of one moment, of both pads."""
 
     frame: TactileFrame
     images: tuple[CameraImage, ...]  # one per sensor
-    depth: float  # below the attempt's start [m]
-    shear: float  # mean shear along the finger since the reference, of the pad that feels more [mm]
+    depth: float  # below the start of the attempt [m]
+    shear: float  # mean shear along the finger since the reference, the larger of both pads [mm]
 
     @property
     def sequences(self) -> tuple[int, ...]:
+        """Sequence numbers of the images."""
         return tuple(image.sequence for image in self.images)
 
 
 class TactileObserver:
-    """Reads the pads during one attempt: fresh trackers, the first readable pair of images is the reference."""
+    """Observes both pads during one attempt, with new trackers; the first pair of images is the reference."""
 
     def __init__(self, cameras: Sequence[Camera], mounts: Sequence[CameraMount], *, stale: float) -> None:
         self._cameras, self._mounts, self._stale = cameras, mounts, stale
@@ -48,35 +49,35 @@ class TactileObserver:
         self.unreadable = 0
 
     def start(self, since: float) -> TactileReading:
-        """The reference, from the first frames that came after the robot time `since` [s].
+        """Set the reference to the first pair of images received after the robot time `since` [s].
 
-        Raises MarkersUnreadable when they show no markers, PeerTimeout when no frames come.
+        Raises MarkersUnreadable when they show too few markers, PeerTimeout when no images arrive.
         """
         images = self.images(since)
         self._last = [image.sequence for image in images]
         try:
             trackeds = self._track(images)
-        except (PeerError, UsageError) as error:  # UsageError: another grid than the lab file's
+        except (PeerError, UsageError) as error:  # UsageError: the grid differs from that of the lab file
             raise MarkersUnreadable(f"no reference frame: {error}") from None
         frame = self._frame(trackeds, images)
         if frame is None:
             raise MarkersUnreadable(
-                f"no reference frame: fewer than {_FEWEST:.0%} of the markers are seen; look at the gels"
+                f"no reference frame: fewer than {_VISIBLE_FRACTION:.0%} of the markers are seen; look at the gels"
             )
         self.reference = TactileReading(frame, images, 0.0, 0.0)
         return self.reference
 
     def next(self) -> TactileReading | None:
-        """The newest pair of frames that was not read yet, with depth 0; None where the pair was unreadable.
+        """The tactile reading of the newest pair of images, with depth 0; None when its markers are unreadable.
 
-        Raises PeerTimeout when no new frames come.
+        Raises PeerTimeout when no new images arrive.
         """
         return self.read(self.images())
 
     def images(self, since: float = -math.inf) -> tuple[CameraImage, ...]:
-        """The newest pair of frames that was not read yet, both from after the robot time `since` [s].
+        """The newest pair of images that was not tracked yet, both received after the robot time `since` [s].
 
-        Raises PeerTimeout when none comes.
+        Raises PeerTimeout when none arrives.
         """
         images = []
         for camera, last in zip(self._cameras, self._last, strict=True):
@@ -87,8 +88,8 @@ class TactileObserver:
         return tuple(images)
 
     def read(self, images: tuple[CameraImage, ...]) -> TactileReading | None:
-        """What a pair of frames shows, with depth 0; None where it is unreadable."""
-        assert self.reference is not None, "start comes first"
+        """Track a pair of images; returns the reading with depth 0, or None when the markers are unreadable."""
+        assert self.reference is not None, "call start() first"
         self._last = [image.sequence for image in images]
         try:
             frame = self._frame(self._track(images), images)
@@ -100,18 +101,18 @@ class TactileObserver:
         return TactileReading(frame, images, 0.0, mean_shear(frame, self.reference.frame))
 
     def keep(self, reading: TactileReading) -> None:
-        """Add a reading, with its depth, to those that the observation is chosen from."""
+        """Add a reading, with its depth, to those that `chosen` selects from."""
         self.readings.append(reading)
 
     def chosen(self, depths: Sequence[float]) -> list[TactileReading]:
-        """For each depth [m] the reading nearest to it; where the descent was stopped before, the last one."""
+        """For each depth [m] the nearest reading; the last one for depths below the end of the descent."""
         if not self.readings:
-            raise MarkersUnreadable("no frame of the descent could be read; look at the gels")
-        found = np.array([reading.depth for reading in reversed(self.readings)])  # of equal depths the newest counts
-        return [self.readings[-1 - int(np.abs(found - min(depth, found[0])).argmin())] for depth in depths]
+            raise MarkersUnreadable("no image of the descent could be tracked; inspect the gels")
+        measured = np.array([reading.depth for reading in reversed(self.readings)])  # newest first for equal depths
+        return [self.readings[-1 - int(np.abs(measured - min(depth, measured[0])).argmin())] for depth in depths]
 
     def observe(self, frames: Sequence[TactileReading], task: InsertionTask) -> FlowMap:
-        """The flow map of chosen readings against the reference."""
+        """The flow map of readings relative to the reference."""
         assert self.reference is not None
         return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)
 
@@ -119,20 +120,20 @@ class TactileObserver:
         trackeds = []
         for sensor, image in enumerate(images):
             pixels = decode_image(image.data)
-            # Listed as soon as the tracker saw it, readable or not: a replay must show it the same images.
+            # Listed before tracking, readable or not: a replay must give the tracker the same images.
             self.tracked[sensor].append(image.sequence)
             trackeds.append(self._trackers[sensor].track(pixels))
         return trackeds
 
     def _frame(self, trackeds: Sequence[TrackingResult], images: Sequence[CameraImage]) -> TactileFrame | None:
         frame = tactile_frame(trackeds, self._mounts, max(image.stamp for image in images))
-        return frame if (frame.valid.mean(axis=1) >= _FEWEST).all() else None
+        return frame if (frame.valid.mean(axis=1) >= _VISIBLE_FRACTION).all() else None
 
 
 def mean_shear(frame: TactileFrame, reference: TactileFrame) -> float:
-    """Mean change of shear along the finger [unit of the frames], of the pad where it is larger.
+    """Mean change of shear along the finger [unit of the frames], the larger of both pads.
 
-    Over the markers that are valid in both frames.
+    The mean is over the markers that are valid in both frames.
     """
     change = frame.shear[..., 0].astype(float) - reference.shear[..., 0]
     both = frame.valid & reference.valid

@@ -1,7 +1,7 @@
-"""The WSG-50's binary protocol as bytes: frames, checksum, commands and replies. No I/O.
+"""The WSG-50's binary protocol as bytes: packets, checksum, commands and replies. No I/O.
 
-A frame is `AA AA AA | id u8 | length u16 LE | payload | crc u16 LE`; a reply's payload starts with a status
-u16 LE. The wire counts in mm, mm/s and mm/s²; everything above this module in metres.
+A packet is `AA AA AA | id u8 | length u16 LE | payload | crc u16 LE`; the payload of a reply starts with a status
+u16 LE. Units on the wire are mm, mm/s and mm/s²; this module converts them to and from metres.
 """
 
 import math
@@ -18,7 +18,7 @@ MM = 1e3  # mm in a metre
 ACKNOWLEDGE_KEY = b"ack"
 
 
-# What follows the status SUCCESS, as struct formats; commands that are not named here answer the status alone.
+# Struct formats of the values behind the status SUCCESS; replies to other commands carry the status alone.
 _REPLY_LAYOUT = {
     Command.GET_ACCELERATION: "<f",
     Command.GET_FORCE_LIMIT: "<f",
@@ -48,9 +48,9 @@ _CRC_TABLE = _crc_table()
 
 
 def crc16(data: bytes, crc: int = 0xFFFF) -> int:
-    """The device's own checksum: the table of the CCITT polynomial, but shifted right as it is updated.
+    """Checksum of the device: the CCITT polynomial's table, with the register shifted right.
 
-    Over a whole frame with its checksum the result is 0.
+    The result over a whole packet including its checksum is 0.
     """
     for byte in data:
         crc = _CRC_TABLE[(crc ^ byte) & 0xFF] ^ (crc >> 8)
@@ -59,19 +59,20 @@ def crc16(data: bytes, crc: int = 0xFFFF) -> int:
 
 @dataclass(frozen=True)
 class Packet:
-    """One message in either direction."""
+    """One protocol packet, in either direction."""
 
     id: int
     payload: bytes = b""
 
     def encode(self, *, crc: bool = True) -> bytes:
-        """The bytes on the wire; `crc=False` sends 00 00, for a device whose checking is off.
+        """The bytes on the wire; `crc=False` sends 00 00 for a device whose checksum is switched off.
 
-        Raises UsageError when id or payload don't fit.
+        Raises UsageError when the id or the payload is too large.
         """
         if not 0 <= self.id <= 0xFF or len(self.payload) > 0xFFFF:
             raise UsageError(
-                f"a frame holds an id of one byte and at most 65535 bytes, got id {self.id} and {len(self.payload)}"
+                "a packet has an id of one byte and at most 65535 bytes of payload, "
+                f"got id {self.id} and {len(self.payload)} bytes"
             )
         head = PREAMBLE + struct.pack("<BH", self.id, len(self.payload)) + self.payload
         return head + struct.pack("<H", crc16(head) if crc else 0)
@@ -79,7 +80,7 @@ class Packet:
 
 @dataclass(frozen=True)
 class Corrupt:
-    """Bytes that look like a frame of this id, but whose checksum is wrong."""
+    """A packet of this id with a wrong checksum."""
 
     id: int
 
@@ -88,60 +89,60 @@ Plausible = Callable[[int, int], bool]
 
 
 class Decoder:
-    """Bytes in, frames out, in any portions.
+    """Incremental decoder: bytes in portions of any size in, packets out.
 
-    Garbage is skipped and counted; a frame with a wrong checksum is told as `Corrupt`, and the search goes on one
-    byte further, so that a good frame inside or behind it is still found. `plausible(id, payload length)` rejects
-    false starts before their bytes are awaited. A start that never ends is given up by `expire`.
+    Garbage is skipped and counted. A packet with a wrong checksum is reported as `Corrupt`, and the search continues
+    one byte further, so that a valid packet inside or behind it is still decoded. `plausible(id, payload length)`
+    rejects false preambles before their bytes are awaited. `expire` abandons an incomplete packet.
     """
 
     def __init__(self, *, plausible: Plausible, check_crc: bool = True) -> None:
         self._plausible = plausible
         self._check_crc = check_crc
         self._buffer = bytearray()
-        self.discarded = 0  # bytes that belonged to no frame
+        self.discarded = 0  # bytes that belonged to no packet
 
     @property
     def waiting(self) -> int:
-        """Bytes held back because they may become a frame."""
+        """Number of bytes of an incomplete packet."""
         return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Packet | Corrupt]:
-        """Take bytes as they came, return what they completed."""
+        """Add received bytes; returns the packets that they complete."""
         self._buffer += data
-        found: list[Packet | Corrupt] = []
-        while self._step(found):
+        packets: list[Packet | Corrupt] = []
+        while self._step(packets):
             pass
-        return found
+        return packets
 
     def expire(self) -> list[Packet | Corrupt]:
-        """Give up the frame that is awaited (its rest did not come in time) and search what came after its start."""
+        """Abandon the incomplete packet (its rest did not arrive in time) and decode the bytes behind its start."""
         if not self._buffer:
             return []
         self._drop(1)
         return self.feed(b"")
 
     def reset(self) -> None:
-        """Forget what was received."""
+        """Discard all received bytes."""
         self._drop(len(self._buffer))
 
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
         self.discarded += count
 
-    def _step(self, found: list[Packet | Corrupt]) -> bool:
-        """Decide on the head of the buffer; False when more bytes are needed."""
+    def _step(self, packets: list[Packet | Corrupt]) -> bool:
+        """Decode the head of the buffer; False when more bytes are needed."""
         buffer = self._buffer
         start = buffer.find(PREAMBLE)
         if start < 0:
-            # The last two bytes may be the beginning of a preamble.
+            # The last two bytes may be the start of a preamble.
             keep = 2 if buffer[-2:] == PREAMBLE[:2] else 1 if buffer[-1:] == PREAMBLE[:1] else 0
             self._drop(len(buffer) - keep)
             return False
         self._drop(start)
         if len(buffer) < HEADER:
             if len(buffer) > 3 and buffer[3] == PREAMBLE[0]:
-                self._drop(1)  # one AA too many: no command has this id
+                self._drop(1)  # an extra AA: no command has this id
                 return True
             return False
         command, length = struct.unpack_from("<BH", buffer, 3)
@@ -154,16 +155,16 @@ class Decoder:
         raw = bytes(buffer[:total])
         unchecked = not self._check_crc and raw[-2:] == b"\0\0"
         if not unchecked and crc16(raw) != 0:
-            found.append(Corrupt(command))
+            packets.append(Corrupt(command))
             self._drop(1)
             return True
-        found.append(Packet(command, raw[HEADER:-2]))
+        packets.append(Packet(command, raw[HEADER:-2]))
         del buffer[:total]
         return True
 
 
 def plausible_reply(command: int, length: int) -> bool:
-    """Whether a reply of this id may have a payload of this length: the status alone, or status and values."""
+    """Whether a reply with this id can have a payload of this length: the status alone, or status and values."""
     if command == Command.LOOP:
         return 2 <= length <= 258
     try:
@@ -174,20 +175,20 @@ def plausible_reply(command: int, length: int) -> bool:
 
 
 def plausible_request(command: int, length: int) -> bool:
-    """Whether a device should wait for a request of this length; ids it does not know may come too."""
+    """Whether a device should wait for a request of this length; unknown ids are plausible."""
     return length <= 258 if command == Command.LOOP else length <= 64
 
 
 @dataclass(frozen=True)
 class Reply:
-    """A device's answer."""
+    """A reply of the device."""
 
     command: Command
     status: Status
     data: bytes = b""
 
     def values(self) -> tuple[float, ...]:
-        """The numbers behind the status, in the wire's units. Raises PeerError when they are missing or not finite."""
+        """The values behind the status, in the wire's units. Raises PeerError when they are missing or not finite."""
         layout = _REPLY_LAYOUT.get(self.command, "<")
         if len(self.data) != struct.calcsize(layout):
             raise PeerError(
@@ -200,37 +201,37 @@ class Reply:
         return values
 
     def encode(self, *, crc: bool = True) -> bytes:
-        """The bytes on the wire (the device's side)."""
+        """The bytes on the wire (sent by the device)."""
         return Packet(self.command, struct.pack("<H", self.status) + self.data).encode(crc=crc)
 
 
 def reply(command: Command, status: Status, *values: float) -> Reply:
-    """A reply with values in the wire's units (the device's side)."""
+    """A reply with values in the wire's units (sent by the device)."""
     return Reply(command, status, struct.pack(_REPLY_LAYOUT.get(command, "<"), *values) if values else b"")
 
 
-def parse_reply(frame: Packet) -> Reply:
-    """A received frame as a reply. Raises PeerError when id or status is not in the tables."""
+def parse_reply(packet: Packet) -> Reply:
+    """A received packet as a reply. Raises PeerError when the id or the status is unknown."""
     try:
-        command = Command(frame.id)
+        command = Command(packet.id)
     except ValueError:
-        raise PeerError(f"the gripper sent id {frame.id:#04x}, which no command has: is it a WSG-50?") from None
-    if len(frame.payload) < 2:
+        raise PeerError(f"the gripper sent the unknown id {packet.id:#04x}: is it a WSG-50?") from None
+    if len(packet.payload) < 2:
         raise PeerError(f"the gripper answered {command.name} without a status: is it a WSG-50?")
-    (code,) = struct.unpack_from("<H", frame.payload)
+    (code,) = struct.unpack_from("<H", packet.payload)
     try:
-        return Reply(command, Status(code), frame.payload[2:])
+        return Reply(command, Status(code), packet.payload[2:])
     except ValueError:
         raise PeerError(f"the gripper answered {command.name} with status {code}, expected 0 to 30") from None
 
 
 def home(direction: int) -> Packet:
-    """Reference the fingers: 0 as the device is set up, 1 outwards, 2 inwards."""
+    """Reference the fingers: 0 in the direction set on the device, 1 outwards, 2 inwards."""
     return Packet(Command.HOME, struct.pack("<B", direction))
 
 
 def pre_position(width: float, speed: float) -> Packet:
-    """Move to `width` [m] at `speed` [m/s]. The flags are always 0: their bits are read in opposite ways."""
+    """Move to `width` [m] at `speed` [m/s]. The flags are 0, because sources disagree on the meaning of their bits."""
     return Packet(Command.PRE_POSITION, struct.pack("<Bff", 0, width * MM, speed * MM))
 
 
@@ -240,7 +241,7 @@ def grasp(width: float, speed: float) -> Packet:
 
 
 def release(width: float, speed: float) -> Packet:
-    """Let a part go: move to `width` [m] at `speed` [m/s]."""
+    """Release a part: move to `width` [m] at `speed` [m/s]."""
     return Packet(Command.RELEASE, struct.pack("<ff", width * MM, speed * MM))
 
 
@@ -255,7 +256,7 @@ def set_force_limit(force: float) -> Packet:
 
 
 def request_updates(command: Command, mode: UpdateMode, period: float) -> Packet:
-    """Ask for a state value; `period` [s] is the interval, or the shortest one for ON_CHANGE.
+    """Request a state value; `period` [s] is the interval, for ON_CHANGE the shortest interval.
 
     Raises UsageError outside 0.010 to 9.999 s.
     """

@@ -1,52 +1,66 @@
-"""What may be asked of a WSG-50, and how long to wait for it."""
+"""Limits and configuration of the WSG-50 driver."""
 
 import math
 from dataclasses import dataclass, replace
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.real.limits import LIMITS
 from gelflow.real.wsg.codec import MM
 
 
 @dataclass(frozen=True)
 class WsgLimits:
-    """What a motion may ask for; the device's own limits narrow it further."""
+    """Allowed motion commands; the limits that the device reports narrow them further."""
 
-    width: tuple[float, float] = (0.0, 0.110)  # [m]
-    speed: tuple[float, float] = (0.005, 0.420)  # [m/s]
-    force: tuple[float, float] = (5.0, 80.0)  # [N]
+    width: tuple[float, float] = LIMITS.gripper_width  # [m]
+    speed: tuple[float, float] = LIMITS.gripper_speed  # [m/s]
+    force: tuple[float, float] = LIMITS.gripper_force  # [N]
 
     def __post_init__(self) -> None:
-        outer = {"width": (0.0, 0.110), "speed": (0.005, 0.420), "force": (5.0, 80.0)}
-        for name, (lowest, highest) in outer.items():
+        hardware = {"width": LIMITS.gripper_width, "speed": LIMITS.gripper_speed, "force": LIMITS.gripper_force}
+        for name, (lowest, highest) in hardware.items():
             low, high = getattr(self, name)
             if not lowest <= low < high <= highest:
-                raise UsageError(f"{name} limits must rise within {lowest} to {highest} (SI), got {low} to {high}")
+                raise UsageError(
+                    f"{name} limits must be increasing and within {lowest} to {highest} (SI), got {low} to {high}"
+                )
 
 
 @dataclass(frozen=True)
 class WsgConfig:
-    """How to talk to the gripper. Times are robot time [s]."""
+    """Configuration of the driver. Times are in robot time [s]."""
 
     limits: WsgLimits = WsgLimits()
-    update_period: float = 0.05  # of each state value [s]
-    stale_after: float = 0.5  # a state older than this is refused [s]
-    reply_timeout: float = 1.0  # for the first answer to any command [s]
-    home_timeout: float = 4.0  # for the result of homing [s]
-    move_timeout: float = 6.0  # for the result of move, grasp and release [s]
-    command_interval: float = 0.05  # pause between commands: shorter ones can bring the device into error [s]
-    crc: bool = True  # False for a device whose checksum is off
+    update_period: float = 0.05  # period of the updates of each state value [s]
+    stale_after: float = LIMITS.gripper_age  # maximum age of a state [s]
+    reply_timeout: float = LIMITS.gripper_reply_time  # for the first reply to a command [s]
+    home_timeout: float = LIMITS.gripper_home_time  # for the result of homing [s]
+    move_timeout: float = LIMITS.gripper_motion_time  # for the result of move, grasp and release [s]
+    command_interval: float = 0.05  # pause between commands; shorter pauses can put the device into an error state [s]
+    crc: bool = True  # False for a device whose checksum is switched off
     dry_run: bool = False  # check, record and report commands, but send no motion
 
     def __post_init__(self) -> None:
         times = (self.update_period, self.stale_after, self.reply_timeout, self.home_timeout, self.move_timeout)
         if not all(math.isfinite(t) and t > 0 for t in times) or not 0 <= self.command_interval < 1:
-            raise UsageError(f"the gripper's times must be above 0 s, the pause between commands below 1 s, got {self}")
+            raise UsageError(
+                "the gripper's times must be above 0 s and the pause between commands 0 to 1 s, "
+                f"got {dict(zip(_TIMES, times, strict=True))} and command_interval {self.command_interval}"
+            )
         if self.update_period > self.stale_after / 2:
-            raise UsageError(f"update_period {self.update_period} s is over half of stale_after {self.stale_after} s")
+            raise UsageError(
+                f"update_period {self.update_period} s is more than half of stale_after {self.stale_after} s"
+            )
+
+
+_TIMES = ("update_period", "stale_after", "reply_timeout", "home_timeout", "move_timeout")
 
 
 def narrowed(limits: WsgLimits, device: tuple[float, ...]) -> WsgLimits:
-    """`limits` within what the device reports (mm, mm/s, N). Raises PeerError when nothing is left."""
+    """`limits` intersected with the limits that the device reports (mm, mm/s, N).
+
+    Raises PeerError when the intersection is empty.
+    """
     stroke, speed_min, speed_max, _, _, force_min, force_nominal, _ = device
     try:
         return replace(
@@ -56,4 +70,6 @@ def narrowed(limits: WsgLimits, device: tuple[float, ...]) -> WsgLimits:
             force=(max(limits.force[0], force_min), min(limits.force[1], force_nominal)),
         )
     except UsageError:
-        raise PeerError(f"the gripper's own limits {device} leave nothing of {limits}: is it a WSG-50?") from None
+        raise PeerError(
+            f"the limits that the gripper reports {device} do not overlap with {limits}: is it a WSG-50?"
+        ) from None

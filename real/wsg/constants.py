@@ -1,10 +1,10 @@
-"""The tables of the WSG-50's binary protocol: commands, statuses, states, flags."""
+"""Constants of the WSG-50's binary protocol: commands, statuses, states and flags."""
 
 from enum import IntEnum, IntFlag
 
 
 class Command(IntEnum):
-    """Every command of the table, by its id on the wire."""
+    """Commands by their id on the wire."""
 
     LOOP = 0x06
     DISCONNECT = 0x07
@@ -34,7 +34,7 @@ class Command(IntEnum):
 
 
 class Status(IntEnum):
-    """What a reply begins with."""
+    """Status code at the start of every reply."""
 
     SUCCESS = 0
     NOT_AVAILABLE = 1
@@ -70,7 +70,7 @@ class Status(IntEnum):
 
 
 class GraspState(IntEnum):
-    """What the grasping control is doing."""
+    """State of the grasping control."""
 
     IDLE = 0
     GRASPING = 1
@@ -83,7 +83,7 @@ class GraspState(IntEnum):
 
     @property
     def label(self) -> str:
-        """As in `gelflow.protocols.GripperState.grasp`."""
+        """The name in `gelflow.protocols.GripperState.grasp`."""
         return self.name.lower().replace("_", " ")
 
 
@@ -112,7 +112,7 @@ class SystemFlag(IntFlag):
 
 
 class UpdateMode(IntEnum):
-    """How a state command answers: now, every period, or when the value changes."""
+    """When a state command answers: now, every period, or when the value changes."""
 
     ONCE = 0
     PERIODIC = 1

@@ -1,8 +1,8 @@
 """Driver of the Weiss WSG-50 gripper over its binary protocol, on a serial line or TCP.
 
-Every motion is checked here before a byte of it is sent, waits for its result, and stops the fingers when
-something goes wrong. FAST STOP and other faults forbid motion until an operator calls `acknowledge_fault`.
-This is no safety-rated function.
+Every motion is checked before a byte of it is sent, waits for its result, and is followed by a stop of the fingers
+when it fails. FAST STOP and other faults forbid motion until an operator calls `acknowledge_fault`.
+This is not a safety-rated function.
 """
 
 import contextlib
@@ -17,27 +17,34 @@ from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout, Sa
 from gelflow.protocols import GripperState
 from gelflow.real.transport import SHORTEST_WALL_TIMEOUT, Transport
 from gelflow.real.wsg import codec
-from gelflow.real.wsg.codec import MM, Packet, Reply
+from gelflow.real.wsg.checks import (
+    check_closes,
+    check_duration,
+    check_limits,
+    check_opens,
+    check_ready,
+    holds_part,
+    may_hold_part,
+)
+from gelflow.real.wsg.codec import Packet, Reply
 from gelflow.real.wsg.config import WsgConfig, WsgLimits, narrowed
 from gelflow.real.wsg.constants import HOME_OUTWARDS, STATE_COMMANDS, Command, Status, UpdateMode
 from gelflow.real.wsg.link import WsgLink, WsgRefused
 from gelflow.real.wsg.state import StateAssembler
 
 _log = logging.getLogger(__name__)
-_log.addHandler(logging.NullHandler())  # a driver prints nothing unless its program asks for it
+_log.addHandler(logging.NullHandler())  # silent unless the program configures logging
 _WSG_50 = 1  # device type
-_SLACK = 0.5e-3  # the measured width may differ this much from where the fingers were sent [m]
-_CLAMPED = 2.5  # fingers that press harder than this may hold a part: half the smallest grasping force [N]
-_FORCE_MATCH = 0.5  # the force limit that the device confirms may differ this much [N]
+_FORCE_TOLERANCE = 0.5  # between the requested and the confirmed force limit [N]
 
 _MEANING = {
     Status.CMD_FAILED: "no part was between the fingers",
-    Status.AXIS_BLOCKED: "the fingers met something before their target",
-    Status.ACCESS_DENIED: "motion is locked, by FAST STOP or by another client",
+    Status.AXIS_BLOCKED: "the fingers were blocked before their target",
+    Status.ACCESS_DENIED: "motion is locked by FAST STOP or by another client",
     Status.NOT_INITIALIZED: "home it first",
-    Status.ALREADY_RUNNING: "it is moving, or holds a part",
+    Status.ALREADY_RUNNING: "it is moving or holds a part",
     Status.CMD_ABORTED: "it was stopped",
-    Status.RANGE_ERROR: "outside the device's or its soft limits",
+    Status.RANGE_ERROR: "outside the hardware limits or the soft limits",
 }
 
 
@@ -46,11 +53,11 @@ OnMeasurement = Callable[[GripperState], None]
 
 
 class WsgGripper:
-    """`gelflow.protocols.Gripper` over a WSG-50. No I/O before `connect` (or `with`).
+    """A WSG-50 as a `gelflow.protocols.Gripper`. No I/O before `connect` (or `with`).
 
-    `on_command(name, values)` is called before a command is sent, values in SI; an exception from it keeps the
-    command from being sent (stops are sent first). `on_measurement(state)` is called from the reading thread
-    whenever all five state values are new; a GelflowError from it ends the link.
+    `on_command(name, values)` is called with SI values before a command is sent; if it raises, the command is not
+    sent (a stop is sent first). `on_measurement(state)` is called from the reader thread whenever all five state
+    values are new; a GelflowError from it ends the link.
     """
 
     def __init__(
@@ -71,7 +78,7 @@ class WsgGripper:
         self._link: WsgLink | None = None
         self._changed = threading.Condition()
         self._values = StateAssembler()
-        self._acknowledged = 0  # frames with a wrong checksum that the operator knows of
+        self._acknowledged = 0  # packets with a wrong checksum that an operator has acknowledged
         self._moving = threading.Lock()
         self._grasped = False
 
@@ -84,10 +91,10 @@ class WsgGripper:
     ) -> None:
         self.close(reason="done" if kind is None else f"{kind.__name__}: {error}")
 
-    # ---------------------------------------------------------------- connection
+    # Connection
 
     def connect(self) -> None:
-        """Open the transport, check that a WSG-50 answers, start its updates. Nothing moves, nothing is acknowledged.
+        """Open the transport, check that a WSG-50 answers, start its updates. Nothing moves or is acknowledged.
 
         Raises PeerError (PeerTimeout, PeerRefused) when no WSG-50 answers, UsageError when already connected.
         """
@@ -117,17 +124,17 @@ class WsgGripper:
             self._await(lambda: self._values.complete, "send its state")
         except BaseException:
             with contextlib.suppress(GelflowError):
-                link.send(Packet(Command.DISCONNECT))  # closing unannounced would raise FAST STOP
+                link.send(Packet(Command.DISCONNECT))  # an unannounced close raises FAST STOP
             link.close()
             self._link = None
             raise
-        self._acknowledged = link.corrupt  # what the line held from before says nothing about this session
+        self._acknowledged = link.corrupt  # bytes left on the line from an earlier session are no fault of this one
         _log.info("gripper %s at %s, firmware %#06x", serial, link.address, int(firmware))
 
     def close(self, *, reason: str = "closed by the program") -> None:
-        """Stop the fingers, announce the disconnect, close. May be called twice; trouble is logged, not raised.
+        """Stop the fingers, announce the disconnect, close. May be called twice; errors are logged, not raised.
 
-        While a part is held no stop is sent: the fingers stand still, and a stop would end the device's grip.
+        While a part is held and nothing moves, no stop is sent, because a stop ends the device's grip.
         """
         link, self._link = self._link, None
         if link is None:
@@ -136,10 +143,10 @@ class WsgGripper:
         with self._changed:
             held = self._values.complete and self._holds(self._values.state(corrupt=False))
         try:
-            farewell = [("disconnect", Command.DISCONNECT)]
+            commands = [("disconnect", Command.DISCONNECT)]
             if (self._moving.locked() or not held) and not self._config.dry_run:
-                farewell.insert(0, ("stop", Command.STOP))
-            for name, command in farewell:
+                commands.insert(0, ("stop", Command.STOP))
+            for name, command in commands:
                 try:
                     link.request(Packet(command), urgent=True)
                     self._record(name, {})
@@ -148,11 +155,11 @@ class WsgGripper:
         finally:
             link.close()
 
-    # ---------------------------------------------------------------- state
+    # State
 
     @property
     def limits(self) -> WsgLimits:
-        """What may be asked for: the configured limits, narrowed by the device's own once connected."""
+        """The configured limits; after `connect` also narrowed by those of the device."""
         return self._limits
 
     def state(self) -> GripperState:
@@ -170,92 +177,84 @@ class WsgGripper:
             raise PeerTimeout(f"the gripper's state is {age:.2f} s old, expected at most {self._config.stale_after} s")
         return state
 
-    # ---------------------------------------------------------------- motion
+    # Motion
 
     def home(self, *, part_removed: bool = False) -> None:
-        """Reference the fingers outwards (inwards would press the gels together); never called by the driver itself.
+        """Reference the fingers outwards (inwards would press the gels together). The driver never homes by itself.
 
-        Raises SafetyError while a part may be held, unless an operator has looked: `part_removed=True`.
+        Raises SafetyError while a part may be held, unless an operator has checked it: `part_removed=True`.
         """
         state = self._ready("home", referenced=False)
-        if not part_removed and self._may_hold(state):
+        if not part_removed and may_hold_part(state, grasped=self._grasped):
             raise SafetyError(
                 f"home refused: a part may be held ({state.grasp}, {state.force:.1f} N); release it, "
-                f"or have an operator look and say part_removed"
+                f"or let an operator check the fingers and pass part_removed=True"
             )
         self._move("home", {"direction": HOME_OUTWARDS}, codec.home(HOME_OUTWARDS), self._config.home_timeout)
         self._settle(lambda s: s.referenced, "referenced")
         self._grasped = False
 
     def move(self, *, width: float, speed: float) -> None:
-        """Move the empty fingers to `width` [m] at `speed` [m/s]; returns when they are there.
+        """Move the empty fingers to `width` [m] at `speed` [m/s]; returns when they have arrived.
 
-        Raises SafetyError outside the limits or while a part is held, PeerRefused when they are blocked.
+        Raises SafetyError outside the limits or while a part is held, PeerRefused when the fingers are blocked.
         """
         state = self._ready("move")
-        self._check(width=width, speed=speed)
+        check_limits(self._limits, width=width, speed=speed)
         if self._holds(state):
             raise SafetyError("move refused: a part is held; release it instead")
-        self._check_duration(state, width, speed)
-        frame = codec.pre_position(width, speed)
-        self._move("move", {"width": width, "speed": speed}, frame, self._config.move_timeout)
+        check_duration(state, width, speed, self._config.move_timeout)
+        packet = codec.pre_position(width, speed)
+        self._move("move", {"width": width, "speed": speed}, packet, self._config.move_timeout)
         self._settle(lambda s: s.grasp != "positioning", "done positioning")
         self._grasped = False
 
     def grasp(self, *, width: float, speed: float, force: float) -> None:
         """Close on a part; returns when the device holds it.
 
-        `width` [m] is where contact is expected: the device moves there and then on, through its clamping travel
-        (set on the device), until `force` [N] is reached. Contact before that band is AXIS_BLOCKED, none in it is
-        CMD_FAILED; both raise PeerRefused. Raises SafetyError outside the limits, when a part is already held, or
-        when `width` is above the present opening (the device would open).
+        `width` [m] is the expected width of the part: the device moves there and continues through its clamping
+        travel (set on the device) until `force` [N] is reached. Contact before that band is AXIS_BLOCKED, no contact
+        within it is CMD_FAILED; both raise PeerRefused. Raises SafetyError outside the limits, when a part is already
+        held, or when `width` is above the present opening (the device would open).
         """
         state = self._ready("grasp")
-        self._check(width=width, speed=speed, force=force)
+        check_limits(self._limits, width=width, speed=speed, force=force)
         if self._holds(state):
             raise SafetyError("grasp refused: a part is already held; release it first")
-        if width > state.width + _SLACK:
-            raise SafetyError(
-                f"grasp refused: width {width * MM:.1f} mm is above the opening of {state.width * MM:.1f} mm, "
-                f"and the fingers would open; move them apart first"
-            )
-        self._check_duration(state, width, speed)
+        check_closes(state, width)
+        check_duration(state, width, speed, self._config.move_timeout)
         before = self._grasped
         try:
             values = {"width": width, "speed": speed, "force": force}
             self._move("grasp", values, codec.grasp(width, speed), self._config.move_timeout, force=force)
         except WsgRefused as error:
-            # Anything but a clear "no part" leaves open what is between the fingers.
+            # Only a definite "no part" rules out a part between the fingers.
             if error.status == Status.CMD_FAILED or not error.pending:
                 self._grasped = before and error.status != Status.CMD_FAILED
             raise
         self._settle(lambda s: s.grasp == "holding", "holding")
 
     def release(self, *, width: float, speed: float) -> None:
-        """Open to `width` [m] at `speed` [m/s] and let the part go. Raises SafetyError when that would close."""
+        """Open to `width` [m] at `speed` [m/s] and release the part. Raises SafetyError when that would close."""
         state = self._ready("release")
-        self._check(width=width, speed=speed)
-        if width < state.width - _SLACK:
-            raise SafetyError(
-                f"release refused: width {width * MM:.1f} mm is below the opening of {state.width * MM:.1f} mm, "
-                f"and the fingers would close"
-            )
-        self._check_duration(state, width, speed)
-        frame = codec.release(width, speed)
-        self._move("release", {"width": width, "speed": speed}, frame, self._config.move_timeout)
+        check_limits(self._limits, width=width, speed=speed)
+        check_opens(state, width)
+        check_duration(state, width, speed, self._config.move_timeout)
+        packet = codec.release(width, speed)
+        self._move("release", {"width": width, "speed": speed}, packet, self._config.move_timeout)
         self._settle(lambda s: s.grasp not in ("releasing", "holding"), "done releasing")
         self._grasped = False
 
     def stop(self) -> None:
-        """Stop the fingers where they are. On the device this also ends a grip's monitoring. Nothing in a dry run."""
+        """Stop the fingers. The device also ceases to monitor a held part. No effect in a dry run."""
         self._stop("stop", Command.STOP)
 
     def fast_stop(self) -> None:
-        """Stop at once and lock every motion until `acknowledge_fault`. Nothing in a dry run."""
+        """Stop at once and lock every motion until `acknowledge_fault`. No effect in a dry run."""
         self._stop("fast stop", Command.FAST_STOP)
 
     def acknowledge_fault(self) -> None:
-        """An operator's word that the fault was looked at: unlocks motion. Nothing in gelflow calls it by itself.
+        """Unlock motion after an operator has inspected the fault. Nothing in gelflow calls this by itself.
 
         Raises PeerRefused when the fault remains.
         """
@@ -268,7 +267,7 @@ class WsgGripper:
         except PeerTimeout:
             raise PeerRefused(f"the gripper still reports {self.state().fault} after the acknowledgement") from None
 
-    # ---------------------------------------------------------------- inside
+    # Internal
 
     def _connected(self) -> WsgLink:
         if self._link is None:
@@ -290,7 +289,7 @@ class WsgGripper:
             self._on_measurement(state)
 
     def _await(self, reached: Callable[[], bool], what: str) -> None:
-        """Wait for an update after which `reached` holds; PeerTimeout says that the gripper did not do `what`."""
+        """Wait for an update after which `reached` holds. Raises PeerTimeout, which names `what` did not happen."""
         end = time.monotonic() + max(self._clock.wall(self._config.reply_timeout), SHORTEST_WALL_TIMEOUT)
         link = self._connected()
         with self._changed:
@@ -303,7 +302,7 @@ class WsgGripper:
                 self._changed.wait(min(left, 0.1))
 
     def _settle(self, reached: Callable[[GripperState], bool], what: str, *, sent: bool = False) -> None:
-        """After a result: wait for a state that was measured later and agrees with it."""
+        """After a result: wait for a state that was measured later and is consistent with it."""
         if self._config.dry_run and not sent:
             return
         link, since = self._connected(), self._clock.now()
@@ -317,61 +316,38 @@ class WsgGripper:
     def _ready(self, name: str, *, referenced: bool = True) -> GripperState:
         self._connected()
         state = self.state()
-        if state.fault:
-            raise SafetyError(
-                f"{name} refused: the gripper reports {state.fault}; look at it, then acknowledge the fault"
-            )
-        if referenced and not state.referenced:
-            raise SafetyError(f"{name} refused: the gripper is not referenced; home it first")
+        check_ready(name, state, referenced=referenced)
         return state
 
     def _holds(self, state: GripperState) -> bool:
-        return state.grasp == "holding" or (self._grasped and state.grasp not in ("part lost", "no part"))
-
-    def _may_hold(self, state: GripperState) -> bool:
-        return self._holds(state) or state.grasp == "grasping" or state.force > _CLAMPED
-
-    def _check(self, **values: float) -> None:
-        for name, value in values.items():
-            low, high = getattr(self._limits, name)
-            # Written so that NaN fails; float32 on the wire may round a bound by parts in ten million.
-            if not low - 1e-9 <= value <= high + 1e-9:
-                raise SafetyError(f"{name} {value} is outside {low} to {high} (m, m/s, N): nothing was sent")
-
-    def _check_duration(self, state: GripperState, width: float, speed: float) -> None:
-        needed = abs(width - state.width) / speed + 0.5
-        if needed > self._config.move_timeout:
-            raise UsageError(
-                f"{abs(width - state.width) * MM:.0f} mm at {speed * MM:.0f} mm/s take {needed:.1f} s, more than the "
-                f"time-out of {self._config.move_timeout} s: choose a higher speed"
-            )
+        return holds_part(state, grasped=self._grasped)
 
     def _move(
-        self, name: str, values: Mapping[str, float], frame: Packet, timeout: float, *, force: float | None = None
+        self, name: str, values: Mapping[str, float], packet: Packet, timeout: float, *, force: float | None = None
     ) -> None:
-        """Send a motion and wait for its result. Raises PeerRefused naming the status; stops the fingers on trouble."""
+        """Send a motion and wait for its result. On a failure, stops the fingers and raises PeerRefused."""
         link = self._connected()
         if not self._moving.acquire(blocking=False):
-            raise SafetyError(f"{name} refused: another motion is under way; stop it or wait")
+            raise SafetyError(f"{name} refused: another motion is in progress; stop it or wait")
         try:
             self._record(name, values)
             if self._config.dry_run:
                 return
             if force is not None:
                 self._limit_force(link, force)
-            self._grasped = self._grasped or frame.id == Command.GRASP
+            self._grasped = self._grasped or packet.id == Command.GRASP
             try:
-                reply, pending = link.run(frame, timeout=timeout)
+                reply, pending = link.run(packet, timeout=timeout)
             except BaseException as error:
                 self._stop_after(name, f"{type(error).__name__}: {error}")
                 raise
             if reply.status == Status.SUCCESS:
                 return
             if pending and reply.status not in (Status.CMD_FAILED, Status.CMD_ABORTED):
-                self._stop_after(name, reply.status.name)  # blocked fingers would go on pushing
+                self._stop_after(name, reply.status.name)  # blocked fingers would continue to push
             if pending:
                 with contextlib.suppress(PeerError):
-                    self._settle(lambda _: True, "still there")  # so that `state` shows what came of it
+                    self._settle(lambda _: True, "alive")  # so that `state` shows the result
             meaning = _MEANING.get(reply.status, "see the device's manual")
             text = f"the gripper ended {name} with {reply.status.name}: {meaning}"
             raise WsgRefused(text, status=reply.status, pending=pending)
@@ -381,7 +357,7 @@ class WsgGripper:
     def _limit_force(self, link: WsgLink, force: float) -> None:
         link.request(codec.set_force_limit(force))
         (confirmed,) = link.request(Packet(Command.GET_FORCE_LIMIT)).values()
-        if abs(confirmed - force) > _FORCE_MATCH:
+        if abs(confirmed - force) > _FORCE_TOLERANCE:
             raise PeerRefused(
                 f"the gripper limits its force to {confirmed:.1f} N, expected {force:.1f} N: not grasping"
             )
@@ -392,11 +368,11 @@ class WsgGripper:
             if not self._config.dry_run:
                 link.request(Packet(command), urgent=True)
         finally:
-            self._record(name, {})  # after the command: a stop does not wait for the record
+            self._record(name, {})  # after the command, because a stop must not wait for the recorder
 
     def _stop_after(self, name: str, reason: str) -> None:
-        """Stop because `name` went wrong; the first trouble is the one that is raised."""
-        _log.error("stopping the gripper: %s went wrong (%s)", name, reason)
+        """Stop because `name` failed. Errors of the stop are logged, so that the first error is the one raised."""
+        _log.error("stopping the gripper: %s failed (%s)", name, reason)
         try:
             self._stop("stop", Command.STOP)
         except GelflowError as error:

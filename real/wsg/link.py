@@ -1,7 +1,7 @@
-"""The conversation with a WSG-50: one thread reads, sorts replies from updates, and callers wait for theirs.
+"""Requests and replies of a WSG-50: a reader thread separates replies from updates, callers wait for their reply.
 
-A motion is answered twice, PENDING and then with its result, and periodic updates come in between. Replies go to
-whoever waits for that command; updates go to a callback; what nobody waits for (a duplicate) is counted.
+A motion is answered twice, first PENDING and then with its result, and periodic updates arrive in between. A reply
+goes to the caller that waits for its command, an update to a callback; an unexpected reply (a duplicate) is counted.
 """
 
 import contextlib
@@ -18,13 +18,13 @@ from gelflow.real.wsg.codec import Corrupt, Decoder, Packet, Reply, parse_reply,
 from gelflow.real.wsg.constants import STATE_COMMANDS, Command, Status
 
 _log = logging.getLogger(__name__)
-_log.addHandler(logging.NullHandler())  # a driver prints nothing unless its program asks for it
-_POLL = 0.05  # how long the reader waits for bytes before it looks around [s]
-_HALF_FRAME = 0.5  # a frame whose rest does not come in this time is given up [s]; TCP may resend for 0.2 s
+_log.addHandler(logging.NullHandler())  # silent unless the program configures logging
+_POLL = 0.05  # time-out of one read, after which the reader thread checks whether it should end [s]
+_PACKET_TIMEOUT = 0.5  # an incomplete packet is abandoned after this time [s]; TCP may resend for 0.2 s
 
 
 class WsgRefused(PeerRefused):
-    """The gripper answered with a status other than success; `pending` when it had begun the motion."""
+    """The gripper answered with a status other than success; `pending` when it had started the motion."""
 
     def __init__(self, text: str, *, status: Status, pending: bool = False) -> None:
         super().__init__(text)
@@ -35,8 +35,8 @@ class WsgRefused(PeerRefused):
 class WsgLink:
     """Requests and replies over a transport.
 
-    `on_update(reply, stamp)` is called from the reading thread for every update; a GelflowError from it ends the
-    link. `corrupt` counts frames with a wrong checksum, `unexpected` replies that nobody waited for.
+    `on_update(reply, stamp)` is called from the reader thread for every update; a GelflowError from it ends the
+    link. `corrupt` counts packets with a wrong checksum, `unexpected` replies without a waiting caller.
     """
 
     def __init__(
@@ -57,9 +57,9 @@ class WsgLink:
         self._crc = crc
         self._decoder = Decoder(plausible=plausible_reply, check_crc=crc)
         self._condition = threading.Condition()
-        self._boxes: list[tuple[Command, deque[Reply]]] = []
+        self._inboxes: list[tuple[Command, deque[Reply]]] = []
         self._failure: GelflowError | None = None
-        self._dead = False  # the transport is broken; after any other failure a stop can still be sent
+        self._broken = False  # the transport failed; after any other failure a stop can still be sent
         self._pacing = threading.Lock()
         self._writing = threading.Lock()
         self._last_write = -float("inf")
@@ -74,11 +74,11 @@ class WsgLink:
 
     @property
     def failure(self) -> GelflowError | None:
-        """Why the link ended, None while it lives."""
+        """The reason why the link ended; None while it is open."""
         return self._failure
 
     def open(self) -> None:
-        """Connect and start to read. Raises PeerError when nobody is there."""
+        """Connect and start the reader thread. Raises PeerError when the connection fails."""
         self._transport.open()
         self._thread = threading.Thread(target=self._read_until_closed, name=f"wsg {self.address}", daemon=True)
         self._thread.start()
@@ -86,95 +86,95 @@ class WsgLink:
     def close(self) -> None:
         """Stop reading and close the transport; may be called twice."""
         self._ending.set()
-        self._dead = True
+        self._broken = True
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._transport.close()
         self._fail(PeerError(f"the link to the gripper at {self.address} is closed"))
 
-    def request(self, frame: Packet, *, urgent: bool = False) -> Reply:
+    def request(self, packet: Packet, *, urgent: bool = False) -> Reply:
         """Send a command that is answered once; returns its successful reply.
 
-        `urgent` does not keep the pause between commands. Raises PeerTimeout, PeerRefused or PeerError.
+        `urgent` skips the pause between commands. Raises PeerTimeout, PeerRefused or PeerError.
         """
-        with self._box(Command(frame.id)) as box:
-            self._send(frame, urgent=urgent)
-            reply = self._take(box, frame, self._reply_timeout)
+        with self._inbox(Command(packet.id)) as inbox:
+            self._send(packet, urgent=urgent)
+            reply = self._take(inbox, packet, self._reply_timeout)
         if reply.status != Status.SUCCESS:
             text = f"the gripper answered {reply.command.name} with {reply.status.name}"
             raise WsgRefused(text, status=reply.status)
         return reply
 
-    def send(self, frame: Packet) -> None:
-        """Send a command at once and wait for no answer. Raises PeerError when the transport is broken."""
-        self._write(frame)
+    def send(self, packet: Packet) -> None:
+        """Send a command at once, without waiting for a reply. Raises PeerError when the transport is broken."""
+        self._write(packet)
 
-    def run(self, frame: Packet, *, timeout: float) -> tuple[Reply, bool]:
-        """Send a motion and wait for its result: the final reply, and whether it was pending before.
+    def run(self, packet: Packet, *, timeout: float) -> tuple[Reply, bool]:
+        """Send a motion and wait for its result; returns the final reply and whether the motion had started.
 
-        Raises PeerTimeout when no first answer comes in the reply time-out or no result in `timeout` [s].
+        Raises PeerTimeout without a first reply within the reply time-out or a result within `timeout` [s].
         """
         pending = False
-        with self._box(Command(frame.id)) as box:
-            self._send(frame, urgent=False)
+        with self._inbox(Command(packet.id)) as inbox:
+            self._send(packet, urgent=False)
             deadline = self._clock.now() + timeout
             while True:
-                reply = self._take(box, frame, deadline - self._clock.now() if pending else self._reply_timeout)
+                reply = self._take(inbox, packet, deadline - self._clock.now() if pending else self._reply_timeout)
                 if reply.status == Status.CMD_PENDING:
                     pending = True
                 elif pending or reply.status != Status.SUCCESS:
                     return reply, pending
-                # A success before the motion was pending repeats an earlier command's result.
+                # A success before the motion is pending repeats the result of an earlier command.
 
-    def _send(self, frame: Packet, *, urgent: bool) -> None:
+    def _send(self, packet: Packet, *, urgent: bool) -> None:
         if urgent:
-            self.send(frame)
+            self.send(packet)
             return
         with self._pacing:
             self._clock.sleep(self._last_write + self._interval - self._clock.now())
-            self._write(frame)
+            self._write(packet)
 
-    def _write(self, frame: Packet) -> None:
+    def _write(self, packet: Packet) -> None:
         with self._writing:
-            if self._dead:
-                raise self._broken()
+            if self._broken:
+                raise self._failure_copy()
             try:
-                self._transport.write(frame.encode(crc=self._crc))
+                self._transport.write(packet.encode(crc=self._crc))
             except PeerError as error:
-                self._dead = True
-                self._fail(error)  # a part of the frame may be out: nothing sensible can follow it
+                self._broken = True
+                self._fail(error)  # a part of the packet may be out, and nothing can follow it
                 raise
             self._last_write = self._clock.now()
 
     @contextlib.contextmanager
-    def _box(self, command: Command) -> Iterator[deque[Reply]]:
+    def _inbox(self, command: Command) -> Iterator[deque[Reply]]:
         entry: tuple[Command, deque[Reply]] = (command, deque())
         with self._condition:
-            self._boxes.append(entry)
+            self._inboxes.append(entry)
         try:
             yield entry[1]
         finally:
             with self._condition:
-                self._boxes = [other for other in self._boxes if other is not entry]
+                self._inboxes = [other for other in self._inboxes if other is not entry]
 
-    def _take(self, box: deque[Reply], frame: Packet, timeout: float) -> Reply:
+    def _take(self, inbox: deque[Reply], packet: Packet, timeout: float) -> Reply:
         end = time.monotonic() + max(self._clock.wall(timeout), SHORTEST_WALL_TIMEOUT)
         with self._condition:
-            while not box:
+            while not inbox:
                 if self._failure is not None:
-                    raise self._broken()
+                    raise self._failure_copy()
                 left = end - time.monotonic()
                 if left <= 0:
                     raise PeerTimeout(
-                        f"the gripper at {self.address} did not answer {Command(frame.id).name} in time: "
+                        f"the gripper at {self.address} did not answer {Command(packet.id).name} in time: "
                         f"is it on, and not used by another program?"
                     )
                 self._condition.wait(left)
-            return box.popleft()
+            return inbox.popleft()
 
-    def _broken(self) -> GelflowError:
+    def _failure_copy(self) -> GelflowError:
         assert self._failure is not None
-        return type(self._failure)(str(self._failure))  # an exception of its own for every thread that raises it
+        return type(self._failure)(str(self._failure))  # a separate exception for each thread that raises it
 
     def _fail(self, error: GelflowError) -> None:
         with self._condition:
@@ -186,7 +186,7 @@ class WsgLink:
 
     def _read_until_closed(self) -> None:
         try:
-            patience = max(self._clock.wall(_HALF_FRAME), SHORTEST_WALL_TIMEOUT)
+            patience = max(self._clock.wall(_PACKET_TIMEOUT), SHORTEST_WALL_TIMEOUT)
             progress = time.monotonic()
             while not self._ending.is_set() and self._failure is None:
                 data = self._read()
@@ -198,7 +198,7 @@ class WsgLink:
                 if events or not self._decoder.waiting:
                     progress = time.monotonic()
                 for event in events:
-                    self._sort(event, stamp)
+                    self._dispatch(event, stamp)
         except GelflowError as error:
             self._fail(error)
         finally:
@@ -208,22 +208,22 @@ class WsgLink:
         try:
             return self._transport.read(_POLL)
         except GelflowError:
-            self._dead = True
+            self._broken = True
             raise
 
-    def _sort(self, event: Packet | Corrupt, stamp: float) -> None:
+    def _dispatch(self, event: Packet | Corrupt, stamp: float) -> None:
         if isinstance(event, Corrupt):
             self.corrupt += 1
-            _log.error("a frame with id %#04x came with a wrong checksum", event.id)
+            _log.error("received a packet with id %#04x and a wrong checksum", event.id)
             return
         reply = parse_reply(event)
         with self._condition:
-            boxes = [box for command, box in self._boxes if command == reply.command]
-            for box in boxes:
-                box.append(reply)
+            inboxes = [inbox for command, inbox in self._inboxes if command == reply.command]
+            for inbox in inboxes:
+                inbox.append(reply)
             self._condition.notify_all()
         if reply.command in STATE_COMMANDS and reply.status == Status.SUCCESS:
             self._on_update(reply, stamp)
-        elif not boxes:
+        elif not inboxes:
             self.unexpected += 1
-            _log.warning("nobody waited for %s %s", reply.command.name, reply.status.name)
+            _log.warning("unexpected reply %s %s", reply.command.name, reply.status.name)

@@ -1,11 +1,11 @@
-"""The gripper's five state values, as they come one by one, made into one measured state."""
+"""Assembles the five state values of a WSG-50, which arrive separately, into one measured state."""
 
 from gelflow.errors import PeerError
 from gelflow.protocols import GripperState
 from gelflow.real.wsg.codec import MM, Reply
 from gelflow.real.wsg.constants import STATE_COMMANDS, Command, GraspState, SystemFlag
 
-# Flags that forbid motion until an operator has looked.
+# Flags that forbid motion until an operator acknowledges them.
 FAULTS = (
     SystemFlag.FAST_STOP,
     SystemFlag.TEMP_FAULT,
@@ -17,16 +17,16 @@ BAD_CHECKSUM = "BAD_CHECKSUM"
 
 
 class StateAssembler:
-    """Collects updates. Not thread-safe: its owner holds a lock."""
+    """Collects updates. Not thread-safe: the owner holds a lock."""
 
     def __init__(self) -> None:
         self._values: dict[Command, tuple[float, float]] = {}
         self._fresh: set[Command] = set()
 
     def update(self, reply: Reply, stamp: float) -> bool:
-        """Take an update that was received at `stamp`; True when every value is new since the last True.
+        """Store an update received at `stamp` [s]; True when every value is new since the last True.
 
-        Raises PeerError when the value is not one the tables know.
+        Raises PeerError when the grasp state is unknown.
         """
         (value,) = reply.values()
         if reply.command == Command.GRASP_STATE and value not in list(GraspState):
@@ -40,20 +40,21 @@ class StateAssembler:
 
     @property
     def complete(self) -> bool:
-        """Whether every value has come at least once."""
+        """Whether every value has arrived at least once."""
         return len(self._values) == len(STATE_COMMANDS)
 
     @property
     def oldest(self) -> float:
-        """When the oldest of the values came [s]; needs `complete`."""
+        """Stamp of the oldest value [s]; requires `complete`."""
         return min(stamp for _, stamp in self._values.values())
 
     @property
     def flags(self) -> SystemFlag:
+        """The flags of the system state; requires `complete`."""
         return SystemFlag(int(self._values[Command.SYSTEM_STATE][0]))
 
     def state(self, *, corrupt: bool) -> GripperState:
-        """The measured state, as old as its oldest value; needs `complete`. `corrupt` adds the fault BAD_CHECKSUM."""
+        """The measured state, stamped with its oldest value; requires `complete`. `corrupt` adds BAD_CHECKSUM."""
         value = {command: entry[0] for command, entry in self._values.items()}
         flags = self.flags
         faults = [str(flag.name) for flag in FAULTS if flag in flags] + [BAD_CHECKSUM] * corrupt

@@ -31,7 +31,7 @@ def matrix(joints: k.Joints) -> np.ndarray:
 
 
 def random_joints(rng: np.random.Generator, share: float = 0.98) -> k.Joints:
-    low, high = np.array(k.LIMITS).T
+    low, high = np.array(k.JOINT_RANGES).T
     return tuple(float(v) for v in rng.uniform(low * share, high * share))  # type: ignore[return-value]
 
 
@@ -63,7 +63,7 @@ def test_inverse_finds_the_pose_and_the_joints_it_came_from() -> None:
         reached, turned = k.forward(elsewhere)
         assert np.allclose(reached, position, atol=1e-9)
         assert geometry.angle_between(turned, quaternion) < 1e-8
-        assert not k.outside(elsewhere)
+        assert not k.range_violation(elsewhere)
 
 
 def test_inverse_follows_a_path_without_a_jump() -> None:
@@ -114,5 +114,5 @@ def test_a_pose_out_of_range_names_the_joint() -> None:
 
 
 def test_ranges_are_those_of_the_robot() -> None:
-    assert k.outside((0.0, 0.0, math.radians(69.9), 0.0, 0.0, math.radians(-399))) == ""
-    assert k.outside((0.0, 0.0, math.radians(70.5), 0.0, 0.0, 0.0)).startswith("joint 3 would be at 70.5°")
+    assert k.range_violation((0.0, 0.0, math.radians(69.9), 0.0, 0.0, math.radians(-399))) == ""
+    assert k.range_violation((0.0, 0.0, math.radians(70.5), 0.0, 0.0, 0.0)).startswith("joint 3 would be at 70.5°")

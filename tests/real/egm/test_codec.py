@@ -68,12 +68,12 @@ def test_counters_wrap_at_32_bits() -> None:
 
 
 def test_trouble_names_what_stands_in_the_way() -> None:
-    assert FEEDBACK.trouble == ""
+    assert FEEDBACK.stop_reason == ""
     # Undefined is what a controller says of a running RAPID after its restart.
-    assert dataclasses.replace(FEEDBACK, rapid="undefined").trouble == ""
-    assert dataclasses.replace(FEEDBACK, motors="off").trouble == "motors off"
-    assert dataclasses.replace(FEEDBACK, rapid="stopped").trouble == "RAPID stopped"
-    assert dataclasses.replace(FEEDBACK, mci="stopped").trouble == "EGM motion stopped"
+    assert dataclasses.replace(FEEDBACK, rapid="undefined").stop_reason == ""
+    assert dataclasses.replace(FEEDBACK, motors="off").stop_reason == "motors off"
+    assert dataclasses.replace(FEEDBACK, rapid="stopped").stop_reason == "RAPID stopped"
+    assert dataclasses.replace(FEEDBACK, mci="stopped").stop_reason == "EGM motion stopped"
 
 
 def test_euler_angles_override_the_quaternion_of_a_reference() -> None:
@@ -126,7 +126,7 @@ def _message(change: str) -> bytes:
         ("quaternion", "unit quaternion"),
         ("no pose", "no pose; set EGM up with"),
         ("five joints", "got 5 joints"),
-        ("no position", "got a part of it"),
+        ("no position", "got an incomplete pose"),
     ],
 )
 def test_unusable_feedback_is_refused(change: str, text: str) -> None:

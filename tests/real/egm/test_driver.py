@@ -245,7 +245,7 @@ def test_stop_ceases_sending_and_latches_until_reset(cell: Cell) -> None:
     assert cell.mock.report.answers - answers <= 1, "an answer on its way may still come"
     assert cell.arm.state().fault == "contact was too hard"
     assert not cell.arm.state().running
-    with pytest.raises(SafetyError, match="stopped: contact was too hard; when the cause is gone, the operator"):
+    with pytest.raises(SafetyError, match="stopped: contact was too hard; after the cause is removed, an operator"):
         cell.arm.target(START, DOWN, lifetime=0.5)
     # The robot's own time-out ends EGM where the arm is; its program starts EGM again, and still nothing is sent.
     cell.until(lambda: cell.mock.report.sessions == 2, "EGM was started again")
@@ -413,7 +413,7 @@ def test_an_egm_process_that_died_is_noticed(cell: Cell) -> None:
         return bool(said)
 
     cell.until(refused, "a target is refused")
-    assert "the EGM process is gone (exit status -9)" in said
+    assert "the EGM process has ended (exit status -9)" in said
     cell.arm.stop("the end")
 
 

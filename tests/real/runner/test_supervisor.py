@@ -12,7 +12,7 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
-from gelflow.real.runner.supervisor import Supervisor, unfit
+from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 
 LAB: Lab = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
 
@@ -88,7 +88,7 @@ def test_a_latch_holds_and_keeps_its_first_reason() -> None:
 def test_what_makes_an_arm_unfit(values: dict[str, object], reason: str) -> None:
     good = {"motors_on": True, "running": True, "operating_mode": "auto", "fault": ""}
     state = ArmState(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(6), 0.0, **{**good, **values})  # type: ignore[arg-type]
-    assert reason in unfit(state) and bool(unfit(state)) == bool(reason)
+    assert reason in not_ready_reason(state) and bool(not_ready_reason(state)) == bool(reason)
     supervisor = Supervisor(LAB)
     if reason:
         with pytest.raises(SafetyError):

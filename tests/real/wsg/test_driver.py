@@ -379,7 +379,7 @@ def test_a_stop_from_another_thread_ends_a_motion_and_two_motions_do_not_mix() -
         gripper.home()
         thread, errors = in_thread(lambda: gripper.move(width=0.010, speed=0.005))
         eventually(lambda: gripper.state().grasp == "positioning", "the move did not begin")
-        with pytest.raises(SafetyError, match="under way"):
+        with pytest.raises(SafetyError, match="in progress"):
             gripper.release(width=0.110, speed=0.1)
         gripper.stop()
         thread.join(PATIENT)

@@ -79,8 +79,8 @@ def lab_for(robot: "MockRobot") -> "Lab":
     # the limits are twelve times those for a robot.
     scale = 12 * max(1.0, factor)
 
-    def camera(finger: int) -> lab.CameraLab:
-        return lab.CameraLab(
+    def camera(finger: int) -> lab.CameraSettings:
+        return lab.CameraSettings(
             source=robot.cameras[finger].url,
             rows=cell.grid.rows,
             cols=cell.grid.cols,
@@ -95,22 +95,24 @@ def lab_for(robot: "MockRobot") -> "Lab":
         return tuple(float(v) for v in cast("list[float]", values))
 
     return lab.Lab(
-        gripper=lab.GripperLab(
+        gripper=lab.GripperSettings(
             address=robot.gripper.addresses[0], grasp_force=12.0, part_width=0.035, open_width=0.06, speed=0.05,
             home_at_start=True,
         ),
         # EGM's own speed limit is 1°/s a joint: faster references would only run ahead of the arm.
-        arm=lab.ArmLab(egm_port=robot.config.egm_port, host=robot.config.host, max_speed=5e-3, max_turn_speed_deg=0.9),
-        cameras=lab.CamerasLab(camera(0), camera(1)),
-        tool=lab.ToolLab(
+        arm=lab.ArmSettings(
+            egm_port=robot.config.egm_port, host=robot.config.host, max_speed=5e-3, max_turn_speed_deg=0.9
+        ),
+        cameras=lab.CamerasSettings(camera(0), camera(1)),
+        tool=lab.ToolSettings(
             cast("lab.Vector", numbers(cell.tool.position)),
             cast("tuple[float, float, float, float]", numbers(cell.tool.quaternion)),
         ),
-        hole=lab.HoleLab(cast("lab.Vector", numbers(cell.hole.position)), math.degrees(cell.hole.yaw)),
-        part=lab.PartLab(
+        hole=lab.HoleSettings(cast("lab.Vector", numbers(cell.hole.position)), math.degrees(cell.hole.yaw)),
+        part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
-        limits=lab.LimitsLab(
+        limits=lab.LimitsSettings(
             stale_pose=0.020 * scale,
             stale_frame=0.250 * scale,
             stale_gripper=0.500 * scale,
