@@ -1,12 +1,13 @@
-"""Points sampled on surfaces, with the area that each stands for.
+"""Points sampled on surfaces, with the area that each point represents.
 
-A contact is felt at points. Where stiffness is given per area, a point's weight is the part of the surface nearest to
-it, clipped to the face, so that the weights add up to the area exactly and results converge as points get denser.
-A point's area comes in three parts, whose sum it is: those across x, y and z. An area with normal n has the shares n²;
-where faces meet, each gives its own. When points are scaled the parts grow with it (docs/reference/physics.md).
+With stiffness per area, the weight of a point is the area of its cell: the part of the surface that is nearest to it,
+clipped to the face. The weights sum to the area exactly, so forces converge as the sampling is refined. The area of a
+point has three components, one for each axis, which sum to the area: an area with normal n has the fractions n². A
+point on an edge has a contribution from each of its faces. The components give the area after scaling along the axes
+(docs/reference/physics.md).
 
-Round surfaces carry a Fibonacci lattice: points at equal steps of height, each turned by the golden angle from the one
-below. On spheres and cylinders alike equal steps of height are equal areas (Archimedes).
+Round surfaces have a Fibonacci lattice: points at equal steps of height, each rotated by the golden angle from the one
+below. Equal steps of height are equal areas on spheres and on cylinders (Archimedes).
 """
 
 from collections.abc import Sequence
@@ -22,10 +23,12 @@ from gelflow.sim.scene.geometry.mesh import TriangleMesh
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 ENDS = ("-z", "+z")
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-_PLASTIC = np.array([0.7548776662466927, 0.5698402909980532])  # powers of 1/1.3247…: they fill a square evenly
-_PIECES = 24  # per point of a mesh, at least
-_LEAST_PIECES = 20_000
-_MOVES = 8
+_PLASTIC = np.array(
+    [0.7548776662466927, 0.5698402909980532]
+)  # powers of 1/1.3247…: low-discrepancy sequence in a square
+_SAMPLES_PER_POINT = 24  # of a mesh, at least
+_MIN_SAMPLES = 20_000
+_LLOYD_ITERATIONS = 8
 
 Array = NDArray[np.float64]
 
@@ -33,18 +36,18 @@ Array = NDArray[np.float64]
 def box_surface(
     half: Sequence[float], resolution: Sequence[int], *, faces: Sequence[str] = FACES
 ) -> tuple[Array, Array]:
-    """Points of a regular grid that lie on the surface of a box; edges and corners are among them, once each.
+    """Points of a regular grid on the surface of a box, including edges and corners once.
 
     Parameters
     ----------
     half: half sizes [m]
-    resolution: points along x, y, z, at least 2 each, edges included
-    faces: which faces to sample, of -x +x -y +y -z +z
+    resolution: number of points along x, y, z, at least 2 each, including the edges
+    faces: faces to sample, some of -x +x -y +y -z +z
 
     Returns
     -------
-    points [m], shape (n, 3), in the box's frame; areas across x, y, z [m²], shape (n, 3), in all those of the faces.
-    Raises UsageError on a resolution below 2 or an unknown face.
+    points in the frame of the box [m], shape (n, 3); area components along x, y, z [m²], shape (n, 3), which sum to
+    the area of the faces. Raises UsageError on a resolution below 2 or an unknown face.
     """
     counts = [int(n) for n in resolution]
     if len(counts) != 3 or min(counts) < 2:
@@ -52,9 +55,9 @@ def box_surface(
     if unknown := [face for face in faces if face not in FACES]:
         raise UsageError(f"unknown face {unknown[0]!r} of a box; faces are {' '.join(FACES)}")
     if len(set(faces)) != len(faces) or not faces:
-        raise UsageError(f"faces of a box must be named once each, at least one, got {list(faces)}")
+        raise UsageError(f"a box needs at least one face, each named once, got {list(faces)}")
     axes = [np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)]
-    # The length nearest to each point: half a spacing at the two ends.
+    # Cell lengths of the trapezoidal rule: half a spacing at both ends.
     lengths = [_trapezoid(2 * h, n) for h, n in zip(half, counts, strict=True)]
     areas = np.zeros((*counts, 3))
     chosen = np.zeros(counts, dtype=bool)
@@ -74,18 +77,18 @@ def disc(
 ) -> tuple[Array, Array]:
     """Points on the flat faces of a disc about z: the centre, and `radii` rings of `angles` points on each face.
 
-    The rim is sampled by the outermost ring; 8 angles and 4 radii give the 66 points of the published pads.
+    The outermost ring is on the rim. 8 angles and 4 radii give the 66 points of the published pads.
 
     Returns
     -------
-    points [m], shape (n, 3); areas across x, y, z [m²], shape (n, 3), in all those of the faces.
-    Raises UsageError when there are fewer than 3 angles or 1 ring, or on an unknown face.
+    points [m], shape (n, 3); area components along x, y, z [m²], shape (n, 3), which sum to the area of the faces.
+    Raises UsageError on fewer than 3 angles or 1 ring, or on an unknown face.
     """
     if angles < 3 or radii < 1:
         raise UsageError(f"a disc needs at least 3 angles and 1 ring, got angles {angles}, radii {radii}")
     _check_faces("a disc", faces, ENDS)
     ring = radius * np.arange(1, radii + 1) / radii
-    # Cells end half way between rings; the outermost ends at the rim.
+    # Cells end halfway between rings; the outermost cell ends at the rim.
     borders = np.append((ring - radius / radii / 2), radius)
     cell = np.pi * np.diff(borders**2) / angles
     phi = 2 * np.pi * np.arange(angles) / angles
@@ -108,12 +111,12 @@ def cylinder(
 ) -> tuple[Array, Array]:
     """Points on a cylinder about z: its ends as in `disc`, and `heights` rows of `angles` points on its wall.
 
-    The wall's rows reach from end to end; where an end is sampled too, its rim is among the points once.
+    The rows of the wall include both rims. The points of a rim that is also on a sampled end occur once.
 
     Returns
     -------
-    points [m], shape (n, 3); areas across x, y, z [m²], shape (n, 3), in all those of the faces.
-    Raises UsageError when there are fewer than 3 angles, 1 ring or 2 heights, or on an unknown face.
+    points [m], shape (n, 3); area components along x, y, z [m²], shape (n, 3), which sum to the area of the faces.
+    Raises UsageError on fewer than 3 angles, 1 ring or 2 heights, or on an unknown face.
     """
     _check_faces("a cylinder", faces, (*ENDS, "wall"))
     ends = [face for face in faces if face != "wall"]
@@ -130,7 +133,7 @@ def cylinder(
     phi = 2 * np.pi * np.arange(angles) / angles
     outwards = np.column_stack([np.cos(phi), np.sin(phi), np.zeros(angles)])
     for row, end in ((0, "-z"), (-1, "+z")):
-        if end in ends:  # the outermost ring is the last of an end's points
+        if end in ends:  # the outermost ring is stored last
             last = (ends.index(end) + 1) * per_end
             areas[last - angles : last] += strip[row] * outwards**2
     kept = slice(1 if "-z" in ends else 0, heights - 1 if "+z" in ends else heights)
@@ -139,13 +142,14 @@ def cylinder(
 
 
 def capsule(radius: float, half_length: float, *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
-    """`count` points on a capsule about z, near-uniform and of equal area; of a sphere where `half_length` is 0.
+    """`count` nearly uniform points of equal area on a capsule about z, or on a sphere if `half_length` is 0.
 
-    `faces` chooses the halves below and above the middle, "-z" and "+z".
+    `faces` selects the lower and the upper half, "-z" and "+z".
 
     Returns
     -------
-    points [m], shape (count, 3); areas across x, y, z [m²], shape (count, 3), in all that of the chosen halves.
+    points [m], shape (count, 3); area components along x, y, z [m²], shape (count, 3), which sum to the area of the
+    selected halves.
     Raises UsageError on a count below 1 or an unknown face.
     """
     height = _heights("a capsule", count, faces) * (radius + half_length)
@@ -158,84 +162,89 @@ def capsule(radius: float, half_length: float, *, count: int, faces: Sequence[st
 
 
 def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS) -> tuple[Array, Array]:
-    """`count` points on an ellipsoid with these half axes [m]: those of a sphere, stretched.
+    """`count` points on an ellipsoid with half axes `axes` [m]: the points of a sphere, scaled along the axes.
 
-    Each weight is proportional to how much the stretch enlarges the surface there; `faces` as in `capsule`.
+    The area of a point is proportional to the local area ratio of the scaling. `faces` is as in `capsule`.
 
     Returns
     -------
-    points [m], shape (count, 3); areas across x, y, z [m²], shape (count, 3), in all that of the chosen halves.
+    points [m], shape (count, 3); area components along x, y, z [m²], shape (count, 3), which sum to the area of the
+    selected halves.
     Raises UsageError on a count below 1 or an unknown face.
     """
     height = _heights("an ellipsoid", count, faces)
     sphere = np.column_stack([np.sqrt(1 - height**2)[:, None] * _spiral(count), height])
     a, b, c = axes
-    enlarged = np.linalg.norm(sphere / axes, axis=1)
-    whole = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)  # Carlson's symmetric integral
-    outwards = sphere / axes / enlarged[:, None]
-    return sphere * axes, outwards**2 * (enlarged * (whole * len(faces) / 2 / enlarged.sum()))[:, None]
+    area_ratio = np.linalg.norm(sphere / axes, axis=1)
+    total = 4 * np.pi * elliprg((a * b) ** 2, (a * c) ** 2, (b * c) ** 2)  # Carlson's symmetric integral
+    outwards = sphere / axes / area_ratio[:, None]
+    return sphere * axes, outwards**2 * (area_ratio * (total * len(faces) / 2 / area_ratio.sum()))[:, None]
 
 
 def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
-    """`count` points on a mesh, spread near-uniformly; the same ones each time.
+    """`count` nearly uniform points on a mesh; deterministic.
 
-    The surface is cut into many pieces of equal area, each standing at one place. Points start at every so many pieces
-    and move to the middle of the pieces nearest to them, some times over. Sides that face different ways count as
-    further apart, so that a point does not stand for both sides of a sheet or of an edge.
+    The surface is divided into samples of equal area, and Lloyd's algorithm clusters them: each point moves to the
+    sample nearest to the mean of its cell. The metric includes the normals, so that a point does not represent both
+    sides of a sheet or of an edge.
 
     Returns
     -------
-    points [m], shape (count, 3), on the surface but not on purpose on its edges; areas across x, y, z [m²], shape
-    (count, 3): the pieces nearest to each, in all the mesh's area.
-    Raises UsageError on a count below 1 or above 20 000.
+    points on the surface [m], shape (count, 3); area components of their cells along x, y, z [m²], shape (count, 3),
+    which sum to the area of the mesh. Raises UsageError on a count below 1 or above 20 000.
     """
-    if not 1 <= count <= _LEAST_PIECES:
-        raise UsageError(f"a mesh needs a count of 1 to {_LEAST_PIECES}, got {count}")
+    if not 1 <= count <= _MIN_SAMPLES:
+        raise UsageError(f"a mesh needs a count of 1 to {_MIN_SAMPLES}, got {count}")
+    samples, normals, total = _equal_area_samples(mesh, max(_SAMPLES_PER_POINT * count, _MIN_SAMPLES))
+    number = len(samples)
+    features = np.column_stack([samples / np.sqrt(total / count), normals])
+    tree = cKDTree(features)  # tree.indices is spatially ordered: strided indices are spread over the mesh
+    chosen = tree.indices[((np.arange(count) + 0.5) * number / count).astype(int)]
+    for _ in range(_LLOYD_ITERATIONS):
+        _, owner = cKDTree(features[chosen]).query(features)
+        sums = np.stack([np.bincount(owner, feature, count) for feature in features.T], axis=-1)
+        _, chosen = tree.query(sums / np.bincount(owner, minlength=count).clip(min=1)[:, None])
+        chosen = _distinct(chosen, number)
+    _, owner = cKDTree(features[chosen]).query(features)
+    fractions: Array = np.stack([np.bincount(owner, fraction, count) for fraction in (normals**2).T], axis=-1)
+    points: Array = samples[chosen]
+    areas: Array = (fractions * (total / number)).astype(float)
+    return points, areas
+
+
+def _equal_area_samples(mesh: TriangleMesh, number: int) -> tuple[Array, Array, float]:
+    """Samples of equal area [m], their normals, both of shape (number, 3), and the area of the mesh [m²]."""
     areas, normals = mesh.areas_and_normals()
-    number = max(_PIECES * count, _LEAST_PIECES)
-    whole = float(areas.sum())
-    face = np.searchsorted(np.cumsum(areas), (np.arange(number) + 0.5) / number * whole).clip(max=len(areas) - 1)
+    total = float(areas.sum())
+    face = np.searchsorted(np.cumsum(areas), (np.arange(number) + 0.5) / number * total).clip(max=len(areas) - 1)
     u, v = (np.outer(_PLASTIC, np.arange(number)) + 0.5) % 1
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
-    pieces = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    space = np.column_stack([pieces / np.sqrt(whole / count), normals[face]])
-    tree = cKDTree(space)  # in its order neighbours are near
-    chosen = tree.indices[((np.arange(count) + 0.5) * number / count).astype(int)]
-    for _ in range(_MOVES):
-        _, owner = cKDTree(space[chosen]).query(space)
-        middle = np.stack([np.bincount(owner, along, count) for along in space.T], axis=-1)
-        _, chosen = tree.query(middle / np.bincount(owner, minlength=count).clip(min=1)[:, None])
-        chosen = _distinct(chosen, number)
-    _, owner = cKDTree(space[chosen]).query(space)
-    shares: Array = np.stack([np.bincount(owner, share, count) for share in (normals[face] ** 2).T], axis=-1)
-    points: Array = pieces[chosen]
-    areas_across: Array = (shares * (whole / number)).astype(float)
-    return points, areas_across
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), normals[face], total
 
 
 def _distinct(chosen: NDArray[np.int64], number: int) -> NDArray[np.int64]:
-    """The same numbers below `number`, but what is there twice replaced by ones that are not there."""
+    """Indices below `number`; repeated ones are replaced by unused ones."""
     _, first = np.unique(chosen, return_index=True)
-    again = np.setdiff1d(np.arange(len(chosen)), first)
-    free = np.setdiff1d(np.arange(number), chosen)
+    repeated = np.setdiff1d(np.arange(len(chosen)), first)
+    unused = np.setdiff1d(np.arange(number), chosen)
     chosen = chosen.copy()
-    chosen[again] = free[np.linspace(0, len(free) - 1, len(again)).astype(int)]
+    chosen[repeated] = unused[np.linspace(0, len(unused) - 1, len(repeated)).astype(int)]
     return chosen
 
 
 def disc_lattice(radius: float, count: int) -> Array:
-    """`count` points spread near-uniformly over a disc, as a sunflower's seeds [m], shape (count, 2)."""
+    """`count` nearly uniform points on a disc (Fibonacci lattice) [m], shape (count, 2)."""
     return radius * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * _spiral(count)
 
 
 def shortest_rotations(normals: Array) -> Array:
-    """Axes x y z turned the shortest way until z is each of these unit normals: columns, shape (n, 3, 3).
+    """Rotation matrices of the smallest angle that map z to unit normals (n, 3), shape (n, 3, 3).
 
-    Where a normal is −z, they are turned about y.
+    For a normal equal to −z, the rotation is about y.
     """
     x, y, z = normals.T
-    # 1 + z, without cancellation near z = −1.
+    # 1 + z without cancellation near z = −1.
     above = np.where(z < 0, (x * x + y * y) / (1 - np.minimum(z, 0)), 1 + z)
     opposite = above < 1e-24
     share = 1 / np.where(opposite, 1, above)
@@ -246,13 +255,13 @@ def shortest_rotations(normals: Array) -> Array:
 
 
 def _spiral(count: int) -> Array:
-    """Directions in the plane, each turned by the golden angle from the one before, shape (count, 2)."""
+    """Unit vectors in the plane, each rotated by the golden angle from the one before, shape (count, 2)."""
     angle = _GOLDEN_ANGLE * np.arange(count)
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _heights(what: str, count: int, faces: Sequence[str]) -> Array:
-    """Equal steps of height between −1 and 1, or over the chosen half, each point in the middle of its step."""
+    """Midpoints of equal steps of height over [−1, 1] or over the selected half."""
     _check_faces(what, faces, ENDS)
     if count < 1:
         raise UsageError(f"{what} needs a count of at least 1, got {count}")
@@ -262,11 +271,11 @@ def _heights(what: str, count: int, faces: Sequence[str]) -> Array:
 
 def _check_faces(what: str, faces: Sequence[str], known: Sequence[str]) -> None:
     if not faces or any(face not in known for face in faces) or len(set(faces)) != len(faces):
-        *most, last = known
-        raise UsageError(f"faces of {what} are {', '.join(most)} and {last}, once each, got {list(faces)}")
+        raise UsageError(f"faces of {what} must be some of {', '.join(known)}, each named once, got {list(faces)}")
 
 
 def _trapezoid(length: float, count: int) -> Array:
+    """Weights of the trapezoidal rule."""
     weights = np.full(count, length / (count - 1))
     weights[[0, -1]] /= 2
     return weights

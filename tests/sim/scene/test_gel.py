@@ -12,7 +12,8 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import Scene, load_scene
-from gelflow.sim.scene.gel import LayerGel, SpringGel, half_space_response, layer_response
+from gelflow.sim.scene.elastic_layer import half_space_response, layer_response
+from gelflow.sim.scene.gel import LayerGel, SpringGel
 from gelflow.sim.scene.geometry.sampling import disc_lattice
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.torch_layer import torch_rollout, torch_state
@@ -57,7 +58,7 @@ def test_the_response_solves_the_layers_equations(nu: float) -> None:
 
 def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
     pitch, rows = 1e-3, 25
-    matrix = on_grid(rows, 3, pitch, np.inf).matrix.reshape(rows, 3, 3, rows, 3, 3)
+    matrix = on_grid(rows, 3, pitch, np.inf).compliance_matrix.reshape(rows, 3, 3, rows, 3, 3)
     # The mean distance⁻¹ of two points of a unit square is 4 (asinh 1 − (√2 − 1)/3).
     own = 4 * (np.arcsinh(1) - (np.sqrt(2) - 1) / 3) / (2 * np.pi * G * pitch)
     assert matrix[0, 0, 2, 0, 0, 2] == pytest.approx((1 - NU) * own, rel=1e-12)
@@ -70,7 +71,7 @@ def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
     # A round cell: the mean distance⁻¹ of two points of a disc is 16 / (3 π a).
     disc = scattered(50, np.inf)
     own = 16 / (3 * np.pi * np.sqrt(disc.cell_area / np.pi)) / (2 * np.pi * G)
-    assert disc.matrix[2, 2] == pytest.approx((1 - NU) * own, rel=1e-4)
+    assert disc.compliance_matrix[2, 2] == pytest.approx((1 - NU) * own, rel=1e-4)
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.5])
@@ -87,7 +88,7 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
         expected[axis] = stress * thickness / shear_modulus * yields
         np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=2e-5 * stress * thickness / G)
     if thickness < 1e-4:  # a marker alone: all of its own cell, nothing of the others but at the cells' borders
-        alone = gel.matrix[::3, 3 * middle] * shear_modulus * gel.cell_area / thickness
+        alone = gel.compliance_matrix[::3, 3 * middle] * shear_modulus * gel.cell_area / thickness
         assert alone[middle] == pytest.approx(1, abs=0.1)
         assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 21, middle + 21])).max() < 1e-3
 
@@ -96,8 +97,8 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
     "make", [lambda h: on_grid(6, 5, 1e-3, h), lambda h: scattered(30, h)], ids=["squares", "discs"]
 )
 def test_a_thick_layer_goes_over_into_the_half_space(make: Any) -> None:
-    half = make(np.inf).matrix
-    away = [np.abs(make(h).matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
+    half = make(np.inf).compliance_matrix
+    away = [np.abs(make(h).compliance_matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
     assert away[0] < 0.05 and away[2] < 3e-4
     np.testing.assert_allclose(np.divide(away[:2], away[1:]), 10, rtol=0.1)  # falls off as 1/h
 
@@ -107,7 +108,7 @@ def test_reciprocity_and_energy(nu: float, thickness: float) -> None:
     rng = np.random.default_rng(0)
     somewhere = LayerGel(E, nu, thickness, rng.uniform(0, 0.01, (40, 2)), 1e-6, None)
     for gel in (on_grid(8, 5, 1.5e-3, thickness, nu), scattered(60, thickness, nu), somewhere):
-        matrix = gel.matrix
+        matrix = gel.compliance_matrix
         np.testing.assert_array_equal(matrix, matrix.T)
         energies = np.linalg.eigvalsh(matrix)
         assert energies[0] > 1e-4 * energies[-1]
@@ -115,7 +116,10 @@ def test_reciprocity_and_energy(nu: float, thickness: float) -> None:
 
 @pytest.mark.parametrize("thickness", [3e-4, 3e-3, np.inf])
 def test_finer_cells_average_to_the_coarse_ones_exactly(thickness: float) -> None:
-    coarse, fine = on_grid(4, 3, 2e-3, thickness).matrix, on_grid(12, 9, 2e-3 / 3, thickness).matrix
+    coarse, fine = (
+        on_grid(4, 3, 2e-3, thickness).compliance_matrix,
+        on_grid(12, 9, 2e-3 / 3, thickness).compliance_matrix,
+    )
     row, col = np.divmod(np.arange(108), 9)
     member = np.zeros((12, 108))
     member[row // 3 * 3 + col // 3, np.arange(108)] = 1 / 9
@@ -143,9 +147,11 @@ def test_a_turned_pad_and_one_seen_from_its_side() -> None:
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     turned = replace(gel, positions=gel.positions @ turn[:2, :2].T)
     every = np.kron(np.eye(40), turn)
-    np.testing.assert_allclose(turned.matrix, every @ gel.matrix @ every.T, atol=1e-9 * gel.matrix.max())
+    np.testing.assert_allclose(
+        turned.compliance_matrix, every @ gel.compliance_matrix @ every.T, atol=1e-9 * gel.compliance_matrix.max()
+    )
     # A rectangle turned by a quarter: x becomes y, y becomes −x; rows become columns.
-    wide, tall = (on_grid(*n, 1e-3, 2e-3).matrix.reshape(*n, 3, *n, 3) for n in ((3, 7), (7, 3)))
+    wide, tall = (on_grid(*n, 1e-3, 2e-3).compliance_matrix.reshape(*n, 3, *n, 3) for n in ((3, 7), (7, 3)))
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     expected = np.einsum("ax,ijxklz,bz->ijaklb", quarter, tall, quarter).transpose(1, 0, 2, 4, 3, 5)
     np.testing.assert_allclose(wide[::-1, :, :, ::-1], expected, atol=1e-12 * wide.max())
@@ -154,10 +160,10 @@ def test_a_turned_pad_and_one_seen_from_its_side() -> None:
 def test_round_cells_do_nearly_what_square_ones_do() -> None:
     square = on_grid(6, 5, 1.5e-3, 4e-3)
     disc = replace(square, grid_shape=None)
-    assert np.abs(disc.matrix - square.matrix).max() < 0.015 * square.matrix.max()
+    assert np.abs(disc.compliance_matrix - square.compliance_matrix).max() < 0.015 * square.compliance_matrix.max()
     far = np.abs(square.positions - square.positions[0]).max(1) > 4e-3
-    difference = (disc.matrix - square.matrix).reshape(30, 3, 30, 3)[far, :, 0]
-    assert np.abs(difference).max() < 2e-3 * square.matrix.max()
+    difference = (disc.compliance_matrix - square.compliance_matrix).reshape(30, 3, 30, 3)[far, :, 0]
+    assert np.abs(difference).max() < 2e-3 * square.compliance_matrix.max()
 
 
 MODEL = """<mujoco>
@@ -207,7 +213,7 @@ def test_displacements_of_all_pads(tmp_path: Path) -> None:
     assert moved.shape == (3, 33, 3) and np.abs(forces).max() > 0
     layer = scene.pads[0].gel
     assert isinstance(layer, LayerGel) and layer.grid_shape == (4, 3) and layer.cell_area == pytest.approx(1e-6)
-    expected = forces[:, :12].reshape(3, 36) @ layer.matrix
+    expected = forces[:, :12].reshape(3, 36) @ layer.compliance_matrix
     np.testing.assert_allclose(moved[:, :12], expected.reshape(3, 12, 3), atol=1e-15)
     np.testing.assert_allclose(moved[:, 12:24], 0.01 * forces[:, 12:24])
     np.testing.assert_allclose(moved[:, 24:], [0.01, 0.01, 0.002] * forces[:, 24:])
@@ -290,9 +296,9 @@ def test_what_is_refused(tmp_path: Path, text: str) -> None:
             'shape = "points"\npositions = [[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 1e-4]]\n',
             "a layer needs coplanar markers",
         ),
-        ('shape = "points"\npositions = [[0, 0, 0]]\n', "there is only one"),
-        ('shape = "points"\npositions = [[0, 0, 0], [0, 0, 0], [1e-3, 0, 0]]\n', "at the same place"),
-        ("rows = 40\ncols = 30\npitch = 1e-3\n", "at most 1000 markers, got 1200"),
+        ('shape = "points"\npositions = [[0, 0, 0]]\n', "needs at least two markers"),
+        ('shape = "points"\npositions = [[0, 0, 0], [0, 0, 0], [1e-3, 0, 0]]\n', "have the same position"),
+        ("rows = 40\ncols = 30\npitch = 1e-3\n", "supports at most 1000 markers, got 1200"),
     ],
 )
 def test_where_no_layer_can_be(tmp_path: Path, shape: str, why: str) -> None:

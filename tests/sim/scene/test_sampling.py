@@ -138,13 +138,13 @@ def test_parts_of_an_area_say_how_it_grows(axes: tuple[float, float, float]) -> 
     [
         (lambda: box_surface((1, 1, 1), (1, 2, 2)), "at least 2 points"),
         (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["z"]), "unknown face 'z'"),
-        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["-z", "-z"]), "once each"),
+        (lambda: box_surface((1, 1, 1), (2, 2, 2), faces=["-z", "-z"]), "each named once"),
         (lambda: disc(1, 1, angles=2), "at least 3 angles"),
-        (lambda: disc(1, 1, faces=["-x"]), "faces of a disc"),
-        (lambda: cylinder(1, 1, faces=["-x"]), "faces of a cylinder are -z, .z and wall, once each"),
+        (lambda: disc(1, 1, faces=["-x"]), "faces of a disc must be some of -z, .z"),
+        (lambda: cylinder(1, 1, faces=["-x"]), "faces of a cylinder must be some of -z, .z, wall, each named once"),
         (lambda: cylinder(1, 1, heights=1), "at least 3 angles and 2 heights, got 16 and 1"),
         (lambda: capsule(1, 1, count=0), "a capsule needs a count of at least 1, got 0"),
-        (lambda: ellipsoid((1, 1, 1), count=9, faces=["wall"]), "faces of an ellipsoid are -z and .z"),
+        (lambda: ellipsoid((1, 1, 1), count=9, faces=["wall"]), "faces of an ellipsoid must be some of -z, .z"),
     ],
 )
 def test_wrong_sampling_is_refused(call: object, message: str) -> None:
