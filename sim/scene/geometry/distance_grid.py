@@ -1,8 +1,8 @@
-"""The distance grid of a mesh: what makes it a shape that can be touched.
+"""Signed distance grids of meshes, with a cache on disk.
 
-Signed distances at the nodes of a regular grid become the coefficients of a tri-cubic B-spline, which goes through
-them all and has continuous second derivatives (grid_shape.hpp). Building takes seconds, so grids are kept in
-a folder of the user: $GELFLOW_CACHE, or the system's place for such things. The folder may be deleted at any time.
+Signed distances at the nodes of a regular grid are interpolated by a tri-cubic B-spline, which has continuous second
+derivatives (sim/csrc/geometry/grid_shape.hpp). Building a grid takes seconds, so grids are cached in $GELFLOW_CACHE or
+in the user's cache folder. The cache may be deleted at any time.
 """
 
 import hashlib
@@ -27,61 +27,61 @@ DEFAULT_RESOLUTION = 64
 MIN_RESOLUTION, MAX_RESOLUTION = 4, 512
 CELLS_PER_ROUNDING = 2  # at least
 
-_VERSION = 1  # of how a grid is built: with it old grids in the cache are passed over
+_VERSION = 1  # of the construction; part of the cache key
 _MARGIN = 3  # cells around the mesh
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])  # of a cell
-_LOOKS = 4
-_PUSHES, _SETTLED = 60, 1e-9  # rounds at most; [m] that none of a round's moves is longer than
-_PAD = 8  # nodes beyond those, straight on: the filter forgets the end of the grid on the way
+_PROJECTION_ITERATIONS = 4
+_MAX_SWEEPS, _SWEEP_TOLERANCE = 60, 1e-9  # of Hildreth's method; tolerance [m]
+_PADDING = 8  # nodes of linear extrapolation, so that boundary effects of the spline filter decay outside the grid
 
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """A signed distance as a tri-cubic B-spline on a regular grid, in the frame of its mesh."""
+    """A signed distance field as a tri-cubic B-spline on a regular grid, in the frame of its mesh."""
 
     origin: Array  # lowest corner of the first cell [m]
     spacing: float  # edge of a cell [m]
-    coefficients: NDArray[np.float32]  # [m], shape cells + 3
+    coefficients: NDArray[np.float32]  # of the B-spline [m], shape cells + 3
 
     @property
     def cells(self) -> tuple[int, int, int]:
-        """Along x, y, z."""
+        """Number of cells along x, y, z."""
         nx, ny, nz = self.coefficients.shape
         return nx - 3, ny - 3, nz - 3
 
     @property
     def nbytes(self) -> int:
-        """Bytes in the core's model: the coefficients, and one per cell for skipping what is far."""
+        """Size in the compiled model [bytes]: the coefficients, and one byte per cell for the broad phase."""
         return self.coefficients.nbytes + int(np.prod(self.cells))
 
 
 def distance_grid(
     mesh: TriangleMesh, name: str, *, resolution: int = DEFAULT_RESOLUTION, rounding: float = 0.0
 ) -> DistanceGrid:
-    """The grid of a mesh, from the cache or built and put there.
+    """The distance grid of a mesh, from the cache if possible.
 
     Parameters
     ----------
-    mesh: a closed surface
-    name: of the mesh in messages
-    resolution: cells along the longest side
-    rounding: radius that edges and corners are rounded with [m]: the solid made a rounding smaller and then larger
+    mesh: a closed mesh
+    name: of the mesh, for messages
+    resolution: number of cells along the longest side
+    rounding: radius of convex edges and corners [m]: a morphological opening with a ball of this radius
 
-    Raises UsageError when the mesh is not closed, is rounded to nothing or too finely for its cells, or when libigl
-    is needed and not installed.
+    Raises UsageError if the mesh is not closed, if the rounding is too large for the mesh or too small for the cells,
+    and if libigl is needed and not installed.
     """
     if not MIN_RESOLUTION <= resolution <= MAX_RESOLUTION:
         raise UsageError(f"resolution must be from {MIN_RESOLUTION} to {MAX_RESOLUTION} cells, got {resolution}")
     file = cache_folder() / f"{_key(mesh, resolution, rounding)}.npz"
-    if (found := _read(file)) is not None:
-        return found
+    if (cached := _read(file)) is not None:
+        return cached
     grid = build_grid(mesh, name, resolution=resolution, rounding=rounding)
     _write(file, grid)
     return grid
 
 
 def build_grid(mesh: TriangleMesh, name: str, *, resolution: int, rounding: float = 0.0) -> DistanceGrid:
-    """As `distance_grid`, without the cache."""
+    """Like `distance_grid`, without the cache."""
     mesh = closed_mesh(mesh, name)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     spacing = float((high - low).max()) / resolution
@@ -97,8 +97,7 @@ def build_grid(mesh: TriangleMesh, name: str, *, resolution: int, rounding: floa
     distances, nearest = signed_distances(mesh, nodes, name)
     if not (distances < -spacing / 2).any():
         raise UsageError(
-            f"mesh {name!r} is thinner than the cells of {spacing:.3g} m that its grid would have; "
-            "set a larger resolution"
+            f"mesh {name!r} is thinner than the cells of {spacing:.3g} m of its grid; set a larger resolution"
         )
     if rounding > 0:
         distances = _opened(name, nodes, distances, nearest, cells + 1, spacing, rounding)
@@ -106,10 +105,10 @@ def build_grid(mesh: TriangleMesh, name: str, *, resolution: int, rounding: floa
 
 
 def spline_grid(distances: Array, origin: Array, spacing: float) -> DistanceGrid:
-    """The spline through distances [m], shape cells + 1, at the corners of cells; the first is at `origin`."""
-    straight_on = np.pad(distances, _PAD, mode="reflect", reflect_type="odd")
-    inner = slice(_PAD - 1, 1 - _PAD)
-    coefficients = ndimage.spline_filter(straight_on, order=3, mode="mirror")[inner, inner, inner]
+    """The B-spline that interpolates distances [m] at the corners of cells, shape cells + 1; the first at `origin`."""
+    padded = np.pad(distances, _PADDING, mode="reflect", reflect_type="odd")
+    inner = slice(_PADDING - 1, 1 - _PADDING)
+    coefficients = ndimage.spline_filter(padded, order=3, mode="mirror")[inner, inner, inner]
     return DistanceGrid(np.asarray(origin), spacing, np.ascontiguousarray(coefficients, dtype=np.float32))
 
 
@@ -127,63 +126,63 @@ def _opened(
     spacing: float,
     rounding: float,
 ) -> Array:
-    """Distances at the nodes to the part of the solid that a ball of this radius reaches: edges and corners are round.
+    """Distances at the nodes to the morphological opening of the solid: its edges and corners are rounded.
 
-    Where the ball's centre can be, the inner solid, the distance is as it was; elsewhere it is the distance to the
-    inner solid less the rounding. The inner solid's surface is first triangulated, which cuts its edges off; then the
-    nearest point is found anew from what the distances at the eight nodes about it say.
+    Inside the solid eroded by the rounding, distances do not change. Outside they are the distance to the eroded solid
+    minus the rounding. Marching cubes triangulates the surface of the eroded solid, but cuts off its edges; therefore
+    the nearest points are refined with the distances and normals at the nodes around them.
     """
     from skimage import measure
 
     if not (distances < -rounding).any():
         raise UsageError(
-            f"mesh {name!r}: a rounding of {rounding:g} m leaves nothing of it; it must be below half its thickness"
+            f"mesh {name!r}: a rounding of {rounding:g} m removes the whole mesh; it must be below half its thickness"
         )
     marching_cubes: Any = measure.marching_cubes
     vertices, faces, *_ = marching_cubes(distances.reshape(counts), -rounding, spacing=(spacing,) * 3)
-    inner = TriangleMesh(vertices.astype(float) + nodes[0], faces.astype(np.int64))
+    eroded = TriangleMesh(vertices.astype(float) + nodes[0], faces.astype(np.int64))
     outside = np.flatnonzero(distances > -rounding)
     x = nodes[outside]
-    y = nearest_points(inner, x, name)
+    y = nearest_points(eroded, x, name)
     normals = (nodes - nearest) / np.where(distances == 0, 1, distances)[:, None]
-    levels = distances - (normals * nodes).sum(1)  # the distance is nearly normal · point + level
-    start, moves = y.copy(), np.zeros(len(x))
-    for _ in range(_LOOKS):  # a cell at a time: the eight do not see what is further away
+    offsets = distances - (normals * nodes).sum(1)  # plane at each node: distance(p) ≈ normal · p + offset
+    start, step = y.copy(), np.zeros(len(x))
+    for _ in range(_PROJECTION_ITERATIONS):  # at most one cell per iteration: the planes hold near their nodes only
         first = np.floor((y - nodes[0]) / spacing).astype(int).clip(0, counts - 2)
-        about = np.ravel_multi_index(tuple((first[:, None] + _CORNERS).T), tuple(counts)).T
-        way = _into_half_spaces(x, normals[about], -rounding - levels[about]) - y
-        moves = np.linalg.norm(way, axis=1) / spacing
-        y += way / np.maximum(moves, 1)[:, None]
-    lost = (moves > 0.5) | (np.linalg.norm(y - start, axis=1) > 2 * spacing)
-    y[lost] = start[lost]
+        around = np.ravel_multi_index(tuple((first[:, None] + _CORNERS).T), tuple(counts)).T
+        move = _project(x, normals[around], -rounding - offsets[around]) - y
+        step = np.linalg.norm(move, axis=1) / spacing
+        y += move / np.maximum(step, 1)[:, None]
+    diverged = (step > 0.5) | (np.linalg.norm(y - start, axis=1) > 2 * spacing)
+    y[diverged] = start[diverged]
     result = distances.copy()
     result[outside] = np.linalg.norm(x - y, axis=1) - rounding
     return result
 
 
-def _into_half_spaces(x: Array, normals: Array, bounds: Array) -> Array:
-    """The points nearest to x (n, 3) with normal · point ≤ bound for k unit normals (n, k, 3), bounds (n, k).
+def _project(x: Array, normals: Array, bounds: Array) -> Array:
+    """Projections of x (n, 3) onto intersections of half spaces: normal · y ≤ bound, (n, k, 3) and (n, k).
 
-    Hildreth's method: one multiplier at a time is made as good as it can be.
+    Hildreth's method: dual coordinate ascent, one multiplier at a time.
     """
-    y, pushes = x.copy(), np.zeros_like(bounds)
-    todo = np.arange(len(x))
-    for _ in range(_PUSHES):
-        largest = np.zeros(len(todo))
+    y, multipliers = x.copy(), np.zeros_like(bounds)
+    active = np.arange(len(x))
+    for _ in range(_MAX_SWEEPS):
+        largest = np.zeros(len(active))
         for k in range(bounds.shape[1]):
-            normal = normals[todo, k]
-            change = np.maximum((normal * y[todo]).sum(1) - bounds[todo, k], -pushes[todo, k])
-            pushes[todo, k] += change
-            y[todo] -= change[:, None] * normal
+            normal = normals[active, k]
+            change = np.maximum((normal * y[active]).sum(1) - bounds[active, k], -multipliers[active, k])
+            multipliers[active, k] += change
+            y[active] -= change[:, None] * normal
             largest = np.maximum(largest, np.abs(change))
-        todo = todo[largest > _SETTLED]
+        active = active[largest > _SWEEP_TOLERANCE]
     return y
 
 
 def cache_folder() -> Path:
-    """Where grids are kept: $GELFLOW_CACHE, or gelflow in the user's folder for caches."""
-    if given := os.environ.get("GELFLOW_CACHE"):
-        return Path(given)
+    """Folder of the cached grids: $GELFLOW_CACHE, or `gelflow` in the user's cache folder."""
+    if folder := os.environ.get("GELFLOW_CACHE"):
+        return Path(folder)
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "gelflow"
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gelflow"
@@ -197,26 +196,26 @@ def _key(mesh: TriangleMesh, resolution: int, rounding: float) -> str:
 
 
 def _read(file: Path) -> DistanceGrid | None:
-    """The grid in a file of the cache; None where there is none, or none that can be used."""
+    """The grid in a cache file; None if the file is missing or invalid."""
     try:
-        with np.load(file, allow_pickle=False) as found:
-            if int(found["format"]) != 1:
+        with np.load(file, allow_pickle=False) as content:
+            if int(content["format"]) != 1:
                 return None
-            grid = DistanceGrid(found["origin"], float(found["spacing"]), found["coefficients"])
+            grid = DistanceGrid(content["origin"], float(content["spacing"]), content["coefficients"])
     except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile):
         return None
     c = grid.coefficients
-    usable = c.dtype == np.float32 and c.ndim == 3 and min(c.shape) > 2 * _MARGIN and np.isfinite(c).all()
-    return grid if usable and grid.origin.shape == (3,) and grid.spacing > 0 else None
+    valid = c.dtype == np.float32 and c.ndim == 3 and min(c.shape) > 2 * _MARGIN and np.isfinite(c).all()
+    return grid if valid and grid.origin.shape == (3,) and grid.spacing > 0 else None
 
 
 def _write(file: Path, grid: DistanceGrid) -> None:
-    """Put the grid into the cache, whole or not at all; where nothing can be written it is built again next time."""
+    """Write a cache file atomically. Without write access the grid is not cached."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=file.parent) as folder:
-            part = Path(folder) / file.name
-            np.savez(part, format=1, origin=grid.origin, spacing=grid.spacing, coefficients=grid.coefficients)
-            os.replace(part, file)
+            temporary = Path(folder) / file.name
+            np.savez(temporary, format=1, origin=grid.origin, spacing=grid.spacing, coefficients=grid.coefficients)
+            os.replace(temporary, file)
     except OSError:
         return

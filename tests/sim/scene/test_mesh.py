@@ -162,7 +162,7 @@ def changed(faces: NDArray[np.int64]) -> TriangleMesh:
 def test_a_mesh_that_is_not_closed_is_refused() -> None:
     box = mesh_solids.box(HALF)
     cases = {
-        "mesh 'm' is not watertight: 3 of its 18 edges have a triangle on one side only": box.faces[1:],
+        "mesh 'm' is not watertight: 3 of its 18 edges belong to one triangle only": box.faces[1:],
         "mesh 'm' is not watertight: at 3 of its 18 edges": np.concatenate([box.faces[:1, ::-1], box.faces[1:]]),
         "mesh 'm' is inside out": box.faces[:, ::-1],
     }
@@ -188,7 +188,7 @@ def test_what_a_grid_can_not_show_is_refused() -> None:
         distance_grid(box, "m", resolution=600)
     with pytest.raises(UsageError, match=r"below 2 cells of 0\.0075 m; set resolution = 40 or more"):
         build_grid(box, "m", resolution=8, rounding=0.003)
-    with pytest.raises(UsageError, match="leaves nothing of it"):
+    with pytest.raises(UsageError, match="removes the whole mesh"):
         build_grid(box, "m", resolution=16, rounding=0.012)
 
 
