@@ -32,7 +32,7 @@ def read_limits(tables: Mapping[str, TomlTable], mechanics: Mechanics, location:
         table = tables.get(joint.name, TomlTable({}, location))
         if table.data and joint.range is None:
             raise UsageError(f"{location}: joint {joint.name!r} has no range in the model; a limit needs one")
-        stiffness, damping = joint.limit or (0.0, 0.0)
+        stiffness, damping = joint.default_limit or (0.0, 0.0)
         if "limit_stiffness" in table.data:
             stiffness, damping = table.number("limit_stiffness", minimum=0), 0.0
         limits.append(JointLimit(stiffness, table.number("limit_damping", damping, minimum=0)))

@@ -1,7 +1,7 @@
-"""Mechanics from MJCF or URDF, read with MuJoCo's own parser and compiler.
+"""Mechanics of a model file: bodies, joints, geometries, sites, actuators.
 
-MuJoCo resolves defaults, meshes and inertia; its compiled arrays are the source of every number here. Nothing is
-ever stepped by it. Bodies without a joint are merged into the body that carries them, mass and geometry included.
+MuJoCo parses and compiles the file (defaults, meshes, inertia); it never steps. Bodies without a joint are merged into
+the body that they are fixed to, including their mass, geometries and sites.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.geometry import Pose
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
-from gelflow.sim.scene.mjcf.actuators import ActuatorDef, default_limit, joint_extra, read_actuators
+from gelflow.sim.scene.mjcf.actuators import ActuatorDef, actuator_addition, default_limit, read_actuators
 from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
 from gelflow.sim.scene.mjcf.unsupported import apply_disable_flags, check_supported, not_modelled
 
@@ -25,67 +25,71 @@ WORLD = -1
 
 @dataclass(frozen=True)
 class BodyDef:
-    """A body with at least one joint, with all that is rigidly attached to it."""
+    """A moving body: a body with at least one joint and all bodies that are fixed to it."""
 
     name: str
     parent: int  # index of a moving body, or WORLD
-    pose: Pose  # in the parent's frame at q = 0
+    pose: Pose  # in the parent frame at q = 0
     mass: float  # [kg]
-    com: Array  # centre of mass in the body's frame [m]
-    inertia: Array  # xx yy zz xy xz yz about the centre of mass, body axes [kg m²]
+    com: Array  # centre of mass in the body frame [m], shape (3,)
+    inertia: Array  # about the centre of mass in body axes [kg m²]: xx, yy, zz, xy, xz, yz
 
 
 @dataclass(frozen=True)
 class JointDef:
+    """A joint. Units are those of a slide joint; those of a hinge and ball joint have rad for m and N m for N."""
+
     name: str
-    body: int
+    body: int  # index of the moving body
     type: str  # "slide", "hinge", "ball" or "free"
-    pos: Array  # in the body's frame [m]
-    axis: Array
+    pos: Array  # in the body frame [m], shape (3,)
+    axis: Array  # in the body frame, shape (3,)
     q_start: int  # index of the first position in q
     v_start: int  # index of the first velocity in v
-    damping: float
-    armature: float
-    stiffness: float
-    springref: float
-    range: tuple[float, float] | None
-    limit: tuple[float, float] | None  # stiffness and damping beyond the range, where the scene gives none
-    ref: float  # position at the pose of the file
-    frictionloss: float  # [N] or [N m]
+    damping: float  # [N s/m]
+    armature: float  # [kg]
+    stiffness: float  # [N/m]
+    springref: float  # position of zero spring force [m]
+    range: tuple[float, float] | None  # [m]
+    default_limit: tuple[float, float] | None  # stiffness [N/m] and damping [N s/m] beyond the range
+    ref: float  # position at the pose of the model file [m]
+    frictionloss: float  # dry friction [N]
 
     @property
     def nq(self) -> int:
-        """How many positions."""
+        """Number of positions."""
         return {"free": 7, "ball": 4}.get(self.type, 1)
 
     @property
     def nv(self) -> int:
-        """How many velocities."""
+        """Number of velocities."""
         return {"free": 6, "ball": 3}.get(self.type, 1)
 
 
 @dataclass(frozen=True)
 class GeomDef:
+    """A geometry of a moving body or of the world."""
+
     name: str
-    body: int
-    kind: str  # MuJoCo's name of the type: "box", "cylinder", …
-    pose: Pose  # in the moving body's frame
+    body: int  # index of a moving body, or WORLD
+    kind: str  # MuJoCo geometry type in lower case: "box", "cylinder", …
+    pose: Pose  # in the body frame
     size: Array  # MuJoCo's three sizes [m]
-    mesh: TriangleMesh | None = None  # of the kind "mesh", in the geometry's frame, as MuJoCo compiled it
+    mesh: TriangleMesh | None = None  # of a mesh, in the frame of the geometry
 
 
 @dataclass(frozen=True)
 class Mechanics:
-    """What a model file says of the mechanics."""
+    """The content of a model file."""
 
     bodies: tuple[BodyDef, ...]
     joints: tuple[JointDef, ...]
     geoms: tuple[GeomDef, ...]
-    sites: dict[str, tuple[int, Pose]]
+    sites: dict[str, tuple[int, Pose]]  # name -> moving body, pose in its frame
     actuators: tuple[ActuatorDef, ...]
-    gravity: Array
-    q0: Array
-    not_modelled: tuple[str, ...]
+    gravity: Array  # [m/s²], shape (3,)
+    q0: Array  # initial positions, shape (nq,)
+    not_modelled: tuple[str, ...]  # elements without effect, with the reason
 
 
 _JOINTS = {
@@ -99,33 +103,35 @@ _JOINTS = {
 def read_mechanics(path: Path) -> Mechanics:
     """Read and compile a model file.
 
-    Raises UsageError, in one line, when a file is missing or unreadable, or holds what the simulator does not model.
+    Raises UsageError, in one line, if a file is missing or invalid, or has an element that is not supported.
     """
     model, urdf = compile_model(path)
     apply_disable_flags(model)
     check_supported(model, path.name)
-    carrier, poses = _merge(model)
+    moving_body, poses = _merge(model)
     actuators = read_actuators(model, path.name)
     sites = {
-        name: (int(carrier[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
+        name: (int(moving_body[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
         for i, (name, b) in enumerate(zip(element_names(model, "site", model.nsite), model.site_bodyid, strict=True))
     }
-    if urdf:  # it has no sites: the frames of its links serve as such
-        sites = {name: (int(carrier[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))}
+    if urdf:  # has no sites; the link frames are used instead
+        sites = {
+            name: (int(moving_body[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))
+        }
     return Mechanics(
-        bodies=_bodies(model, carrier, poses),
-        joints=_joints(model, carrier, actuators),
-        geoms=_geoms(model, carrier, poses),
+        bodies=_bodies(model, moving_body, poses),
+        joints=_joints(model, moving_body, actuators),
+        geoms=_geoms(model, moving_body, poses),
         sites=sites,
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
-        q0=_start(model),
+        q0=_initial_positions(model),
         not_modelled=not_modelled(model),
     )
 
 
-def _start(model: Any) -> Array:
-    """Where the scene starts: the keyframe "start", else "home", else the pose in the file."""
+def _initial_positions(model: Any) -> Array:
+    """The keyframe "start", else the keyframe "home", else the pose of the file."""
     for name in ("start", "home"):
         if (key := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)) >= 0:
             return np.array(model.key_qpos[key])
@@ -133,25 +139,25 @@ def _start(model: Any) -> Array:
 
 
 def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
-    """For every body of the file: the moving body that carries it, and its pose in that body's frame."""
-    carrier = np.full(model.nbody, WORLD)
+    """For each body of the file: the moving body that it is merged into, and its pose in the frame of that body."""
+    moving_body = np.full(model.nbody, WORLD)
     poses = [Pose()]
     for b in range(1, model.nbody):
         parent = model.body_parentid[b]
         if model.body_jntnum[b]:
-            carrier[b] = carrier.max() + 1
+            moving_body[b] = moving_body.max() + 1
             poses.append(Pose())
         else:
-            carrier[b] = carrier[parent]
+            moving_body[b] = moving_body[parent]
             poses.append(poses[parent] @ Pose(model.body_pos[b].copy(), model.body_quat[b].copy()))
-    return carrier, poses
+    return moving_body, poses
 
 
-def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[BodyDef, ...]:
+def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tuple[BodyDef, ...]:
     bodies = []
     body_names = element_names(model, "body", model.nbody)
     for root in np.flatnonzero(model.body_jntnum > 0):
-        members = np.flatnonzero(carrier == carrier[root])
+        members = np.flatnonzero(moving_body == moving_body[root])
         masses = model.body_mass[members]
         mass = float(masses.sum())
         frames = [poses[b] @ Pose(model.body_ipos[b].copy(), model.body_iquat[b].copy()) for b in members]
@@ -164,53 +170,53 @@ def _bodies(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[
         parent = model.body_parentid[root]
         pose = poses[parent] @ Pose(model.body_pos[root].copy(), model.body_quat[root].copy())
         packed = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        bodies.append(BodyDef(body_names[root], int(carrier[parent]), pose, mass, com, packed))
+        bodies.append(BodyDef(body_names[root], int(moving_body[parent]), pose, mass, com, packed))
     return tuple(bodies)
 
 
-def _joints(model: Any, carrier: NDArray[np.int64], actuators: tuple[ActuatorDef, ...]) -> tuple[JointDef, ...]:
+def _joints(model: Any, moving_body: NDArray[np.int64], actuators: tuple[ActuatorDef, ...]) -> tuple[JointDef, ...]:
     joints = []
     for j, name in enumerate(element_names(model, "joint", model.njnt)):
         kind = _JOINTS[int(model.jnt_type[j])]
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-        turns = kind in ("ball", "free")
-        limited = bool(model.jnt_limited[j]) and not turns
-        own = [a for a in actuators if a.joint == j]
+        rotates_freely = kind in ("ball", "free")
+        limited = bool(model.jnt_limited[j]) and not rotates_freely
+        joint_actuators = [a for a in actuators if a.joint == j]
         joints.append(
             JointDef(
                 name=name,
-                body=int(carrier[model.jnt_bodyid[j]]),
+                body=int(moving_body[model.jnt_bodyid[j]]),
                 type=kind,
                 pos=model.jnt_pos[j].copy(),
                 axis=model.jnt_axis[j].copy(),
                 q_start=q,
                 v_start=v,
-                damping=float(model.dof_damping[v]) + joint_extra(model, j, "damping"),
-                armature=float(model.dof_armature[v]) + joint_extra(model, j, "armature"),
+                damping=float(model.dof_damping[v]) + actuator_addition(model, j, "damping"),
+                armature=float(model.dof_armature[v]) + actuator_addition(model, j, "armature"),
                 stiffness=float(model.jnt_stiffness[j]),
-                springref=0.0 if turns else float(model.qpos_spring[q]),
+                springref=0.0 if rotates_freely else float(model.qpos_spring[q]),
                 range=(float(model.jnt_range[j, 0]), float(model.jnt_range[j, 1])) if limited else None,
-                limit=default_limit(kind, float(model.dof_M0[v]), own) if limited else None,
-                ref=0.0 if turns else float(model.qpos0[q]),
+                default_limit=default_limit(kind, float(model.dof_M0[v]), joint_actuators) if limited else None,
+                ref=0.0 if rotates_freely else float(model.qpos0[q]),
                 frictionloss=float(model.dof_frictionloss[v]),
             )
         )
     return tuple(joints)
 
 
-def _geoms(model: Any, carrier: NDArray[np.int64], poses: list[Pose]) -> tuple[GeomDef, ...]:
+def _geoms(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tuple[GeomDef, ...]:
     geoms = []
     for g, name in enumerate(element_names(model, "geom", model.ngeom)):
         b = model.geom_bodyid[g]
         pose = poses[b] @ Pose(model.geom_pos[g].copy(), model.geom_quat[g].copy())
         kind = mujoco.mjtGeom(model.geom_type[g]).name.removeprefix("mjGEOM_").lower()
         mesh = _mesh(model, int(model.geom_dataid[g])) if kind == "mesh" else None
-        geoms.append(GeomDef(name, int(carrier[b]), kind, pose, model.geom_size[g].copy(), mesh))
+        geoms.append(GeomDef(name, int(moving_body[b]), kind, pose, model.geom_size[g].copy(), mesh))
     return tuple(geoms)
 
 
 def _mesh(model: Any, m: int) -> TriangleMesh:
-    """A compiled mesh: scaled, and in its own principal axes, which the geometry's pose makes up for."""
+    """A compiled mesh: scaled, and in its principal axes; the pose of the geometry includes the inverse rotation."""
     first, count = model.mesh_vertadr[m], model.mesh_vertnum[m]
     face, faces = model.mesh_faceadr[m], model.mesh_facenum[m]
     vertices = model.mesh_vert[first : first + count].astype(float)

@@ -1,4 +1,4 @@
-"""What model files may hold and the simulator does not model: refused by name, since its absence changes the motion."""
+"""Elements of model files that the simulator does not support: an error if they affect the motion, else a notice."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,9 +9,9 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.sim.scene.mjcf.model_file import element_names
 
-Problem = tuple[str, str]  # what is not modelled, and what to do
+Unsupported = tuple[str, str]  # element, advice
 
-# What each <flag> of the file switches off: fields of the model, which become 0.
+# Fields of the model that each disable flag sets to 0.
 _FLAGS = {
     "SPRING": ("jnt_stiffness", "jnt_stiffnesspoly", "tendon_stiffness", "tendon_stiffnesspoly"),
     "DAMPER": ("dof_damping", "dof_dampingpoly", "tendon_damping", "tendon_dampingpoly", "actuator_damping"),
@@ -23,18 +23,18 @@ _FLAGS = {
 _FLAGS["PASSIVE"] = _FLAGS["SPRING"] + _FLAGS["DAMPER"]
 _FLAGS["CONSTRAINT"] = _FLAGS["LIMIT"] + _FLAGS["FRICTIONLOSS"] + _FLAGS["EQUALITY"]
 
-_PULLS = {
+_TRANSMISSIONS = {
     mujoco.mjtTrn.mjTRN_TENDON: "on a tendon",
     mujoco.mjtTrn.mjTRN_SITE: "on a site",
     mujoco.mjtTrn.mjTRN_SLIDERCRANK: "on a slider-crank",
     mujoco.mjtTrn.mjTRN_BODY: "on a body (adhesion)",
 }
 
-_TURNING = {int(mujoco.mjtJoint.mjJNT_FREE): "free", int(mujoco.mjtJoint.mjJNT_BALL): "ball"}
+_ROTATING_JOINTS = {int(mujoco.mjtJoint.mjJNT_FREE): "free", int(mujoco.mjtJoint.mjJNT_BALL): "ball"}
 
 
 def apply_disable_flags(model: Any) -> None:
-    """Do what the file's flags say: what is switched off there becomes 0 here."""
+    """Set the fields of the model to 0 that the disable flags of the file switch off."""
     flags = model.opt.disableflags
     for flag, fields in _FLAGS.items():
         if flags & _bit(flag):
@@ -45,30 +45,30 @@ def apply_disable_flags(model: Any) -> None:
         model.opt.gravity[:] = 0
 
 
-def check_supported(model: Any, where: str) -> None:
-    """Raise UsageError, in one line, when the model holds what is not modelled."""
-    problems = [*_elements(model), *_options(model), *_joints(model), *_actuators(model)]
-    if not problems:
+def check_supported(model: Any, location: str) -> None:
+    """Raise UsageError, in one line, if the model has elements that are not supported."""
+    unsupported = [*_elements(model), *_options(model), *_joints(model), *_actuators(model)]
+    if not unsupported:
         return
-    (what, advice), *rest = problems
-    more = f" (also not modelled: {', '.join(other for other, _ in rest[:5])}{', …' * (len(rest) > 5)})" if rest else ""
-    raise UsageError(f"{where}: {what} is not modelled: {advice}{more}")
+    (element, advice), *rest = unsupported
+    more = (
+        f" (also not supported: {', '.join(other for other, _ in rest[:5])}{', …' * (len(rest) > 5)})" if rest else ""
+    )
+    raise UsageError(f"{location}: {element} is not supported: {advice}{more}")
 
 
 def not_modelled(model: Any) -> tuple[str, ...]:
-    """What the file has besides, that changes no motion here."""
-    parts = []
-    if model.npair or model.nexclude:
-        parts.append(
-            f"{model.npair + model.nexclude} contact pairs and excludes: the scene file says what touches what"
-        )
+    """Elements of the file that have no effect on the motion, one line each."""
+    lines = []
+    if pairs := model.npair + model.nexclude:
+        lines.append(f"{pairs} contact pairs and excludes: the TOML file defines the contacts")
     if model.nsensor:
-        parts.append(f"{model.nsensor} MuJoCo sensors: the scene file has pads")
+        lines.append(f"{model.nsensor} MuJoCo sensors: the TOML file defines the pads")
     if model.ntendon:
-        parts.append(f"{model.ntendon} tendons: nothing pulls on them")
+        lines.append(f"{model.ntendon} tendons: without force")
     if model.neq:
-        parts.append(f"{model.neq} equality constraints: not active")
-    return tuple(parts)
+        lines.append(f"{model.neq} equality constraints: not active")
+    return tuple(lines)
 
 
 def _bit(flag: str) -> int:
@@ -76,33 +76,33 @@ def _bit(flag: str) -> int:
 
 
 def _nonzero(model: Any, prefix: str, *fields: str) -> list[int]:
-    """Indices of the elements for which any of the fields is not 0; a field that this MuJoCo lacks counts as 0."""
-    found: set[int] = set()
+    """Indices of elements with a field that is not 0; fields that this version of MuJoCo does not have count as 0."""
+    indices: set[int] = set()
     for field in fields:
         if hasattr(model, prefix + field):
-            found |= {i for i, value in enumerate(getattr(model, prefix + field)) if np.any(value)}
-    return sorted(found)
+            indices |= {i for i, value in enumerate(getattr(model, prefix + field)) if np.any(value)}
+    return sorted(indices)
 
 
-def _elements(model: Any) -> Iterator[Problem]:
+def _elements(model: Any) -> Iterator[Unsupported]:
     tendons, bodies = element_names(model, "tendon", model.ntendon), element_names(model, "body", model.nbody)
-    pulled = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0].tolist()
+    actuated = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0].tolist()
     stiff = _nonzero(
         model, "tendon_", "stiffness", "stiffnesspoly", "damping", "dampingpoly", "frictionloss", "limited", "armature"
     )
     for f in range(model.nflex):
         yield f"flex {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, f)!r}", "remove it"
-    for t in sorted({*pulled, *stiff}):
+    for t in sorted({*actuated, *stiff}):
         yield f"tendon {tendons[t]!r}", "remove it or drive the joints directly"
     for e in _nonzero(model, "eq_", "active0"):
-        yield f"equality {_equality(model, e)}", "remove it, or make it inactive; drive each joint by itself"
+        yield f"equality {_equality(model, e)}", "remove it, or make it inactive; drive each joint by its own actuator"
     for b, body in enumerate(bodies):
         if model.body_plugin[b] >= 0:
             yield f"plugin of body {body!r}", "remove it"
         if model.body_mocapid[b] >= 0:
-            yield f"mocap body {body!r}", 'take mocap="true" away (it then stands still), or remove the body'
+            yield f"mocap body {body!r}", 'remove mocap="true" (the body is then fixed), or remove the body'
         if model.body_gravcomp[b] != 0:
-            yield f"gravcomp of body {body!r}", "remove it, or switch gravity off for the whole model"
+            yield f"gravcomp of body {body!r}", "remove it, or disable gravity for the whole model"
 
 
 def _equality(model: Any, e: int) -> str:
@@ -116,46 +116,48 @@ def _equality(model: Any, e: int) -> str:
     return f"{kind} of {' and '.join(repr(getattr(model, what)(i).name) for i in ends)}" if what else kind
 
 
-def _options(model: Any) -> Iterator[Problem]:
+def _options(model: Any) -> Iterator[Unsupported]:
     for option in ("density", "viscosity", "wind"):
         if np.any(getattr(model.opt, option)):
-            yield f"option {option}", "remove it; there is no air or water"
+            yield f"option {option}", "remove it; fluid forces are not simulated"
     if model.opt.disableflags & _bit("ACTUATION"):
-        yield 'flag actuation="disable"', "remove it; controls of 0 do the same for motors"
+        yield 'flag actuation="disable"', "remove it; for motors, controls of 0 have the same effect"
     if model.opt.disableactuator:
         yield "option actuatorgroupdisable", "remove it, and the actuators of those groups"
 
 
-def _joints(model: Any) -> Iterator[Problem]:
+def _joints(model: Any) -> Iterator[Unsupported]:
     driven = np.bincount(model.actuator_trnid[_on_joint(model), 0], minlength=model.njnt)
-    curved = _nonzero(model, "jnt_", "stiffnesspoly"), _nonzero(model, "dof_", "dampingpoly")
+    polynomial_stiffness = _nonzero(model, "jnt_", "stiffnesspoly")
+    polynomial_damping = _nonzero(model, "dof_", "dampingpoly")
     for j, joint in enumerate(element_names(model, "joint", model.njnt)):
-        turns = _TURNING.get(int(model.jnt_type[j]))
-        if turns == "ball" and model.jnt_limited[j]:
-            yield f"range of ball joint {joint!r}", "remove it, or build the joint from three hinges"
-        if turns and model.jnt_stiffness[j] != 0:
-            yield f"stiffness of {turns} joint {joint!r}", "remove it"
-        if j in curved[0]:
-            yield f"polynomial stiffness of joint {joint!r}", "give one number"
-        if model.jnt_dofadr[j] in curved[1]:
-            yield f"polynomial damping of joint {joint!r}", "give one number"
+        rotating = _ROTATING_JOINTS.get(int(model.jnt_type[j]))
+        if rotating == "ball" and model.jnt_limited[j]:
+            yield f"range of ball joint {joint!r}", "remove it, or replace the joint by three hinges"
+        if rotating and model.jnt_stiffness[j] != 0:
+            yield f"stiffness of {rotating} joint {joint!r}", "remove it"
+        if j in polynomial_stiffness:
+            yield f"polynomial stiffness of joint {joint!r}", "give one coefficient"
+        if model.jnt_dofadr[j] in polynomial_damping:
+            yield f"polynomial damping of joint {joint!r}", "give one coefficient"
         if model.jnt_actfrclimited[j] and driven[j] > 1:
-            yield f"actuatorfrcrange of joint {joint!r}, which {driven[j]} actuators drive,", "give each a forcerange"
+            yield f"actuatorfrcrange of joint {joint!r} with {driven[j]} actuators", "give each actuator a forcerange"
 
 
 def _on_joint(model: Any) -> Any:
     return np.isin(model.actuator_trntype, (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
-def _actuators(model: Any) -> Iterator[Problem]:
+def _actuators(model: Any) -> Iterator[Unsupported]:
     for a, name in enumerate(element_names(model, "actuator", len(model.actuator_trntype))):
-        if found := _actuator(model, a):
-            yield f"actuator {name!r} {found[0]}", found[1]
+        if problem := _actuator(model, a):
+            feature, advice = problem
+            yield f"actuator {name!r} {feature}", advice
     for a in _nonzero(model, "actuator_", "dampingpoly"):
-        yield f"polynomial damping of actuator {element_names(model, 'actuator', a + 1)[a]!r}", "give one number"
+        yield f"polynomial damping of actuator {element_names(model, 'actuator', a + 1)[a]!r}", "give one coefficient"
 
 
-def _actuator(model: Any, a: int) -> Problem | None:
+def _actuator(model: Any, a: int) -> Unsupported | None:
     kinds = [
         (kind, mujoco_enum(getattr(model, f"actuator_{kind}")[a]).name.split("_", 1)[1].lower())
         for kind, mujoco_enum in (
@@ -165,23 +167,23 @@ def _actuator(model: Any, a: int) -> Problem | None:
         )
     ]
     gain, bias, dyn = (value for _, value in kinds)
-    servo = "use motor, position, velocity or general on joints"
+    advice = "use motor, position, velocity or general on joints"
     if model.actuator_plugin[a] >= 0:
-        return "with a plugin", servo
+        return "with a plugin", advice
     if gain == "affine" and not model.actuator_gainprm[a, 1:3].any():
-        gain = "fixed"  # an affine gain without its slopes
+        gain = "fixed"  # an affine gain with slopes 0
     if gain != "fixed":
-        return f"with gaintype {gain}", servo
+        return f"with gaintype {gain}", advice
     if bias not in ("none", "affine"):
-        return f"with biastype {bias}", servo
+        return f"with biastype {bias}", advice
     if dyn != "none":
-        return f"with an activation (dyntype {dyn})", "take timeconst or dyntype away"
+        return f"with an activation (dyntype {dyn})", "remove timeconst or dyntype"
     trn = model.actuator_trntype[a]
     if not _on_joint(model)[a]:
-        return _PULLS.get(mujoco.mjtTrn(trn), "on no joint"), "drive the joints directly"
+        return _TRANSMISSIONS.get(mujoco.mjtTrn(trn), "without a joint"), "drive the joints directly"
     joint = int(model.actuator_trnid[a, 0])
-    if turns := _TURNING.get(int(model.jnt_type[joint])):
-        return f"on {turns} joint {model.joint(joint).name!r}", "drive slide or hinge joints"
+    if rotating := _ROTATING_JOINTS.get(int(model.jnt_type[joint])):
+        return f"on {rotating} joint {model.joint(joint).name!r}", "drive slide or hinge joints"
     if np.any(getattr(model, "actuator_delay", np.zeros(a + 1))[a]):
         return "with a delay", "remove it"
     return None

@@ -43,21 +43,25 @@ def option(text: str) -> tuple[str, str]:
 
 
 REFUSALS = [
-    (section(TENDON.format('stiffness="3"')), "tendon 'split' is not modelled: remove it or drive the joints directly"),
-    (section(TENDON.format('range="-1 1"')), "tendon 'split' is not modelled: remove it or drive the joints directly"),
+    (
+        section(TENDON.format('stiffness="3"')),
+        "tendon 'split' is not supported: remove it or drive the joints directly",
+    ),
+    (section(TENDON.format('range="-1 1"')), "tendon 'split' is not supported: remove it or drive the joints directly"),
     (
         section(TENDON.format("") + '<actuator><position tendon="split"/></actuator>'),
-        "tendon 'split' is not modelled: remove it or drive the joints directly "
-        "(also not modelled: actuator 'actuator0' on a tendon)",
+        "tendon 'split' is not supported: remove it or drive the joints directly "
+        "(also not supported: actuator 'actuator0' on a tendon)",
     ),
     (
         section('<equality><joint joint1="swing"/></equality>'),
-        "equality joint of 'swing' is not modelled: remove it, or make it inactive; drive each joint by itself",
+        "equality joint of 'swing' is not supported: "
+        "remove it, or make it inactive; drive each joint by its own actuator",
     ),
-    (section('<equality><weld name="glue" body1="arm"/></equality>'), "equality weld 'glue' is not modelled: remove"),
+    (section('<equality><weld name="glue" body1="arm"/></equality>'), "equality weld 'glue' is not supported: remove"),
     (
         section('<equality><connect body1="arm" body2="ball" anchor="0 0 0"/></equality>'),
-        "equality connect of 'arm' and 'ball' is not modelled: remove it",
+        "equality connect of 'arm' and 'ball' is not supported: remove it",
     ),
     (
         (
@@ -65,90 +69,96 @@ REFUSALS = [
             '<body name="cloth"><flexcomp name="cloth" type="grid" count="3 3 1" spacing="0.1 0.1 0.1" mass="1" '
             'radius="0.01" dim="2"><edge equality="true"/></flexcomp></body></worldbody>',
         ),
-        "flex 'cloth' is not modelled: remove it",
+        "flex 'cloth' is not supported: remove it",
     ),
     (
         section(
             '<extension><plugin plugin="mujoco.pid"><instance name="pid"/></plugin></extension>'
             '<actuator><plugin name="servo" joint="swing" plugin="mujoco.pid" instance="pid"/></actuator>'
         ),
-        f"actuator 'servo' with a plugin is not modelled: {SERVO}",
+        f"actuator 'servo' with a plugin is not supported: {SERVO}",
     ),
     (
         ("</worldbody>", '<body name="target" mocap="true"/></worldbody>'),
-        "mocap body 'target' is not modelled: take mocap=\"true\" away (it then stands still), or remove the body",
+        "mocap body 'target' is not supported: remove mocap=\"true\" (the body is then fixed), or remove the body",
     ),
     (
         ('<body name="arm">', '<body name="arm" gravcomp="1">'),
-        "gravcomp of body 'arm' is not modelled: remove it, or switch gravity off for the whole model",
+        "gravcomp of body 'arm' is not supported: remove it, or disable gravity for the whole model",
     ),
-    (option('density="1"/>'), "option density is not modelled: remove it; there is no air or water"),
-    (option('viscosity="1"/>'), "option viscosity is not modelled: remove it; there is no air or water"),
-    (option('wind="1 0 0"/>'), "option wind is not modelled: remove it; there is no air or water"),
+    (option('density="1"/>'), "option density is not supported: remove it; fluid forces are not simulated"),
+    (option('viscosity="1"/>'), "option viscosity is not supported: remove it; fluid forces are not simulated"),
+    (option('wind="1 0 0"/>'), "option wind is not supported: remove it; fluid forces are not simulated"),
     (
         option('><flag actuation="disable"/></option>'),
-        'flag actuation="disable" is not modelled: remove it; controls of 0 do the same for motors',
+        'flag actuation="disable" is not supported: remove it; for motors, controls of 0 have the same effect',
     ),
-    (option('actuatorgroupdisable="2"/>'), "option actuatorgroupdisable is not modelled: remove it, and the actuators"),
+    (
+        option('actuatorgroupdisable="2"/>'),
+        "option actuatorgroupdisable is not supported: remove it, and the actuators",
+    ),
     (
         ('type="ball"', 'type="ball" range="0 60"'),
-        "range of ball joint 'socket' is not modelled: remove it, or build the joint from three hinges",
+        "range of ball joint 'socket' is not supported: remove it, or replace the joint by three hinges",
     ),
-    (('type="ball"', 'type="ball" stiffness="2"'), "stiffness of ball joint 'socket' is not modelled: remove it"),
+    (('type="ball"', 'type="ball" stiffness="2"'), "stiffness of ball joint 'socket' is not supported: remove it"),
     (
         ('<freejoint name="floating"/>', '<joint name="floating" type="free" stiffness="2"/>'),
-        "stiffness of free joint 'floating' is not modelled: remove it",
+        "stiffness of free joint 'floating' is not supported: remove it",
     ),
-    (swing('stiffness="1 2"'), "polynomial stiffness of joint 'swing' is not modelled: give one number"),
-    (swing('damping="1 2"'), "polynomial damping of joint 'swing' is not modelled: give one number"),
+    (swing('stiffness="1 2"'), "polynomial stiffness of joint 'swing' is not supported: give one coefficient"),
+    (swing('damping="1 2"'), "polynomial damping of joint 'swing' is not supported: give one coefficient"),
     (
         actuator('<motor joint="socket"/>'),
-        "actuator 'actuator0' on ball joint 'socket' is not modelled: drive slide or hinge joints",
+        "actuator 'actuator0' on ball joint 'socket' is not supported: drive slide or hinge joints",
     ),
-    (actuator('<motor joint="floating"/>'), "actuator 'actuator0' on free joint 'floating' is not modelled: drive"),
-    (actuator('<motor name="jet" site="tip"/>'), "actuator 'jet' on a site is not modelled: drive the joints directly"),
+    (actuator('<motor joint="floating"/>'), "actuator 'actuator0' on free joint 'floating' is not supported: drive"),
+    (
+        actuator('<motor name="jet" site="tip"/>'),
+        "actuator 'jet' on a site is not supported: drive the joints directly",
+    ),
     (
         actuator('<motor name="crank" cranksite="tip" slidersite="tip" cranklength="1"/>'),
-        "actuator 'crank' on a slider-crank is not modelled: drive the joints directly",
+        "actuator 'crank' on a slider-crank is not supported: drive the joints directly",
     ),
     (actuator('<adhesion name="cup" body="arm" ctrlrange="0 1"/>'), "actuator 'cup' on a body (adhesion) is not"),
     (
         actuator('<muscle name="biceps" joint="swing" lengthrange="0 1"/>'),
-        f"actuator 'biceps' with gaintype muscle is not modelled: {SERVO}",
+        f"actuator 'biceps' with gaintype muscle is not supported: {SERVO}",
     ),
     (
         actuator('<damper name="brake" joint="swing" kv="2" ctrlrange="0 1"/>'),
-        f"actuator 'brake' with gaintype affine is not modelled: {SERVO}",
+        f"actuator 'brake' with gaintype affine is not supported: {SERVO}",
     ),
     (
         actuator('<dcmotor name="dc" joint="swing" motorconst="0.1" resistance="1"/>'),
-        f"actuator 'dc' with gaintype dcmotor is not modelled: {SERVO}",
+        f"actuator 'dc' with gaintype dcmotor is not supported: {SERVO}",
     ),
     (
         actuator('<position name="slow" joint="swing" timeconst="0.1"/>'),
-        "actuator 'slow' with an activation (dyntype filterexact) is not modelled: take timeconst or dyntype away",
+        "actuator 'slow' with an activation (dyntype filterexact) is not supported: remove timeconst or dyntype",
     ),
     (
         actuator('<intvelocity name="int" joint="swing" kp="2" actrange="-1 1"/>'),
-        "actuator 'int' with an activation (dyntype integrator) is not modelled: take timeconst or dyntype away",
+        "actuator 'int' with an activation (dyntype integrator) is not supported: remove timeconst or dyntype",
     ),
     (
         actuator('<cylinder name="air" joint="swing" timeconst="1"/>'),
-        "actuator 'air' with an activation (dyntype filter) is not modelled: take timeconst or dyntype away",
+        "actuator 'air' with an activation (dyntype filter) is not supported: remove timeconst or dyntype",
     ),
     (
         actuator('<motor name="late" joint="swing" delay="0.1" nsample="3"/>'),
-        "actuator 'late' with a delay is not modelled: remove it",
+        "actuator 'late' with a delay is not supported: remove it",
     ),
     (
         actuator('<motor name="push" joint="swing" damping="1 2"/>'),
-        "polynomial damping of actuator 'push' is not modelled: give one number",
+        "polynomial damping of actuator 'push' is not supported: give one coefficient",
     ),
     (
         section('<asset><mesh name="shell" file="meshes/gone.stl"/></asset>'),
-        "mesh 'shell': no file meshes/gone.stl (looked for ",
+        "mesh 'shell': no file meshes/gone.stl (searched at ",
     ),
-    (section('<asset><mesh file="robot.toml"/></asset>'), "mesh 'robot': robot.toml is of a kind that is not read; "),
+    (section('<asset><mesh file="robot.toml"/></asset>'), "mesh 'robot': robot.toml has an unsupported format; "),
     (section('<asset><texture name="wood" type="2d" file="gone.png"/></asset>'), "gone.png"),
     (section('<include file="gone.xml"/>'), "Error opening file"),
     (('name="ball" pos', 'name="arm" pos'), "repeated name 'arm' in body"),
@@ -187,12 +197,14 @@ def test_a_joint_s_force_range_is_for_one_actuator(tmp_path: Path) -> None:
     check_refused(
         tmp_path,
         "robot.xml",
-        "actuatorfrcrange of joint 'swing', which 2 actuators drive, is not modelled: give each a forcerange",
+        "actuatorfrcrange of joint 'swing' with 2 actuators is not supported: give each actuator a forcerange",
     )
     (tmp_path / "robot.xml").write_text(
         limited.replace(MOTOR, '<motor name="push" joint="swing" forcerange="-1 0.5"/>')
     )
-    check_refused(tmp_path, "robot.xml", "actuator 'push': its forcerange and the joint's actuatorfrcrange share no")
+    check_refused(
+        tmp_path, "robot.xml", "actuator 'push': forcerange and the actuatorfrcrange of the joint are disjoint"
+    )
 
 
 HAND = """<mujoco model="hand">
@@ -217,8 +229,8 @@ def test_a_hand_with_coupled_fingers_is_refused_in_one_line(tmp_path: Path) -> N
     check_refused(
         tmp_path,
         "hand.xml",
-        "hand.xml: tendon 'split' is not modelled: remove it or drive the joints directly "
-        "(also not modelled: equality joint of 'finger_1' and 'finger_2', actuator 'grip' on a tendon)",
+        "hand.xml: tendon 'split' is not supported: remove it or drive the joints directly "
+        "(also not supported: equality joint of 'finger_1' and 'finger_2', actuator 'grip' on a tendon)",
     )
 
 
@@ -233,11 +245,11 @@ URDF = f"""<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><link n
 URDF_REFUSALS = [
     (
         ("</joint></robot>", '<mimic joint="a" multiplier="2"/></joint></robot>'),
-        "joint 'b' mimics 'a', which is not modelled: remove <mimic> and drive the joint by itself",
+        "joint 'b' mimics 'a', which is not supported: remove <mimic> and drive the joint by its own actuator",
     ),
     (("<link", '<xacro:include filename="macros.xacro"/><link'), "has xacro macros, which are not expanded; run xacro"),
-    (("FILE", "package://my_arm/link.stl"), "mesh 'link': no file package://my_arm/link.stl (looked for "),
-    (("FILE", "robot.toml"), "mesh 'robot': robot.toml is of a kind that is not read; convert it to .stl or .obj"),
+    (("FILE", "package://my_arm/link.stl"), "mesh 'link': no file package://my_arm/link.stl (searched at "),
+    (("FILE", "robot.toml"), "mesh 'robot': robot.toml has an unsupported format; convert it to .stl or .obj"),
     (("</robot>", ""), "XML"),
 ]
 
