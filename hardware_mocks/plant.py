@@ -1,8 +1,8 @@
-"""The physics behind the mocks, as small protocols, and kinematic stand-ins for tests.
+"""Plants: the physics behind the mock devices, as protocols, and kinematic plants for tests.
 
-A mock speaks a device's protocol on the wire and asks a plant what the machine does. The simulator drives the
-plants of the mock robot; the stand-ins here know only kinematics, so that protocols can be tested without it.
-All methods are called from the mocks' threads: a plant must be thread-safe. SI units; quaternions w x y z.
+A mock implements the device's protocol on the wire; its plant simulates the mechanism. The simulated cell is the plant
+of the mock robot; the kinematic plants here allow tests of the protocols without the simulator. Plants are called from
+several threads and must be thread-safe. SI units; quaternions w x y z.
 """
 
 import threading
@@ -19,19 +19,19 @@ class GripperPlant(Protocol):
     """A parallel gripper: two fingers that move symmetrically."""
 
     def gripper_state(self) -> tuple[float, float, float]:
-        """Width between the fingers [m], speed [m/s, positive opens], force on what they press [N, ≥ 0], now."""
+        """Width between the fingers [m], speed [m/s, positive opens], pressing force [N, ≥ 0]."""
         ...
 
     def command_gripper(self, *, width: float, speed: float, force: float) -> None:
-        """Move towards `width` [m] at `speed` [m/s], pushing with at most `force` [N]; replaces the last command."""
+        """Move towards `width` [m] at `speed` [m/s] with at most `force` [N]; replaces the last command."""
         ...
 
 
 class ArmPlant(Protocol):
-    """An arm's tool in the robot's base frame."""
+    """The tool of an arm in the robot's base frame."""
 
     def arm_pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Tool position [m], shape (3,), and quaternion w x y z, shape (4,), now."""
+        """Tool position [m], shape (3,), and quaternion w x y z, shape (4,)."""
         ...
 
     def command_arm(self, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
@@ -50,8 +50,8 @@ class GelPlant(Protocol):
 class KinematicGripper:
     """Fingers that move at the commanded speed and stop at a rigid part or at the ends of the stroke.
 
-    `part_width` [m] is the part between the fingers, None where there is none. Against the part or an end the
-    fingers push with the commanded force.
+    `part_width` [m] is the width of the part between the fingers, None without a part. The fingers press on the part
+    or an end with the commanded force.
     """
 
     STROKE = 0.110  # [m]
@@ -71,9 +71,9 @@ class KinematicGripper:
         self._time = clock.now()
 
     def _stop_width(self) -> float:
-        """Where the fingers end up [m]; call with the lock held."""
+        """Width at which the fingers stop [m]; the caller holds the lock."""
         reachable = min(max(self._target, 0.0), self.STROKE)
-        # A part that is wider than the opening can't come between the fingers.
+        # A part wider than the opening is not between the fingers.
         if self._part is not None and self._part <= self._width + 1e-9:
             reachable = max(reachable, self._part)
         return reachable
@@ -99,7 +99,7 @@ class KinematicGripper:
             self._target, self._speed, self._force = width, speed, force
 
     def set_part(self, width: float | None) -> None:
-        """Put a part of `width` [m] between the fingers, or take it away (None)."""
+        """Put a part of `width` [m] between the fingers, or remove it (None)."""
         with self._lock:
             self._advance()
             if width is not None and not 0 < width <= self._width:
@@ -108,7 +108,7 @@ class KinematicGripper:
 
 
 class KinematicArm:
-    """A tool that follows its reference as a first-order lag: what is left of an error falls by e every `lag` [s]."""
+    """A tool that follows its reference with a first-order lag of time constant `lag` [s]."""
 
     def __init__(
         self, clock: Clock, *, position: NDArray[np.float64], quaternion: NDArray[np.float64], lag: float = 0.015
@@ -128,7 +128,7 @@ class KinematicArm:
         self._time = now
         position, quaternion = self._reference
         self._position = self._position + share * (position - self._position)
-        # The shorter way round; for the small angles between two references this is a rotation at steady rate.
+        # Interpolate along the shorter rotation; linear interpolation is accurate for the small angles of one update.
         sign = 1.0 if float(quaternion @ self._quaternion) >= 0 else -1.0
         mixed = (1 - share) * self._quaternion + share * sign * quaternion
         self._quaternion = mixed / np.linalg.norm(mixed)
@@ -151,8 +151,8 @@ def _pose(
     p = np.array(position, dtype=float)
     q = np.array(quaternion, dtype=float)
     if p.shape != (3,) or q.shape != (4,) or not np.isfinite(p).all() or not np.isfinite(q).all():
-        raise UsageError(f"a pose is a finite position (3,) and quaternion w x y z (4,), got {p} and {q}")
+        raise UsageError(f"expected a finite position (3,) and quaternion w x y z (4,), got {p} and {q}")
     norm = float(np.linalg.norm(q))
     if norm < 0.5:
-        raise UsageError(f"a quaternion has length 1, got {norm:.3g}")
+        raise UsageError(f"expected a quaternion of length 1, got length {norm:.3g}")
     return p, q / norm

@@ -1,4 +1,4 @@
-"""The whole mock robot: gripper, arm and two tactile cameras on the wire, one simulated world behind them."""
+"""The mock robot: gripper, arm and two tactile cameras on the wire, with one simulated cell as their plant."""
 
 import contextlib
 import json
@@ -26,28 +26,29 @@ from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, TimeSync
 
 Rotation = Literal[0, 90, 180, 270]
 
-# Elbow up, flange down, wrist not stretched: where the arm stands above the hole.
+# Joint configuration above the hole: elbow up, flange down, wrist away from its singularity.
 _NEAR: Joints = (0.0, 0.3, 0.1, 0.0, 1.2, 0.0)
 
 
 @dataclass(frozen=True)
 class MockRobotConfig:
-    """Where the mock robot is served, and what it looks like. Times in robot time."""
+    """Addresses, camera images and plant of the mock robot. Times in robot time."""
 
     cell: SimulatedCellConfig = field(default_factory=SimulatedCellConfig)
     host: str = "127.0.0.1"
-    egm_port: int = 6510  # where the arm sends its feedback
-    tcp_port: int = 0  # of the gripper, beside its pty; 0 takes a free one
-    truth_port: int = 0  # of the side channel that tells the truth; 0 takes a free one
-    camera_rate: float = 12.5  # frames a second: one every 80 ms, as the real set-up processes them
+    egm_port: int = 6510  # UDP port to which the arm sends its feedback
+    tcp_port: int = 0  # of the gripper, in addition to its pty; 0 takes a free port
+    truth_port: int = 0  # of the HTTP server of the ground truth; 0 takes a free port
+    camera_rate: float = 12.5  # images per second: one every 80 ms, as in the real cell
     look: GelAppearance = field(default_factory=GelAppearance)
-    rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and the right camera's image [°]: 0, 90, 180 or 270
+    rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
 
 
 class MockRobot:
-    """Starts all mocks; `with` or `start` and `stop`. Order faults from the parts: `gripper`, `arm`, `cameras`.
+    """All mock devices and the simulated cell. Use `with`, or `start` and `stop`.
 
-    Its `clock` runs at most `factor` times as fast as the wall clock: as fast as this computer can simulate.
+    Faults are injected through the devices `gripper`, `arm` and `cameras`. `clock` runs at most `factor` times as fast
+    as the wall clock, and slower where this computer cannot simulate as fast.
     """
 
     def __init__(self, factor: float = 1.0, config: MockRobotConfig | None = None) -> None:
@@ -57,7 +58,7 @@ class MockRobot:
         TimeSync.create(time_sync)
         self.clock = clock = ScaledClock(factor, time_sync)
         self.cell = SimulatedCellProcess(clock, config.cell)
-        # CommTimeout is 0.4 s in wall time: this computer's jitter does not shrink when the clock is scaled.
+        # CommTimeout is 0.4 s in wall time, because the computer's jitter does not scale with the clock.
         timeout = 0.4 * max(1.0, clock.factor)
         controller = MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR, comm_timeout=timeout)
         self.arm = MockEgmArm(self.cell, clock=clock, config=controller)
@@ -77,12 +78,12 @@ class MockRobot:
 
     @property
     def truth_url(self) -> str:
-        """Of the side channel: GET tells what is true now, POST ?seed=N chooses the next part."""
+        """URL of the ground truth: GET returns it, POST ?seed=N selects the next part."""
         host, port = self._truth.server_address[:2]
         return f"http://{host!s}:{port}/truth"
 
     def start(self) -> Self:
-        """Start the world, then the devices. Raises UsageError when a port is taken."""
+        """Start the simulated cell, then the devices. Raises UsageError when a port is in use."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._folder.cleanup)
             self.cell.start()
@@ -98,7 +99,7 @@ class MockRobot:
         return self
 
     def stop(self) -> None:
-        """Stop all. Raises what went wrong inside a mock."""
+        """Stop all devices and the cell. Raises errors that occurred inside a mock."""
         self._stack.close()
 
     def __enter__(self) -> Self:
@@ -117,7 +118,7 @@ def _look(config: MockRobotConfig, finger: int) -> GelAppearance:
 
 
 class _Gel:
-    """The picture source of one camera."""
+    """Image source of one camera."""
 
     def __init__(self, cell: SimulatedCellProcess, finger: int, look: GelAppearance) -> None:
         self._cell, self._finger = cell, finger
@@ -131,7 +132,7 @@ class _Gel:
 
 
 class _TruthServer(ThreadingHTTPServer):
-    """What no device tells: for demonstrations and evaluations, which print it as another column."""
+    """Serves the ground truth, which no device provides, to demonstrations and evaluations."""
 
     daemon_threads = True
     block_on_close = False
@@ -141,14 +142,14 @@ class _TruthServer(ThreadingHTTPServer):
         try:
             super().__init__(where, _TruthHandler)
         except OSError as error:
-            raise UsageError(f"cannot serve the truth at {where[0]}:{where[1]}: {error.strerror}") from error
+            raise UsageError(f"cannot serve the ground truth at {where[0]}:{where[1]}: {error.strerror}") from error
 
     def close(self) -> None:
         self.shutdown()
         self.server_close()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that left is no error, and a mock does not print."""
+        """Ignore clients that disconnect; mocks do not print."""
 
 
 class _TruthHandler(BaseHTTPRequestHandler):
@@ -160,7 +161,7 @@ class _TruthHandler(BaseHTTPRequestHandler):
     def do_POST(self) -> None:
         text = parse_qs(urlsplit(self.path).query).get("seed", [""])[0]
         if not text.isdecimal():
-            self.send_error(400, "expected ?seed=N with a whole number")
+            self.send_error(400, "expected ?seed=N with an integer N")
             return
         self.server.cell.next_seed(int(text))
         self._answer({"next_seed": int(text)})
@@ -178,7 +179,7 @@ class _TruthHandler(BaseHTTPRequestHandler):
 
 
 def _finite(value: Any) -> Any:
-    """JSON has no infinity: what was not measured yet becomes null."""
+    """Replace numbers that are not finite (not measured yet) by null, because JSON has none."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""A tactile camera's HTTP server: an MJPEG stream like that of a Raspberry Pi's streamer, with faults on demand."""
+"""Mock tactile camera: an HTTP server with an MJPEG stream as sent by mjpg-streamer, and faults on demand."""
 
 import contextlib
 import math
@@ -20,11 +20,11 @@ CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
 
 
 class MockMjpegCamera:
-    """Serves one camera to any number of clients: `source` gives one JPEG per call.
+    """Serves one camera to any number of clients; `source` returns one JPEG per call.
 
-    Frames are made `rate` times a second of robot time, in a thread of its own, once for all clients together, and
-    only while somebody looks. A client that cannot keep up gets newer frames, not later ones. `port` 0 takes a free
-    one; `url` tells it. With a `slot` of a paced clock (`gelflow.time_sync`) robot time waits for frames that are late.
+    A thread creates `rate` images per second of robot time, once for all clients, and only while a client is
+    connected. A slow client skips images. `port` 0 takes a free port; `url` contains it. With a `slot` of the time
+    synchronization (`gelflow.time_sync`), robot time waits for late images.
     """
 
     def __init__(
@@ -47,26 +47,26 @@ class MockMjpegCamera:
         self._server: _Server | None = None
         self._threads: list[threading.Thread] = []
         self._changed = threading.Condition()
-        self._frame = b""
-        self._number = 0  # of frames made
+        self._image = b""
+        self._number = 0  # of images created
         self._watchers = 0
         self._closing = False
         self._stalled = False
-        self._epoch = 0  # raised to end all streams
+        self._epoch = 0  # incremented to end all streams
         self._corrupt: list[Corruption] = []
         self._failure: Exception | None = None
 
-    # Running
+    # Server
 
     def start(self) -> Self:
-        """Bind and serve. Raises UsageError when the address is taken."""
+        """Bind and serve. Raises UsageError when the address is in use."""
         try:
             self._server = _Server(self._where, self)
         except OSError as error:
             host, port = self._where
-            raise UsageError(f"cannot serve a camera at {host}:{port}: {error.strerror}; take another port") from error
+            raise UsageError(f"cannot serve a camera at {host}:{port}: {error.strerror}; use another port") from error
         serve = threading.Thread(target=self._server.serve_forever, args=(0.05,), name="mjpeg server", daemon=True)
-        produce = threading.Thread(target=self._produce, name="mjpeg frames", daemon=True)
+        produce = threading.Thread(target=self._produce, name="mjpeg images", daemon=True)
         self._threads = [serve, produce]
         for thread in self._threads:
             thread.start()
@@ -85,11 +85,11 @@ class MockMjpegCamera:
 
     @property
     def clients(self) -> int:
-        """How many look at the stream now."""
+        """Number of clients of the stream."""
         return self._watchers
 
     def close(self) -> None:
-        """End all streams and stop. Raises PeerError when `source` had failed."""
+        """End all streams and stop. Raises PeerError when `source` has failed."""
         if self._server is None:
             return
         server, self._server = self._server, None
@@ -102,7 +102,7 @@ class MockMjpegCamera:
             thread.join(2.0)
         if self._failure is not None:
             kind, message = type(self._failure).__name__, self._failure
-            raise PeerError(f"the mock camera's picture source failed: {kind}: {message}") from self._failure
+            raise PeerError(f"the image source of the mock camera failed: {kind}: {message}") from self._failure
 
     def __enter__(self) -> Self:
         return self if self._server is not None else self.start()
@@ -113,7 +113,7 @@ class MockMjpegCamera:
     # Faults
 
     def stall(self) -> None:
-        """Send nothing more, but keep the connections, until `resume`."""
+        """Send no images until `resume`, with the connections kept open."""
         with self._changed:
             self._stalled = True
 
@@ -123,14 +123,14 @@ class MockMjpegCamera:
             self._changed.notify_all()
 
     def corrupt(self, count: int = 1, *, how: Corruption = "truncated") -> None:
-        """Spoil the next `count` frames sent: cut off, with noise in the image, or with a wrong Content-Length."""
+        """Corrupt the next `count` images: truncated, with noise in the image, or with a wrong Content-Length."""
         if how not in CORRUPTIONS:
             raise UsageError(f"how must be one of {', '.join(CORRUPTIONS)}, got {how!r}")
         with self._changed:
             self._corrupt += [how] * count
 
     def drop_clients(self) -> None:
-        """Close all streams; new clients are served."""
+        """Close all streams; new clients are accepted."""
         with self._changed:
             self._epoch += 1
             self._changed.notify_all()
@@ -147,15 +147,15 @@ class MockMjpegCamera:
                 if self._closing:
                     return
             try:
-                frame = self._source()
-            except Exception as error:  # noqa: BLE001 - `close` raises it; until then clients see the stream end
+                image = self._source()
+            except Exception as error:  # noqa: BLE001 - `close` raises it; the streams end
                 with self._changed:
                     self._failure = error
                     self._allow(math.inf)
                     self._changed.notify_all()
                 return
             with self._changed:
-                self._frame = frame
+                self._image = image
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
@@ -167,14 +167,14 @@ class MockMjpegCamera:
             self._clock.grant(self._slot, until)
 
     def _watch(self, change: int) -> int:
-        """Count a client in or out; returns the current epoch."""
+        """Add or remove a client; returns the current epoch."""
         with self._changed:
             self._watchers += change
             self._changed.notify_all()
             return self._epoch
 
     def _next(self, after: int, epoch: int) -> tuple[int, bytes, Corruption | None] | None:
-        """The newest frame once its number is greater than `after`; None when the stream shall end."""
+        """The newest image with a number above `after`; None when the stream ends."""
 
         def ended() -> bool:
             return self._closing or self._failure is not None or self._epoch != epoch
@@ -183,8 +183,8 @@ class MockMjpegCamera:
             self._changed.wait_for(lambda: ended() or (self._number > after and not self._stalled))
             if ended():
                 return None
-            spoilt = self._corrupt.pop(0) if self._corrupt else None
-            return self._number, self._frame, spoilt
+            corruption = self._corrupt.pop(0) if self._corrupt else None
+            return self._number, self._image, corruption
 
     def _newest(self) -> int:
         with self._changed:
@@ -200,12 +200,12 @@ class _Server(ThreadingHTTPServer):
         super().__init__(where, _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A client that left in mid-frame is no error, and a mock does not print."""
+        """Ignore clients that disconnect; mocks do not print."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
-    timeout = 5.0  # of the socket [s]: a client that neither reads nor leaves is given up
+    timeout = 5.0  # of the socket [s], for clients that neither read nor disconnect
 
     def do_GET(self) -> None:
         action = parse_qs(urlsplit(self.path).query).get("action", [""])[0]
@@ -217,7 +217,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(404, "expected ?action=stream or ?action=snapshot")
 
     def log_message(self, format: str, *args: object) -> None:
-        """Drivers and mocks do not print."""
+        """Mocks do not print."""
 
     def _stream(self) -> None:
         self.send_response(200)
@@ -231,10 +231,10 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self.wfile.write(f"--{BOUNDARY}\r\n".encode())
             while (step := camera._next(number, epoch)) is not None:
-                number, frame, spoilt = step
-                self.wfile.write(_part(frame, spoilt))
+                number, image, corruption = step
+                self.wfile.write(_part(image, corruption))
         except OSError:
-            return  # the client has left
+            return  # the client has disconnected
         finally:
             camera._watch(-1)
 
@@ -246,26 +246,26 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             camera._watch(-1)
         if step is None:
-            self.send_error(503, "the camera has no picture")
+            self.send_error(503, "the camera has no image")
             return
         self.send_response(200)
         self.send_header("Content-Type", "image/jpeg")
         self.send_header("Content-Length", str(len(step[1])))
         self.end_headers()
-        with contextlib.suppress(OSError):  # the client has left
+        with contextlib.suppress(OSError):  # the client has disconnected
             self.wfile.write(step[1])
 
 
-def _part(frame: bytes, spoilt: Corruption | None) -> bytes:
-    """One part of the stream and the boundary behind it, as the streamer on a camera's computer sends them."""
-    length, body = len(frame), frame
-    if spoilt == "truncated":
-        body = frame[: len(frame) // 2]
-    elif spoilt == "garbage":
-        third = len(frame) // 3
-        body = frame[:third] + bytes((7 * i) & 0xFF for i in range(third)) + frame[2 * third :]
+def _part(image: bytes, corruption: Corruption | None) -> bytes:
+    """One part of the stream and the boundary behind it, in the order of mjpg-streamer."""
+    length, body = len(image), image
+    if corruption == "truncated":
+        body = image[: len(image) // 2]
+    elif corruption == "garbage":
+        third = len(image) // 3
+        body = image[:third] + bytes((7 * i) & 0xFF for i in range(third)) + image[2 * third :]
         length = len(body)
-    elif spoilt == "length":
-        length = 10 * len(frame)
+    elif corruption == "length":
+        length = 10 * len(image)
     head = f"Content-Type: image/jpeg\r\nContent-Length: {length}\r\n\r\n".encode()
     return head + body + f"\r\n--{BOUNDARY}\r\n".encode()

@@ -1,4 +1,4 @@
-"""The robot's side of EGM in a process of its own: started by `gelflow.hardware_mocks.egm.device`, which see."""
+"""Controller of the mock IRB 120 in a helper process; started by `gelflow.hardware_mocks.egm.device`."""
 
 import gc
 import math
@@ -25,18 +25,18 @@ _IDENTITY: PoseTuple = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 
 @dataclass(frozen=True)
 class MockEgmConfig:
-    """How the controller is set up. Times are robot time."""
+    """Settings of the controller. Times are in robot time."""
 
-    host: str = "127.0.0.1"  # UCDevice: where feedback is sent
+    host: str = "127.0.0.1"  # UCDevice: destination of the feedback
     port: int = 6510
     period: float = 0.004  # between messages [s]
-    lag: float = 0.010  # of the controller's filter; the plant's own lag comes on top [s]
+    lag: float = 0.010  # time constant of the controller's filter, in addition to the plant's lag [s]
     joint_speed: float = math.radians(1.0)  # MaxSpeedDeviation [rad/s]
-    comm_timeout: float = 0.2  # without an answer EGM ends [s]
-    restart_after: float = 1.0  # the RAPID program starts EGM again [s]
-    tool: PoseTuple = _IDENTITY  # the plant's tool in the flange: position [m], quaternion w x y z
-    near: Joints = HOME  # of the joint solutions for the first pose, the one closest to this is taken [rad]
-    convergence: tuple[float, float, float] = (1e-3, math.radians(0.5), 1.0)  # within [m], [rad], for [s]
+    comm_timeout: float = 0.2  # EGM ends without an answer for this time [s]
+    restart_after: float = 1.0  # the RAPID program restarts EGM after this time [s]
+    tool: PoseTuple = _IDENTITY  # the plant's tool in the flange frame: position [m], quaternion w x y z
+    near: Joints = HOME  # selects the closest joint solution for the first pose [rad]
+    convergence: tuple[float, float, float] = (1e-3, math.radians(0.5), 1.0)  # distance [m], angle [rad], time [s]
 
     def __post_init__(self) -> None:
         for name in ("period", "lag", "joint_speed", "comm_timeout", "restart_after"):
@@ -48,39 +48,39 @@ class MockEgmConfig:
 
 @dataclass
 class MockEgmReport:
-    """What the controller saw: a copy, as it was when asked for."""
+    """Snapshot of the controller's state and counters."""
 
-    state: str = "waiting"  # waiting for an answer, running, ended
-    reason: str = ""  # why EGM ended last
-    sessions: int = 1  # how often EGM was started
-    sent: int = 0  # messages
-    answers: int = 0  # references taken in
-    invalid: int = 0  # datagrams that were no references
+    state: str = "waiting"  # waiting (for an answer), running, ended
+    reason: str = ""  # of the last end of EGM
+    sessions: int = 1  # number of starts of EGM
+    sent: int = 0  # messages sent
+    answers: int = 0  # references received
+    invalid: int = 0  # datagrams that were not references
     late: int = 0  # cycles that were skipped because this computer was busy
-    first_error: float = 0.0  # first reference of the session to the pose then [m]
+    first_error: float = 0.0  # distance from the pose to the first reference of the session [m]
     largest_step: float = 0.0  # between two references while running [m]
-    largest_turn: float = 0.0  # [rad]
-    last_sequence: int = -1  # the last answer's count
+    largest_turn: float = 0.0  # between two references while running [rad]
+    last_sequence: int = -1  # message count of the last answer
 
 
 def joints_of(config: MockEgmConfig, pose: PoseTuple, near: Joints) -> Joints:
-    """Joint angles [rad] of the plant's tool at `pose`. Raises SafetyError when there are none in range."""
+    """Joint angles [rad] of the plant's tool at `pose`. Raises SafetyError when there are none within the ranges."""
     position, quaternion = compose(pose, invert(config.tool))
     return inverse(position, quaternion, near=near)
 
 
 class Controller:
-    """The controller itself, without I/O: answers go in, messages come out, cycle by cycle."""
+    """The controller without I/O: computes one message per cycle from the answers."""
 
     def __init__(self, config: MockEgmConfig, clock: Clock, pose: PoseTuple) -> None:
         self._config = config
         self._clock = clock
         self.report = MockEgmReport()
-        self.pose = pose  # of the plant, as last heard
-        self._joints = joints_of(config, pose, config.near)  # of the controller's own motion
-        self._wanted = self._joints  # of the newest reference
-        self._shown, self._shown_at = self._joints, pose  # of the plant's pose
-        self._way: deque[tuple[PoseTuple, Joints]] = deque(maxlen=4)  # where the plant was sent last
+        self.pose = pose  # last known pose of the plant
+        self._joints = joints_of(config, pose, config.near)  # commanded joint angles
+        self._target_joints = self._joints  # of the newest reference
+        self._measured_joints, self._measured_at = self._joints, pose  # joint angles of the plant's pose
+        self._recent: deque[tuple[PoseTuple, Joints]] = deque(maxlen=4)  # last commands to the plant
         self._reference: EgmReference | None = None
         self._motors = self._rapid = True
         self._random = random.Random(0)
@@ -108,8 +108,8 @@ class Controller:
     def silence(self, seconds: float) -> None:
         self._silent_until = self._clock.now() + seconds
 
-    def hear(self, data: bytes) -> None:
-        """A datagram has come: start to follow, or follow on."""
+    def receive(self, data: bytes) -> None:
+        """Process a datagram: start or continue to follow."""
         if self._clock.now() < self._silent_until:
             return
         report, last = self.report, self._reference
@@ -132,12 +132,14 @@ class Controller:
         self._reference = reference
         if last is None or (last.position, last.quaternion) != (reference.position, reference.quaternion):
             try:
-                self._wanted = joints_of(self._config, (reference.position, reference.quaternion), self._wanted)
+                self._target_joints = joints_of(
+                    self._config, (reference.position, reference.quaternion), self._target_joints
+                )
             except SafetyError as error:
                 self._end(f"a reference is out of range: {error}")
 
     def cycle(self, periods: int) -> tuple[bytes | None, PoseTuple | None]:
-        """One message, after `periods` periods of motion: what to send, and where the plant is to go."""
+        """Advance by `periods` periods; returns the message to send and the new pose command of the plant."""
         elapsed = periods * self._config.period
         report = self.report
         self._ticks += periods
@@ -145,7 +147,7 @@ class Controller:
         move = None
         if report.state == "running":
             move = self._move(elapsed)
-            # Skipped cycles sent nothing that could have been answered.
+            # Skipped cycles sent no message, so they count once.
             self._unanswered += self._config.period
             if self._unanswered > self._config.comm_timeout:
                 self._end(f"no answer for {self._config.comm_timeout} s")
@@ -174,29 +176,29 @@ class Controller:
         self.report.sessions += 1
 
     def _end(self, reason: str) -> None:
-        """EGM is over: the arm stands where it is."""
+        """End EGM: the arm holds its position."""
         if self.report.state != "ended":
             self.report.state, self.report.reason = "ended", reason
             self._ended = self._clock.now()
-            self._wanted = self._joints
+            self._target_joints = self._joints
             self._reference = None
 
     def _move(self, elapsed: float) -> PoseTuple | None:
         share = 1 - math.exp(-elapsed / self._config.lag)
-        change = [(w - q) * share for w, q in zip(self._wanted, self._joints, strict=True)]
+        change = [(w - q) * share for w, q in zip(self._target_joints, self._joints, strict=True)]
         largest = max(map(abs, change))
         if largest == 0.0:
             return None
-        # All joints are slowed alike, so that the tool stays on its way.
+        # Scale all joints equally, so that the tool stays on its path.
         scale = min(1.0, self._config.joint_speed * elapsed / largest)
         a, b, c, d, e, f = (q + scale * d for q, d in zip(self._joints, change, strict=True))
         self._joints = (a, b, c, d, e, f)
-        frame = compose(forward(self._joints), self._config.tool)
-        self._way.append((frame, self._joints))
-        return frame
+        pose = compose(forward(self._joints), self._config.tool)
+        self._recent.append((pose, self._joints))
+        return pose
 
     def _feedback(self, elapsed: float) -> EgmFeedback:
-        self._look()
+        self._update_measured_joints()
         running = self.report.state == "running"
         self._settled = self._settled + elapsed if running and self._near() else 0.0
         return EgmFeedback(
@@ -204,24 +206,24 @@ class Controller:
             time=self._ticks * self._config.period,
             position=self.pose[0],
             quaternion=self.pose[1],
-            joints=self._shown,
+            joints=self._measured_joints,
             motors="on" if self._motors else "off",
             mci="running" if running else "stopped",
             rapid="running" if self._rapid else "stopped",
             converged=self._settled >= self._config.convergence[2],
         )
 
-    def _look(self) -> None:
-        """Joints of the plant's pose: known where it is on the way that it was sent, else computed."""
-        if self.pose == self._shown_at:
+    def _update_measured_joints(self) -> None:
+        """Update the joint angles of the plant's pose: those of a recent command, otherwise by inverse kinematics."""
+        if self.pose == self._measured_at:
             return
-        self._shown_at = self.pose
-        for frame, joints in self._way:
-            if frame == self.pose:
-                self._shown = joints
+        self._measured_at = self.pose
+        for pose, joints in self._recent:
+            if pose == self.pose:
+                self._measured_joints = joints
                 return
         try:
-            self._shown = joints_of(self._config, self.pose, self._shown)
+            self._measured_joints = joints_of(self._config, self.pose, self._measured_joints)
         except SafetyError as error:
             self._end(f"the arm is out of range: {error}")
 
@@ -234,27 +236,27 @@ class Controller:
 
 
 class _Loop:
-    """Sends on time, hears answers, and talks to the parent, which has the plant."""
+    """Sends messages on time, receives answers, and exchanges poses with the parent, which owns the plant."""
 
     def __init__(self, controller: Controller, config: MockEgmConfig, clock: ScaledClock, parent: Messages) -> None:
         self._controller = controller
         self._config = config
         self._clock = clock
         self._parent = parent
-        self._asked: float | None = None  # when the parent was asked what it has not answered yet [s, robot time]
+        self._asked: float | None = None  # robot time of a request that the parent has not answered yet [s]
         self._move: PoseTuple | None = None
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.bind(("", 0))
         self._udp.setblocking(False)
 
     def run(self) -> None:
-        """As the controller does, it looks once a cycle at what has come."""
+        """Run until the parent ends; received answers are processed once per cycle, as on the controller."""
         grandparent = os.getppid()
         due = self._clock.now()
         while not self._parent.closed and os.getppid() == grandparent:
             self._wait_until(due)
             self._listen()
-            # The controller's time goes on, whatever this computer does: what was missed is skipped, not made up for.
+            # The controller's time continues while this computer is busy: missed cycles are skipped.
             missed = int((self._clock.now() - due) / self._config.period)
             due += (1 + missed) * self._config.period
             data, move = self._controller.cycle(1 + missed)
@@ -266,7 +268,7 @@ class _Loop:
                 self._asked, self._move = due, None
 
     def _wait_until(self, due: float) -> None:
-        """For the next cycle; robot time does not run far ahead of it, nor of a plant that owes an answer."""
+        """Wait for the next cycle; robot time waits for late cycles and for the plant's answer."""
         while True:
             self._clock.grant(CONTROLLER, MAX_LEAD + (due if self._asked is None else self._asked))
             left = due - self._clock.now()
@@ -283,7 +285,7 @@ class _Loop:
             while True:
                 data, sender = self._udp.recvfrom(4096)
                 if sender[1] == self._config.port:
-                    self._controller.hear(data)
+                    self._controller.receive(data)
 
     def _hear_parent(self) -> None:
         for kind, *values in self._parent.read():
@@ -301,7 +303,7 @@ class _Loop:
 
 
 def main(arguments: list[str]) -> int:
-    """Started by `MockEgmArm`."""
+    """Entry point; started by `MockEgmArm`."""
     settings, parent, _ = connect_to_parent(arguments)
     clock = ScaledClock(*settings["clock"])
     config = MockEgmConfig(**{name: _tuple(value) for name, value in settings["config"].items()})
@@ -315,7 +317,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _tuple(value: Any) -> Any:
-    """What was a tuple before it went through JSON."""
+    """Convert lists to tuples, because JSON has only lists."""
     return tuple(map(_tuple, value)) if isinstance(value, list) else value
 
 

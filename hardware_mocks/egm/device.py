@@ -1,11 +1,12 @@
-"""The robot's side of EGM: an IRB 120 that sends its feedback over UDP every 4 ms and follows what it is answered.
+"""Mock IRB 120 on the wire: sends EGM feedback over UDP every 4 ms and follows the references in the answers.
 
-It plays the controller together with its RAPID program (docs/guide/arm.md): EGM waits for the first answer,
-runs until answers stay out for CommTimeout, and is started again by the program a second later, with a new message
-count. Motion goes through the joints (lag, then the speed limit of MaxSpeedDeviation) to an `ArmPlant`.
+The mock simulates the controller and its RAPID program (docs/guide/arm.md shows the real one): EGM waits for the first
+answer, runs until no answer arrives for CommTimeout, and is restarted by the program one second later with a new
+message count. The joints follow with a lag and the speed limit of MaxSpeedDeviation; the pose goes to an `ArmPlant`.
 
-As on a robot, the controller keeps its 4 ms whatever the physics and the cameras cost: it runs in a process of its own
-(`egm_controller`), and only poses go back and forth. A paced clock waits for it and for the plant's answers.
+The controller runs in a helper process (`gelflow.hardware_mocks.egm.controller`) and exchanges only poses with the
+plant, so that its 4 ms cycle does not depend on the simulation and the cameras. With time synchronization, robot time
+waits for the controller and for the plant.
 """
 
 import select
@@ -22,13 +23,13 @@ from gelflow.hardware_mocks.egm.controller import MockEgmConfig, MockEgmReport, 
 from gelflow.hardware_mocks.plant import ArmPlant
 from gelflow.helper_process import HelperProcess
 
-_REPLY_LIMIT = 10.0  # of our own process, its start included [s, wall]
+_REPLY_TIMEOUT = 10.0  # of the helper process, including its start [s, wall]
 
 
 class MockEgmArm:
-    """The controller on the wire. `start` and `stop`; the other methods are the operator and the faults.
+    """The mock arm. Use `start` and `stop`; the other methods act as the operator or inject faults.
 
-    Each of those takes effect before it returns, and raises PeerError when the controller's process is gone.
+    Each of them has taken effect when it returns, and raises PeerError when the controller's process has ended.
     """
 
     def __init__(self, plant: ArmPlant, *, clock: ScaledClock, config: MockEgmConfig | None = None) -> None:
@@ -43,14 +44,14 @@ class MockEgmArm:
         self._asked = 0
 
     def start(self) -> None:
-        """Begin to send. Raises UsageError when the plant stands where the arm can't reach."""
+        """Start to send feedback. Raises UsageError when the plant's pose is out of reach of the arm."""
         if self._helper is not None:
-            raise UsageError("the mock EGM robot runs already")
+            raise UsageError("the mock arm is already running")
         pose = self._pose()
         try:
             joints_of(self._config, pose, self._config.near)
         except SafetyError as error:
-            raise UsageError(f"the mock arm cannot start where its plant is: {error}") from None
+            raise UsageError(f"the mock arm cannot start at the pose of its plant: {error}") from None
         settings = {"clock": self._clock.settings, "config": asdict(self._config), "pose": pose}
         self._quit.clear()
         self._helper = HelperProcess.start("gelflow.hardware_mocks.egm.controller", settings)
@@ -63,7 +64,7 @@ class MockEgmArm:
             raise
 
     def stop(self) -> None:
-        """Cease sending: as if the controller were switched off."""
+        """Stop sending, as a controller that is switched off."""
         if self._helper is not None and self._thread is not None:
             self._quit.set()
             self._thread.join()
@@ -72,12 +73,12 @@ class MockEgmArm:
 
     @property
     def report(self) -> MockEgmReport:
-        """What the controller saw so far."""
+        """Counters and states of the controller so far."""
         return self._call("report")
 
     @property
     def pid(self) -> int | None:
-        """Of the controller's process; None when it is not running."""
+        """Process id of the controller; None when it is not running."""
         return None if self._helper is None else self._helper.pid
 
     def motors(self, on: bool) -> None:
@@ -89,37 +90,37 @@ class MockEgmArm:
         self._call("rapid", running)
 
     def restart_sequence(self) -> None:
-        """Begin to count messages anew in the middle of a session."""
+        """Restart the message count in the middle of a session."""
         self._call("restart_sequence")
 
     def lose(self, count: int = 0, *, share: float = 0.0) -> None:
-        """Lose the next `count` messages on the way, and from now on a random `share` (0 to 1) of all."""
+        """Drop the next `count` messages, and from now on a random fraction `share` (0 to 1) of all messages."""
         self._call("lose", count, share)
 
     def silence(self, seconds: float) -> None:
-        """Send and hear nothing for `seconds` of robot time."""
+        """Neither send nor receive for `seconds` of robot time."""
         self._call("silence", seconds)
 
     def _call(self, name: str, *values: Any) -> MockEgmReport:
         helper = self._helper
         if helper is None:
-            raise UsageError("the mock EGM robot is not running; call start() first")
+            raise UsageError("the mock arm is not running; call start() first")
         with self._replied:
             self._asked += 1
             number = self._asked
             try:
                 helper.messages.send(["do", number, name, *values])
             except OSError:
-                raise PeerError(f"the mock controller's process is gone ({helper.exit_reason()})") from None
-            self._replied.wait_for(lambda: number in self._replies or helper.messages.closed, _REPLY_LIMIT)
+                raise PeerError(f"the mock controller's process has ended ({helper.exit_reason()})") from None
+            self._replied.wait_for(lambda: number in self._replies or helper.messages.closed, _REPLY_TIMEOUT)
             if number in self._replies:
                 return self._replies.pop(number)
         if helper.messages.closed:
-            raise PeerError(f"the mock controller's process is gone ({helper.exit_reason()})")
-        raise PeerTimeout(f"the mock controller's process did not answer within {_REPLY_LIMIT} s")
+            raise PeerError(f"the mock controller's process has ended ({helper.exit_reason()})")
+        raise PeerTimeout(f"the mock controller's process did not answer within {_REPLY_TIMEOUT} s")
 
     def _serve(self, helper: HelperProcess) -> None:
-        """The plant's side: moves it, and says where it is."""
+        """Forward commands to the plant and its pose to the controller; runs in a thread."""
         while not self._quit.is_set() and not helper.messages.closed:
             select.select((helper.messages,), (), (), 0.1)
             asked = False
@@ -141,7 +142,7 @@ class MockEgmArm:
         try:
             helper.messages.send(["pose", *self._pose()])
         except OSError:
-            # It ended just now; the next read says so, and whoever asks it anything is told.
+            # The controller has just ended: the next read detects it, and the next call raises.
             return
 
     def _pose(self) -> PoseTuple:

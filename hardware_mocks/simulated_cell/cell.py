@@ -1,8 +1,8 @@
-"""The world behind the mock robot: the insertion scene under the elastic law, stepped on the robot's clock.
+"""The simulated cell behind the mock robot: the insertion scene with elastic friction, stepped on the robot's clock.
 
-It is the plant of all mocks (gripper, arm, gels), and the hand that a real cell would have: a person who puts a part
-between the open fingers, holds it until it is gripped, and takes it away when it was let go. What the robot was taught
-and what is true differ by a random misalignment for every part; `truth` tells it, the devices never do.
+It is the plant of all mocks (gripper, arm, gels) and it simulates the operator, who presents a part between the open
+fingers, holds it until it is gripped, and removes it after its release. The true hole pose differs from the taught
+one by a random misalignment for every part; `truth` returns it, the devices do not.
 """
 
 import math
@@ -25,44 +25,44 @@ from gelflow.task import INSERTION, InsertionTask
 from gelflow.time_sync import MAX_LEAD, MIN_WAIT, SIMULATED_CELL
 
 Array = NDArray[np.float64]
-_PARKED = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # where a part waits that is not on the scene [m], w x y z
+_PARKED_POSE = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # of a part that is not in use [m], w x y z
 _HALF_HEIGHT = 0.030  # of the part [m]
 _PART_WIDTH = 0.035  # between the pads [m]
 _HOLE = (0.01975, 0.02725)  # half its opening [m]
-_INTO_WALL = 0.3e-3  # an inserted part may press this far into a wall [m]
-_STILL = (2e-5, math.radians(0.02))  # a tool that stays within this of where it was is still [m, rad]
+_INTO_WALL = 0.3e-3  # largest penetration of an inserted part into a wall of the hole [m]
+_AT_REST = (2e-5, math.radians(0.02))  # largest motion of a tool at rest [m, rad]
 
 
 @dataclass(frozen=True)
 class SimulatedCellConfig:
-    """How the mock cell is built. Lengths in metres, angles in radians, times in robot time."""
+    """Parameters of the simulated cell. Lengths in metres, angles in radians, times in robot time."""
 
     hole: Pose = field(default_factory=lambda: Pose(np.array([0.374, 0.05, 0.05]), yaw_quaternion(0.0)))
     tool: Pose = field(default_factory=lambda: Pose(np.array([0.0, 0.0, 0.18]), np.array([0.0, 1.0, 0.0, 0.0])))
     grid: Grid = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # markers printed on the gels [mm]
-    grasp_height: float = 0.030  # of the pads' centres above the part's lower face [m]
-    load_height: float = 0.032  # of the lower face above the hole's floor where the hand holds out a part, over it [m]
-    height_error: float = 0.2e-3  # the hand holds it this much too high or too low, at most [m]
-    step: float = 4e-3  # of the simulation [s]; divides EGM's 4 ms
+    grasp_height: float = 0.030  # of the pad centres above the part's lower face [m]
+    load_height: float = 0.032  # of the lower face above the hole's floor when the operator presents a part [m]
+    height_error: float = 0.2e-3  # largest height error of a presented part [m]
+    step: float = 4e-3  # time step of the simulation [s]; must divide EGM's 4 ms
     arm_stiffness: float = 1e5  # [N/m]
     yaw_stiffness: float = 500.0  # [N m/rad]
     start_width: float = 0.060  # between the fingers [m]
-    seed: int = 0  # of the first part; each further part has the next
-    preset: str | None = None  # of the insertion scene, all but its step: see `preset_config`
+    seed: int = 0  # of the first part; incremented for each further part
+    preset: str | None = None  # of the insertion scene, except for its step: see `preset_config`
 
     def __post_init__(self) -> None:
         if not 0 < self.step <= 4e-3 or abs(4e-3 / self.step - round(4e-3 / self.step)) > 1e-9:
-            raise UsageError(f"the world's step must divide 4 ms, got {self.step} s")
+            raise UsageError(f"the time step of the simulated cell must divide 4 ms, got {self.step} s")
 
     def start_tool(self) -> tuple[Array, Array]:
-        """Where the arm stands at first, the gripper ready to be loaded: position [m] and quaternion w x y z."""
+        """Initial tool pose, with the gripper ready to be loaded: position [m] and quaternion w x y z."""
         taught = Pose(np.array([0.0, 0.0, self.load_height + self.grasp_height]), yaw_quaternion(0.0))
         pose = self.hole @ taught @ self.tool.inverse()
         return pose.position, pose.quaternion
 
 
 def preset_config(preset: str | None, *, seed: int) -> SimulatedCellConfig:
-    """The cell simulated as a preset of the insertion scene says, in steps that divide 4 ms and are no longer.
+    """The cell with a preset of the insertion scene; its step is the longest that divides 4 ms and is not longer.
 
     Raises UsageError when there is no such preset.
     """
@@ -74,16 +74,16 @@ def preset_config(preset: str | None, *, seed: int) -> SimulatedCellConfig:
 
 @dataclass
 class PartTruth:
-    """What is true of one part, whatever the robot believes."""
+    """Ground truth of one part."""
 
     seed: int
     misalignment: tuple[float, float, float]  # of the gripper at the taught pose, in the hole's frame [m, m, rad]
-    phase: str = "held out"  # held out, gripped, let go
+    phase: str = "presented"  # presented, gripped, released
     height: float = 0.0  # of the lower face's highest corner above the hole's floor, when last held [m]
-    x: float = 0.0  # of the part in the hole, now [m]
+    x: float = 0.0  # of the part in the hole frame [m]
     y: float = 0.0
     yaw: float = 0.0  # [rad]
-    slip: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the part in the grip, in the gripper's frame [m, m, rad]
+    slip: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the part relative to the gripper frame [m, m, rad]
     inserted: bool = False  # in the hole when last held
 
 
@@ -109,21 +109,21 @@ class SimulatedCell:
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         sim.reset()
         sim.q[0] = scene.q0
-        self._grip = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
+        self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
         self._lock = threading.Lock()
         self._time = clock.now()
         self._still_since = self._time
         self._next_seed = config.seed
         self._hole_to_base = config.hole.inverse()
-        self._to_scene = self._hole_to_base  # with the present part's misalignment
-        self._hand: Array | None = _PARKED
+        self._to_scene = self._hole_to_base  # including the misalignment of the present part
+        self._held_pose: Array | None = _PARKED_POSE
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
         self._tool = self._rest = self._start = Pose(*config.start_tool())
-        self._place_arm()
+        self._reset_arm()
         self._hold_part()
 
-    # Running
+    # Simulation loop
 
     def run(self, ending: threading.Event, *, after_step: Callable[[], None] = lambda: None) -> None:
         """Step on the clock until `ending` is set. Raises SimulationError when the simulation fails.
@@ -144,7 +144,7 @@ class SimulatedCell:
             after_step()
 
     def advance(self, steps: int) -> None:
-        """Take steps by hand, without a clock."""
+        """Take `steps` simulation steps without a clock."""
         with self._lock:
             for _ in range(steps):
                 self._step()
@@ -152,7 +152,7 @@ class SimulatedCell:
     # ArmPlant
 
     def arm_pose(self) -> tuple[Array, Array]:
-        """The tool as the arm's encoders show it: where it was told to be (the arm's stiffness lies behind them)."""
+        """Tool pose measured by the encoders: the commanded pose, because the arm's compliance is behind them."""
         with self._lock:
             return self._tool.position.copy(), self._tool.quaternion.copy()
 
@@ -160,9 +160,9 @@ class SimulatedCell:
         """Follow this pose from now on: position [m], shape (3,); quaternion w x y z, shape (4,)."""
         pose = Pose(np.array(position, dtype=float), np.array(quaternion, dtype=float))
         if not (np.isfinite(pose.position).all() and np.isfinite(pose.quaternion).all()):
-            raise UsageError(f"the arm can not go to {pose}")
+            raise UsageError(f"the arm cannot move to {pose}")
         with self._lock:
-            if not pose.is_near(self._rest, *_STILL):
+            if not pose.is_near(self._rest, *_AT_REST):
                 self._rest, self._still_since = pose, self._time
             self._tool = pose
             self._u[self._arm_u] = self._in_scene()
@@ -170,14 +170,14 @@ class SimulatedCell:
     # GripperPlant
 
     def gripper_state(self) -> tuple[float, float, float]:
-        """Width between the fingers [m], speed [m/s, positive opens], force on what they press [N]."""
+        """Width between the fingers [m], speed [m/s, positive opens], pressing force [N]."""
         with self._lock:
-            return self._grip.state()
+            return self._gripper.state()
 
     def command_gripper(self, *, width: float, speed: float, force: float) -> None:
         """Move towards `width` [m] at `speed` [m/s], pushing with at most `force` [N]."""
         with self._lock:
-            self._grip.command(width=width, speed=speed, force=force)
+            self._gripper.command(width=width, speed=speed, force=force)
 
     # GelPlant
 
@@ -191,18 +191,18 @@ class SimulatedCell:
             moved = 1e3 * self._sim.displacement()[0]
         return np.stack([weights @ moved[pad, :2] for weights, pad in zip(self._weights, self._pads, strict=True)])
 
-    # What the devices can not know
+    # Ground truth, not available to the devices
 
     def next_seed(self, seed: int) -> None:
-        """The next part that the hand holds out is this one."""
+        """Set the seed of the next part that the operator presents."""
         with self._lock:
             self._next_seed = seed
 
     def truth(self) -> dict[str, Any]:
-        """What is true now, as plain data: the present part, all parts so far, and how long robot time had to wait."""
+        """Ground truth as plain data: the present part, all parts so far, and the time lost by robot time [s]."""
         with self._lock:
             if self._current is not None:
-                self._look(self._current)
+                self._measure(self._current)
             return {
                 "part": None if self._current is None else asdict(self._current),
                 "parts": [asdict(part) for part in self.parts],
@@ -210,69 +210,69 @@ class SimulatedCell:
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
-    # Inside, with the lock held
+    # Internal; the caller holds the lock
 
     def _servo(self, name: str, stiffness: float, force: float) -> None:
         for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
             self._sim.param(f"{name}.{key}")[:] = value
 
     def _in_scene(self) -> Array:
-        """The arm's four joints for the present tool pose, in the scene: x, y, z [m], yaw [rad]."""
+        """Positions of the arm's four joints in the scene for the present tool pose: x, y, z [m], yaw [rad]."""
         gripper = self._to_scene @ (self._tool @ self.config.tool)
         return np.array([*gripper.position, gripper.yaw])
 
-    def _place_arm(self) -> None:
+    def _reset_arm(self) -> None:
         self._u[self._arm_u] = self._sim.q[0, self._arm] = self._in_scene()
         self._sim.v[0] = 0.0
 
     def _hold_part(self) -> None:
-        if self._hand is not None:
-            self._sim.q[0, self._part : self._part + 7] = self._hand
+        if self._held_pose is not None:
+            self._sim.q[0, self._part : self._part + 7] = self._held_pose
             self._sim.v[0, self._part_v : self._part_v + 6] = 0.0
-            # What BDF2 remembers of the part: it did not move, and stood still before.
+            # Clear the part's history of BDF2: no displacement and zero velocity in the previous step.
             if self._sim.history.size:
                 for first in (0, self._sim.model.nv):
                     self._sim.history[0, first + self._part_v : first + self._part_v + 6] = 0.0
 
     def _step(self) -> None:
         self._time += self.config.step
-        self._grip.drive(self.config.step)
+        self._gripper.drive(self.config.step)
         self._sim.step(self._u)
         self._sim.check()
         self._hold_part()
-        self._hands_on()
+        self._update_operator()
 
-    def _hands_on(self) -> None:
-        """What the person beside the robot does."""
+    def _update_operator(self) -> None:
+        """Simulate the operator: present a part, let it go when it is gripped, remove it after its release."""
         part = self._current
         if part is None:
             if self._ready_to_load():
-                self._hold_out()
-        elif part.phase == "held out":
-            if self._grip.locked:
-                self._hand, part.phase = None, "gripped"
+                self._present_part()
+        elif part.phase == "presented":
+            if self._gripper.locked:
+                self._held_pose, part.phase = None, "gripped"
         elif part.phase == "gripped":
-            if not self._grip.locked:
-                self._look(part)
-                part.phase = "let go"
+            if not self._gripper.locked:
+                self._measure(part)
+                part.phase = "released"
         elif self._ready_to_load():
-            self._hand, self._current = _PARKED, None
+            self._held_pose, self._current = _PARKED_POSE, None
 
     def _ready_to_load(self) -> bool:
-        """The fingers are open, and the arm stands still where parts are handed over."""
-        open_wide = self._grip.width() > _PART_WIDTH + 0.005
+        """Whether the fingers are open and the arm is at rest at the hand-over pose."""
+        open_wide = self._gripper.width() > _PART_WIDTH + 0.005
         there = self._tool.is_near(self._start, 1e-3, math.radians(1.0))
         return open_wide and there and self._time - self._still_since > 0.3
 
-    def _hold_out(self) -> None:
-        """Draw the next part's misalignment and hold the part between the fingers."""
+    def _present_part(self) -> None:
+        """Sample the misalignment of the next part and hold the part between the fingers."""
         rng = np.random.default_rng((self._next_seed, 0x6E1))
         x, y, yaw = self._task.draw_misalignment(rng, 1)[0]
         self._to_scene = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)) @ self._hole_to_base
-        self._place_arm()
+        self._reset_arm()
         gx, gy, gz, turn = self._in_scene()
         z = gz - self.config.grasp_height + _HALF_HEIGHT + rng.uniform(-1, 1) * self.config.height_error
-        self._hand = np.array([gx, gy, z, *yaw_quaternion(turn)])
+        self._held_pose = np.array([gx, gy, z, *yaw_quaternion(turn)])
         self._hold_part()
         self._sim.clear_history()
         self._current = PartTruth(self._next_seed, (float(x), float(y), float(yaw)))
@@ -284,14 +284,14 @@ class SimulatedCell:
         return Pose(q[:3].copy(), q[3:].copy())
 
     def _lower_face(self, pose: Pose) -> Array:
-        """The corners of the part's lower face in the hole's frame [m], shape (4, 3)."""
+        """Corners of the part's lower face in the hole frame [m], shape (4, 3)."""
         half = (_PART_WIDTH / 2, 0.025, -_HALF_HEIGHT)
         corners = [np.array([i * half[0], j * half[1], half[2]]) for i in (-1, 1) for j in (-1, 1)]
         return pose.apply(np.array(corners))
 
-    def _look(self, part: PartTruth) -> None:
-        """Take the part's true pose, while it is not let go: what counts is where the robot brought it."""
-        if part.phase == "let go":
+    def _measure(self, part: PartTruth) -> None:
+        """Update the ground truth of a part until its release, so that it describes the pose reached by the robot."""
+        if part.phase == "released":
             return
         pose = self._part_pose()
         corners = self._lower_face(pose)

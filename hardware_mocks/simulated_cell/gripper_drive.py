@@ -1,4 +1,4 @@
-"""The gripper's drive in the simulated world: a ramped width, a force limit, and jaws that are geared together."""
+"""Gripper drive of the simulated cell: ramped width command, force limit, coupled jaws."""
 
 from typing import Any
 
@@ -8,18 +8,19 @@ from numpy.typing import NDArray
 from gelflow.sim.scene import Scene
 from gelflow.sim.simulator import Simulator
 
-_SATURATED = 0.9  # of the force limit: the jaws press
-_LOCK_AFTER = 0.1  # both press this long: the part is gripped [s]
+_SATURATED = 0.9  # fraction of the force limit at which a jaw counts as pressing
+_LOCK_AFTER = 0.1  # time for which both jaws press before the part counts as gripped [s]
+_WIDTH_TOLERANCE = 3e-3  # of the width against the part's width while gripping [m]
 _FINGERS = ("finger_left", "finger_right")
 _HOLDS = ("hold_left", "hold_right")
 
 
 class GripperDrive:
-    """Drives the two fingers of the insertion scene. The caller holds the world's lock.
+    """Drives the two fingers of the insertion scene. The caller holds the cell's lock.
 
-    Moving, both fingers follow a servo whose force is limited. Once both press on a part the left jaw keeps its place
-    stiffly while the right one goes on pressing: the jaws of the real gripper are geared and cannot both yield to one
-    side, which a tree of joints does not have.
+    In motion, both fingers follow a servo with a force limit. When both press on a part, the left jaw holds its
+    position stiffly while the right one continues to press: the jaws of the real gripper are coupled by a gear and
+    cannot both yield to one side, and a kinematic tree has no such coupling.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class GripperDrive:
         self._limit(force)
 
     def width(self) -> float:
-        """Between the pads, now [m]."""
+        """Distance between the pads [m]."""
         return -(float(self._joints[self._q[0]]) + float(self._joints[self._q[1]]))
 
     def state(self) -> tuple[float, float, float]:
@@ -59,20 +60,20 @@ class GripperDrive:
         return self.width(), speed, max(0.0, sum(self._forces()) / 2)
 
     def drive(self, seconds: float) -> None:
-        """Set the servos for the next step of `seconds`."""
+        """Set the servo targets for the next step of `seconds`."""
         if self.locked:
             return
-        way = self._target - self._width
-        self._width += min(max(way, -self._speed * seconds), self._speed * seconds)
+        remaining = self._target - self._width
+        self._width += min(max(remaining, -self._speed * seconds), self._speed * seconds)
         self._u[self._hold] = -self._width / 2
         closing = self._width < self.width() and min(self._forces()) > _SATURATED * self._force
-        on_part = abs(self.width() - self._part_width) < 3e-3
+        on_part = abs(self.width() - self._part_width) < _WIDTH_TOLERANCE
         self._pressing = self._pressing + seconds if closing and on_part else 0.0
         if self._pressing > _LOCK_AFTER:
             self._lock()
 
     def _forces(self) -> list[float]:
-        """What each servo closes with [N]."""
+        """Closing force of each servo [N]."""
         forces = []
         for q, v, hold, kp, kd in zip(self._q, self._v, self._hold, self._kp, self._kd, strict=True):
             force = kp * (float(self._u[hold]) - float(self._joints[q])) - kd * float(self._rates[v])
@@ -82,7 +83,7 @@ class GripperDrive:
     def _lock(self) -> None:
         self.locked = True
         left = self._joints[self._q[0]]
-        # The servo's target lies ahead of the jaw by what gives the force that it has now: nothing jumps.
+        # Offset the servo target so that the present force continues without a jump.
         self._u[self._hold[0]] = left + self._force / self._kp[0]
         self._set("hold_left", np.inf)
 

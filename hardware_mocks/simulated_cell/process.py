@@ -1,4 +1,4 @@
-"""The simulated world in a helper process, so that neither cameras nor protocols of the mocks delay it.
+"""The simulated cell in a helper process, so that neither cameras nor protocols of the mocks delay it.
 
 Values that change with every step pass through shared memory; rare requests pass as messages.
 """
@@ -24,11 +24,11 @@ from gelflow.session.records import from_plain, to_plain
 Array = NDArray[np.float64]
 _START_LIMIT = 30.0  # [s, wall]
 _ANSWER_LIMIT = 5.0  # [s, wall]
-_GEL_PERIOD = 0.02  # markers are read this often, several times for every frame of a camera [s]
+_GEL_PERIOD = 0.02  # period of marker readings, several per camera image [s]
 
 
-class _Cell:
-    """Some numbers in shared memory: one writer, any readers, never half a value."""
+class _SharedBlock:
+    """Numbers in shared memory with one writer and any number of readers; readers never see a partial update."""
 
     def __init__(self, words: Array, start: int, size: int) -> None:
         self._count = words[start : start + 1]
@@ -36,12 +36,13 @@ class _Cell:
         self.end = start + 1 + size
 
     def write(self, values: Any) -> None:
-        self._count[0] += 1  # odd while it is written
+        """Update the values. Single writer only."""
+        self._count[0] += 1  # odd during the update
         self._values[:] = values
         self._count[0] += 1
 
     def read(self) -> tuple[int, Array]:
-        """How often it was written, and the values."""
+        """The number of updates and the values."""
         while True:
             before = self._count[0]
             values = self._values.copy()
@@ -50,25 +51,26 @@ class _Cell:
 
 
 class _Shared:
-    """The layout of the memory that both processes map."""
+    """Layout of the memory that both processes map."""
 
     def __init__(self, descriptor: int, grid: Grid) -> None:
         markers = grid.rows * grid.cols
         self.shape = (2, markers, 2)
         self._map = mmap.mmap(descriptor, self.size(grid))
         words = np.frombuffer(self._map, dtype=np.float64)
-        self.arm = _Cell(words, 0, 7)  # commanded pose
-        self.command = _Cell(words, self.arm.end, 3)  # of the gripper: width, speed, force
-        self.fingers = _Cell(words, self.command.end, 3)  # measured: width, speed, force
-        self.gels = _Cell(words, self.fingers.end, 4 * markers)
+        self.arm = _SharedBlock(words, 0, 7)  # commanded pose
+        self.command = _SharedBlock(words, self.arm.end, 3)  # of the gripper: width [m], speed [m/s], force [N]
+        self.fingers = _SharedBlock(words, self.command.end, 3)  # measured: width, speed, force
+        self.gels = _SharedBlock(words, self.fingers.end, 4 * markers)
 
     @staticmethod
     def size(grid: Grid) -> int:
+        """Size of the memory [bytes]."""
         return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols)
 
 
 class SimulatedCellProcess:
-    """The plants of the mock robot, simulated in another process; `with` or `start` and `stop`."""
+    """`SimulatedCell` in a helper process, with the same plant methods. Use `with`, or `start` and `stop`."""
 
     def __init__(self, clock: ScaledClock, config: SimulatedCellConfig | None = None) -> None:
         self.config = SimulatedCellConfig() if config is None else config
@@ -86,7 +88,7 @@ class SimulatedCellProcess:
             os.ftruncate(file.fileno(), _Shared.size(grid))
             self._shared = _Shared(file.fileno(), grid)
             self._shared.arm.write([*self._tool[0], *self._tool[1]])
-            settings = {"world": to_plain(self.config), "clock": self._clock.settings}
+            settings = {"cell": to_plain(self.config), "clock": self._clock.settings}
             module = "gelflow.hardware_mocks.simulated_cell.process"
             self._helper = HelperProcess.start(module, settings, descriptors=(file.fileno(),))
         try:
@@ -106,7 +108,7 @@ class SimulatedCellProcess:
         reason = helper.exit_reason()
         helper.close()
         if failed:
-            raise SimulationError(f"the simulated world failed: {reason}")
+            raise SimulationError(f"the simulated cell failed: {reason}")
 
     def __enter__(self) -> Self:
         return self.start()
@@ -127,7 +129,7 @@ class SimulatedCellProcess:
 
     def gripper_state(self) -> tuple[float, float, float]:
         if self._shared is None:
-            return self.config.start_width, 0.0, 0.0  # the device looks at its fingers before the world is started
+            return self.config.start_width, 0.0, 0.0  # the mock gripper reads its state before the simulation starts
         _, (width, speed, force) = self._shared.fingers.read()
         return float(width), float(speed), float(force)
 
@@ -139,29 +141,29 @@ class SimulatedCellProcess:
         shared = self._running()
         return np.asarray(shared.gels.read()[1].reshape(shared.shape)[finger])
 
-    # What the devices can not know
+    # Ground truth, not available to the devices
 
     def truth(self) -> dict[str, Any]:
-        """`SimulatedCell.truth`. Raises SimulationError when the world has failed."""
+        """See `SimulatedCell.truth`. Raises SimulationError when the simulation has failed."""
         return dict(self._ask({"ask": "truth"}))
 
     def next_seed(self, seed: int) -> None:
-        """`SimulatedCell.next_seed`."""
+        """See `SimulatedCell.next_seed`."""
         self._ask({"ask": "next_seed", "seed": seed})
 
     def _running(self) -> _Shared:
         if self._shared is None:
-            raise SimulationError("the simulated world was not started")
+            raise SimulationError("the simulated cell was not started")
         return self._shared
 
     def _ask(self, question: dict[str, Any]) -> Any:
         with self._asking:
             if self._helper is None:
-                raise SimulationError("the simulated world does not run")
+                raise SimulationError("the simulated cell is not running")
             try:
                 self._helper.messages.send(question)
             except OSError:
-                raise SimulationError(f"the simulated world is gone: {self._helper.exit_reason()}") from None
+                raise SimulationError(f"the simulated cell has ended: {self._helper.exit_reason()}") from None
             return self._receive(self._helper, _ANSWER_LIMIT)
 
     @staticmethod
@@ -170,66 +172,66 @@ class SimulatedCellProcess:
         try:
             values = helper.messages.wait(limit)
         except TimeoutError:
-            raise SimulationError(f"the simulated world did not answer within {limit:g} s") from None
+            raise SimulationError(f"the simulated cell did not answer within {limit:g} s") from None
         if not values:
-            raise SimulationError(f"the simulated world is gone: {helper.exit_reason()}")
+            raise SimulationError(f"the simulated cell has ended: {helper.exit_reason()}")
         return values[0]
 
 
 class _Service:
-    """The process's side."""
+    """Serves the parent inside the helper process."""
 
-    def __init__(self, world: SimulatedCell, parent: Messages, shared: _Shared) -> None:
-        self._world, self._parent, self._shared = world, parent, shared
+    def __init__(self, cell: SimulatedCell, parent: Messages, shared: _Shared) -> None:
+        self._cell, self._parent, self._shared = cell, parent, shared
         self._commands = shared.command.read()[0]
         self._poses = -1
         self._steps = 0
-        self._gel_every = max(1, round(_GEL_PERIOD / world.config.step))
+        self._gel_every = max(1, round(_GEL_PERIOD / cell.config.step))
         self.ending = threading.Event()
 
-    def pass_on(self) -> None:
-        """After each step: commands in, measurements out."""
-        shared, world = self._shared, self._world
+    def exchange(self) -> None:
+        """After each step: read commands, write measurements."""
+        shared, cell = self._shared, self._cell
         poses, pose = shared.arm.read()
         if poses != self._poses:
             self._poses = poses
-            world.command_arm(pose[:3], pose[3:])
+            cell.command_arm(pose[:3], pose[3:])
         commands, (width, speed, force) = shared.command.read()
         if commands != self._commands:
             self._commands = commands
-            world.command_gripper(width=float(width), speed=float(speed), force=float(force))
-        shared.fingers.write(world.gripper_state())
+            cell.command_gripper(width=float(width), speed=float(speed), force=float(force))
+        shared.fingers.write(cell.gripper_state())
         if self._steps % self._gel_every == 0:
-            shared.gels.write(world.displacements().reshape(-1))
+            shared.gels.write(cell.displacements().reshape(-1))
         self._steps += 1
 
     def answer(self) -> None:
-        """A thread: questions of the parent, until it is gone."""
+        """Answer requests of the parent until it ends; runs in a thread."""
         try:
             while not self._parent.closed:
                 for question in self._parent.wait():
                     reply: Any = None
                     if question["ask"] == "truth":
-                        reply = self._world.truth()
+                        reply = self._cell.truth()
                     else:
-                        self._world.next_seed(int(question["seed"]))
+                        self._cell.next_seed(int(question["seed"]))
                     self._parent.send(reply)
         except OSError:
-            return  # the parent ended in the middle of an answer
+            return  # the parent ended during an answer
         finally:
             self.ending.set()
 
 
 def main(arguments: list[str]) -> int:
-    """Started by `SimulatedCellProcess`, with the shared memory."""
+    """Entry point; `SimulatedCellProcess` passes the descriptor of the shared memory."""
     settings, parent, (memory,) = connect_to_parent(arguments)
-    config = from_plain(SimulatedCellConfig, settings["world"], what="configuration of the simulated world")
-    world = SimulatedCell(ScaledClock(*settings["clock"]), config)
-    service = _Service(world, parent, _Shared(memory, config.grid))
+    config = from_plain(SimulatedCellConfig, settings["cell"], what="configuration of the simulated cell")
+    cell = SimulatedCell(ScaledClock(*settings["clock"]), config)
+    service = _Service(cell, parent, _Shared(memory, config.grid))
     threading.Thread(target=service.answer, daemon=True).start()
-    service.pass_on()
+    service.exchange()
     parent.send(None)
-    world.run(service.ending, after_step=service.pass_on)
+    cell.run(service.ending, after_step=service.exchange)
     return 0
 
 

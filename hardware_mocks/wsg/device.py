@@ -1,4 +1,4 @@
-"""The mock WSG-50 on the wire: the same device behind a pty, a TCP port, or both."""
+"""Mock WSG-50 on the wire: one device behind a pty, a TCP port, or both."""
 
 import contextlib
 import os
@@ -13,17 +13,17 @@ from gelflow.hardware_mocks.plant import GripperPlant
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.hardware_mocks.wsg.protocol import WsgDevice, WsgSession
 
-_TICK = 0.005  # how often the device looks at its fingers [s]; half the shortest period of updates
-_SHORTEST_WAIT = 0.0005  # however fast the clock [s, wall]
+_TICK = 0.005  # period of the device [s]; half the shortest period of updates
+_SHORTEST_WAIT = 0.0005  # lower bound of the wait for any clock factor [s, wall]
 _READ_SIZE = 4096  # bytes
-_BACKLOG = 65536  # a TCP client that leaves more than this unread is dropped [bytes]
+_BACKLOG = 65536  # a TCP client with more unread bytes is disconnected
 
 
 class MockWsgGripper:
-    """Serves one device. Nothing is opened before `open` (or `with`).
+    """Serves one mock gripper. Nothing is opened before `open` (or `with`).
 
-    `serial` offers a pty, whose path is `serial_path`; `tcp_port` a TCP port on `host` (0: any free one), which is
-    `tcp_address` then. One TCP client at a time; a second one is turned away.
+    `serial` opens a pty at `serial_path`; `tcp_port` opens a TCP port on `host` (0: any free port) at `tcp_address`.
+    One TCP client at a time; further clients are rejected.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class MockWsgGripper:
         self.close()
 
     def open(self) -> None:
-        """Open pty and port and serve them from a thread. Raises UsageError when the port is taken."""
+        """Open the pty and the port and serve them in a thread. Raises UsageError when the port is in use."""
         if self._thread is not None:
             raise UsageError("the mock gripper is already open")
         self._selector = selectors.DefaultSelector()
@@ -87,17 +87,17 @@ class MockWsgGripper:
         self._close_files()
 
     def lose_part(self) -> None:
-        """A fault to order: the device reports that the held part is lost."""
+        """Inject a fault: the device reports that the held part is lost."""
         with self._device.lock:
             self._device.fingers.lose_part()
 
     def raise_fast_stop(self) -> None:
-        """A fault to order: FAST STOP."""
+        """Inject a fault: FAST STOP."""
         self._device.stop(fast=True)
 
     @property
     def addresses(self) -> tuple[str, ...]:
-        """Where it is served, as a driver takes it: `serial:PATH`, `tcp:HOST:PORT`, or both."""
+        """Addresses for a driver: `serial:PATH`, `tcp:HOST:PORT`, or both."""
         line = (f"serial:{self.serial_path}",) if self._serial else ()
         port = ("tcp:{}:{}".format(*self.tcp_address),) if self._wanted else ()
         return line + port
@@ -112,7 +112,7 @@ class MockWsgGripper:
         try:
             self._listener = socket.create_server(address)
         except (OSError, OverflowError) as error:
-            raise UsageError(f"the mock gripper can't listen on {address[0]}:{address[1]} ({error})") from None
+            raise UsageError(f"the mock gripper cannot listen on {address[0]}:{address[1]} ({error})") from None
         self._listener.setblocking(False)
         self.tcp_address = self._listener.getsockname()[:2]
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
@@ -120,7 +120,7 @@ class MockWsgGripper:
     def _open_line(self) -> None:
         assert self._selector is not None
         self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)  # kept open, so that the line outlives its clients
+        tty.setraw(self._slave)  # kept open, so that the pty persists between clients
         os.set_blocking(self._master, False)
         self.serial_path = os.ttyname(self._slave)
         self._line_session = WsgSession(self._device)
@@ -147,10 +147,10 @@ class MockWsgGripper:
                 key.data()
             self._device.poll()
             if self._line_session is not None:
-                for frame in self._line_session.tick():
-                    # A line has no flow control: what nobody reads is lost.
+                for packet in self._line_session.tick():
+                    # A serial line has no flow control: unread bytes are lost.
                     with contextlib.suppress(BlockingIOError):
-                        os.write(self._master, frame)
+                        os.write(self._master, packet)
             if self._client_session is not None:
                 self._unsent += b"".join(self._client_session.tick())
                 self._flush()
@@ -165,8 +165,8 @@ class MockWsgGripper:
         try:
             client, _ = self._listener.accept()
         except OSError:
-            return  # it went away before it was accepted
-        self._read_client()  # the end of the client before may wait to be read
+            return  # the client disconnected before it was accepted
+        self._read_client()  # the disconnect of the previous client may still be unread
         if self._client is not None:
             client.close()
             return

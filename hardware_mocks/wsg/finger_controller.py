@@ -1,33 +1,34 @@
-"""What the WSG-50 does with its fingers: motions and their results, the grasping control, FAST STOP, flags."""
+"""Finger control of the mock WSG-50: motions and their results, grasping control, FAST STOP, flags."""
 
 import math
 from dataclasses import dataclass
 
 from gelflow.hardware_mocks.plant import GripperPlant
+from gelflow.real.limits import LIMITS
 from gelflow.real.wsg.constants import HOME_INWARDS, Command, GraspState, Status, SystemFlag
 
-_REACHED = 0.2e-3  # this near to its goal a motion is done [m]
-_STILL = 1e-3  # slower than this the fingers stand [m/s]
-_SETTLE = 0.05  # fingers that stand this long before their goal are blocked [s]
-_PRESSED = 0.8  # of the force limit: the grasping force is there
-_SLIPPED = 1.5e-3  # fingers that close this far beyond where they held have lost the part [m]
-_SLACK = 0.1  # of the force limit; less than this for _LOOSE is a lost part
-_LOOSE = 0.1  # [s]
+_REACHED = 0.2e-3  # distance from the goal at which a motion is complete [m]
+_AT_REST = 1e-3  # speed below which the fingers are at rest [m/s]
+_SETTLE = 0.05  # fingers at rest this long before their goal are blocked [s]
+_PRESSED = 0.8  # fraction of the force limit at which a part counts as grasped
+_SLIPPED = 1.5e-3  # a held part is lost when the fingers close by more than this [m]
+_LOOSE_FORCE = 0.1  # a held part is lost when the force is below this fraction of the force limit ...
+_LOOSE_TIME = 0.1  # ... for this time [s]
 
 
 @dataclass(frozen=True)
 class MockWsgConfig:
-    """What a laboratory sets on the device, or what its type says. SI units."""
+    """Hardware data and settings of the mock gripper. SI units."""
 
-    stroke: float = 0.110  # [m]
-    speed: tuple[float, float] = (0.005, 0.420)  # [m/s]
+    stroke: float = LIMITS.gripper_width[1]  # [m]
+    speed: tuple[float, float] = LIMITS.gripper_speed  # [m/s]
     acceleration: tuple[float, float] = (0.1, 5.0)  # [m/s²]
-    force: tuple[float, float, float] = (5.0, 80.0, 120.0)  # least, nominal, overdrive [N]
-    clamp_travel: float = 3e-3  # half the band around a part's nominal width in which it is grasped [m]
+    force: tuple[float, float, float] = (*LIMITS.gripper_force, 120.0)  # minimum, nominal, overdrive [N]
+    clamp_travel: float = 3e-3  # half the band around the nominal width in which a part is grasped [m]
     homing_speed: float = 0.060  # [m/s]
     crc: bool = True  # False: checksums are neither checked nor sent
     fast_stop_on_disconnect: bool = True  # an unannounced TCP close raises FAST STOP
-    shortest_command_interval: float = 0.0  # faster commands are answered with OVERRUN [s]
+    shortest_command_interval: float = 0.0  # commands at shorter intervals are answered with OVERRUN [s]
     serial_number: int = 50_110
 
 
@@ -36,13 +37,13 @@ class _Motion:
     command: Command
     goal: float  # [m]
     sign: int  # +1 opens, −1 closes
-    nominal: float  # a part's expected width [m]
+    nominal: float  # expected width of the part [m]
     started: float
-    still_since: float | None = None
+    at_rest_since: float | None = None
 
 
 class FingerController:
-    """The state machine over a plant. Not thread-safe: the device holds a lock."""
+    """State machine of the finger motions on a plant. Not thread-safe: the device holds a lock."""
 
     def __init__(self, plant: GripperPlant, config: MockWsgConfig) -> None:
         self._plant = plant
@@ -60,12 +61,12 @@ class FingerController:
         self.fast_stopped = False
         self.grasp = GraspState.IDLE
         self.force_limit = config.force[1] / 2  # [N]
-        self.acceleration = 1.0  # [m/s²]; kept and reported, the plants don't know it
+        self.acceleration = 1.0  # [m/s²]; stored and reported, not simulated
         self.soft_limits: tuple[float, float] | None = None  # [m]
         self.measured = plant.gripper_state()  # width [m], speed [m/s], force [N]
 
     def home(self, direction: int, now: float) -> Status:
-        """Start homing; PENDING, or why not."""
+        """Start homing; returns PENDING or the reason of a refusal."""
         if direction not in (0, 1, 2):
             return Status.INVALID_PARAMETER
         goal = 0.0 if direction == HOME_INWARDS else self._config.stroke
@@ -76,14 +77,14 @@ class FingerController:
         return Status.CMD_PENDING
 
     def travel(self, command: Command, width: float, speed: float, now: float) -> Status:
-        """Start a pre-position, grasp or release [m, m/s]; PENDING, or why not."""
+        """Start a pre-position, grasp or release [m, m/s]; returns PENDING or the reason of a refusal."""
         if refusal := self._refusal(command):
             return refusal
         if not (math.isfinite(width) and math.isfinite(speed)):
             return Status.INVALID_PARAMETER
         low, high = self.soft_limits or (0.0, self._config.stroke)
         slowest, fastest = self._config.speed
-        tiny = 1e-7  # what float32 on the wire may add
+        tiny = 1e-7  # rounding of float32 on the wire
         if not (low - tiny <= width <= high + tiny and slowest - tiny <= speed <= fastest + tiny):
             if self.soft_limits is not None:
                 self._at_limit = (width > high) - (width < low)
@@ -97,9 +98,9 @@ class FingerController:
         return Status.CMD_PENDING
 
     def stop(self) -> tuple[Command, Status] | None:
-        """Stop the fingers; the command that this ends, with its status."""
+        """Stop the fingers; returns the command that ends, with its status."""
         ended = (self._motion.command, Status.CMD_ABORTED) if self._motion is not None else None
-        # A held part stays clamped: the drive keeps its position, only the grasping control ends.
+        # A held part stays clamped: the drive holds its position, and only the grasping control ends.
         if self.grasp != GraspState.HOLDING:
             self._plant.command_gripper(
                 width=self.measured[0], speed=self._config.speed[0], force=self._config.force[0]
@@ -111,7 +112,7 @@ class FingerController:
         return ended
 
     def fast_stop(self) -> tuple[Command, Status] | None:
-        """Stop and lock; the command that this ends, with its status."""
+        """Stop and lock; returns the command that ends, with its status."""
         ended = self.stop()
         self.fast_stopped = True
         self.grasp = GraspState.ERROR
@@ -124,12 +125,12 @@ class FingerController:
             self.grasp = GraspState.IDLE
 
     def lose_part(self) -> None:
-        """A fault to order: what is held is lost."""
+        """Inject a fault: the held part is lost."""
         if self.grasp == GraspState.HOLDING:
             self.grasp = GraspState.PART_LOST
 
     def poll(self, now: float) -> tuple[Command, Status] | None:
-        """Look at the plant; the command that ended now, with its status."""
+        """Read the plant; returns the command that ends now, with its status."""
         self.measured = self._plant.gripper_state()
         if self._motion is None:
             self._monitor(now)
@@ -143,7 +144,7 @@ class FingerController:
         return command, status
 
     def flags(self) -> SystemFlag:
-        """The system state."""
+        """Flags of the system state."""
         shown = {
             SystemFlag.REFERENCED: self.referenced,
             SystemFlag.MOVING: self._motion is not None,
@@ -184,13 +185,13 @@ class FingerController:
     def _result(self, motion: _Motion, now: float) -> Status | None:
         width, speed, force = self.measured
         there = abs(width - motion.goal) < _REACHED
-        if abs(speed) > _STILL or now - motion.started < _SETTLE:
-            motion.still_since = None
-        elif motion.still_since is None:
-            motion.still_since = now
-        blocked = not there and motion.still_since is not None and now - motion.still_since >= _SETTLE
+        if abs(speed) > _AT_REST or now - motion.started < _SETTLE:
+            motion.at_rest_since = None
+        elif motion.at_rest_since is None:
+            motion.at_rest_since = now
+        blocked = not there and motion.at_rest_since is not None and now - motion.at_rest_since >= _SETTLE
         if motion.command == Command.GRASP:
-            pressed = force >= _PRESSED * self.force_limit and abs(speed) < 5 * _STILL
+            pressed = force >= _PRESSED * self.force_limit and abs(speed) < 5 * _AT_REST
             return self._grasp_result(motion, now, there=there, pressed=pressed or blocked)
         if there:
             self._reached = True
@@ -222,14 +223,14 @@ class FingerController:
         return Status.AXIS_BLOCKED
 
     def _monitor(self, now: float) -> None:
-        """A held part that is no longer felt is lost."""
+        """Detect the loss of a held part."""
         if self.grasp != GraspState.HOLDING:
             return
         width, _, force = self.measured
-        if force >= _SLACK * self.force_limit:
+        if force >= _LOOSE_FORCE * self.force_limit:
             self._loose_since = None
         elif self._loose_since is None:
             self._loose_since = now
-        loose = self._loose_since is not None and now - self._loose_since >= _LOOSE
+        loose = self._loose_since is not None and now - self._loose_since >= _LOOSE_TIME
         if loose or self._held_sign * (width - self._held_width) > _SLIPPED:
             self.grasp = GraspState.PART_LOST

@@ -1,7 +1,7 @@
-"""The WSG-50's side of its binary protocol, without I/O: bytes of a client in, replies and updates out.
+"""Device side of the WSG-50's binary protocol, without I/O: bytes of a client in, replies and updates out.
 
-One device has any number of sessions (a serial line, a TCP client); each has its own decoder and its own updates,
-and a motion's result goes to the session that asked for it.
+A device has any number of sessions (a serial line, a TCP client), each with its own decoder and updates; the result of
+a motion goes to the session that started it.
 """
 
 import struct
@@ -33,12 +33,12 @@ from gelflow.real.wsg.constants import (
     UpdateMode,
 )
 
-_HALF_FRAME = 0.5  # a frame whose rest does not come in this time is given up [s]
-_UNHURRIED = (Command.STOP, Command.FAST_STOP, Command.DISCONNECT)  # taken at any rate
+_PACKET_TIMEOUT = 0.5  # an incomplete packet is abandoned after this time [s]
+_ACCEPTED_AT_ANY_RATE = (Command.STOP, Command.FAST_STOP, Command.DISCONNECT)
 
-_WSG_50, _FIRMWARE = 1, 0x0400  # device type, and a version of the firmware that speaks this protocol
+_WSG_50, _FIRMWARE = 1, 0x0400  # device type and firmware version
 
-# Formats of the requests' payloads; commands that are not named here take none.
+# Struct formats of the request payloads; commands that are not listed have none.
 _REQUEST_LAYOUT = {
     Command.HOME: "<B",
     Command.PRE_POSITION: "<Bff",
@@ -66,7 +66,7 @@ class _Update:
 
 
 class WsgDevice:
-    """The device itself. Thread-safe."""
+    """The mock device. Thread-safe."""
 
     def __init__(self, plant: GripperPlant, *, clock: Clock, config: MockWsgConfig | None = None) -> None:
         self.clock = clock
@@ -76,18 +76,18 @@ class WsgDevice:
         self._owner: WsgSession | None = None
 
     def poll(self) -> None:
-        """Let the motion under way go on; its result goes to the session that started it."""
+        """Advance the motion in progress; its result goes to the session that started it."""
         with self.lock:
             if ended := self.fingers.poll(self.clock.now()):
                 self._finish(*ended)
 
     def start(self, session: "WsgSession", command: Command, values: tuple[float, ...]) -> Status:
-        """Start a motion for a session; PENDING, or why not."""
+        """Start a motion for a session; returns PENDING or the reason of a refusal."""
         now = self.clock.now()
         if command == Command.HOME:
             status = self.fingers.home(int(values[0]), now)
         elif command == Command.PRE_POSITION and values[0] != 0:
-            status = Status.INVALID_PARAMETER  # drivers disagree on what the flags mean
+            status = Status.INVALID_PARAMETER  # drivers disagree on the meaning of the flags
         else:
             width, speed = values[-2:]
             status = self.fingers.travel(command, width / MM, speed / MM, now)
@@ -96,14 +96,14 @@ class WsgDevice:
         return status
 
     def stop(self, *, fast: bool = False) -> None:
-        """Stop the fingers; `fast` locks them as well."""
+        """Stop the fingers; `fast` also locks them."""
         with self.lock:
             ended = self.fingers.fast_stop() if fast else self.fingers.stop()
             if ended is not None:
                 self._finish(*ended)
 
     def state_reply(self, command: Command) -> Reply:
-        """The answer to a question after a state value."""
+        """The reply to a request of a state value."""
         width, speed, force = self.fingers.measured
         values: dict[Command, float] = {
             Command.SYSTEM_STATE: int(self.fingers.flags()),
@@ -122,7 +122,7 @@ class WsgDevice:
 
 
 class WsgSession:
-    """One client's conversation with the device."""
+    """The session of one client with the device."""
 
     def __init__(self, device: WsgDevice) -> None:
         self._device = device
@@ -131,7 +131,7 @@ class WsgSession:
         self._outbox: list[bytes] = []
         self._last_bytes = 0.0
         self._last_command = -float("inf")
-        self.announced = False  # the client said that it will disconnect
+        self.announced = False  # the client has announced its disconnect
         self._handlers = self._table()
 
     def _table(self) -> dict[Command, Callable[[Command, tuple[Any, ...]], Reply]]:
@@ -150,30 +150,30 @@ class WsgSession:
         return {command: handler for commands, handler in groups.items() for command in commands}
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the client, in any portions."""
+        """Process bytes from the client, in portions of any size."""
         with self._device.lock:
             self._last_bytes = self._device.clock.now()
             self._handle(self._decoder.feed(data))
 
     def tick(self) -> list[bytes]:
-        """What the client gets now: replies and due updates, one frame each."""
+        """Replies and due updates for the client, one packet each."""
         with self._device.lock:
             now = self._device.clock.now()
-            if self._decoder.waiting and now - self._last_bytes > _HALF_FRAME:
+            if self._decoder.waiting and now - self._last_bytes > _PACKET_TIMEOUT:
                 self._last_bytes = now
                 self._handle(self._decoder.expire())
             for command, update in self._updates.items():
                 if now >= update.due:
                     self._update(command, update, now)
-            frames, self._outbox = self._outbox, []
-            return frames
+            packets, self._outbox = self._outbox, []
+            return packets
 
     def send(self, answer: Reply) -> None:
-        """Put a reply into the outbox."""
+        """Queue a reply."""
         self._outbox.append(answer.encode(crc=self._device.config.crc))
 
     def lost(self) -> None:
-        """The connection ended: unannounced, that is a fault."""
+        """Handle the end of the connection; an unannounced end is a fault."""
         if not self.announced and self._device.config.fast_stop_on_disconnect:
             self._device.stop(fast=True)
 
@@ -193,7 +193,7 @@ class WsgSession:
     def _answer(self, command: Command, payload: bytes) -> Reply:
         now = self._device.clock.now()
         since, self._last_command = now - self._last_command, now
-        if since < self._device.config.shortest_command_interval and command not in _UNHURRIED:
+        if since < self._device.config.shortest_command_interval and command not in _ACCEPTED_AT_ANY_RATE:
             return reply(command, Status.OVERRUN)
         self.announced = command == Command.DISCONNECT
         if command == Command.LOOP:
@@ -210,16 +210,16 @@ class WsgSession:
         return self._handlers[command](command, struct.unpack(layout, payload))
 
     def _update(self, command: Command, update: _Update, now: float) -> None:
-        frame = self._device.state_reply(command)
+        answer = self._device.state_reply(command)
         if update.mode == UpdateMode.ON_CHANGE:
-            if frame.data == update.last:
+            if answer.data == update.last:
                 return
             update.due = now + update.period
         else:
-            # A late tick does not shift the beat, but it makes up for no more than one update.
+            # A late tick does not shift the schedule, and at most one missed update is made up for.
             update.due = max(update.due + update.period, now)
-        update.last = frame.data
-        self.send(frame)
+        update.last = answer.data
+        self.send(answer)
 
     def _state(self, command: Command, values: tuple[float, ...]) -> Reply:
         mode, period = int(values[0]), values[1] / MM
@@ -288,7 +288,7 @@ class WsgSession:
         return reply(command, Status.SUCCESS)
 
     def _tare(self, command: Command, _: tuple[float, ...]) -> Reply:
-        return reply(command, Status.NOT_AVAILABLE)  # needs fingers that measure force
+        return reply(command, Status.NOT_AVAILABLE)  # requires force-measuring fingers
 
     def _description(self, command: Command, _: tuple[float, ...]) -> Reply:
         config = self._device.config

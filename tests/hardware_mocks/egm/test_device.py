@@ -198,12 +198,12 @@ def test_several_threads_may_ask(bench: Bench) -> None:
 def test_a_plant_out_of_reach_is_said_at_the_start() -> None:
     clock = ScaledClock()
     plant = KinematicArm(clock, position=START + 1.0, quaternion=DOWN)
-    with pytest.raises(UsageError, match=r"the mock arm cannot start where its plant is: .*out of reach"):
+    with pytest.raises(UsageError, match=r"the mock arm cannot start at the pose of its plant: .*out of reach"):
         MockEgmArm(plant, clock=clock).start()
 
 
 def test_a_mock_that_is_not_running_says_so(bench: Bench) -> None:
-    with pytest.raises(UsageError, match="runs already"):
+    with pytest.raises(UsageError, match="already running"):
         bench.mock.start()
     bench.mock.stop()
     with pytest.raises(UsageError, match=r"not running; call start\(\) first"):
@@ -215,7 +215,7 @@ def test_a_mock_that_is_not_running_says_so(bench: Bench) -> None:
 def test_a_dead_controller_is_noticed(bench: Bench) -> None:
     assert bench.mock.pid is not None
     os.kill(bench.mock.pid, signal.SIGKILL)
-    with pytest.raises(PeerError, match="the mock controller's process is gone"):
+    with pytest.raises(PeerError, match="the mock controller's process has ended"):
         for _ in range(1000):
             bench.mock.motors(True)
             time.sleep(0.01)

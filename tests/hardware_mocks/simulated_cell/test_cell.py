@@ -58,7 +58,7 @@ def test_the_hand_holds_out_a_part_and_the_grip_takes_it() -> None:
     cell = world(3)
     assert cell.truth()["part"] is None
     cell.advance(100)
-    assert cell.truth()["part"]["phase"] == "held out"
+    assert cell.truth()["part"]["phase"] == "presented"
     limits = np.array(INSERTION.misalignment)
     assert (np.abs(cell.truth()["part"]["misalignment"]) <= limits).all()
     cell.command_gripper(width=0.032, speed=0.1, force=12.0)
@@ -103,12 +103,12 @@ def test_what_was_true_when_a_part_was_let_go_stays_on_record() -> None:
     go(cell, place, 0.002, steps=800)
     cell.command_gripper(width=0.06, speed=0.1, force=50.0)
     cell.advance(100)
-    assert cell.truth()["part"]["phase"] == "let go" and cell.truth()["part"]["inserted"]
+    assert cell.truth()["part"]["phase"] == "released" and cell.truth()["part"]["inserted"]
     go(cell, (0.0, 0.0, 0.0), cell.config.load_height, steps=600)
     cell.advance(200)
     truth = cell.truth()
     assert [part["seed"] for part in truth["parts"]] == [5, 6]
-    assert truth["parts"][0]["inserted"] and truth["part"]["phase"] == "held out"
+    assert truth["parts"][0]["inserted"] and truth["part"]["phase"] == "presented"
 
 
 def test_the_same_seed_gives_the_same_world_bit_for_bit() -> None:
@@ -179,7 +179,7 @@ def wait_for(condition: Callable[[], bool], seconds: float = 30.0) -> None:
 def test_the_world_in_a_process_of_its_own_does_the_same() -> None:
     with SimulatedCellProcess(ScaledClock(4.0), SimulatedCellConfig(seed=3)) as remote:
         assert remote.gripper_state()[0] == pytest.approx(0.06, abs=1e-6)
-        wait_for(lambda: (remote.truth()["part"] or {}).get("phase") == "held out")
+        wait_for(lambda: (remote.truth()["part"] or {}).get("phase") == "presented")
         assert remote.truth()["part"]["misalignment"] == pytest.approx(
             list(INSERTION.draw_misalignment(np.random.default_rng((3, 0x6E1)), 1)[0])
         )
@@ -197,7 +197,7 @@ def test_a_world_that_died_is_named() -> None:
     assert remote._helper is not None
     remote.command_arm(np.array([math.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
     wait_for(lambda: remote._helper is not None and not remote._helper.running)
-    with pytest.raises(SimulationError, match="the arm can not go to"):
+    with pytest.raises(SimulationError, match="the arm cannot move to"):
         remote.truth()
     with pytest.raises(SimulationError, match="failed"):
         remote.stop()

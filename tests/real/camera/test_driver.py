@@ -263,7 +263,7 @@ def test_wrong_sources_and_settings() -> None:
     with pytest.raises(UsageError, match="rate"):
         MockMjpegCamera(Source(), CLOCK, rate=0)
     with served() as (server, _):
-        with pytest.raises(UsageError, match="another port"):
+        with pytest.raises(UsageError, match="use another port"):
             MockMjpegCamera(Source(), CLOCK, port=server.port).start()
         with pytest.raises(UsageError, match="how must be"):
             server.corrupt(how="painted")  # type: ignore[arg-type]
