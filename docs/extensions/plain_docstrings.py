@@ -1,6 +1,7 @@
-"""Docstrings are plain text with Markdown code spans: this extension makes valid reStructuredText of them.
+"""Converts docstrings to reStructuredText.
 
-Fields of dataclasses are described by the comment behind them; they are added to the docstring of their class.
+Docstrings are plain text with Markdown code spans and NumPy-style section headings. The comments behind the fields of a
+dataclass are added to the docstring of the class.
 """
 
 import ast
@@ -10,23 +11,21 @@ import io
 import re
 import textwrap
 import tokenize
-from collections.abc import Iterable, Iterator
 
 from sphinx.application import Sphinx
 from sphinx.util.typing import ExtensionMetadata
 
-BEFORE_NAPOLEON = 400  # priority; napoleon has 500
 CODE_SPAN = re.compile(r"(`+)(.+?)\1", re.DOTALL)
-UNDERLINE = re.compile(r"^\s*-{3,}\s*$")
-LIST_ITEM = re.compile(r"^\s*(?:[-*•]|\d+\.) ")
+UNDERLINE = re.compile(r"-{3,}")
+LIST_ITEM = re.compile(r"(?:[-*•]|\d+\.) ")
+ENTRY = re.compile(r"(\*{0,2}\w+(?:, \w+)*) ?: (.*)")
 
 
 def escape(text: str) -> str:
-    """Plain text as reStructuredText: code spans are kept, characters with a meaning are escaped."""
+    """Keep code spans and escape all other characters that have a meaning in reStructuredText."""
 
     def outside(part: str) -> str:
-        part = part.replace("\\", "\\\\")
-        return re.sub(r"([*|`]|_(?!\w))", r"\\\1", part)
+        return re.sub(r"([*|`]|_(?!\w))", r"\\\1", part.replace("\\", "\\\\"))
 
     pieces, start = [], 0
     for match in CODE_SPAN.finditer(text):
@@ -36,55 +35,54 @@ def escape(text: str) -> str:
     return "".join([*pieces, outside(text[start:])])
 
 
-def indent_of(line: str) -> int:
-    """Number of leading spaces."""
-    return len(line) - len(line.lstrip())
+def is_section(block: list[str]) -> bool:
+    """Whether the block starts with a heading and its underline."""
+    return len(block) > 1 and UNDERLINE.fullmatch(block[1]) is not None
 
 
-def with_literal_blocks(lines: list[str]) -> Iterator[str]:
-    """Indented lines, such as equations, become literal blocks; the lines of list items stay."""
-    in_block, in_list = False, False
+def blocks(lines: list[str]) -> list[list[str]]:
+    """Split at blank lines, and where the indentation changes between unindented text and an indented block."""
+    result: list[list[str]] = [[]]
     for line in lines:
-        indented = indent_of(line) > 0
         if not line.strip():
-            yield ""
+            result.append([])
             continue
-        if LIST_ITEM.match(line) and not in_block:
-            if not in_list:
-                yield ""
-            in_list = True
-        elif not indented:
-            if in_block or (in_list and not in_block):
-                yield ""
-            in_block = in_list = False
-        elif not in_list and not in_block:
-            yield from ("", "::", "")
-            in_block = True
-        yield line
+        block = result[-1]
+        splits = LIST_ITEM.match(line) or line.startswith(" ") != block[0].startswith(" ") if block else False
+        if splits and not is_section([*block, line]) and not LIST_ITEM.match(block[0]):
+            result.append([])
+        result[-1].append(line)
+    return [block for block in result if block]
+
+
+def entries(block: list[str], directive: str) -> list[str]:
+    """A block of a section, one field or list item per entry."""
+    result: list[str] = []
+    for line in block:
+        if match := ENTRY.fullmatch(line):
+            result.append(directive.format(match.group(1)) + escape(match.group(2)))
+        elif result:
+            result.append("  " + escape(line.strip()))
+        else:
+            result.append("- " + escape(line))
+    return result
 
 
 def to_restructured_text(lines: list[str]) -> list[str]:
-    """A docstring as reStructuredText; sections such as "Parameters" are left to napoleon."""
-    section = next((i - 1 for i, line in enumerate(lines) if UNDERLINE.match(line) and i), len(lines))
-    return escape_outside_blocks(with_literal_blocks(lines[:section])) + escape("\n".join(lines[section:])).split("\n")
-
-
-def escape_outside_blocks(lines: Iterable[str]) -> list[str]:
-    """Escape everything except the contents of literal blocks."""
+    """The docstring `lines` as reStructuredText."""
     result: list[str] = []
-    pending: list[str] = []
-    in_block = False
-    for line in lines:
-        if in_block and (not line.strip() or indent_of(line) > 0):
-            result.append(line)
-            continue
-        in_block = False
-        if line == "::":
-            result += [*escape("\n".join(pending)).split("\n"), line]
-            pending, in_block = [], True
+    for block in blocks(lines):
+        if is_section(block):
+            heading, body = block[0], block[2:]
+            if heading != "Parameters":
+                result += [f".. rubric:: {heading}", ""]
+            result += entries(body, ":param {}: " if heading == "Parameters" else "- ``{}``: ")
+        elif block[0].startswith(" "):  # an equation or a table
+            result += ["::", "", *block]
         else:
-            pending.append(line)
-    return result + escape("\n".join(pending)).split("\n")
+            result += escape("\n".join(block)).split("\n")
+        result.append("")
+    return result
 
 
 def field_comments(cls: type) -> dict[str, str]:
@@ -97,9 +95,10 @@ def field_comments(cls: type) -> dict[str, str]:
         for token in tokenize.generate_tokens(io.StringIO(source).readline)
         if token.type == tokenize.COMMENT
     }
-    fields = [node for node in definition.body if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)]
     return {
-        node.target.id: comments.get(node.end_lineno or 0, "") for node in fields if isinstance(node.target, ast.Name)
+        node.target.id: comments[node.end_lineno]
+        for node in definition.body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.end_lineno in comments
     }
 
 
@@ -107,12 +106,10 @@ def process(app: Sphinx, what: str, name: str, obj: object, options: object, lin
     """Handler of autodoc-process-docstring."""
     lines[:] = to_restructured_text(lines)
     if what in ("class", "exception") and inspect.isclass(obj) and dataclasses.is_dataclass(obj):
-        described = {field: text for field, text in field_comments(obj).items() if text}
-        if described:
-            lines += ["", *(f"- ``{field}``: {escape(text)}" for field, text in described.items()), ""]
+        lines += [*(f"- ``{field}``: {escape(text)}" for field, text in field_comments(obj).items()), ""]
 
 
 def setup(app: Sphinx) -> ExtensionMetadata:
     """Register the handler."""
-    app.connect("autodoc-process-docstring", process, priority=BEFORE_NAPOLEON)
+    app.connect("autodoc-process-docstring", process)
     return {"parallel_read_safe": True}
