@@ -1,118 +1,68 @@
-"""Everything that docs/guide/tradeoff.md shows: `python benchmarks/tradeoff.py [SCENE …]`.
+"""Accuracy and speed of all settings and presets of the scenes: `python benchmarks/tradeoff.py [SCENE …]`.
 
-For each scene: all settings (`gelflow.sim.benchmark.tradeoff.sweep`) to benchmarks/results/tradeoff_SCENE.json and
-docs/pictures/tradeoff_SCENE.png, and the errors of its presets over draws of its physics, whose bounds go into the
-table of docs/guide/tradeoff.md. Errors do not depend on the machine; run it where nothing else runs, for the times.
+For each scene the measurements (`gelflow.sim.benchmark.tradeoff`) are written to benchmarks/results/tradeoff_SCENE.json
+and docs/pictures/tradeoff_SCENE.png, and the error bounds of its presets to the table of docs/guide/tradeoff.md. Times
+require an idle machine; errors do not depend on the machine.
 """
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
+import script
 
-from gelflow.cli.commands.tradeoff import plain, short, table
-from gelflow.errors import GelflowError
+from gelflow.cli.commands.tradeoff import short, table
 from gelflow.measurement.machine import processor
-from gelflow.sim.benchmark import versions
+from gelflow.sim.benchmark.tradeoff.page import preset_rows, update_page
 from gelflow.sim.benchmark.tradeoff.picture import draw
-from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, Bounds, bounds, preset_errors
-from gelflow.sim.benchmark.tradeoff.run import Errors
-from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff, measure
-from gelflow.sim.scene import load_scene, scene_names
+from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds, preset_errors
+from gelflow.sim.benchmark.tradeoff.sweep import measure
+from gelflow.sim.scene import scene_names
 
-ROOT = Path(__file__).parents[1]
-PAGE = ROOT / "docs" / "guide" / "tradeoff.md"
-DRAWS = 48
-HALVINGS = 8  # of a frame, for the references of the draws
-BEGIN, END = "<!-- written by benchmarks/tradeoff.py -->", "<!-- end -->"
-
-
-def row(scene: str, name: str, bound: Errors, speed: float) -> str:
-    """One line of the page's table. Units as in its heading."""
-    way = load_scene(scene, preset=None if name == SCENE_DEFAULT else name)
-    how = f"{way.integrator.upper()}, {1e3 * way.step:g} ms, {way.tolerance:.0e}".replace("e-0", "e-")
-    figures = (1e3 * bound.position, 1e3 * bound.rotation, 100 * bound.markers, bound.flow)
-    cells = [scene, name, how, f"{speed:.0f}", *(f"{x:.3g}" for x in figures), f"{bound.cosine:.4f}"]
-    return f"| {' | '.join([*cells, f'{100 * bound.gradient:.3g}'])} |"
-
-
-def speeds(found: Tradeoff) -> dict[str, float]:
-    """Times faster than real time, by preset."""
-    result = {name: measurement.speed for measurement in found.measurements for name in measurement.presets}
-    return result | {
-        SCENE_DEFAULT: next(
-            measurement.speed for measurement in found.measurements if measurement.setting.group == "default"
-        )
-    }
-
-
-def write_page(rows: dict[str, list[str]]) -> None:
-    """Replace the rows of these scenes in the page's table."""
-    text = PAGE.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    inside, after = rest.split(END)
-    lines = inside.strip().splitlines()
-    kept = {name: [line for line in lines[2:] if line.startswith(f"| {name} |")] for name in scene_names()}
-    body = [line for name in scene_names() for line in rows.get(name, kept[name])]
-    PAGE.write_text(f"{before}{BEGIN}\n{chr(10).join([*lines[:2], *body])}\n{END}{after}", encoding="utf-8")
-
-
-def record(found: Tradeoff, limits: dict[str, Bounds], machine: str) -> dict[str, Any]:
-    return {
-        "format": 1,
-        "processor": machine,
-        "versions": versions(),
-        **plain(found),
-        "bounds": {name: asdict(limit) for name, limit in limits.items()},
-    }
-
-
-def one(scene: str, draws: int, repeats: int, progress: Progress) -> tuple[Tradeoff, dict[str, Bounds]]:
-    """Everything about one scene."""
-    bar = progress.add_task(scene, total=2.0)
-    worst = preset_errors(
-        scene,
-        range(draws),
-        halvings=HALVINGS,
-        done=lambda share: progress.update(bar, description=f"{scene}: presets", completed=share),
-    )
-    found = measure(
-        scene,
-        repeats=repeats,
-        done=lambda what, share: progress.update(bar, description=f"{scene}: {what}", completed=1 + share),
-    )
-    return found, bounds(worst, draws)
+PAGE = script.ROOT / "docs" / "guide" / "tradeoff.md"
+HALVINGS = 8  # of a frame, for the references of the sampled physics
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Measure cost against accuracy; writes docs/guide/tradeoff.md.")
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="all that come along, when none is named")
+    parser = argparse.ArgumentParser(description="Measure accuracy and speed of the settings of scenes.")
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="default: all included scenes")
+    parser.add_argument("--out", type=Path, default=script.RESULTS, metavar="DIR", help="folder of tradeoff_SCENE.json")
     parser.add_argument("--repeats", type=int, default=21, metavar="N", help="timed runs of each setting (%(default)s)")
-    parser.add_argument("--draws", type=int, default=DRAWS, metavar="N", help="of the physics (%(default)s)")
+    parser.add_argument("--draws", type=int, default=48, metavar="N", help="samples of the physics (%(default)s)")
+    parser.add_argument("--quick", action="store_true", help="fewer settings, 3 repeats, 2 samples; no page or picture")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="first seed of the samples (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the records instead of tables")
     args = parser.parse_args()
-    console, machine = Console(width=80, highlight=False), processor()
-    try:
-        for scene in args.scenes or scene_names():
-            with Progress(console=Console(stderr=True, width=80), transient=True) as progress:
-                found, limits = one(scene, args.draws, args.repeats, progress)
-            fast = speeds(found)
-            write_page({scene: [row(scene, name, limit.bound, fast[name]) for name, limit in limits.items()]})
-            text = json.dumps(record(found, limits, machine), indent=1, allow_nan=False)
-            (ROOT / "benchmarks" / "results" / f"tradeoff_{scene}.json").write_text(text + "\n", encoding="utf-8")
-            draw(found, ROOT / "docs" / "pictures" / f"tradeoff_{scene}.png")
-            console.print(table(found, f"{scene}, one thread of {machine}"))
-            for name, limit in limits.items():
-                console.print(f"{name}: markers at most {short(100 * limit.worst.markers)} % off in {args.draws} draws")
-    except GelflowError as error:
-        print(error, file=sys.stderr)
-        return 2
+    for scene in args.scenes or scene_names():
+        _measure_scene(scene, args)
     return 0
 
 
+def _measure_scene(scene: str, args: argparse.Namespace) -> None:
+    """Measure one scene; write its record, picture and rows of the page."""
+    draws, repeats = (2, 3) if args.quick else (args.draws, args.repeats)
+    with script.progress_share(f"{scene}: presets") as update:
+        seeds = range(args.seed, args.seed + draws)
+        errors = preset_errors(scene, seeds, halvings=HALVINGS, done=update)
+    with script.progress_share(f"{scene}: settings") as update:
+        tradeoff = measure(scene, quick=args.quick, repeats=repeats, done=lambda _, share: update(share))
+    limits = bounds(errors, draws)
+    if not args.quick:
+        update_page(PAGE, {scene: preset_rows(tradeoff, limits)})
+        draw(tradeoff, script.PICTURES / f"tradeoff_{scene}.png")
+    record = {
+        **script.header(),
+        **asdict(tradeoff),
+        "bounds": {name: asdict(limit) for name, limit in limits.items()},
+    }
+    summaries = [
+        f"{name}: largest error of the markers {short(100 * limit.worst.markers)} % in {draws} samples"
+        for name, limit in limits.items()
+    ]
+    file = args.out / f"tradeoff_{scene}.json"
+    script.write(file, record, args.json, table(tradeoff, f"{scene}, one thread of {processor()}"), *summaries)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(script.run(main))

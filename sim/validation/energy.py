@@ -100,7 +100,7 @@ class EnergyGauge:
         return contact, friction
 
 
-def motor_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
+def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
     """What each actuator pulls its joint with now, under controls u (nu,), shape (N, nu) [N, N m].
 
     Times the way of a step it is the motor's work in it, since a step's forces are those at its end.

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.energy import EnergyGauge, motor_forces
+from gelflow.sim.validation.energy import EnergyGauge, actuator_forces
 from gelflow.sim.validation.reference_motions import reference_motion
 from gelflow.sim.validation.thrown_bodies import GRAVITY, KINDS, MASS, SIZE, Kind, ThrownBody, throw_bodies
 
@@ -134,7 +134,7 @@ def test_what_scenes_gain_is_bounded(name: str, law: str, integrator: str) -> No
         for u in moves.step_controls(step):
             start, halved = sim.q[0, driven].copy(), sim.halved[0]
             sim.step(u)
-            done = motor_forces(scene, sim, u)[0] @ (sim.q[0, driven] - start)
+            done = actuator_forces(scene, sim, u)[0] @ (sim.q[0, driven] - start)
             after = gauge.read(sim).total[0]
             if sim.halved[0] == halved:  # else the motors' work is not told by the step's end
                 gains.append(after - before - done)

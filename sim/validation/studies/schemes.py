@@ -1,11 +1,11 @@
-"""Other implicit schemes than the core's two, on a reduced example and, where the core need not change, on scenes.
+"""Implicit integration schemes compared on a reduced example in NumPy, and on scenes where the core supports it.
 
-The example, in NumPy alone: a ball (x, z, angle) is thrown on a plane of penalty springs with depth damping and viscous
-friction that slips and sticks, and bounces until it rolls. Every scheme solves systems of one form,
+In the example a ball (x, z, angle) is thrown on a plane with penalty contact, depth damping and viscous friction, and
+bounces until it rolls. All schemes solve systems of the form
 
     Y = base + γ h F(Y),
 
-the one that a step of the core solves, so that costs compare: one Newton solve per stage. All are counted.
+like a step of the core, so that costs are comparable: the number of Newton iterations of all stages.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ BALL_HALVINGS, REFERENCE_HALVINGS = 8, 12
 
 @dataclass(frozen=True)
 class Scheme:
-    """Errors of one scheme over its steps and its cost."""
+    """Errors and costs of one scheme over the step."""
 
     name: str
     steps: list[float]  # [s]
@@ -39,11 +39,11 @@ class Scheme:
     solves: list[int]  # Newton iterations, each with one linear solve, over the whole run
 
     def slope(self, last: int = 5) -> float:
-        """Order over the finest halvings."""
+        """Order of convergence over the finest `last` halvings."""
         return float(np.polyfit(np.log(self.steps[-last - 1 :]), np.log(self.errors[-last - 1 :]), 1)[0])
 
     def cost_of(self, error: float) -> float | None:
-        """Iterations from which on the error stays below `error`, interpolated; None where it was not reached."""
+        """Iterations beyond which the error stays below `error`, interpolated; None if it does not."""
         below = np.array(self.errors) <= error
         if not below[-1]:
             return None
@@ -55,7 +55,7 @@ class Scheme:
 
 
 def force(y: Array) -> tuple[Array, Array]:
-    """F(y), shape (6,), and ∂F/∂y: gravity, and the contact law of the core at the ball's lowest point."""
+    """F(y), shape (6,), and ∂F/∂y: gravity, and the core's contact law at the lowest point of the ball."""
     f, by = np.zeros(6), np.zeros((6, 6))
     f[:3] = y[3:]
     by[:3, 3:] = np.eye(3)
@@ -77,8 +77,8 @@ def force(y: Array) -> tuple[Array, Array]:
     return f, by
 
 
-class Solves:
-    """Solves Y = base + h F(Y) by Newton's method and counts its iterations."""
+class NewtonSolver:
+    """Solves Y = base + h F(Y) by Newton's method and counts the iterations."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -92,44 +92,44 @@ class Solves:
                 return y
             y = y - np.linalg.solve(np.eye(6) - h * by, residual)
             self.count += 1
-        return y  # steps between two sides of a kink, by less than matters
+        return y  # alternates between the sides of a kink, with negligible difference
 
 
-Stepper = Callable[[Solves, Array, Array | None, float], Array]  # (solve, y, the y before, h) → next y
+Stepper = Callable[[NewtonSolver, Array, Array | None, float], Array]  # (solver, y, previous y, h) → next y
 
 
-def bdf1(solve: Solves, y: Array, _: Array | None, h: float) -> Array:
+def bdf1(solve: NewtonSolver, y: Array, _: Array | None, h: float) -> Array:
     return solve(y, h, y)
 
 
-def bdf2(solve: Solves, y: Array, before: Array | None, h: float) -> Array:
+def bdf2(solve: NewtonSolver, y: Array, before: Array | None, h: float) -> Array:
     return solve(y, h, y) if before is None else solve((4 * y - before) / 3, 2 / 3 * h, y)
 
 
-def extrapolated(solve: Solves, y: Array, _: Array | None, h: float) -> Array:
-    """Two half steps of BDF1, twice, less one whole step: second order."""
+def extrapolated(solve: NewtonSolver, y: Array, _: Array | None, h: float) -> Array:
+    """Richardson extrapolation of BDF1, twice two half steps minus one whole step: second order."""
     half = solve(y, h / 2, y)
     return 2 * solve(half, h / 2, half) - solve(y, h, y)
 
 
-def sdirk2(solve: Solves, y: Array, _: Array | None, h: float) -> Array:
-    """Alexander's two stages, γ = 1 − 1/√2: second order, L-stable."""
+def sdirk2(solve: NewtonSolver, y: Array, _: Array | None, h: float) -> Array:
+    """SDIRK method of Alexander with two stages, γ = 1 − 1/√2: second order, L-stable."""
     gamma = 1 - np.sqrt(0.5)
     first = solve(y, gamma * h, y)
     slope = (first - y) / (gamma * h)
     return solve(y + (1 - gamma) * h * slope, gamma * h, first)
 
 
-def trbdf2(solve: Solves, y: Array, _: Array | None, h: float) -> Array:
-    """The trapezoidal rule to (2 − √2) h, then BDF2 over both pieces: second order, L-stable."""
+def trbdf2(solve: NewtonSolver, y: Array, _: Array | None, h: float) -> Array:
+    """Trapezoidal rule up to (2 − √2) h, then BDF2: second order, L-stable."""
     gamma = 2 - np.sqrt(2)
     middle = solve(y + gamma * h / 2 * force(y)[0], gamma * h / 2, y)
     base = (middle / gamma - (1 - gamma) ** 2 / gamma * y) / (2 - gamma)
     return solve(base, (1 - gamma) / (2 - gamma) * h, middle)
 
 
-def sdirk3(solve: Solves, y: Array, _: Array | None, h: float) -> Array:
-    """Alexander's three stages: third order where all is smooth, L-stable."""
+def sdirk3(solve: NewtonSolver, y: Array, _: Array | None, h: float) -> Array:
+    """SDIRK method of Alexander with three stages: third order for smooth systems, L-stable."""
     g = 0.4358665215084590
     b1, b2 = -(6 * g * g - 16 * g + 1) / 4, (6 * g * g - 20 * g + 5) / 4
     first = solve(y, g * h, y)
@@ -151,8 +151,8 @@ STEPPERS: dict[str, Stepper] = {
 
 
 def throw(stepper: Stepper, halvings: int) -> tuple[Array, int]:
-    """Where the ball ends, (6,), and how many Newton iterations it took."""
-    solve, h = Solves(), LONGEST / 2**halvings
+    """Final state of the ball, (6,), and number of Newton iterations."""
+    solve, h = NewtonSolver(), LONGEST / 2**halvings
     y, before = START, None
     for _ in range(round(DURATION / h)):
         y, before = stepper(solve, y, before, h), y
@@ -160,7 +160,7 @@ def throw(stepper: Stepper, halvings: int) -> tuple[Array, int]:
 
 
 def ball_errors(done: Callable[[float], None]) -> list[Scheme]:
-    """Every scheme on the ball; errors of its place and angle, relative to how far it went."""
+    """All schemes on the ball: errors of position and angle relative to the displacement."""
     reference, _ = throw(trbdf2, REFERENCE_HALVINGS)
     done(0.5)
     size = float(np.linalg.norm(reference[:3] - START[:3]))
@@ -175,10 +175,10 @@ def ball_errors(done: Callable[[float], None]) -> list[Scheme]:
 
 
 def extrapolated_scene(whole: Simulator, halves: Simulator, moves: ReferenceMotion) -> tuple[Array, int]:
-    """A scene's motion by BDF1 extrapolated in every step: final q and Newton iterations.
+    """A scene's motion with BDF1 extrapolated in every step: final q (nq,) and Newton iterations.
 
     `whole` has steps of h, `halves` of h / 2, both BDF1. Anchors are those of the half steps. Raises SimulationError
-    where a step can't be taken.
+    when a step fails.
     """
     model = whole.model
     u = moves.step_controls(whole.model.step)

@@ -1,20 +1,23 @@
-"""The picture of `order.py`: errors over the step on whole scenes, and errors over cost for some schemes."""
+"""Picture of the convergence study: errors over the step on whole scenes, and errors over cost of some schemes."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
+from gelflow.sim.validation.studies.convergence import Convergence
+from gelflow.sim.validation.studies.schemes import Scheme
 
 COLORS = {"viscous": "tab:blue", "elastic": "tab:orange"}
 
 
-def draw(found: list[Any], ball: list[Any], scenes: dict[str, list[Any]], path: Path) -> None:
-    """`found`: results of order.py by scene, law and integrator; `ball`, `scenes`: schemes by cost."""
+def draw(
+    found: Sequence[Convergence], ball: Sequence[Scheme], scenes: Mapping[str, Sequence[Scheme]], path: Path
+) -> None:
+    """Draw convergence of the scenes, and errors over cost of the schemes on the ball and on scenes. Writes `path`."""
+    from matplotlib.figure import Figure  # deferred: slow to import
+
     names = list(dict.fromkeys(r.scene for r in found))
-    figure, axes = plt.subplots(2, 3, figsize=(12, 7.5), layout="constrained")
+    figure = Figure(figsize=(12, 7.5), layout="constrained")
+    axes = figure.subplots(2, 3)
     for axis, name in zip(axes[0], names, strict=True):
         for r in (r for r in found if r.scene == name):
             style = {"bdf1": "o--", "bdf2": "s-"}[r.integrator]
@@ -26,13 +29,12 @@ def draw(found: list[Any], ball: list[Any], scenes: dict[str, list[Any]], path: 
         axis.set(title=name, xlabel="time step [s]", ylabel="mean relative error")
         axis.grid(alpha=0.3)
     axes[0][0].legend(fontsize=6)
-    shown = {"ball on a plane": ball} | scenes
-    for axis, (title, schemes) in zip(axes[1], shown.items(), strict=False):
+    panels = {"ball on a plane": ball, **scenes}
+    for axis, (title, schemes) in zip(axes[1], panels.items(), strict=False):
         for scheme in schemes:
             axis.loglog(scheme.solves, scheme.errors, "o-", ms=3, label=scheme.name)
-        axis.set(title=title, xlabel="Newton iterations", ylabel="relative error of the end")
+        axis.set(title=title, xlabel="Newton iterations", ylabel="relative error at the end")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-    plt.close(figure)

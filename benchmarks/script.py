@@ -1,0 +1,89 @@
+"""Options, progress and output shared by the benchmark scripts."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, RenderableType
+from rich.progress import Progress
+
+from gelflow.errors import GelflowError
+from gelflow.measurement.machine import processor
+from gelflow.sim.benchmark import versions
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PICTURES = ROOT / "docs" / "pictures"
+WIDTH = 80
+
+
+def parser(description: str, *, out: str, quick: str, seed: int | None = None) -> argparse.ArgumentParser:
+    """A parser with the options of all scripts.
+
+    Parameters
+    ----------
+    description: of the script
+    out: name of the default output file in benchmarks/results
+    quick: what --quick reduces
+    seed: default of --seed; None for a script without random numbers
+    """
+    result = argparse.ArgumentParser(description=description)
+    result.add_argument("--out", type=Path, default=RESULTS / out, metavar="FILE", help="file to write (%(default)s)")
+    result.add_argument("--quick", action="store_true", help=quick)
+    if seed is not None:
+        result.add_argument("--seed", type=int, default=seed, metavar="N", help="of random numbers (%(default)s)")
+    result.add_argument("--json", action="store_true", help="print the record instead of tables")
+    return result
+
+
+@contextmanager
+def progress(name: str, total: float = 1.0) -> Iterator[Callable[[float], None]]:
+    """A progress bar on standard error; the result advances it by an amount."""
+    with Progress(console=Console(stderr=True, width=WIDTH), transient=True) as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda amount: bar.advance(task, amount)
+
+
+@contextmanager
+def progress_share(name: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar on standard error; the result sets the share that is done."""
+    with Progress(console=Console(stderr=True, width=WIDTH), transient=True) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def run(main: Callable[[], int]) -> int:
+    """The exit status of `main`; 2, with a message on standard error, when it raises a gelflow error."""
+    try:
+        return main()
+    except GelflowError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def header() -> dict[str, Any]:
+    """The start of a record: format, processor and versions."""
+    return {"format": 1, "processor": processor(), "versions": versions()}
+
+
+def finish(args: argparse.Namespace, record: dict[str, Any], *tables: RenderableType) -> None:
+    """Write the record to `args.out`; print the tables, or the record with --json."""
+    write(args.out, record, args.json, *tables)
+
+
+def write(file: Path, record: dict[str, Any], as_json: bool, *tables: RenderableType) -> None:
+    """Write the record to a file; print the tables, or the record if `as_json`."""
+    text = json.dumps(record, indent=1, allow_nan=False) + "\n"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+    if as_json:
+        print(text, end="")
+        return
+    console = Console(width=WIDTH, highlight=False)
+    for table in tables:
+        console.print(table)
+    console.print(str(file), soft_wrap=True, markup=False)
