@@ -1,4 +1,4 @@
-"""Gels: the elastic layer against closed forms and its limits, and gels in scenes."""
+"""Gels: the elastic layer against closed forms and limits, and gels in scenes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,12 +32,12 @@ def scattered(count: int, thickness: float, nu: float = NU) -> LayerGel:
 
 
 @pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.49])
-def test_the_response_solves_the_layers_equations(nu: float) -> None:
-    """exp(±kz) (A + Bz) fitted to the rigid back and to the load, k = G = 1, against the closed forms."""
+def test_layer_response_solves_the_equilibrium_equations(nu: float) -> None:
+    """exp(±kz) (A + Bz), fitted to the boundary conditions with k = G = 1, against the closed forms."""
     kappa, lame = 3 - 4 * nu, 2 * nu / (1 - 2 * nu)
 
     def wave(z: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Along, outwards, and their slopes, by A+, B+, A−, B−."""
+        """Tangential and normal displacement and their z derivatives, as coefficients of A+, B+, A−, B−."""
         up, down = np.exp(z), np.exp(-z)
         along = np.array([up, (kappa + z) * up, -down, (kappa - z) * down])
         out = np.array([up, z * up, down, z * down])
@@ -56,14 +56,14 @@ def test_the_response_solves_the_layers_equations(nu: float) -> None:
     np.testing.assert_allclose(layer_response(np.array(1e4), nu), half_space_response(nu), atol=1e-12)
 
 
-def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
+def test_half_space_agrees_with_boussinesq_and_cerruti() -> None:
     pitch, rows = 1e-3, 25
     matrix = on_grid(rows, 3, pitch, np.inf).compliance_matrix.reshape(rows, 3, 3, rows, 3, 3)
     # The mean distance⁻¹ of two points of a unit square is 4 (asinh 1 − (√2 − 1)/3).
     own = 4 * (np.arcsinh(1) - (np.sqrt(2) - 1) / 3) / (2 * np.pi * G * pitch)
     assert matrix[0, 0, 2, 0, 0, 2] == pytest.approx((1 - NU) * own, rel=1e-12)
     assert matrix[0, 0, 0, 0, 0, 0] == pytest.approx((1 - NU / 2) * own, rel=1e-12)
-    # Far away a point load, at distance r along x: shear along x and y, pressure; what pressure does to shear.
+    # Far away a point load, at distance r along x: shear along x and y, normal, and their coupling.
     far, r = matrix[-1, 0, :, 0, 0, :], (rows - 1) * pitch
     point = np.diag([1, 1 - NU, 1 - NU]) / (2 * np.pi * G * r)
     point[0, 2], point[2, 0] = -(1 - 2 * NU) / (4 * np.pi * G * r), (1 - 2 * NU) / (4 * np.pi * G * r)
@@ -76,8 +76,8 @@ def test_a_half_space_is_that_of_boussinesq_and_cerruti() -> None:
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.5])
 @pytest.mark.parametrize("thickness", [2e-5, 2e-4, 6e-4])
-def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -> None:
-    """u = τ h / G, and p h (1 − 2ν) / (2 G (1 − ν)) into the layer, in the middle of a wide even load."""
+def test_thin_layer_displaces_under_its_local_load(nu: float, thickness: float) -> None:
+    """u = τ h / G in shear and p h (1 − 2ν) / (2 G (1 − ν)) in the normal, at the centre of a wide uniform load."""
     gel = on_grid(21, 21, 1e-3, thickness, nu)
     stress, middle = 100.0, 10 * 21 + 10
     shear_modulus = E / (2 + 2 * nu)
@@ -87,7 +87,7 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
         expected = np.zeros(3)
         expected[axis] = stress * thickness / shear_modulus * yields
         np.testing.assert_allclose(gel.displacement(forces)[middle], expected, atol=2e-5 * stress * thickness / G)
-    if thickness < 1e-4:  # a marker alone: all of its own cell, nothing of the others but at the cells' borders
+    if thickness < 1e-4:  # a single marker displaces its own cell only, except at the borders of adjacent cells
         alone = gel.compliance_matrix[::3, 3 * middle] * shear_modulus * gel.cell_area / thickness
         assert alone[middle] == pytest.approx(1, abs=0.1)
         assert np.abs(np.delete(alone, [middle, middle - 1, middle + 1, middle - 21, middle + 21])).max() < 1e-3
@@ -96,26 +96,26 @@ def test_a_thin_wide_layer_yields_by_its_own_load(nu: float, thickness: float) -
 @pytest.mark.parametrize(
     "make", [lambda h: on_grid(6, 5, 1e-3, h), lambda h: scattered(30, h)], ids=["squares", "discs"]
 )
-def test_a_thick_layer_goes_over_into_the_half_space(make: Any) -> None:
+def test_thick_layer_converges_to_the_half_space(make: Any) -> None:
     half = make(np.inf).compliance_matrix
-    away = [np.abs(make(h).compliance_matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
-    assert away[0] < 0.05 and away[2] < 3e-4
-    np.testing.assert_allclose(np.divide(away[:2], away[1:]), 10, rtol=0.1)  # falls off as 1/h
+    difference = [np.abs(make(h).compliance_matrix - half).max() / half.max() for h in (0.05, 0.5, 5.0)]
+    assert difference[0] < 0.05 and difference[2] < 3e-4
+    np.testing.assert_allclose(np.divide(difference[:2], difference[1:]), 10, rtol=0.1)  # ∝ 1/h
 
 
 @pytest.mark.parametrize(("nu", "thickness"), [(0.5, 1e-4), (0.5, 3e-3), (0.0, 3e-3), (-0.9, 3e-3), (0.5, np.inf)])
-def test_reciprocity_and_energy(nu: float, thickness: float) -> None:
+def test_compliance_is_symmetric_positive_definite(nu: float, thickness: float) -> None:
     rng = np.random.default_rng(0)
-    somewhere = LayerGel(E, nu, thickness, rng.uniform(0, 0.01, (40, 2)), 1e-6, None)
-    for gel in (on_grid(8, 5, 1.5e-3, thickness, nu), scattered(60, thickness, nu), somewhere):
+    random_markers = LayerGel(E, nu, thickness, rng.uniform(0, 0.01, (40, 2)), 1e-6, None)
+    for gel in (on_grid(8, 5, 1.5e-3, thickness, nu), scattered(60, thickness, nu), random_markers):
         matrix = gel.compliance_matrix
         np.testing.assert_array_equal(matrix, matrix.T)
-        energies = np.linalg.eigvalsh(matrix)
-        assert energies[0] > 1e-4 * energies[-1]
+        eigenvalues = np.linalg.eigvalsh(matrix)
+        assert eigenvalues[0] > 1e-4 * eigenvalues[-1]
 
 
 @pytest.mark.parametrize("thickness", [3e-4, 3e-3, np.inf])
-def test_finer_cells_average_to_the_coarse_ones_exactly(thickness: float) -> None:
+def test_averaged_fine_cells_equal_coarse_cells(thickness: float) -> None:
     coarse, fine = (
         on_grid(4, 3, 2e-3, thickness).compliance_matrix,
         on_grid(12, 9, 2e-3 / 3, thickness).compliance_matrix,
@@ -127,8 +127,8 @@ def test_finer_cells_average_to_the_coarse_ones_exactly(thickness: float) -> Non
     np.testing.assert_allclose(spread @ fine @ spread.T, coarse, atol=1e-10 * coarse.max())
 
 
-def test_per_area_loads_converge_as_the_grid_is_refined() -> None:
-    """A bell of shear and pressure, 3 mm wide, on 15 × 15 mm: the middle marker's error falls as the pitch squared."""
+def test_displacement_converges_with_grid_refinement() -> None:
+    """A Gaussian load 3 mm wide on 15 × 15 mm: the error at the centre is of second order in the pitch."""
 
     def middle(cells: int) -> Any:
         gel = on_grid(cells, cells, 0.015 / cells, 4e-3)
@@ -141,7 +141,7 @@ def test_per_area_loads_converge_as_the_grid_is_refined() -> None:
     np.testing.assert_allclose(medium[[0, 2]], fine[[0, 2]], rtol=0.02)
 
 
-def test_a_turned_pad_and_one_seen_from_its_side() -> None:
+def test_compliance_is_invariant_under_rotation() -> None:
     gel = scattered(40, 3e-3)
     c, s = np.cos(0.7), np.sin(0.7)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -150,14 +150,14 @@ def test_a_turned_pad_and_one_seen_from_its_side() -> None:
     np.testing.assert_allclose(
         turned.compliance_matrix, every @ gel.compliance_matrix @ every.T, atol=1e-9 * gel.compliance_matrix.max()
     )
-    # A rectangle turned by a quarter: x becomes y, y becomes −x; rows become columns.
+    # A rectangle rotated by 90°: x becomes y, y becomes −x, rows become columns.
     wide, tall = (on_grid(*n, 1e-3, 2e-3).compliance_matrix.reshape(*n, 3, *n, 3) for n in ((3, 7), (7, 3)))
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     expected = np.einsum("ax,ijxklz,bz->ijaklb", quarter, tall, quarter).transpose(1, 0, 2, 4, 3, 5)
     np.testing.assert_allclose(wide[::-1, :, :, ::-1], expected, atol=1e-12 * wide.max())
 
 
-def test_round_cells_do_nearly_what_square_ones_do() -> None:
+def test_round_cells_approximate_square_cells() -> None:
     square = on_grid(6, 5, 1.5e-3, 4e-3)
     disc = replace(square, grid_shape=None)
     assert np.abs(disc.compliance_matrix - square.compliance_matrix).max() < 0.015 * square.compliance_matrix.max()
@@ -225,36 +225,38 @@ def test_displacements_of_all_pads(tmp_path: Path) -> None:
     np.testing.assert_allclose(single.displacement()[0], moved[0], rtol=1e-4, atol=1e-5 * np.abs(moved[0]).max())
 
 
-def test_gradients_go_back_through_the_gel(tmp_path: Path) -> None:
-    """By the transposed map: ⟨M f, w⟩ = ⟨f, Mᵀ w⟩; and through a rollout to its controls."""
+def test_gradients_through_the_gel(tmp_path: Path) -> None:
+    """Adjoint identity ⟨M f, w⟩ = ⟨f, Mᵀ w⟩, and gradients through a rollout to its controls."""
     scene = scene_with(tmp_path, layer=RECTANGLE + LAYER, springs=RECTANGLE + "gel = { compliance = 0.01 }")
     sim = Simulator(scene, num_envs=2)
     rng = np.random.default_rng(1)
-    wanted = rng.normal(size=(5, 2, 24, 3))
+    weights = rng.normal(size=(5, 2, 24, 3))
     forces = torch.tensor(rng.normal(size=(5, 2, 24, 3)), requires_grad=True)
-    moved = sim.displacement(forces)
-    np.testing.assert_allclose(moved.detach().numpy(), sim.displacement(forces.detach().numpy()), rtol=1e-13)
-    (moved * torch.from_numpy(wanted)).sum().backward()
+    displacement = sim.displacement(forces)
+    np.testing.assert_allclose(displacement.detach().numpy(), sim.displacement(forces.detach().numpy()), rtol=1e-13)
+    (displacement * torch.from_numpy(weights)).sum().backward()
     assert forces.grad is not None
-    np.testing.assert_allclose(forces.grad.numpy(), sim.displacement(wanted), rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(forces.grad.numpy(), sim.displacement(weights), rtol=1e-10, atol=1e-14)
     assert sim.displacement(forces.detach().float()).dtype == torch.float32
 
     controls = torch.full((6, 2, 2), -1e-3, dtype=torch.float64, requires_grad=True)
 
     def loss(u: torch.Tensor) -> torch.Tensor:
-        moved: torch.Tensor = sim.displacement(torch_rollout(sim, torch_state(sim), u, read_after=(4, 6)).tactile)
-        return 1e6 * (moved**2).sum()
+        displacement: torch.Tensor = sim.displacement(
+            torch_rollout(sim, torch_state(sim), u, read_after=(4, 6)).tactile
+        )
+        return 1e6 * (displacement**2).sum()
 
     assert torch.autograd.gradcheck(loss, (controls,), eps=1e-7, rtol=1e-4)
 
 
-def test_given_markers_on_any_plane(tmp_path: Path) -> None:
-    """A list that lies slanted in the site's frame is the same gel as flat; its cells come from its distances."""
+def test_listed_markers_on_an_inclined_plane(tmp_path: Path) -> None:
+    """Rotated coplanar markers give the same gel; the cell area follows from their distances."""
     flat = np.array([[i * 1e-3, j * 1e-3, 0] for i in range(4) for j in range(3)])
     x, y, z = np.array([0.6, 0, -0.8]), np.array([0.0, 1, 0]), np.array([0.8, 0, 0.6])
-    slanted = flat @ np.stack([x, y, z]) + [1e-3, 0, 2e-3]
+    inclined = flat @ np.stack([x, y, z]) + [1e-3, 0, 2e-3]
     text = 'shape = "points"\npositions = {}\nnormals = {}\nx_axes = {}\n'
-    shape = text.format(slanted.tolist(), [z.tolist()] * 12, [x.tolist()] * 12)
+    shape = text.format(inclined.tolist(), [z.tolist()] * 12, [x.tolist()] * 12)
     gel = scene_with(tmp_path, pad=shape + LAYER).pads[0].gel
     assert isinstance(gel, LayerGel) and gel.grid_shape is None
     assert gel.cell_area == pytest.approx(1e-6)
@@ -262,7 +264,7 @@ def test_given_markers_on_any_plane(tmp_path: Path) -> None:
 
 
 HEMISPHERE = 'shape = "hemisphere"\nradius = 5e-3\ncount = 20\n'
-REFUSED = {
+INVALID_GELS = {
     "gel = {}": "either compliance, or youngs_modulus, poisson_ratio and thickness",
     "gel = { complience = 1.0 }": "unknown key 'complience'; did you mean 'compliance'",
     "gel = { compliance = 1.0, youngs_modulus = 1.0 }": "unknown key 'youngs_modulus'",
@@ -280,12 +282,12 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("text", REFUSED)
-def test_what_is_refused(tmp_path: Path, text: str) -> None:
-    with pytest.raises(UsageError) as refused:
+@pytest.mark.parametrize("text", INVALID_GELS)
+def test_invalid_gel_gives_a_one_line_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(UsageError) as error:
         scene_with(tmp_path, pad=RECTANGLE + text)
-    assert REFUSED[text] in str(refused.value) and "pads.pad" in str(refused.value)
-    assert "\n" not in str(refused.value)
+    assert INVALID_GELS[text] in str(error.value) and "pads.pad" in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -301,28 +303,30 @@ def test_what_is_refused(tmp_path: Path, text: str) -> None:
         ("rows = 40\ncols = 30\npitch = 1e-3\n", "supports at most 1000 markers, got 1200"),
     ],
 )
-def test_where_no_layer_can_be(tmp_path: Path, shape: str, why: str) -> None:
+def test_markers_that_do_not_support_a_layer(tmp_path: Path, shape: str, why: str) -> None:
     with pytest.raises(UsageError, match=why):
         scene_with(tmp_path, pad=shape + LAYER)
     assert isinstance(scene_with(tmp_path, pad=shape + "gel = { compliance = 1.0 }").pads[0].gel, SpringGel)
 
 
-def test_who_has_no_gel_has_no_displacement(tmp_path: Path) -> None:
+def test_displacement_needs_a_gel(tmp_path: Path) -> None:
     scene = scene_with(tmp_path, first=RECTANGLE + LAYER, second=RECTANGLE)
     with pytest.raises(UsageError, match=r"pad 'second' has no gel; give pads\.second\.gel in the scene"):
         Simulator(scene).displacement()
     with pytest.raises(UsageError, match="needs a scene with pads"):
         Simulator(scene.build()).displacement()
-    endless = scene_with(tmp_path, pad=RECTANGLE + "gel = { youngs_modulus = 1.0, poisson_ratio = 0, thickness = inf }")
-    assert isinstance(endless.pads[0].gel, LayerGel) and endless.pads[0].gel.thickness == np.inf
+    half_space = scene_with(
+        tmp_path, pad=RECTANGLE + "gel = { youngs_modulus = 1.0, poisson_ratio = 0, thickness = inf }"
+    )
+    assert isinstance(half_space.pads[0].gel, LayerGel) and half_space.pads[0].gel.thickness == np.inf
     with pytest.raises(UsageError, match=r"forces must have shape \(…, 12, 3\), got \(12, 2\)"):
-        Simulator(endless).displacement(np.zeros((12, 2)))
+        Simulator(half_space).displacement(np.zeros((12, 2)))
 
 
-def test_insertions_gel_is_told(tmp_path: Path) -> None:
-    told = describe(load_scene("insertion")).pads
-    assert [pad.gel for pad in told] == ["compliance 10 mm/N in shear, 10 mm/N into the pad"] * 2
+def test_describe_shows_the_gel(tmp_path: Path) -> None:
+    pads = describe(load_scene("insertion")).pads
+    assert [pad.gel for pad in pads] == ["compliance 10 mm/N in shear, 10 mm/N into the pad"] * 2
     layer = {"youngs_modulus": 1e5, "poisson_ratio": 0.45, "thickness": 3e-3}
-    told = describe(load_scene("insertion", overrides={"pads.*.gel": layer})).pads
-    assert told[1].gel == "layer of 3 mm, 100000 Pa, Poisson's ratio 0.45"
+    pads = describe(load_scene("insertion", overrides={"pads.*.gel": layer})).pads
+    assert pads[1].gel == "layer of 3 mm, 100000 Pa, Poisson's ratio 0.45"
     assert describe(load_scene("rolling")).pads[0].gel is None

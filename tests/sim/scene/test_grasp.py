@@ -1,4 +1,4 @@
-"""The grasp scene: what is in it, a bar that is lifted and weighed by touch."""
+"""The grasp scene: geometry, and a bar that is lifted and weighed by the tactile forces."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ GRAVITY = 9.8
 
 
 def closed(sim: Simulator, force: float = 10.0) -> np.ndarray:
-    """Close the fingers on the bar; the controls that hold it."""
+    """Close the fingers on the bar; returns the controls that hold it."""
     scene = load_scene("grasp")
     sim.q[:] = scene.q0
     u = np.zeros(scene.nu)
@@ -27,7 +27,7 @@ def lift(sim: Simulator, u: np.ndarray, steps: int) -> None:
     sim.check()
 
 
-def test_the_bar_is_as_published() -> None:
+def test_bar_matches_the_publication() -> None:
     scene = load_scene("grasp")
     bar = scene.bodies[scene.body("bar")]
     assert bar.mass == pytest.approx(11 * 500 * 0.025**3)
@@ -42,7 +42,7 @@ def test_the_bar_is_as_published() -> None:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_a_bar_at_rest_stays_on_its_tables(law: str) -> None:
+def test_bar_at_rest_stays_on_the_tables(law: str) -> None:
     scene = load_scene("grasp", friction=law)
     sim = Simulator(scene)
     sim.q[:] = scene.q0
@@ -52,43 +52,45 @@ def test_a_bar_at_rest_stays_on_its_tables(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_the_gripper_lifts_the_bar(law: str) -> None:
+def test_gripper_lifts_the_bar(law: str) -> None:
     sim = Simulator(load_scene("grasp", friction=law))
     lift(sim, closed(sim), 70)
     bar = sim.q[0, sim.joint_q("bar") :]
     assert bar[2] - 0.0525 > 0.02
-    assert 2 * np.arccos(min(1.0, bar[3])) < 1e-3  # held in its middle it does not tilt
+    assert 2 * np.arccos(min(1.0, bar[3])) < 1e-3  # no tilt: it is held at its middle
     resting = [i for i, name in enumerate(sim.model.contact_names) if name.startswith("bar_rest/")]
     assert not sim.wrenches()[0, resting].any()
 
 
 @pytest.mark.parametrize("mass", [0.051, 0.085, 0.12])
-def test_the_markers_show_the_weight(mass: float) -> None:
-    """Contact points and markers go along with the same gel: their forces are as their stiffnesses together."""
+def test_tactile_forces_give_the_weight(mass: float) -> None:
+    """Contact points and markers have the same shear displacement: the ratio of forces is that of total stiffnesses."""
     scene = load_scene("grasp", friction="elastic")
     sim = Simulator(scene)
     sim.param("bar.mass")[:] = mass
     lift(sim, closed(sim), 100)
-    reading = sim.tactile()[0]
-    np.testing.assert_allclose(reading[:130], reading[130:] * [1, -1, 1], atol=1e-9)  # of two hands, y mirrored
+    forces = sim.tactile()[0]
+    np.testing.assert_allclose(
+        forces[:130], forces[130:] * [1, -1, 1], atol=1e-9
+    )  # mirrored pads: y has the opposite sign
     below_top = sim.poses()[0, scene.body("bar"), 2] + 0.0125 - sim.q[0, sim.joint_q("arm_z")]
-    points = scene.points[0].points  # of a pad's two faces only one touches
-    touching = 2 * ((points[:, 2] < below_top) & (points[:, 0] > -1e-9)).sum() * scene.contacts[0].params["ks"]
-    feeling = (reading[:, 2] > 0).sum() * scene.pads[0].params["ks"]
-    assert reading[:, 0].sum() * touching / feeling == pytest.approx(mass * GRAVITY, rel=0.02)
-    assert abs(reading[:, 1].sum()) < 1e-6
+    points = scene.points[0].points  # only one of the two faces of a pad is in contact
+    point_stiffness = 2 * ((points[:, 2] < below_top) & (points[:, 0] > -1e-9)).sum() * scene.contacts[0].params["ks"]
+    marker_stiffness = (forces[:, 2] > 0).sum() * scene.pads[0].params["ks"]
+    assert forces[:, 0].sum() * point_stiffness / marker_stiffness == pytest.approx(mass * GRAVITY, rel=0.02)
+    assert abs(forces[:, 1].sum()) < 1e-6
 
 
-def test_a_bar_held_off_its_centre_of_mass_tilts_towards_it() -> None:
+def test_bar_held_off_its_centre_of_mass_tilts() -> None:
     sim = Simulator(load_scene("grasp", friction="elastic"), num_envs=2)
     sim.param("bar.com.y")[:] = 0.05, -0.05
     lift(sim, closed(sim), 100)
-    tilt = 2 * sim.q[:, sim.joint_q("bar") + 4]  # about x: its +y end goes up where positive
+    tilt = 2 * sim.q[:, sim.joint_q("bar") + 4]  # about x; positive: the +y end rises
     assert tilt[0] == pytest.approx(-tilt[1], rel=1e-6)
     assert -0.2 < tilt[0] < -0.005
 
 
-def test_it_is_described(capsys: pytest.CaptureFixture[str]) -> None:
+def test_describe_shows_the_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["describe", "grasp", "--no-timing"]) == 0
     text = capsys.readouterr().out
     assert "grasp: steps of 5 ms, elastic law" in text

@@ -1,4 +1,4 @@
-"""Scene files: what they become, checked against MuJoCo's own view of the same model; and what is refused."""
+"""Loading of scene files: agreement with MuJoCo, overrides, and one-line errors."""
 
 import shutil
 from pathlib import Path
@@ -16,7 +16,7 @@ SHIPPED = ("dclaw", "grasp", "insertion", "pushing", "rolling")
 
 
 class RecordingSpec:
-    """Stands where the core's model builder stands, and remembers what it was told."""
+    """A stand-in for the model builder of the core that records all calls."""
 
     def __init__(self) -> None:
         self.calls: dict[str, list[tuple[tuple[Any, ...], dict[str, Any]]]] = {}
@@ -44,14 +44,14 @@ def rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
     return flat.reshape(3, 3)
 
 
-def about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def rotation_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
     quat = np.zeros(4)
     mujoco.mju_axisAngle2Quat(quat, axis, angle)
     return rotation(quat)
 
 
 def body_frames(spec: RecordingSpec, q: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Where the recorded bodies are at q: kinematics written once more, plainly."""
+    """Positions and rotations of the recorded bodies at q, by an independent implementation of the kinematics."""
     frames: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     at = 0
     for index, (args, _) in enumerate(spec.calls["add_body"]):
@@ -69,7 +69,7 @@ def body_frames(spec: RecordingSpec, q: NDArray[np.float64]) -> list[tuple[NDArr
             if kind == "slide":
                 x = x + r @ axis * q[at]
             else:
-                turned = r @ about(axis, q[at])
+                turned = r @ rotation_about(axis, q[at])
                 x, r = x + r @ anchor - turned @ anchor, turned
             at += 1
         frames.append((x, r))
@@ -80,7 +80,7 @@ def reference(scene: Scene) -> Any:
     return mujoco.MjModel.from_xml_path(str(scene.path.with_suffix(".xml")))
 
 
-def test_the_scenes_that_come_along() -> None:
+def test_scene_names() -> None:
     assert scene_names() == SHIPPED
 
 
@@ -105,8 +105,10 @@ def test_frames_agree_with_mujoco(name: str, friction: str) -> None:
             site = model.site(_site_of(scene, pad.name)).id
             axes = data.site_xmat[site].reshape(3, 3)
             if pad.grid is None:
-                middle = x + pad.positions @ r.T - 0.01 * (r @ pad.axes)[..., 2]  # of the sphere, from every marker
-                np.testing.assert_allclose(middle, np.tile(data.site_xpos[site], (302, 1)), atol=1e-12)
+                center = (
+                    x + pad.positions @ r.T - 0.01 * (r @ pad.axes)[..., 2]
+                )  # of the sphere, computed from each marker
+                np.testing.assert_allclose(center, np.tile(data.site_xpos[site], (302, 1)), atol=1e-12)
                 assert ((r @ pad.axes)[..., 2] @ axes[:, 2] > 0).all()
                 continue
             corner = np.array([*(pad.grid.positions()[0] * 1e-3), 0])
@@ -120,7 +122,7 @@ def _site_of(scene: Scene, pad: str) -> str:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_mass_and_inertia_agree_with_mujocos_own_merging(name: str, tmp_path: Path) -> None:
+def test_mass_and_inertia_agree_with_mujoco_fusestatic(name: str, tmp_path: Path) -> None:
     scene = load_scene(name)
     text = scene.path.with_suffix(".xml").read_text().replace("<compiler ", '<compiler fusestatic="true" ')
     merged = mujoco.MjModel.from_xml_string(text)
@@ -137,8 +139,8 @@ def test_mass_and_inertia_agree_with_mujocos_own_merging(name: str, tmp_path: Pa
         np.testing.assert_allclose(full, expected, atol=1e-9 * expected.max())
 
 
-def test_merging_moves_inertia_to_the_common_centre(tmp_path: Path) -> None:
-    """Two unit cubes a metre apart, one on a body without joint: closed forms."""
+def test_merged_inertia_is_about_the_common_centre_of_mass(tmp_path: Path) -> None:
+    """Closed form for two unit cubes, 1 m apart, one of them on a body without a joint."""
     write(tmp_path, BLOCKS)
     scene = load_scene(tmp_path / "s.toml")
     (args, _) = recorded(scene).calls["add_body"][0]
@@ -148,8 +150,8 @@ def test_merging_moves_inertia_to_the_common_centre(tmp_path: Path) -> None:
     np.testing.assert_allclose(packed, [1 / 3 + 0.5, 1 / 3 + 0.5, 1 / 3, 0, 0, 0], atol=1e-12)
 
 
-def test_the_pads_follow_the_observation_format() -> None:
-    """x from base to tip: down for a gripper that points down; z outward, towards the other finger; sensor 0 at −x."""
+def test_pad_frames_follow_the_observation_format() -> None:
+    """x points from base to tip (down), z outwards to the other finger; sensor 0 is at −x."""
     scene = load_scene("insertion")
     model = reference(scene)
     data = mujoco.MjData(model)
@@ -160,13 +162,13 @@ def test_the_pads_follow_the_observation_format() -> None:
         np.testing.assert_allclose(axes[:, 0], [0, 0, -1], atol=1e-12)
         np.testing.assert_allclose(axes[:, 2], [outward, 0, 0], atol=1e-12)
         np.testing.assert_allclose(axes[:, 1], np.cross(axes[:, 2], axes[:, 0]), atol=1e-12)
-        place = data.site_xpos[model.site(f"pad_{pad.name}").id]
-        np.testing.assert_allclose(place, [-outward * 0.0175, 0, 0.0555], atol=1e-12)  # on the part's face
+        position = data.site_xpos[model.site(f"pad_{pad.name}").id]
+        np.testing.assert_allclose(position, [-outward * 0.0175, 0, 0.0555], atol=1e-12)  # on the face of the part
     assert scene.pads[0].name == "left"
     assert scene.marker_slice("right") == slice(130, 260)
 
 
-def test_the_hole_is_as_published() -> None:
+def test_hole_matches_the_publication() -> None:
     scene = load_scene("insertion")
     boxes = {
         s.name: (s.pose.position - s.size, s.pose.position + s.size) for s in scene.shapes if s.name.startswith("wall")
@@ -176,8 +178,8 @@ def test_the_hole_is_as_published() -> None:
     assert {high[2] for _, high in boxes.values()} == {0.025}
 
 
-def test_the_reference_pad_is_where_its_data_say() -> None:
-    """The marker positions that the published data give in the pad's frame, row by row."""
+def test_reference_pad_matches_the_published_markers() -> None:
+    """First and last marker of the published data, which are ordered row by row."""
     scene = load_scene("pushing")
     spec = recorded(scene)
     x, r = body_frames(spec, np.zeros(7))[scene.pads[0].body]
@@ -187,7 +189,7 @@ def test_the_reference_pad_is_where_its_data_say() -> None:
     np.testing.assert_allclose(markers[-1, 1:], [0.00675, 0.18 - 0.1472 - 0.011], atol=1e-12)
 
 
-def test_only_what_the_scene_requires_is_passed_on(tmp_path: Path) -> None:
+def test_unused_geometry_is_not_modelled(tmp_path: Path) -> None:
     write(tmp_path, BLOCKS)
     scene = load_scene(tmp_path / "s.toml")
     assert [shape.name for shape in scene.shapes] == ["ground"]
@@ -208,7 +210,7 @@ def test_names_and_indices() -> None:
         scene.u("grip")
 
 
-def test_the_law_chooses_its_own_numbers() -> None:
+def test_parameters_depend_on_the_friction_law() -> None:
     viscous = load_scene("insertion", friction="viscous")
     elastic = load_scene("insertion", friction="elastic")
     assert viscous.contacts[0].params == {"kn": 8e3, "kt": 80.0, "mu": 1.5, "kd": 1e3, "ks": 0.0}
@@ -218,7 +220,7 @@ def test_the_law_chooses_its_own_numbers() -> None:
     assert {c.name: c.law for c in rolling.contacts} == {"pad_ball": "elastic", "ball_ground": "viscous"}
 
 
-def test_a_rolling_point_keeps_no_anchor() -> None:
+def test_exact_sphere_contact_has_no_anchor() -> None:
     with pytest.raises(UsageError, match='set law = "viscous" for this contact'):
         load_scene("rolling", overrides={"contacts.ball_ground.law": "elastic", "contacts.ball_ground.ks": 1.0})
     with pytest.raises(UsageError, match="supports planes only; sample 'pad' instead"):
@@ -242,7 +244,7 @@ def test_overrides_replace_values_and_are_checked() -> None:
             load_scene("rolling", overrides={key: 1})
 
 
-def test_area_weights_are_passed_on(tmp_path: Path) -> None:
+def test_area_weights_reach_the_model(tmp_path: Path) -> None:
     scene = load_scene(
         "rolling",
         overrides={"points.pad.stiffness": "per area", "pads.pad.stiffness": "per area", "pads.pad.rows": 200},
@@ -303,7 +305,7 @@ def write(folder: Path, files: dict[str, str]) -> None:
         (folder / name).write_text(text)
 
 
-TOML_FAULTS = [
+INVALID_TOML = [
     ('model = "s.xml"', 'modell = "s.xml"', "unknown key 'modell'; did you mean 'model'"),
     ("[contacts.block_ground]", "[contact.block_ground]", "unknown key 'contact'; did you mean 'contacts'"),
     ("kn = 1.0", "kn = 1.0\nknn = 2", "unknown key 'knn'; did you mean 'kn'"),
@@ -333,14 +335,14 @@ TOML_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "message"), TOML_FAULTS, ids=[f[2] for f in TOML_FAULTS])
-def test_a_fault_in_the_scene_file_is_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("old", "new", "message"), INVALID_TOML, ids=[f[2] for f in INVALID_TOML])
+def test_invalid_scene_file_gives_a_one_line_error(old: str, new: str, message: str, tmp_path: Path) -> None:
     assert old in BLOCKS["s.toml"]
     write(tmp_path, {**BLOCKS, "s.toml": BLOCKS["s.toml"].replace(old, new, 1)})
-    check_refused(tmp_path / "s.toml", message)
+    check_error(tmp_path / "s.toml", message)
 
 
-MODEL_FAULTS = [
+INVALID_MODELS = [
     ('<joint name="slide" type="slide" axis="0 0 1"/>', '<joint name="slide" type="ball"/>', "on ball joint 'slide'"),
     ('type="capsule" size="0.1 0.2"', 'type="mesh" mesh="m"', "m"),
     ("</worldbody>", "</worldbody><asset><mesh name='m' file='missing.obj'/></asset>", "mesh 'm': no file missing.obj"),
@@ -348,14 +350,14 @@ MODEL_FAULTS = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "message"), MODEL_FAULTS, ids=[f[2] for f in MODEL_FAULTS])
-def test_a_fault_in_the_model_file_is_one_clear_line(old: str, new: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("old", "new", "message"), INVALID_MODELS, ids=[f[2] for f in INVALID_MODELS])
+def test_invalid_model_file_gives_a_one_line_error(old: str, new: str, message: str, tmp_path: Path) -> None:
     assert old in BLOCKS["s.xml"]
     write(tmp_path, {**BLOCKS, "s.xml": BLOCKS["s.xml"].replace(old, new, 1)})
-    check_refused(tmp_path / "s.toml", message)
+    check_error(tmp_path / "s.toml", message)
 
 
-def check_refused(path: Path, message: str) -> None:
+def check_error(path: Path, message: str) -> None:
     with pytest.raises(UsageError) as caught:
         load_scene(path)
     text = str(caught.value)
@@ -363,13 +365,13 @@ def check_refused(path: Path, message: str) -> None:
     assert "\n" not in text
 
 
-def test_a_scene_that_is_not_there(tmp_path: Path) -> None:
-    check_refused(tmp_path / "none.toml", "no such file")
+def test_missing_scene_is_an_error(tmp_path: Path) -> None:
+    check_error(tmp_path / "none.toml", "no such file")
     with pytest.raises(UsageError, match="no scene 'insertoin'; did you mean 'insertion'"):
         load_scene("insertoin")
 
 
-def test_a_copied_scene_loads_from_its_own_folder(tmp_path: Path) -> None:
+def test_copied_scene_is_loaded_from_its_folder(tmp_path: Path) -> None:
     shipped = load_scene("pushing")
     for suffix in (".toml", ".xml"):
         shutil.copy(shipped.path.with_suffix(suffix), tmp_path)
@@ -378,7 +380,7 @@ def test_a_copied_scene_loads_from_its_own_folder(tmp_path: Path) -> None:
     np.testing.assert_array_equal(copied.q0, shipped.q0)
 
 
-def test_urdf_is_read_too(tmp_path: Path) -> None:
+def test_urdf_is_loaded(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(
         """<robot name="arm"><mujoco><compiler fusestatic="false"/></mujoco>
         <link name="base"/><link name="tip"><inertial><mass value="2"/>

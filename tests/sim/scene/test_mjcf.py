@@ -1,4 +1,4 @@
-"""Model files as public collections write them: each loads, and moves as MuJoCo's forward dynamics says."""
+"""Model files in the style of public collections: loading, and agreement with the dynamics of MuJoCo."""
 
 from pathlib import Path
 from typing import Any
@@ -167,31 +167,33 @@ def load(folder: Path, model: str = "scene.xml", more: str = "") -> Scene:
     return load_scene(folder / "scene.toml")
 
 
-def follow_mujoco(scene: Scene, twin: Any, steps: int = 20, seed: int = 0) -> None:
-    """Mass matrix and bias agree at random states; each of `steps` steps solves the implicit equation with MuJoCo's
-    M, C and forces at its end: M(q₁) (v₁ − v₀) / h = f(q₁, v₁, u) − C(q₁, v₁). Ranges are not reached.
+def check_against_mujoco(scene: Scene, model: Any, steps: int = 20, seed: int = 0) -> None:
+    """Compare with MuJoCo: mass matrix and bias at random states, and the equation of each of `steps` steps.
+
+    A step satisfies M(q₁) (v₁ − v₀) / h = f(q₁, v₁, u) − C(q₁, v₁) with M, C and f of MuJoCo. No joint reaches its
+    range.
     """
     rng = np.random.default_rng(seed)
-    twin.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    data, sim = mujoco.MjData(twin), Simulator(scene)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data, sim = mujoco.MjData(model), Simulator(scene)
 
     def at(q: Array, v: Array, u: Array) -> Array:
-        data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, u[: twin.nu]
-        mujoco.mj_forward(twin, data)
-        full = np.zeros((twin.nv, twin.nv))
-        mujoco.mj_fullM(twin, data, full)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, u[: model.nu]
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
         return full
 
     for _ in range(3):
-        q = twin.qpos0.copy()
-        mujoco.mj_integratePos(twin, q, rng.normal(size=twin.nv) * 0.3, 1.0)
-        v, u = rng.normal(size=twin.nv), rng.normal(size=scene.nu) * 10
+        q = model.qpos0.copy()
+        mujoco.mj_integratePos(model, q, rng.normal(size=model.nv) * 0.3, 1.0)
+        v, u = rng.normal(size=model.nv), rng.normal(size=scene.nu) * 10
         full = at(q, v, u)
         sim.q[0], sim.v[0] = q, v
         np.testing.assert_allclose(sim.mass_matrix()[0], full, atol=1e-10)
         np.testing.assert_allclose(sim.bias()[0], data.qfrc_bias, rtol=1e-9, atol=1e-9)
 
-    motors = [a for a in scene.actuators if twin.nu == 0]  # those that were made from URDF: u is the joint's force
+    motors = [a for a in scene.actuators if model.nu == 0]  # of a URDF file: u is the joint force
     for step in range(steps):
         before, u = sim.v[0].copy(), rng.normal(size=scene.nu) * (10 if step % 4 == 0 else 0.5)
         sim.step(u)
@@ -199,7 +201,7 @@ def follow_mujoco(scene: Scene, twin: Any, steps: int = 20, seed: int = 0) -> No
         q, v = sim.q[0].copy(), sim.v[0].copy()
         full = at(q, v, u)
         force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
-        force -= twin.dof_frictionloss * np.clip(v / 1e-3, -1, 1)
+        force -= model.dof_frictionloss * np.clip(v / 1e-3, -1, 1)
         for motor, control in zip(motors, u, strict=bool(motors)):
             force[scene.joints[motor.joint].v_start] += np.clip(control, *motor.force_range)
         inertia = full @ (v - before) / scene.step
@@ -207,21 +209,21 @@ def follow_mujoco(scene: Scene, twin: Any, steps: int = 20, seed: int = 0) -> No
     assert sim.halved[0] == 0
 
 
-def test_an_arm_with_classes_meshes_and_servos(tmp_path: Path) -> None:
+def test_arm_with_classes_meshes_and_servos(tmp_path: Path) -> None:
     write(tmp_path, ARM)
     write_stl(tmp_path / "assets" / "link.stl")
     scene = load(tmp_path)
     assert [a.kind for a in scene.actuators] == ["position"] * 6
     assert [(a.kp, a.kd) for a in scene.actuators[:3]] == [(2000, 400)] * 3
     assert scene.actuators[3].kd > 0 and scene.actuators[3].ctrl_range == (-6.2831, 6.2831)
-    assert [a.name for a in scene.actuators][-1] == "actuator5"  # made up
+    assert [a.name for a in scene.actuators][-1] == "actuator5"  # generated
     assert scene.q0[0] == -1.5708  # the keyframe "home"
     assert any("exclude" in line for line in scene.not_modelled)
     assert any(line.startswith("mesh geom") for line in scene.not_modelled)
-    follow_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
+    check_against_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
 
 
-def test_a_rover_with_velocity_servos_ball_joint_and_references(tmp_path: Path) -> None:
+def test_rover_with_velocity_servos_and_ball_joint(tmp_path: Path) -> None:
     scene = load(write(tmp_path, ROVER))
     assert [(a.kind, a.kd, a.gear) for a in scene.actuators] == [("velocity", 2, 5)] * 2
     assert [j.type for j in scene.joints] == ["free", "hinge", "hinge", "ball", "hinge", "slide"]
@@ -229,7 +231,7 @@ def test_a_rover_with_velocity_servos_ball_joint_and_references(tmp_path: Path) 
     assert scene.q("caster") == slice(9, 13) and scene.v("caster") == slice(8, 11)
     assert scene.joints[4].ref == pytest.approx(np.radians(30))
     np.testing.assert_allclose(Simulator(scene).q[0], scene.q0)
-    follow_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
+    check_against_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
 
 
 def urdf(folder: Path, more: str = "") -> Scene:
@@ -238,7 +240,7 @@ def urdf(folder: Path, more: str = "") -> Scene:
     return load(folder, "my_arm/urdf/arm.urdf")
 
 
-def test_a_urdf_arm_with_a_mesh_of_its_package(tmp_path: Path) -> None:
+def test_urdf_arm_with_a_package_mesh(tmp_path: Path) -> None:
     scene = urdf(tmp_path)
     assert [b.name for b in scene.bodies] == ["upper", "lower", "slider"]
     assert [(j.name, j.type, j.frictionloss) for j in scene.joints] == [
@@ -251,22 +253,22 @@ def test_a_urdf_arm_with_a_mesh_of_its_package(tmp_path: Path) -> None:
         ("lift", "motor", (-5, 5)),
         ("slide", "motor", (-np.inf, np.inf)),
     ]
-    beside = tmp_path / "beside.urdf"  # MuJoCo alone reads meshes next to the file
-    beside.write_text(URDF.replace("package://my_arm/meshes/link.stl", str(tmp_path / "my_arm/meshes/link.stl")))
-    follow_mujoco(scene, mujoco.MjModel.from_xml_path(str(beside)))
+    absolute = tmp_path / "absolute.urdf"  # MuJoCo does not resolve package:// addresses
+    absolute.write_text(URDF.replace("package://my_arm/meshes/link.stl", str(tmp_path / "my_arm/meshes/link.stl")))
+    check_against_mujoco(scene, mujoco.MjModel.from_xml_path(str(absolute)))
 
 
 @pytest.mark.parametrize(
-    ("more", "driven"),
+    ("more", "actuators"),
     [(TRANSMISSION, ["lift_motor"]), (CONTROL, ["turn"]), (TRANSMISSION + CONTROL, ["turn", "lift_motor"])],
 )
-def test_a_urdf_says_which_joints_are_driven(more: str, driven: list[str], tmp_path: Path) -> None:
+def test_urdf_transmissions_select_the_actuated_joints(more: str, actuators: list[str], tmp_path: Path) -> None:
     scene = urdf(tmp_path, more)
-    assert [a.name for a in scene.actuators] == driven
+    assert [a.name for a in scene.actuators] == actuators
     assert all(a.gear == 1 for a in scene.actuators)
 
 
-def test_a_pad_may_sit_on_a_link_of_a_urdf(tmp_path: Path) -> None:
+def test_pad_on_a_urdf_link(tmp_path: Path) -> None:
     urdf(tmp_path)
     more = (
         '[pads.p]\nsite = "tcp"\nrows = 2\ncols = 2\npitch = 1e-3\nagainst = "geom1"\nkn = 1\nkt = 1\nmu = 1\nkd = 1\n'
@@ -305,29 +307,29 @@ ACTUATORS = [  # (attributes of the joint, actuators, kinds)
 
 
 @pytest.mark.parametrize(("joint", "actuators", "kinds"), ACTUATORS, ids=[f"{j} {a}".strip() for j, a, _ in ACTUATORS])
-def test_joints_and_actuators_do_what_mujoco_says(joint: str, actuators: str, kinds: list[str], tmp_path: Path) -> None:
+def test_joints_and_actuators_agree_with_mujoco(joint: str, actuators: str, kinds: list[str], tmp_path: Path) -> None:
     write(tmp_path, {"scene.xml": JOINT.format(joint=joint, actuators=actuators)})
     scene = load(tmp_path)
     assert [a.kind for a in scene.actuators] == kinds
-    follow_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
+    check_against_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml")))
 
 
 FLAGS = ["gravity", "spring", "damper", "frictionloss", "clampctrl"]
 
 
 @pytest.mark.parametrize("flag", FLAGS)
-def test_what_the_file_switches_off_is_off(flag: str, tmp_path: Path) -> None:
+def test_disable_flags_are_applied(flag: str, tmp_path: Path) -> None:
     text = JOINT.format(
         joint='stiffness="3" damping="0.3" frictionloss="0.4"', actuators='<motor joint="j" ctrlrange="-1 1"/>'
     ).replace("<worldbody>", f'<option><flag {flag}="disable"/></option><worldbody>')
     scene = load(write(tmp_path, {"scene.xml": text}))
-    twin = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     if flag == "frictionloss":
-        twin.dof_frictionloss[:] = 0
-    follow_mujoco(scene, twin)
+        model.dof_frictionloss[:] = 0
+    check_against_mujoco(scene, model)
 
 
-def test_what_has_no_effect_is_left_out(tmp_path: Path) -> None:
+def test_elements_without_effect_are_not_modelled(tmp_path: Path) -> None:
     text = JOINT.format(joint="", actuators="").replace(
         "<actuator>",
         '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
@@ -337,7 +339,7 @@ def test_what_has_no_effect_is_left_out(tmp_path: Path) -> None:
     assert [line.split(":")[0] for line in scene.not_modelled[:2]] == ["1 tendons", "1 equality constraints"]
 
 
-LIMITS = [  # (attributes of the joint, actuator, what the stiffness must be, without the inertia's part)
+LIMITS = [  # (attributes of the joint, actuator, expected stiffness without the lower bound by the inertia)
     ("", '<motor joint="j" gear="2" forcerange="-3 1"/>', 2 * 3 / 0.01),
     ("", '<motor joint="j" gear="2" ctrlrange="-3 5"/>', 2 * 5 / 0.01),
     ('actuatorfrcrange="-50 50"', '<position joint="j" kp="70" kv="2"/>', 50 / 0.01),
@@ -348,20 +350,20 @@ LIMITS = [  # (attributes of the joint, actuator, what the stiffness must be, wi
 
 
 @pytest.mark.parametrize(("joint", "actuators", "stiffness"), LIMITS)
-def test_a_range_is_stiff_by_default(joint: str, actuators: str, stiffness: float, tmp_path: Path) -> None:
+def test_default_joint_limits(joint: str, actuators: str, stiffness: float, tmp_path: Path) -> None:
     write(tmp_path, {"scene.xml": JOINT.format(joint=f'range="-0.5 0.5" {joint}', actuators=actuators)})
     scene = load(tmp_path)
     inertia = Simulator(scene).mass_matrix()[0, 0, 0]
     limit = scene.limits[0]
     assert limit.stiffness == pytest.approx(max(stiffness, inertia / 0.01**2))
     assert limit.damping == pytest.approx(2 * (limit.stiffness * inertia) ** 0.5)
-    own = load(tmp_path, more="[joints.j]\nlimit_stiffness = 7\n").limits[0]
-    assert (own.stiffness, own.damping) == (7, 0)
-    own = load(tmp_path, more="[joints.j]\nlimit_damping = 7\n").limits[0]
-    assert (own.stiffness, own.damping) == (limit.stiffness, 7)
+    custom = load(tmp_path, more="[joints.j]\nlimit_stiffness = 7\n").limits[0]
+    assert (custom.stiffness, custom.damping) == (7, 0)
+    custom = load(tmp_path, more="[joints.j]\nlimit_damping = 7\n").limits[0]
+    assert (custom.stiffness, custom.damping) == (limit.stiffness, 7)
 
 
-def test_full_motor_force_ends_a_hundredth_beyond_the_range(tmp_path: Path) -> None:
+def test_full_motor_force_deflects_the_default_limit_by_10_mrad(tmp_path: Path) -> None:
     text = JOINT.format(joint='range="-0.5 0.5"', actuators='<motor joint="j" forcerange="-20 20"/>')
     scene = load(write(tmp_path, {"scene.xml": text.replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>')}))
     sim = Simulator(scene)

@@ -1,4 +1,4 @@
-"""What model files may hold and the simulator does not model: one line that names it and says what to do."""
+"""Unsupported elements of model files give a one-line error with the element and advice."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def option(text: str) -> tuple[str, str]:
     return "<worldbody>", f"<option {text}<worldbody>"
 
 
-REFUSALS = [
+UNSUPPORTED = [
     (
         section(TENDON.format('stiffness="3"')),
         "tendon 'split' is not supported: remove it or drive the joints directly",
@@ -166,15 +166,15 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), REFUSALS, ids=[message for _, message in REFUSALS])
-def test_what_is_not_modelled_is_refused_by_name(change: tuple[str, str], message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("change", "message"), UNSUPPORTED, ids=[message for _, message in UNSUPPORTED])
+def test_unsupported_element_is_an_error(change: tuple[str, str], message: str, tmp_path: Path) -> None:
     old, new = change
     assert old in MODEL
     (tmp_path / "robot.xml").write_text(MODEL.replace(old, new, 1))
-    check_refused(tmp_path, "robot.xml", message)
+    check_error(tmp_path, "robot.xml", message)
 
 
-def check_refused(folder: Path, model: str, message: str, more: str = "") -> None:
+def check_error(folder: Path, model: str, message: str, more: str = "") -> None:
     (folder / "robot.toml").write_text(f'format = 1\nmodel = "{model}"\nstep = 0.002\n{more}')
     with pytest.raises(UsageError) as caught:
         load_scene(folder / "robot.toml")
@@ -184,17 +184,17 @@ def check_refused(folder: Path, model: str, message: str, more: str = "") -> Non
     assert "\n" not in text
 
 
-def test_nothing_is_refused_without_the_changes(tmp_path: Path) -> None:
+def test_unchanged_model_is_supported(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(MODEL)
     (tmp_path / "robot.toml").write_text('format = 1\nmodel = "robot.xml"\nstep = 0.002\n')
     scene = load_scene(tmp_path / "robot.toml")
     assert [j.type for j in scene.joints] == ["hinge", "ball", "free"]
 
 
-def test_a_joint_s_force_range_is_for_one_actuator(tmp_path: Path) -> None:
+def test_joint_force_range_with_several_actuators_is_an_error(tmp_path: Path) -> None:
     limited = MODEL.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="1 2"')
     (tmp_path / "robot.xml").write_text(limited.replace(MOTOR, MOTOR + '<position joint="swing"/>'))
-    check_refused(
+    check_error(
         tmp_path,
         "robot.xml",
         "actuatorfrcrange of joint 'swing' with 2 actuators is not supported: give each actuator a forcerange",
@@ -202,9 +202,7 @@ def test_a_joint_s_force_range_is_for_one_actuator(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(
         limited.replace(MOTOR, '<motor name="push" joint="swing" forcerange="-1 0.5"/>')
     )
-    check_refused(
-        tmp_path, "robot.xml", "actuator 'push': forcerange and the actuatorfrcrange of the joint are disjoint"
-    )
+    check_error(tmp_path, "robot.xml", "actuator 'push': forcerange and the actuatorfrcrange of the joint are disjoint")
 
 
 HAND = """<mujoco model="hand">
@@ -224,9 +222,9 @@ HAND = """<mujoco model="hand">
 </mujoco>"""
 
 
-def test_a_hand_with_coupled_fingers_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_hand_with_coupled_fingers_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "hand.xml").write_text(HAND)
-    check_refused(
+    check_error(
         tmp_path,
         "hand.xml",
         "hand.xml: tendon 'split' is not supported: remove it or drive the joints directly "
@@ -242,7 +240,7 @@ URDF = f"""<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><link n
   <joint name="a" type="continuous"><parent link="base"/><child link="upper"/></joint>
   <joint name="b" type="continuous"><parent link="upper"/><child link="lower"/></joint></robot>"""
 
-URDF_REFUSALS = [
+UNSUPPORTED_URDF = [
     (
         ("</joint></robot>", '<mimic joint="a" multiplier="2"/></joint></robot>'),
         "joint 'b' mimics 'a', which is not supported: remove <mimic> and drive the joint by its own actuator",
@@ -254,16 +252,16 @@ URDF_REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), URDF_REFUSALS, ids=[message for _, message in URDF_REFUSALS])
-def test_urdf_refusals(change: tuple[str, str], message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("change", "message"), UNSUPPORTED_URDF, ids=[message for _, message in UNSUPPORTED_URDF])
+def test_unsupported_urdf_is_an_error(change: tuple[str, str], message: str, tmp_path: Path) -> None:
     old, new = change
     assert old in URDF
     (tmp_path / "arm.urdf").write_text(URDF.replace(old, new, 1))
-    check_refused(tmp_path, "arm.urdf", message)
+    check_error(tmp_path, "arm.urdf", message)
 
 
-def test_a_mesh_that_is_sampled_needs_a_count(tmp_path: Path) -> None:
+def test_sampled_mesh_needs_a_count(tmp_path: Path) -> None:
     mesh = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>'
     text = MODEL.replace("<worldbody>", mesh).replace('name="ball" size="0.1"', 'name="ball" type="mesh" mesh="m"')
     (tmp_path / "robot.xml").write_text(text)
-    check_refused(tmp_path, "robot.xml", "points.p: count is missing", '[points.p]\ngeom = "ball"\n')
+    check_error(tmp_path, "robot.xml", "points.p: count is missing", '[points.p]\ngeom = "ball"\n')

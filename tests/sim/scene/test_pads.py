@@ -1,4 +1,4 @@
-"""Pads of every shape: where their markers are, how they stand, and what is refused."""
+"""Pads of every shape: positions and axes of the markers, and error messages."""
 
 from pathlib import Path
 from typing import Any
@@ -51,26 +51,26 @@ def check_frames(axes: np.ndarray) -> None:
     np.testing.assert_allclose(np.linalg.det(axes), 1)
 
 
-def test_a_hemisphere(tmp_path: Path) -> None:
-    """Markers on the half beyond the site, as far apart as their area says, axes turned as little as possible."""
+def test_hemisphere(tmp_path: Path) -> None:
+    """Nearly uniform markers on the half in direction z of the site, with axes of the smallest rotation."""
     text = 'shape = "hemisphere"\nradius = 0.01\ncount = 302\nstiffness = "per area"'
     pad = loaded(tmp_path, text).pads[0]
     outward = (pad.positions - [0.001, 0, 0]) / 0.01
     np.testing.assert_allclose(np.linalg.norm(outward, axis=1), 1)
     np.testing.assert_allclose(pad.axes[..., 2], outward, atol=1e-12)
-    assert (outward[:, 2] < 0).all()  # the site's z points down
+    assert (outward[:, 2] < 0).all()  # z of the site points down
     check_frames(pad.axes)
-    # Of all frames with this z, the nearest to the site's own: the trace of the turn between them is 1 + 2 cos(angle).
+    # The smallest rotation to this z: the trace of the rotation matrix is 1 + 2 cos(angle).
     site = np.diag([1.0, -1.0, -1.0])
     np.testing.assert_allclose(np.trace(site.T @ pad.axes, axis1=1, axis2=2), 1 - 2 * outward[:, 2], atol=1e-12)
     gaps = np.linalg.norm(pad.positions[:, None] - pad.positions, axis=-1) + np.eye(302)
-    even = np.sqrt(2 * np.pi * 0.01**2 / 302)
-    assert (gaps.min(1) > 0.7 * even).all() and (gaps.min(1) < 1.2 * even).all()
+    spacing = np.sqrt(2 * np.pi * 0.01**2 / 302)
+    assert (gaps.min(1) > 0.7 * spacing).all() and (gaps.min(1) < 1.2 * spacing).all()
     assert pad.weights.sum() == pytest.approx(2 * np.pi * 0.01**2)
     assert pad.grid is None and pad.shape == "hemisphere"
 
 
-def test_a_disc(tmp_path: Path) -> None:
+def test_disc(tmp_path: Path) -> None:
     text = 'shape = "disc"\nradius = 0.018\ncount = 130\ncenter = [0.002, 0.0]\nstiffness = "per area"'
     scene = loaded(tmp_path, text)
     pad = scene.pads[0]
@@ -81,56 +81,58 @@ def test_a_disc(tmp_path: Path) -> None:
     assert pad.weights.sum() == pytest.approx(np.pi * 0.018**2)
     with pytest.raises(UsageError, match="pad 'pad' is not a rectangle and has no marker grid"):
         _ = scene.grids
-    told = describe(scene).pads[0]
-    assert (told.shape, told.markers, told.rows, told.pitch) == ("disc", 130, None, None)
+    info = describe(scene).pads[0]
+    assert (info.shape, info.markers, info.rows, info.pitch) == ("disc", 130, None, None)
 
 
 POINTS = np.array([[0.0, 0, 0.01], [0.01, 0, 0], [0, 0.01, 0], [0, 0, -0.01]])
-NORMALS = POINTS * 250  # of any length
+NORMALS = POINTS * 250  # not normalized
 
 
 @pytest.mark.parametrize("source", ["toml", "csv", "npz"])
-def test_given_points(tmp_path: Path, source: str) -> None:
-    tips = np.array([[1.0, 0, 0], [0, 0, 2], [1, 1, 0], [1, 0, 1]])
+def test_listed_points(tmp_path: Path, source: str) -> None:
+    x_axes = np.array([[1.0, 0, 0], [0, 0, 2], [1, 1, 0], [1, 0, 1]])
     if source == "toml":
-        text = f"positions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}\nx_axes = {tips.tolist()}"
+        text = f"positions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}\nx_axes = {x_axes.tolist()}"
     else:
         text = f'file = "markers.{source}"'
         if source == "csv":
-            np.savetxt(tmp_path / "markers.csv", np.hstack([POINTS, NORMALS, tips]), delimiter=",", header="x, y, z")
+            np.savetxt(tmp_path / "markers.csv", np.hstack([POINTS, NORMALS, x_axes]), delimiter=",", header="x, y, z")
         else:
-            np.savez(tmp_path / "markers.npz", positions=POINTS, normals=NORMALS, x_axes=tips)
+            np.savez(tmp_path / "markers.npz", positions=POINTS, normals=NORMALS, x_axes=x_axes)
     pad = loaded(tmp_path, f'shape = "points"\n{text}').pads[0]
     site = np.diag([1.0, -1.0, -1.0])
     np.testing.assert_allclose(pad.positions, POINTS @ site + [0.001, 0, 0], atol=1e-15)
     check_frames(pad.axes)
-    inside = site @ pad.axes
-    np.testing.assert_allclose(inside[..., 2], POINTS / 0.01, atol=1e-12)
-    np.testing.assert_allclose(inside[..., 0], [[1, 0, 0], [0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-12)
+    local_axes = site @ pad.axes
+    np.testing.assert_allclose(local_axes[..., 2], POINTS / 0.01, atol=1e-12)
+    np.testing.assert_allclose(local_axes[..., 0], [[1, 0, 0], [0, 0, 1], [1, 0, 0], [1, 0, 0]], atol=1e-12)
     assert (pad.weights == 1).all()
 
 
-def test_given_points_without_axes_have_those_of_the_site_or_of_their_normals(tmp_path: Path) -> None:
+def test_default_axes_of_listed_points(tmp_path: Path) -> None:
     site = np.diag([1.0, -1.0, -1.0])
-    plain = loaded(tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}').pads[0]
-    np.testing.assert_allclose(site @ plain.axes, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
-    turned = loaded(tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}').pads[0]
-    check_frames(turned.axes)
-    np.testing.assert_allclose((site @ turned.axes)[..., 2], POINTS / 0.01, atol=1e-12)
-    np.testing.assert_allclose((site @ turned.axes)[3], np.diag([-1.0, 1, -1]), atol=1e-12)  # the opposite of z
+    no_normals = loaded(tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}').pads[0]
+    np.testing.assert_allclose(site @ no_normals.axes, np.tile(np.eye(3), (4, 1, 1)), atol=1e-12)
+    with_normals = loaded(
+        tmp_path, f'shape = "points"\npositions = {POINTS.tolist()}\nnormals = {NORMALS.tolist()}'
+    ).pads[0]
+    check_frames(with_normals.axes)
+    np.testing.assert_allclose((site @ with_normals.axes)[..., 2], POINTS / 0.01, atol=1e-12)
+    np.testing.assert_allclose((site @ with_normals.axes)[3], np.diag([-1.0, 1, -1]), atol=1e-12)  # normal −z
 
 
-def test_every_marker_has_its_own_axes(tmp_path: Path) -> None:
-    """A fingertip pressed into the ground: the force is straight up, and each marker reads it in its own frame."""
+def test_tactile_forces_are_in_marker_axes(tmp_path: Path) -> None:
+    """A fingertip pressed into the ground: vertical forces, expressed in the axes of each marker."""
     scene = loaded(tmp_path, 'shape = "hemisphere"\nradius = 0.01\ncount = 40')
     sim = Simulator(scene)
     assert not sim.tactile().any()
     sim.q[0, 0] = -0.1
-    reading, axes = sim.tactile()[0], scene.pads[0].axes
+    tactile, axes = sim.tactile()[0], scene.pads[0].axes
     force = 1.0 * -scene.pads[0].positions[:, 2]  # k_n × depth
     assert (force > 0).all()
-    np.testing.assert_allclose(reading[:, 2], -force * axes[:, 2, 2], atol=1e-12)
-    np.testing.assert_allclose(reading[:, :2], force[:, None] * axes[:, 2, :2], atol=1e-12)
+    np.testing.assert_allclose(tactile[:, 2], -force * axes[:, 2, 2], atol=1e-12)
+    np.testing.assert_allclose(tactile[:, :2], force[:, None] * axes[:, 2, :2], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -143,12 +145,12 @@ def test_every_marker_has_its_own_axes(tmp_path: Path) -> None:
         ("ellipsoid", (0.02, 0.03, 0.04)),
     ],
 )
-def test_markers_feel_every_shape(kind: str, ends: tuple[float, float, float], tmp_path: Path) -> None:
-    """One millimetre inside each end of a body's extent, and as far outside."""
-    middle = np.array([0.299, 0, 0])  # of the body, in the site's frame
-    inside = middle + np.diag(ends) - 1e-3 * np.eye(3)
-    places = np.concatenate([inside, 2 * middle - inside, inside + 2e-3 * np.eye(3)])
-    scene = loaded(tmp_path, f'shape = "points"\npositions = {places.tolist()}', kind)
+def test_tactile_forces_on_every_shape(kind: str, ends: tuple[float, float, float], tmp_path: Path) -> None:
+    """Markers 1 mm inside each extremal point of a body have a force; markers 1 mm outside have none."""
+    center = np.array([0.299, 0, 0])  # of the body in the frame of the site
+    inside = center + np.diag(ends) - 1e-3 * np.eye(3)
+    positions = np.concatenate([inside, 2 * center - inside, inside + 2e-3 * np.eye(3)])
+    scene = loaded(tmp_path, f'shape = "points"\npositions = {positions.tolist()}', kind)
     assert next(shape for shape in scene.shapes if shape.name == "cap").kind == kind
     force = np.linalg.norm(Simulator(scene).tactile()[0], axis=1)
     np.testing.assert_allclose(force, [1e-3] * 6 + [0] * 3, atol=1e-12)
@@ -159,14 +161,18 @@ def test_markers_feel_every_shape(kind: str, ends: tuple[float, float, float], t
     [
         ("sphere", "count = 20", ""),
         ("sphere", 'faces = ["+z"]', "without a count 'cap' is one exact contact point, which takes no other keys"),
-        ("capsule", 'count = 20\nfaces = ["wall"]', "faces of a capsule are -z and +z, once each, got ['wall']"),
+        (
+            "capsule",
+            'count = 20\nfaces = ["wall"]',
+            "faces of a capsule must be some of -z, +z, each named once, got ['wall']",
+        ),
         ("ellipsoid", "count = 20", ""),
         ("ellipsoid", "", "count is missing"),
         ("cylinder", 'faces = ["-z", "+z", "wall"]\nheights = 4', ""),
         ("cylinder", "heights = 4", 'heights apply to the wall; add faces = ["-z", "+z", "wall"]'),
     ],
 )
-def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Path) -> None:
+def test_contact_points_on_round_geometries(kind: str, text: str, message: str, tmp_path: Path) -> None:
     loaded(tmp_path, "rows = 1\ncols = 1\npitch = 1e-3", kind)
     contact = '[contacts.c]\npoints = "cap"\nagainst = "finger"\nkn = 1.0\nkt = 1.0\nmu = 1.0\nkd = 1.0\n'
     path = tmp_path / "s.toml"
@@ -209,7 +215,7 @@ def test_points_on_round_bodies(kind: str, text: str, message: str, tmp_path: Pa
         ('shape = "points"\npositions = [[0, 0, 0]]\nstiffness = "per area"', 'set stiffness = "per point"'),
     ],
 )
-def test_a_wrong_pad_is_refused_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_pad_gives_a_one_line_error(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "two.csv").write_text("1, 2\n")
     (tmp_path / "words.csv").write_text("x, y, z\n")
     (tmp_path / "words.npz").write_text("x, y, z\n")

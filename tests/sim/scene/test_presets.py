@@ -1,4 +1,4 @@
-"""Presets: one word chooses how exactly a scene is simulated, everywhere, and nothing that a policy sees."""
+"""Presets change the accuracy of the simulation in all interfaces, but not the observation."""
 
 import re
 from pathlib import Path
@@ -43,22 +43,31 @@ def write(folder: Path, presets: str) -> Path:
 
 
 @pytest.mark.parametrize("name", scene_names())
-def test_every_scene_has_three_that_leave_alone_what_is_seen(name: str) -> None:
-    own = load_scene(name)
-    assert tuple(own.presets) == PRESET_NAMES
-    assert (own.tolerance, own.precision, own.step, own.integrator) == (DEFAULT_TOLERANCE, "double", 5e-3, "bdf1")
+def test_presets_of_scenes_keep_markers_and_contacts(name: str) -> None:
+    default = load_scene(name)
+    assert tuple(default.presets) == PRESET_NAMES
+    assert (default.tolerance, default.precision, default.step, default.integrator) == (
+        DEFAULT_TOLERANCE,
+        "double",
+        5e-3,
+        "bdf1",
+    )
     steps = []
     for preset in PRESET_NAMES:
         scene = load_scene(name, preset=preset)
         steps.append(scene.step)
-        assert scene.num_markers == own.num_markers and scene.friction == own.friction and scene.precision == "double"
-        assert [p.grid for p in scene.pads] == [p.grid for p in own.pads]
-        assert [c.params for c in scene.contacts] == [c.params for c in own.contacts]
-        np.testing.assert_array_equal(scene.q0, own.q0)
+        assert (
+            scene.num_markers == default.num_markers
+            and scene.friction == default.friction
+            and scene.precision == "double"
+        )
+        assert [p.grid for p in scene.pads] == [p.grid for p in default.pads]
+        assert [c.params for c in scene.contacts] == [c.params for c in default.contacts]
+        np.testing.assert_array_equal(scene.q0, default.q0)
     assert steps == sorted(steps, reverse=True) and len(set(steps)) == 3
 
 
-def test_a_preset_sets_what_it_says_and_overrides_count_more(tmp_path: Path) -> None:
+def test_overrides_take_precedence_over_presets(tmp_path: Path) -> None:
     presets = """[presets.mine]
 step = 2e-3
 integrator = "bdf2"
@@ -104,14 +113,14 @@ def test_precision_and_tolerance_reach_the_simulator(tmp_path: Path) -> None:
         ("pads.pad.rows = 5", "presets.mine: 'pads.pad.rows': no table 'pads'; valid names: contacts, points"),
     ],
 )
-def test_an_unknown_key_is_named_with_the_nearest_one(tmp_path: Path, preset: str, message: str) -> None:
-    """Also where the preset is not asked for."""
+def test_unknown_key_in_a_preset_suggests_the_nearest_key(tmp_path: Path, preset: str, message: str) -> None:
+    """The error is raised even if the preset is not used."""
     path = write(tmp_path, f"[presets.mine]\n{preset}\n")
     with pytest.raises(UsageError, match=re.escape(f"{path}, {message}")):
         load_scene(path)
 
 
-def test_a_wrong_value_or_name_is_named(tmp_path: Path) -> None:
+def test_invalid_preset_value_or_name_is_an_error(tmp_path: Path) -> None:
     path = write(tmp_path, '[presets.mine]\nintegrator = "bdf3"\n')
     with pytest.raises(UsageError, match="integrator is 'bdf3'; did you mean 'bdf2'"):
         load_scene(path, preset="mine")
@@ -119,14 +128,14 @@ def test_a_wrong_value_or_name_is_named(tmp_path: Path) -> None:
         load_scene("rolling", preset="fats")
 
 
-def test_attempts_take_the_same_time_and_see_the_same_grid() -> None:
+def test_attempts_have_the_same_duration_and_marker_grid() -> None:
     for preset, steps in ((None, 45), ("fast", 22), ("accurate", 360)):
         attempts = InsertionAttempts(1, scene=insertion_scene(preset=preset), randomization=NOMINAL)
         assert attempts._steps == steps
         assert attempts.scene.grids == (INSERTION.grid, INSERTION.grid)
 
 
-def test_flow_maps_under_presets_are_alike() -> None:
+def test_flow_maps_agree_between_presets() -> None:
     images = []
     for preset in (None, *PRESET_NAMES):
         env = InsertionVectorEnv(1, preset=preset, randomization=NOMINAL)
@@ -145,7 +154,7 @@ def test_environments_take_a_scene_or_a_preset() -> None:
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-def test_the_mock_s_world_steps_in_parts_of_4_ms(preset: str) -> None:
+def test_simulated_cell_step_divides_4_ms(preset: str) -> None:
     config = preset_config(preset, seed=3)
     assert config.step <= load_scene("insertion", preset=preset).step
     assert round(4e-3 / config.step) * config.step == pytest.approx(4e-3)
@@ -160,7 +169,7 @@ def test_the_mock_s_world_steps_in_parts_of_4_ms(preset: str) -> None:
 
 
 @pytest.mark.parametrize("command", ["train insertion", "eval insertion", "mock", "describe insertion", "demo"])
-def test_the_command_line_refuses_an_unknown_preset(
+def test_command_line_reports_an_unknown_preset(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = ["--out", str(tmp_path / "out")] if command.split()[0] in ("train", "demo") else []

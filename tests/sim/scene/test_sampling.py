@@ -1,4 +1,4 @@
-"""Sampled points: they lie on the surface, and their weights add up to its area."""
+"""Sampled points are on the surface, and their weights sum to its area."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
 
 
-def test_the_rolling_pad_has_as_many_points_as_published() -> None:
+def test_rolling_pad_has_the_published_number_of_points() -> None:
     points, areas = box_surface((0.025, 0.025, 0.005), (20, 20, 20))
     assert len(points) == len(areas) == 20**3 - 18**3
 
@@ -20,7 +20,7 @@ def test_the_rolling_pad_has_as_many_points_as_published() -> None:
     resolution=st.tuples(*[st.integers(2, 6)] * 3),
     faces=st.lists(st.sampled_from(FACES), min_size=1, max_size=6, unique=True),
 )
-def test_box_weights_add_up_to_the_area_of_the_faces(
+def test_box_weights_sum_to_the_area_of_the_faces(
     half: tuple[float, float, float], resolution: tuple[int, int, int], faces: list[str]
 ) -> None:
     points, areas = box_surface(half, resolution, faces=faces)
@@ -29,7 +29,7 @@ def test_box_weights_add_up_to_the_area_of_the_faces(
     assert (areas.sum(1) > 0).all()
     scaled = points / np.array(half)
     assert np.abs(scaled).max(axis=1) == pytest.approx(1)  # on the surface
-    assert len(np.unique(points.round(9), axis=0)) == len(points)  # edges and corners once
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # edges and corners occur once
     for face in faces:
         axis, sign = "xyz".index(face[1]), -1 if face[0] == "-" else 1
         on_face = np.isclose(scaled[:, axis], sign)
@@ -42,12 +42,10 @@ def test_box_points_include_the_corners() -> None:
     assert sorted(map(tuple, points.tolist())) == sorted(
         (x, y, z) for x in (-1.0, 1.0) for y in (-2.0, 2.0) for z in (-3.0, 3.0)
     )
-    assert areas == pytest.approx(
-        np.tile([6.0, 3.0, 2.0], (8, 1))
-    )  # a quarter of each of the three faces that meet there
+    assert areas == pytest.approx(np.tile([6.0, 3.0, 2.0], (8, 1)))  # a quarter of each adjacent face
 
 
-def test_disc_has_the_published_points_and_its_area() -> None:
+def test_disc_has_the_published_number_of_points() -> None:
     points, areas = disc(0.018, 0.0015)
     assert len(points) == 66
     assert areas.sum() == pytest.approx(2 * np.pi * 0.018**2)
@@ -56,7 +54,7 @@ def test_disc_has_the_published_points_and_its_area() -> None:
 
 
 def test_integrals_over_a_disc_converge() -> None:
-    """∫ x² dA over a unit disc is π/4: the error falls with the square of the spacing."""
+    """∫ x² dA over a unit disc is π/4: the error is of second order in the spacing."""
     errors = []
     for radii in (4, 8, 16):
         points, areas = disc(1.0, 0.1, angles=16, radii=radii, faces=["+z"])
@@ -71,20 +69,18 @@ def test_integrals_over_a_disc_converge() -> None:
     heights=st.integers(2, 6),
     faces=st.lists(st.sampled_from(("-z", "+z", "wall")), min_size=1, max_size=3, unique=True),
 )
-def test_cylinder_weights_add_up_to_the_area_of_the_faces(
-    angles: int, radii: int, heights: int, faces: list[str]
-) -> None:
+def test_cylinder_weights_sum_to_the_area_of_the_faces(angles: int, radii: int, heights: int, faces: list[str]) -> None:
     radius, half = 0.3, 0.5
     points, areas = cylinder(radius, half, angles=angles, radii=radii, heights=heights, faces=faces)
     area = {"-z": np.pi * radius**2, "+z": np.pi * radius**2, "wall": 4 * np.pi * radius * half}
     assert areas.sum() == pytest.approx(sum(area[face] for face in faces))
     assert (areas.sum(1) > 0).all()
-    assert len(np.unique(points.round(9), axis=0)) == len(points)  # the rims once
+    assert len(np.unique(points.round(9), axis=0)) == len(points)  # points of the rims occur once
     around = np.linalg.norm(points[:, :2], axis=1)
     assert np.maximum(around / radius, np.abs(points[:, 2]) / half) == pytest.approx(1)  # on the surface
     flat = sum(area[face] for face in faces if face != "wall")
     assert areas.sum(0) == pytest.approx([area["wall"] / 2 * ("wall" in faces)] * 2 + [flat])
-    # What each face integrates to on its own: moments of the height.
+    # First moment of each face in z.
     expected = sum(area[face] * {"-z": -half, "+z": half, "wall": 0}[face] for face in faces)
     assert (areas.sum(1) * points[:, 2]).sum() == pytest.approx(expected, abs=1e-12)
 
@@ -109,7 +105,7 @@ def test_spheres_and_capsules(half: float, faces: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("faces", HALVES)
 @pytest.mark.parametrize("axes", [(0.1, 0.1, 0.1), (0.1, 0.2, 0.3), (0.3, 0.1, 0.1)])
 def test_ellipsoids(axes: tuple[float, float, float], faces: tuple[str, ...]) -> None:
-    """Area by the mean of a dense grid over both angles; ∫ z² over the whole surface converges."""
+    """Area and ∫ z² dA against a dense quadrature over both angles."""
     u, v = np.meshgrid((np.arange(400) + 0.5) / 400 * np.pi, np.arange(400) / 400 * 2 * np.pi)
     direction = np.stack([np.sin(u) * np.cos(v), np.sin(u) * np.sin(v), np.cos(u)], axis=-1)
     cell = np.prod(axes) * np.linalg.norm(direction / axes, axis=-1) * np.sin(u) * np.pi / 400 * 2 * np.pi / 400
@@ -122,8 +118,8 @@ def test_ellipsoids(axes: tuple[float, float, float], faces: tuple[str, ...]) ->
 
 
 @pytest.mark.parametrize("axes", [(0.1, 0.1, 0.1), (0.1, 0.2, 0.3)])
-def test_parts_of_an_area_say_how_it_grows(axes: tuple[float, float, float]) -> None:
-    """Stretched by a little along one axis, the area grows by the parts across the other two."""
+def test_area_components_give_the_derivative_of_the_area(axes: tuple[float, float, float]) -> None:
+    """dA/ds of a scaling s along one axis is the sum of the components along the other two axes."""
     _, areas = ellipsoid(axes, count=400)
     for axis in range(3):
         stretch = np.ones(3)
@@ -147,6 +143,6 @@ def test_parts_of_an_area_say_how_it_grows(axes: tuple[float, float, float]) -> 
         (lambda: ellipsoid((1, 1, 1), count=9, faces=["wall"]), "faces of an ellipsoid must be some of -z, .z"),
     ],
 )
-def test_wrong_sampling_is_refused(call: object, message: str) -> None:
+def test_invalid_sampling_is_an_error(call: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         call()  # type: ignore[operator]

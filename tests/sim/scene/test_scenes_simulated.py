@@ -1,4 +1,4 @@
-"""Scenes in the simulator: its kinematics and masses against MuJoCo's, and what the scenes do."""
+"""Simulation of the scenes: kinematics and mass matrix against MuJoCo, tactile forces, rolling and sliding."""
 
 from pathlib import Path
 from typing import Any
@@ -40,12 +40,12 @@ def test_poses_and_mass_matrix_agree_with_mujoco(name: str) -> None:
         np.testing.assert_allclose(sim.mass_matrix()[0], mass, atol=1e-12)
 
 
-def test_marker_forces_agree_with_an_independent_simulator() -> None:
-    """States and marker forces of the pushing run from DiffRedMax (DiffHand c53b5c4), Newton tolerance 1e-16.
+def test_tactile_forces_agree_with_an_independent_simulator() -> None:
+    """States and tactile forces of the pushing scene from DiffRedMax (DiffHand c53b5c4), Newton tolerance 1e-16.
 
-    It takes the box's velocity at the surface point x − d n instead of at the marker x. On a marker that sticks this
-    changes the force by exactly k_t times the tangential part of ω × (d n), which is taken into account here; on one
-    that slips it turns the friction a little, and those few are compared along the pad's normal alone.
+    DiffRedMax evaluates the velocity of the box at the surface point x − d n instead of at the marker x. This changes
+    the force of a sticking marker by k_t times the tangential part of ω × (d n), which is corrected here. It changes
+    the direction of friction of a slipping marker; these few markers are compared in the normal direction only.
     """
     data = np.load(Path(__file__).parents[2] / "data" / "pushing_reference.npz")
     scene = load_scene("pushing")
@@ -91,8 +91,8 @@ ROLLING = [((0.0, 0.0, 0.2), 100), ((0.1, 0, 0.2), 50), ((-0.2, 0, 0.2), 50), ((
 
 
 @pytest.mark.parametrize("friction", ["viscous", "elastic"])
-def test_the_ball_rolls_between_pad_and_ground(friction: str) -> None:
-    """Without slip the ball goes half as far as the pad, and turns by its way over its radius."""
+def test_ball_rolls_between_pad_and_ground(friction: str) -> None:
+    """Without slip the ball moves half as far as the pad and rotates by distance over radius."""
     scene = load_scene("rolling", friction=friction, overrides={"pads.pad.rows": 25, "pads.pad.cols": 25})
     sim = Simulator(scene)
     sim.q[:] = scene.q0
@@ -101,7 +101,7 @@ def test_the_ball_rolls_between_pad_and_ground(friction: str) -> None:
     start = sim.q[0].copy()
     reading = sim.tactile()[0]
     assert (reading[:, 2] > 0).sum() > 20
-    # Pressed without any motion along the plane, the pattern is the same on all four sides.
+    # Under normal load only, the normal forces have point symmetry.
     normal = reading[:, 2].reshape(25, 25)
     np.testing.assert_allclose(normal, normal[::-1, ::-1], atol=1e-6)
     for force, steps in ROLLING[1:]:
@@ -115,22 +115,22 @@ def test_the_ball_rolls_between_pad_and_ground(friction: str) -> None:
 
 
 @pytest.mark.parametrize("friction", ["viscous", "elastic"])
-def test_the_reading_shows_which_way_the_pad_is_pulled(friction: str) -> None:
-    """A ball that is dragged along +x pulls the pad back: shear along the pad's −x, and −y of the pad is +y here."""
+def test_tactile_shear_has_the_direction_of_the_load(friction: str) -> None:
+    """A ball dragged along +x pulls the pad along −x; y of the pad is −y of the world."""
     scene = load_scene("rolling", friction=friction, overrides={"pads.pad.rows": 25, "pads.pad.cols": 25})
     for force, axis, sign in (((0.1, 0, 0.2), 0, -1), ((0, 0.1, 0.2), 1, 1)):
         sim = Simulator(scene)
         sim.q[:] = scene.q0
         sim.step(np.array([0.0, 0, 0.2]), 100)
-        calm = sim.tactile()[0].sum(0)
+        before = sim.tactile()[0].sum(0)
         sim.step(np.array(force, dtype=float), 4)
-        pulled = sim.tactile()[0].sum(0) - calm
-        assert sign * pulled[axis] > 0
-        assert abs(pulled[axis]) > 10 * abs(pulled[1 - axis])
+        change = sim.tactile()[0].sum(0) - before
+        assert sign * change[axis] > 0
+        assert abs(change[axis]) > 10 * abs(change[1 - axis])
 
 
-def test_the_elastic_law_s_pushed_box_stays_against_its_support() -> None:
-    """Under the elastic law a box at rest on the ground does not creep under a force below its friction."""
+def test_box_under_the_elastic_law_does_not_creep() -> None:
+    """A box on the ground stays in place under a force below the friction limit."""
     scene = load_scene("pushing", friction="elastic")
     sim = Simulator(scene)
     sim.q[:] = scene.q0

@@ -1,4 +1,4 @@
-"""Readings that add up: a pad whose markers are contact points reads exactly what pushes its body."""
+"""Colliding pads: the tactile forces sum to the contact wrench of the pad."""
 
 from typing import Any
 
@@ -22,49 +22,49 @@ COLLIDING: dict[str, dict[str, Any]] = {
 }
 
 
-def pushed(name: str, law: str, **more: Any) -> Scene:
+def with_colliding_pads(name: str, law: str, **more: Any) -> Scene:
     return load_scene(name, friction=law, overrides={**COLLIDING[name], **more})
 
 
 def in_world(sim: Simulator, scene: Scene, index: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Forces of a pad's markers [N] and where they are [m], in the world, each (markers, 3)."""
+    """Tactile forces [N] and positions [m] of the markers of a pad in world coordinates, each (markers, 3)."""
     pad = scene.pads[index]
     start = sum(len(p.positions) for p in scene.pads[:index])
-    axes, places = pad.axes, pad.positions
+    axes, positions = pad.axes, pad.positions
     body = sim.poses()[0, pad.body]
     w, v = body[3], body[4:]
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    readings = sim.tactile()[0, start : start + len(places)] * [1, 1, -1]
-    return np.einsum("mij,mj->mi", axes, readings) @ turn.T, places @ turn.T + body[:3]
+    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    tactile = sim.tactile()[0, start : start + len(positions)] * [1, 1, -1]
+    return np.einsum("mij,mj->mi", axes, tactile) @ rotation.T, positions @ rotation.T + body[:3]
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", COLLIDING)
-def test_markers_add_up_to_the_wrench(name: str, law: str) -> None:
-    """After every step of a motion that touches, sticks, slips and lets go."""
-    scene = pushed(name, law)
+def test_tactile_forces_sum_to_the_contact_wrench(name: str, law: str) -> None:
+    """After every step of a motion with touching, sticking, slipping and separating markers."""
+    scene = with_colliding_pads(name, law)
     sim, run = Simulator(scene), reference_motion(scene)
     sim.q[:] = run.q0
-    felt, names = 0, list(sim.model.contact_names)
+    checked, names = 0, list(sim.model.contact_names)
     for u in run.step_controls(scene.step):
         sim.step(u)
         wrenches = sim.wrenches()[0]
         for i, pad in enumerate(scene.pads):
-            forces, places = in_world(sim, scene, i)
+            forces, positions = in_world(sim, scene, i)
             size = np.linalg.norm(forces, axis=1).sum()
-            own = sum(wrenches[n] for n, c in enumerate(names) if c == pad.name or c.startswith(pad.name + "/"))
-            np.testing.assert_allclose(forces.sum(0), own[3:], atol=1e-12 * size, rtol=0)
-            np.testing.assert_allclose(np.cross(places, forces).sum(0), own[:3], atol=1e-12 * size, rtol=0)
-            felt += bool(size)
+            contact = sum(wrenches[n] for n, c in enumerate(names) if c == pad.name or c.startswith(pad.name + "/"))
+            np.testing.assert_allclose(forces.sum(0), contact[3:], atol=1e-12 * size, rtol=0)
+            np.testing.assert_allclose(np.cross(positions, forces).sum(0), contact[:3], atol=1e-12 * size, rtol=0)
+            checked += bool(size)
     sim.check()
-    assert felt > 50
+    assert checked > 50
 
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_gradients(law: str, integrator: str) -> None:
-    scene = pushed("rolling", law, integrator=integrator)
+    scene = with_colliding_pads("rolling", law, integrator=integrator)
     spec = scene.describe_to(_core.ModelSpec())
     spec.polish = 2
     sim = Simulator(_core.Model(spec))
@@ -77,8 +77,8 @@ def test_gradients(law: str, integrator: str) -> None:
         assert gradient_check.compare_to_dual_numbers(case, rng).error < 1e-10
 
 
-def test_separate_grids_converge_to_one_total() -> None:
-    """Per area, the markers' sum and the contact's differ less and less as both grids get denser."""
+def test_total_tactile_force_converges_to_the_contact_force() -> None:
+    """With stiffness per area, sums over markers and over contact points converge to each other."""
     differences = []
     for fine in (1, 2, 4, 8):
         numbers = {"kn": 1e5, "kt": 1e2, "mu": 0.5, "kd": 1e3}
@@ -91,27 +91,27 @@ def test_separate_grids_converge_to_one_total() -> None:
         sim.step([0, 0, 0.2], 100)
         sim.check()
         normal = sim.tactile()[0, :, 2].sum()
-        pushed_with = abs(sim.wrenches()[0, list(sim.model.contact_names).index("pad_ball"), 5])
-        differences.append(abs(normal / pushed_with - 1))
+        contact_normal = abs(sim.wrenches()[0, list(sim.model.contact_names).index("pad_ball"), 5])
+        differences.append(abs(normal / contact_normal - 1))
     print("difference of the totals:", [f"{d:.1e}" for d in differences])
     assert differences[-1] < 2e-3 and differences[-1] < differences[0] / 8
 
 
-def test_one_set_of_numbers_and_anchors() -> None:
-    scene = pushed("insertion", "elastic")
-    plain = load_scene("insertion", friction="elastic")
-    assert scene.build().na == plain.build().na
+def test_colliding_pads_share_parameters_and_anchors_with_their_contacts() -> None:
+    scene = with_colliding_pads("insertion", "elastic")
+    default = load_scene("insertion", friction="elastic")
+    assert scene.build().na == default.build().na
     sim = Simulator(scene, num_envs=2)
     sim.q[:] = reference_motion(scene).q0
     sim.param(f"{scene.pads[0].name}.kn")[1] *= 2
     sim.step(np.tile(reference_motion(scene).step_controls(scene.step)[0], (2, 1)))
-    assert not np.array_equal(sim.v[0], sim.v[1]), "the number pushes"
+    assert not np.array_equal(sim.v[0], sim.v[1]), "the parameter of the pad affects the motion"
     gauge = EnergyGauge(scene, num_envs=2)
     assert np.isfinite(gauge.read(sim).total).all()
 
 
-def test_describe_and_refusal() -> None:
-    described = describe(pushed("insertion", "viscous"))
+def test_describe_and_invalid_values() -> None:
+    described = describe(with_colliding_pads("insertion", "viscous"))
     assert all(pad.collides for pad in described.pads)
     assert described.size.contact_pairs > describe(load_scene("insertion")).size.contact_pairs
     with pytest.raises(UsageError, match="collides must be true or false"):
