@@ -260,18 +260,18 @@ def _spiral(count: int) -> Array:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _heights(what: str, count: int, faces: Sequence[str]) -> Array:
+def _heights(solid: str, count: int, faces: Sequence[str]) -> Array:
     """Midpoints of equal steps of height over [−1, 1] or over the selected half."""
-    _check_faces(what, faces, ENDS)
+    _check_faces(solid, faces, ENDS)
     if count < 1:
-        raise UsageError(f"{what} needs a count of at least 1, got {count}")
+        raise UsageError(f"{solid} needs a count of at least 1, got {count}")
     low, high = -1.0 if "-z" in faces else 0.0, 1.0 if "+z" in faces else 0.0
     return low + (high - low) * (np.arange(count) + 0.5) / count
 
 
-def _check_faces(what: str, faces: Sequence[str], known: Sequence[str]) -> None:
-    if not faces or any(face not in known for face in faces) or len(set(faces)) != len(faces):
-        raise UsageError(f"faces of {what} must be some of {', '.join(known)}, each named once, got {list(faces)}")
+def _check_faces(solid: str, faces: Sequence[str], valid: Sequence[str]) -> None:
+    if not faces or any(face not in valid for face in faces) or len(set(faces)) != len(faces):
+        raise UsageError(f"faces of {solid} must be some of {', '.join(valid)}, each named once, got {list(faces)}")
 
 
 def _trapezoid(length: float, count: int) -> Array:

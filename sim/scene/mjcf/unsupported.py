@@ -109,11 +109,11 @@ def _equality(model: Any, e: int) -> str:
     kind = mujoco.mjtEq(model.eq_type[e]).name.removeprefix("mjEQ_").lower()
     if name := model.equality(e).name:
         return f"{kind} {name!r}"
-    what = {"joint": "joint", "tendon": "tendon", "connect": "body", "weld": "body"}.get(kind)
+    target = {"joint": "joint", "tendon": "tendon", "connect": "body", "weld": "body"}.get(kind)
     if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
-        what = "site"
+        target = "site"
     ends = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e]) if i >= 0]
-    return f"{kind} of {' and '.join(repr(getattr(model, what)(i).name) for i in ends)}" if what else kind
+    return f"{kind} of {' and '.join(repr(getattr(model, target)(i).name) for i in ends)}" if target else kind
 
 
 def _options(model: Any) -> Iterator[Unsupported]:

@@ -145,10 +145,10 @@ def test_compliance_is_invariant_under_rotation() -> None:
     gel = scattered(40, 3e-3)
     c, s = np.cos(0.7), np.sin(0.7)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    turned = replace(gel, positions=gel.positions @ turn[:2, :2].T)
+    rotated = replace(gel, positions=gel.positions @ turn[:2, :2].T)
     every = np.kron(np.eye(40), turn)
     np.testing.assert_allclose(
-        turned.compliance_matrix, every @ gel.compliance_matrix @ every.T, atol=1e-9 * gel.compliance_matrix.max()
+        rotated.compliance_matrix, every @ gel.compliance_matrix @ every.T, atol=1e-9 * gel.compliance_matrix.max()
     )
     # A rectangle rotated by 90°: x becomes y, y becomes −x, rows become columns.
     wide, tall = (on_grid(*n, 1e-3, 2e-3).compliance_matrix.reshape(*n, 3, *n, 3) for n in ((3, 7), (7, 3)))

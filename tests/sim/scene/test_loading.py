@@ -69,8 +69,8 @@ def body_frames(spec: RecordingSpec, q: NDArray[np.float64]) -> list[tuple[NDArr
             if kind == "slide":
                 x = x + r @ axis * q[at]
             else:
-                turned = r @ rotation_about(axis, q[at])
-                x, r = x + r @ anchor - turned @ anchor, turned
+                rotated = r @ rotation_about(axis, q[at])
+                x, r = x + r @ anchor - rotated @ anchor, rotated
             at += 1
         frames.append((x, r))
     return frames
