@@ -3,6 +3,26 @@ from numpy.typing import NDArray
 
 PROFILE_STEPS: int
 
+class StartResult:
+    @property
+    def position(self) -> NDArray[np.float64]: ...
+    @property
+    def contrast(self) -> NDArray[np.float64]: ...
+    @property
+    def quality(self) -> NDArray[np.float64]: ...
+
+class TrackResult:
+    @property
+    def position(self) -> NDArray[np.float64]: ...
+    @property
+    def displacement(self) -> NDArray[np.float64]: ...
+    @property
+    def valid(self) -> NDArray[np.bool_]: ...
+    @property
+    def inferred(self) -> NDArray[np.bool_]: ...
+    @property
+    def quality(self) -> NDArray[np.float64]: ...
+
 class Tracker:
     def __init__(
         self,
@@ -17,16 +37,12 @@ class Tracker:
         radius: float,
         noise: float,
         profile: NDArray[np.float32],
-        reach: float,
+        profile_reach: float,
         rest: NDArray[np.float64],
-        seen: NDArray[np.bool_],
-        oval: NDArray[np.float64],
+        visible: NDArray[np.bool_],
+        ellipse: NDArray[np.float64],
         contrast: NDArray[np.float64],
     ) -> None: ...
-    def start(
-        self, image: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
+    def start(self, image: NDArray[np.uint8]) -> StartResult: ...
     def rest(self) -> NDArray[np.float64]: ...
-    def track(
-        self, image: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float64]]: ...
+    def track(self, image: NDArray[np.uint8]) -> TrackResult: ...

@@ -1,8 +1,8 @@
-"""What the tracker learns from the first image: the shape of a dot, its oval at each marker, its contrast, the noise.
+"""The dot model, estimated from the first image: dot profile, ellipse and contrast per marker, and pixel noise.
 
-All dots are prints of one shape, seen through one lens: each is the same profile over q = dᵀ Q d, d from its centre,
-where the oval Q follows the local steps of the grid (so that tilt, keystone and distortion are in it) and one matrix
-for the print itself. Centres and profile are found in turns, each with the other known.
+All dots are prints of one shape seen through one lens. Each has the same profile over q = dᵀ Q d, d the offset from its
+centre. The ellipse Q combines the local grid steps, which contain tilt, keystone and lens distortion, with one
+common matrix for the print. Centres and profile are estimated alternately.
 """
 
 from dataclasses import dataclass, replace
@@ -12,166 +12,168 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.perception._tracker import PROFILE_STEPS, Tracker
-from gelflow.perception.detect import PLANES, plane_of
-from gelflow.perception.errors import TrackerInitError, draw_seen
-from gelflow.perception.grid import Found
+from gelflow.perception.detect import PLANES, image_plane
+from gelflow.perception.errors import TrackerInitError, draw_detections
+from gelflow.perception.grid import MarkerGrid
 
 Floats = NDArray[np.float64]
 
-_ROUNDS = 2
-_REACH = 2.2  # the profile is known up to this many radii
-_ALIKE = 0.6  # share of the dots that must have the common shape
-_RINGS = 44  # in which it is averaged, as a function of the radius
+_ROUNDS = 2  # of the alternating estimation
+_PROFILE_REACH = 2.2  # the profile ends at this many radii
+_MIN_MATCHING = 0.6  # fraction of the dots that must match the common profile
+_RINGS = 44  # bins of the radius in which the profile is averaged
 
 
 @dataclass(frozen=True)
-class Learned:
-    """What `Tracker` is built from, for the markers line by line."""
+class DotModel:
+    """The dot model of a `Tracker`. Markers row by row."""
 
-    rest: Floats  # [px], shape (markers, 2)
-    seen: NDArray[np.bool_]  # shape (markers,)
-    oval: Floats  # Q as xx, xy, yy [1/px²], shape (markers, 3); 1 = dᵀ Q d is a dot's edge
-    contrast: Floats  # of a dot, negative where it is dark, shape (markers,)
-    profile: NDArray[np.float32]  # over q in equal steps up to _REACH², 1 inside, 0 outside
-    noise: float  # of a pixel, as a share of the light
-    quality: Floats  # of each dot's fit, 0 where not seen, shape (markers,)
+    rest: Floats  # positions at rest (right, down) [px], shape (markers, 2)
+    visible: NDArray[np.bool_]  # whether the first image shows the dot, shape (markers,)
+    ellipse: Floats  # Q as xx, xy, yy [1/px²], shape (markers, 3); dᵀ Q d = 1 on the edge of a dot
+    contrast: Floats  # of each dot, negative for dark dots, shape (markers,)
+    profile: NDArray[
+        np.float32
+    ]  # at equidistant q up to _PROFILE_REACH², 1 inside, 0 outside, shape (PROFILE_STEPS + 1,)
+    noise: float  # standard deviation of a pixel / background
+    quality: Floats  # of the fit of each dot, 0 where not visible, shape (markers,)
 
 
-def learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
-    """A tracker for the markers `found` in `image` (B G R), started there.
+def fit_dot_model(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, DotModel]:
+    """A tracker started on the marker `grid` of `image` (B G R), and its dot model.
 
-    Raises TrackerInitError when the dots do not look alike, or like no dots: then they are no print.
+    Raises TrackerInitError when the dots do not have a common profile or cannot be fitted.
     """
-    _alike(image, found, found.seen.astype(np.float64).reshape(-1))
+    _matching(image, grid, grid.visible.astype(np.float64).reshape(-1))
     try:
-        return _learn(image, found)
-    except ValueError as error:  # of a shape without an edge, of dots that touch
-        picture = draw_seen(image, found.positions[found.seen], found.radius, None)
-        raise TrackerInitError(
-            f"the spots in lines and columns are no dots that can be measured: {error}", picture
-        ) from None
+        return _fit(image, grid)
+    except ValueError as error:  # profile without an edge, or dots that touch
+        picture = draw_detections(image, grid.positions[grid.visible], grid.radius, None)
+        raise TrackerInitError(f"the spots in rows and columns cannot be measured as dots: {error}", picture) from None
 
 
-def _learn(image: NDArray[np.uint8], found: Found) -> tuple[Tracker, Learned]:
-    plane = plane_of(image, found.look.plane).astype(np.float64)
-    window = _Windows(plane, found)
-    oval = window.ovals(found)
-    sign = 1.0 if found.look.bright else -1.0
-    profile = _edge(np.sqrt(np.linspace(0, _REACH**2, PROFILE_STEPS + 1)))
-    seen = found.seen.reshape(-1)
-    contrast = np.full(len(seen), sign * float(np.median(window.depth)))
-    learned = Learned(found.positions.reshape(-1, 2), seen, oval, contrast, profile, 0.02, seen.astype(np.float64))
+def _fit(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, DotModel]:
+    plane = image_plane(image, grid.appearance.plane).astype(np.float64)
+    windows = _DotWindows(plane, grid)
+    ellipse = windows.ellipses(grid)
+    sign = 1.0 if grid.appearance.bright else -1.0
+    profile = _edge(np.sqrt(np.linspace(0, _PROFILE_REACH**2, PROFILE_STEPS + 1)))
+    visible = grid.visible.reshape(-1)
+    contrast = np.full(len(visible), sign * float(np.median(windows.contrast)))
+    quality = visible.astype(np.float64)
+    model = DotModel(grid.positions.reshape(-1, 2), visible, ellipse, contrast, profile, 0.02, quality)
     for _ in range(_ROUNDS):
-        tracker = _tracker(image, found, learned)
-        rest, measured, quality = tracker.start(image)
-        seen = _alike(image, found, quality)
-        contrast = np.where(seen, measured, np.median(measured[seen]))
-        profile, noise = window.profile(rest, oval, seen)
-        learned = replace(learned, contrast=contrast, rest=rest, profile=profile, noise=noise)
-    tracker = _tracker(image, found, learned)
-    rest, _, quality = tracker.start(image)
-    return tracker, replace(learned, rest=rest, seen=_alike(image, found, quality), quality=quality)
+        tracker = _make_tracker(image, grid, model)
+        fit = tracker.start(image)
+        visible = _matching(image, grid, fit.quality)
+        contrast = np.where(visible, fit.contrast, np.median(fit.contrast[visible]))
+        profile, noise = windows.profile(fit.position, ellipse, visible)
+        model = replace(model, contrast=contrast, rest=fit.position, profile=profile, noise=noise)
+    tracker = _make_tracker(image, grid, model)
+    fit = tracker.start(image)
+    visible = _matching(image, grid, fit.quality)
+    return tracker, replace(model, rest=fit.position, visible=visible, quality=fit.quality)
 
 
-def _alike(image: NDArray[np.uint8], found: Found, quality: Floats) -> NDArray[np.bool_]:
-    """Which dots have the common shape."""
-    seen, dots = quality > 0, int(found.seen.sum())
-    if seen.sum() < max(_ALIKE * dots, 6):
+def _matching(image: NDArray[np.uint8], grid: MarkerGrid, quality: Floats) -> NDArray[np.bool_]:
+    """Which dots match the common profile, shape (markers,). Raises TrackerInitError when too few match."""
+    visible, dots = quality > 0, int(grid.visible.sum())
+    if visible.sum() < max(_MIN_MATCHING * dots, 6):
         raise TrackerInitError(
-            f"of {dots} spots in lines and columns only {seen.sum()} look alike: they are no printed markers, "
-            "or too blurred or damaged",
-            draw_seen(image, found.positions[found.seen], found.radius, None),
+            f"only {visible.sum()} of {dots} spots in rows and columns have the same shape: they are not printed "
+            "markers, or too blurred or damaged",
+            draw_detections(image, grid.positions[grid.visible], grid.radius, None),
         )
-    return seen
+    return visible
 
 
-def _tracker(image: NDArray[np.uint8], found: Found, learned: Learned) -> Tracker:
+def _make_tracker(image: NDArray[np.uint8], grid: MarkerGrid, model: DotModel) -> Tracker:
     return Tracker(
         width=image.shape[1],
         height=image.shape[0],
-        channel=PLANES.index(found.look.plane),
-        bright=found.look.bright,
-        rows=found.shape[0],
-        cols=found.shape[1],
-        spacing=found.spacing,
-        radius=found.radius,
-        noise=learned.noise,
-        profile=learned.profile,
-        reach=_REACH**2,
-        rest=learned.rest,
-        seen=learned.seen,
-        oval=learned.oval,
-        contrast=learned.contrast,
+        channel=PLANES.index(grid.appearance.plane),
+        bright=grid.appearance.bright,
+        rows=grid.shape[0],
+        cols=grid.shape[1],
+        spacing=grid.spacing,
+        radius=grid.radius,
+        noise=model.noise,
+        profile=model.profile,
+        profile_reach=_PROFILE_REACH**2,
+        rest=model.rest,
+        visible=model.visible,
+        ellipse=model.ellipse,
+        contrast=model.contrast,
     )
 
 
-class _Windows:
-    """The pixels around each dot that was seen, their offsets from a first guess of its centre, and their light."""
+class _DotWindows:
+    """Pixel windows around the visible dots: values, offsets from the initial centre, and fitted background."""
 
-    def __init__(self, plane: Floats, found: Found) -> None:
-        half = int(np.ceil(min(2.0 * found.radius + 1, 0.5 * found.spacing)))
-        self.seen = np.flatnonzero(found.seen)
-        self.corner = np.round(found.positions.reshape(-1, 2)).astype(np.intp)
+    def __init__(self, plane: Floats, grid: MarkerGrid) -> None:
+        half = int(np.ceil(min(2.0 * grid.radius + 1, 0.5 * grid.spacing)))
+        self.markers = np.flatnonzero(grid.visible)
+        self.centre_pixel = np.round(grid.positions.reshape(-1, 2)).astype(np.intp)
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
-        steps = np.arange(-half, half + 1, max(1, round(found.radius / 4)))  # more pixels would tell no more
+        steps = np.arange(-half, half + 1, max(1, round(grid.radius / 4)))  # denser samples add no information
         down, right = (a.reshape(-1) for a in np.meshgrid(steps, steps, indexing="ij"))
         self.step = np.stack([right, down], axis=1).astype(np.float64)  # shape (pixels, 2)
-        at = np.clip(self.corner[self.seen], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
+        at = np.clip(self.centre_pixel[self.markers], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
         self.pixels = padded[at[:, 1, None] + half + down, at[:, 0, None] + half + right]  # shape (dots, pixels)
-        self.offset = self.step - (found.positions.reshape(-1, 2) - self.corner)[self.seen][:, None]
+        self.offset = self.step - (grid.positions.reshape(-1, 2) - self.centre_pixel)[self.markers][:, None]
         distance = np.linalg.norm(self.offset, axis=-1)
-        self.light = _plane_through(self.pixels, self.step, (distance > 1.6 * found.radius).astype(np.float64))
-        share = self.pixels / np.maximum(self.light, 1.0) - 1
-        inside = distance < 0.6 * found.radius
-        self.depth = np.abs((share * inside).sum(1) / np.maximum(inside.sum(1), 1))
-        sign = 1.0 if found.look.bright else -1.0
-        self.ink = sign * share / np.maximum(self.depth, 1e-3)[:, None]
+        self.background = _fit_planes(self.pixels, self.step, (distance > 1.6 * grid.radius).astype(np.float64))
+        ratio = self.pixels / np.maximum(self.background, 1.0) - 1
+        inside = distance < 0.6 * grid.radius
+        self.contrast = np.abs((ratio * inside).sum(1) / np.maximum(inside.sum(1), 1))
+        sign = 1.0 if grid.appearance.bright else -1.0
+        self.ink = sign * ratio / np.maximum(self.contrast, 1e-3)[:, None]
 
-    def ovals(self, found: Found) -> Floats:
-        """Q of every marker, shape (markers, 3), from the dots' second moments and the grid's local steps."""
-        near = np.linalg.norm(self.offset, axis=-1) < 2.0 * found.radius
-        weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * near
+    def ellipses(self, grid: MarkerGrid) -> Floats:
+        """Q of each marker, shape (markers, 3), from the second moments of the dots and the local grid steps."""
+        inner = np.linalg.norm(self.offset, axis=-1) < 2.0 * grid.radius
+        weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * inner
         total = np.maximum(weight.sum(1), 1e-9)[:, None]
         mean = (weight[:, None] @ self.offset)[:, 0] / total
         off = self.offset - mean[:, None]
         moments = (off * weight[..., None]).transpose(0, 2, 1) @ off / total[..., None]
-        steps = _steps(found)
-        back = np.linalg.inv(steps)
-        # As a share of the steps the print is the same everywhere; a disc of radius 1 has the moments 1/4.
-        common = np.median(back[self.seen] @ moments @ back[self.seen].transpose(0, 2, 1), axis=0)
-        q = back.transpose(0, 2, 1) @ np.linalg.inv(4 * common) @ back
+        steps = _grid_steps(grid)
+        inverse = np.linalg.inv(steps)
+        # In units of the grid steps, all dots have the same moments; a disc of radius 1 has second moments 1/4.
+        common = np.median(inverse[self.markers] @ moments @ inverse[self.markers].transpose(0, 2, 1), axis=0)
+        q = inverse.transpose(0, 2, 1) @ np.linalg.inv(4 * common) @ inverse
         return np.stack([q[:, 0, 0], q[:, 0, 1], q[:, 1, 1]], axis=1)
 
-    def profile(self, rest: Floats, oval: Floats, seen: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
-        """The mean ink over q, as `Learned.profile`, and the noise that is left."""
-        use = seen[self.seen]
-        markers = self.seen[use]
-        off = self.step - (rest - self.corner)[markers][:, None]
-        xx, xy, yy = oval[markers].T[:, :, None]
+    def profile(self, rest: Floats, ellipse: Floats, visible: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+        """The mean profile, as in `DotModel`, and the pixel noise outside the dots."""
+        use = visible[self.markers]
+        markers = self.markers[use]
+        off = self.step - (rest - self.centre_pixel)[markers][:, None]
+        xx, xy, yy = ellipse[markers].T[:, :, None]
         radius = np.sqrt(off[..., 0] ** 2 * xx + 2 * off[..., 0] * off[..., 1] * xy + off[..., 1] ** 2 * yy)
-        light = _plane_through(self.pixels[use], self.step, (radius > 1.7).astype(np.float64))
-        share = self.pixels[use] / np.maximum(light, 1.0) - 1
+        background = _fit_planes(self.pixels[use], self.step, (radius > 1.7).astype(np.float64))
+        ratio = self.pixels[use] / np.maximum(background, 1.0) - 1
         inside = radius < 0.6
-        depth = (share * inside).sum(1) / np.maximum(inside.sum(1), 1)
-        ink = share / np.where(np.abs(depth) > 1e-3, depth, 1e-3)[:, None]
-        ring = np.minimum(radius / _REACH * _RINGS, _RINGS).astype(np.intp)
-        sound = np.abs(ink - _edge(radius)) < 0.75  # not where dots are damaged
+        contrast = (ratio * inside).sum(1) / np.maximum(inside.sum(1), 1)
+        ink = ratio / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3)[:, None]
+        ring = np.minimum(radius / _PROFILE_REACH * _RINGS, _RINGS).astype(np.intp)
+        sound = np.abs(ink - _edge(radius)) < 0.75  # excludes damaged parts of dots
         count = np.bincount(ring[sound], minlength=_RINGS + 1)[:_RINGS]
         total = np.bincount(ring[sound], ink[sound], minlength=_RINGS + 1)[:_RINGS]
-        middle = (np.arange(_RINGS) + 0.5) / _RINGS * _REACH
+        middle = (np.arange(_RINGS) + 0.5) / _RINGS * _PROFILE_REACH
         mean = np.interp(middle, middle[count > 0], total[count > 0] / count[count > 0])
         mean = np.convolve(np.pad(mean, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid")
         mean -= mean[middle > 1.8].mean()
         mean /= mean[middle < 0.6].mean()
-        at = np.sqrt(np.linspace(0, _REACH**2, PROFILE_STEPS + 1))
-        table = np.interp(at, middle, mean, right=0.0) * np.clip((_REACH - at) / 0.3, 0, 1)
-        outside = share[(radius > 1.7) & (radius < 2.0)]
+        at = np.sqrt(np.linspace(0, _PROFILE_REACH**2, PROFILE_STEPS + 1))
+        table = np.interp(at, middle, mean, right=0.0) * np.clip((_PROFILE_REACH - at) / 0.3, 0, 1)
+        outside = ratio[(radius > 1.7) & (radius < 2.0)]
         noise = 1.4826 * float(np.median(np.abs(outside))) if outside.size else 0.02
         return table.astype(np.float32), noise
 
 
-def _plane_through(pixels: Floats, step: Floats, weight: Floats) -> Floats:
-    """The least-squares plane through each window's pixels, shape (windows, pixels)."""
+def _fit_planes(pixels: Floats, step: Floats, weight: Floats) -> Floats:
+    """Weighted least-squares plane through the pixels of each window, shape (windows, pixels)."""
     terms = np.concatenate([np.ones((len(step), 1)), step / np.abs(step).max()], axis=1)
     products = (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
     matrix = (weight @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
@@ -179,21 +181,21 @@ def _plane_through(pixels: Floats, step: Floats, weight: Floats) -> Floats:
     return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0] @ terms.T)
 
 
-def _steps(found: Found) -> Floats:
-    """The grid's local steps to the right and down as columns [px], shape (markers, 2, 2)."""
-    rows, cols = found.shape
+def _grid_steps(grid: MarkerGrid) -> Floats:
+    """Local grid steps (rightward, downward) as matrix columns [px], shape (markers, 2, 2), from a cubic fit."""
+    rows, cols = grid.shape
     degree = min(3, rows - 1, cols - 1)
     down, right = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij")
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     terms = np.stack([right**i * down**j for i, j in powers], axis=-1)
-    weights = np.linalg.lstsq(terms[found.seen], found.positions[found.seen], rcond=None)[0]
-    by_right = np.stack([i * right ** max(i - 1, 0) * down**j for i, j in powers], axis=-1) @ weights
-    by_down = np.stack([j * right**i * down ** max(j - 1, 0) for i, j in powers], axis=-1) @ weights
-    steps = np.stack([by_right * 2 / (cols - 1), by_down * 2 / (rows - 1)], axis=-1)
+    weights = np.linalg.lstsq(terms[grid.visible], grid.positions[grid.visible], rcond=None)[0]
+    along_row = np.stack([i * right ** max(i - 1, 0) * down**j for i, j in powers], axis=-1) @ weights
+    along_column = np.stack([j * right**i * down ** max(j - 1, 0) for i, j in powers], axis=-1) @ weights
+    steps = np.stack([along_row * 2 / (cols - 1), along_column * 2 / (rows - 1)], axis=-1)
     return steps.reshape(-1, 2, 2)
 
 
 def _edge(radius: Floats) -> NDArray[np.float32]:
-    """A first guess of the profile: a smooth step at radius 1."""
+    """Initial profile: a smooth step at radius 1."""
     part = np.clip((1.5 - radius) / 1.0, 0, 1)
     return (part * part * (3 - 2 * part)).astype(np.float32)

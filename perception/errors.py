@@ -1,4 +1,4 @@
-"""Why a first image is no reference, with a picture of what was seen in it."""
+"""The error of a first image that cannot be the reference, with a picture of the detected dots."""
 
 import cv2
 import numpy as np
@@ -8,14 +8,13 @@ from gelflow.errors import PeerError
 
 _DOT = (0, 255, 255)
 _LINE = (255, 180, 0)
-_SHIFT = 4  # OpenCV takes coordinates in 1/16 px
+_SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 class TrackerInitError(PeerError):
-    """The image shows no grid of markers that can be trusted. The message says why.
+    """No grid of markers was reliably found in the first image; the message states the reason.
 
-    `picture` (B G R, uint8) is the image with what was seen drawn over it: yellow rings are dots, blue lines join
-    neighbours of the grid.
+    `picture` (B G R, uint8) is the image with the detections: yellow rings are dots, blue lines join grid neighbours.
     """
 
     def __init__(self, reason: str, picture: NDArray[np.uint8]) -> None:
@@ -23,19 +22,19 @@ class TrackerInitError(PeerError):
         self.picture = picture
 
 
-def draw_seen(
+def draw_detections(
     image: NDArray[np.uint8], centers: NDArray[np.float64], radius: float, grid: NDArray[np.intp] | None
 ) -> NDArray[np.uint8]:
     """`image` (B G R) with rings of `radius` [px] around `centers` (right, down) [px], shape (n, 2).
 
-    `grid`, shape (lines, columns), has the number of the dot at each node, −1 where there is none.
+    `grid`, shape (rows, columns), holds the index of the dot at each node, −1 without a dot.
     """
     picture = image.copy()
     fixed = np.round(centers * 2**_SHIFT).astype(np.int32)
     if grid is not None:
         for one, two in ((grid[:, :-1], grid[:, 1:]), (grid[:-1], grid[1:])):
-            both = (one >= 0) & (two >= 0)
-            lines = np.stack([fixed[one[both]], fixed[two[both]]], axis=1)
+            joined = (one >= 0) & (two >= 0)
+            lines = np.stack([fixed[one[joined]], fixed[two[joined]]], axis=1)
             cv2.polylines(picture, list(lines), False, _LINE, 1, cv2.LINE_AA, _SHIFT)
     for right, down in fixed.tolist():
         cv2.circle(picture, (right, down), round((radius + 1) * 2**_SHIFT), _DOT, 1, cv2.LINE_AA, _SHIFT)

@@ -1,4 +1,4 @@
-"""From received bytes and tracked markers to tactile frames: the camera's edge of the observation format."""
+"""Camera images to tactile frames: decoding, the mounting of a camera, and conversion to the pad frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,26 +15,26 @@ from gelflow.perception.tracker import TrackerConfig, TrackingResult
 
 Image = NDArray[np.uint8]
 
-ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # how the bytes of JPEG and PNG start
+ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG files
 
 
 @dataclass(frozen=True)
 class CameraMount:
-    """How a camera looks at its pad, and the grid of markers that is printed there.
+    """Orientation of a camera relative to its pad, the printed grid of markers, and the scale.
 
-    Millimetres come from its `calibration`, or from one scale where perspective and lens don't matter.
-    At rotation 0 the finger's tip is at the image's bottom; the rotation is that of the image against this,
-    clockwise. Seen from behind (`mirrored`) the pad's y then points to the left, otherwise to the right.
+    Millimetres come from `calibration`, or from `pixels_per_mm` where perspective and lens distortion are negligible.
+    At rotation 0 the fingertip is at the bottom of the image; the pad's y axis points left if `mirrored`, else right;
+    `rotation` turns the image clockwise.
     """
 
-    rows: int = 18  # markers from the finger's base to its tip
+    rows: int = 18  # markers from the base to the tip of the finger
     cols: int = 14  # markers across
-    pitch: float = 1.4  # distance between neighbouring markers on the gel at rest [mm]
-    center: tuple[float, float] = (2.0, 0.0)  # (x, y) of the grid's centre on the pad [mm]
+    pitch: float = 1.4  # marker spacing on the gel at rest [mm]
+    center: tuple[float, float] = (2.0, 0.0)  # (x, y) of the grid centre on the pad [mm]
     rotation: Literal[0, 90, 180, 270] = 0  # of the image, clockwise [deg]
-    mirrored: bool = True  # the camera sees the gel from behind
-    pixels_per_mm: float | None = None  # the same everywhere in the image
-    calibration: Calibration | None = None  # exact everywhere; with neither, frames are in px
+    mirrored: bool = True  # the camera views the gel from behind
+    pixels_per_mm: float | None = None  # uniform scale
+    calibration: Calibration | None = None  # position-dependent scale; with neither of both, frames are in px
 
     def __post_init__(self) -> None:
         if self.rotation not in (0, 90, 180, 270):
@@ -44,54 +44,57 @@ class CameraMount:
         if self.pixels_per_mm is not None and self.calibration is not None:
             raise UsageError("a camera has a calibration or pixels_per_mm, not both")
         self._check_calibration()
-        _ = self.grid  # refuses impossible numbers of rows and columns, and pitches
+        _ = self.grid  # raises UsageError for invalid rows, cols and pitch
 
     def _check_calibration(self) -> None:
         c = self.calibration
         if c is not None and (c.rows, c.cols, c.spacing_mm) != (*self.image_grid, self.pitch):
-            lines, across = self.image_grid
+            rows, cols = self.image_grid
             raise UsageError(
-                f"the calibration is of {c.rows} lines of {c.cols} markers, {c.spacing_mm:g} mm apart; the mount says "
-                f"{lines} lines of {across}, {self.pitch:g} mm apart"
+                f"the calibration is for {c.rows} rows of {c.cols} markers with spacing {c.spacing_mm:g} mm; the mount "
+                f"has {rows} rows of {cols} with spacing {self.pitch:g} mm"
             )
 
     @property
     def grid(self) -> Grid:
-        """The printed markers on the pad."""
+        """The printed grid of markers in the pad frame."""
         return Grid(self.rows, self.cols, self.pitch, self.center)
 
     @property
     def image_grid(self) -> tuple[int, int]:
-        """(lines, markers in a line) of the grid as it lies in the image."""
+        """(rows, columns) of the grid in the image."""
         return (self.cols, self.rows) if self.rotation in (90, 270) else (self.rows, self.cols)
 
     def tracker_config(self, *, polarity: Literal["auto", "dark", "bright"] = "auto") -> TrackerConfig:
-        """Settings for a tracker that expects this grid, and in this direction."""
-        lines, across = self.image_grid
-        return TrackerConfig(rows=lines, cols=across, either_way=False, polarity=polarity)
+        """Tracker configuration for this grid in this orientation."""
+        rows, cols = self.image_grid
+        return TrackerConfig(rows=rows, cols=cols, either_way=False, polarity=polarity)
 
-    def order(self) -> NDArray[np.intp]:
-        """For each marker of the pad (row by row) its place among the image's (line by line), shape (markers,)."""
-        lines, across = self.image_grid
-        numbers = np.arange(lines * across).reshape(lines, across)
-        turned = np.rot90(numbers, k=self.rotation // 90)  # against the clock: back to the tip at the bottom
-        return np.ascontiguousarray(turned[:, ::-1] if self.mirrored else turned).reshape(-1)
+    def marker_order(self) -> NDArray[np.intp]:
+        """Index in the image (row by row) of each marker of the pad (row by row), shape (markers,)."""
+        rows, cols = self.image_grid
+        index = np.arange(rows * cols).reshape(rows, cols)
+        rotated = np.rot90(index, k=self.rotation // 90)  # counterclockwise: fingertip at the bottom
+        return np.ascontiguousarray(rotated[:, ::-1] if self.mirrored else rotated).reshape(-1)
 
     @property
     def unit(self) -> Literal["mm", "px"]:
-        """What displacements are known in."""
+        """Unit of the displacements."""
         return "px" if self.calibration is None and self.pixels_per_mm is None else "mm"
 
-    def displacement_mm(self, tracked: TrackingResult) -> NDArray[np.float64]:
-        """Displacements in the image's axes (right, down) [mm], shape (markers, 2). Raises UsageError in "px"."""
+    def displacement_mm(self, result: TrackingResult) -> NDArray[np.float64]:
+        """Displacements along the image axes (right, down) [mm], shape (markers, 2).
+
+        Raises UsageError when the unit is "px".
+        """
         if self.calibration is not None:
-            return self.calibration.displacement_mm(tracked.position, tracked.displacement)
+            return self.calibration.displacement_mm(result.position, result.displacement)
         if self.pixels_per_mm is None:
-            raise UsageError("this camera's millimetres are not known: give the mount a calibration or pixels_per_mm")
-        return tracked.displacement / self.pixels_per_mm
+            raise UsageError("the scale of this camera is unknown: give the mount a calibration or pixels_per_mm")
+        return result.displacement / self.pixels_per_mm
 
     def to_pad(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Vectors in the image (right, down), shape (n, 2), as (x, y) on the pad, in the same unit."""
+        """Image vectors (right, down), shape (n, 2), as (x, y) in the pad frame, in the same unit."""
         right, down = vectors[:, 0], vectors[:, 1]
         for _ in range(self.rotation // 90):
             right, down = down, -right
@@ -99,43 +102,44 @@ class CameraMount:
 
 
 def decode_image(data: bytes) -> Image:
-    """The image in `data` (JPEG or PNG) as B G R, uint8, shape (height, width, 3).
+    """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3).
 
-    Raises PeerError when the bytes are no image. Live and replay both decode here, so that they see the same.
+    The runner and replay both use this function, so that they process identical images. Raises PeerError when the
+    bytes are not an image.
     """
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
-        start = f"are none (they start with {data[:8].hex(' ') or 'nothing'})"
+        problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
         if data.startswith(ENCODED):
-            start = "start like one and can not be decoded: cut off, or damaged"
-        raise PeerError(f"expected a JPEG or PNG image, got {len(data)} bytes that {start}")
+            problem = "cannot be decoded: truncated or damaged"
+        raise PeerError(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
     return np.asarray(image, dtype=np.uint8)
 
 
-def tactile_frame(trackeds: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
-    """What all sensors felt: one tracked image and one mount per sensor, sensor 0 (the left finger) first.
+def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
+    """The tactile frame of all sensors: one tracking result and one mount per sensor, sensor 0 (left finger) first.
 
-    The unit is "mm" when every mount knows it, otherwise "px". Raises UsageError when the numbers of images
-    and mounts differ, the pads have different grids, or a tracked grid is not the mount's.
+    The unit is "mm" if every mount has a scale, otherwise "px"; `stamp` is in seconds. Raises UsageError when the
+    numbers of results and mounts differ, the pads have different grids, or a tracked grid is not that of its mount.
     """
-    if not trackeds or len(trackeds) != len(mounts):
-        raise UsageError(f"expected one tracked image per mount, got {len(trackeds)} images and {len(mounts)} mounts")
+    if not results or len(results) != len(mounts):
+        raise UsageError(f"expected one tracking result per mount, got {len(results)} results, {len(mounts)} mounts")
     if any(mount.grid != mounts[0].grid for mount in mounts):
         raise UsageError("the sensors of one frame must have the same grid of markers")
     unit: Literal["mm", "px"] = "px" if any(mount.unit == "px" for mount in mounts) else "mm"
     grid = mounts[0].grid
     shear = np.zeros((len(mounts), grid.rows * grid.cols, 2), dtype=np.float32)
     valid = np.zeros(shear.shape[:2], dtype=bool)
-    for sensor, (tracked, mount) in enumerate(zip(trackeds, mounts, strict=True)):
-        if (tracked.rows, tracked.cols) != mount.image_grid:
-            lines, across = mount.image_grid
+    for sensor, (result, mount) in enumerate(zip(results, mounts, strict=True)):
+        if (result.rows, result.cols) != mount.image_grid:
+            rows, cols = mount.image_grid
             raise UsageError(
-                f"sensor {sensor} shows {tracked.rows} lines of {tracked.cols} markers, its mount "
-                f"({mount.rows} × {mount.cols}, turned {mount.rotation}°) expects {lines} lines of {across}"
+                f"sensor {sensor} shows {result.rows} rows of {result.cols} markers, its mount "
+                f"({mount.rows} × {mount.cols}, rotated by {mount.rotation}°) expects {rows} rows of {cols}"
             )
-        order = mount.order()
-        valid[sensor] = tracked.valid[order]
-        displacement = mount.displacement_mm(tracked) if unit == "mm" else tracked.displacement
+        order = mount.marker_order()
+        valid[sensor] = result.valid[order]
+        displacement = mount.displacement_mm(result) if unit == "mm" else result.displacement
         vectors = mount.to_pad(displacement[order])
         shear[sensor] = np.where(valid[sensor, :, None], vectors, np.nan)
     return TactileFrame(shear, valid, grid.positions().astype(np.float32), stamp, unit, grid=grid)

@@ -1,4 +1,4 @@
-"""The grid of markers in a first image, with nothing known but, perhaps, how many lines and columns it has."""
+"""Finds the grid of markers in a first image. The numbers of rows and columns are optional."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -7,42 +7,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.perception.detect import BRIGHT, DARK, Dots, Look, contrast, find_dots, smaller
-from gelflow.perception.errors import TrackerInitError, draw_seen
-from gelflow.perception.lattice import Lattice, fill, grow
+from gelflow.perception.detect import BRIGHT, DARK, DetectedDots, DotAppearance, detect_dots, downsample, local_contrast
+from gelflow.perception.errors import TrackerInitError, draw_detections
+from gelflow.perception.lattice import Lattice, fill_from_neighbours, grow_lattice
 
 Polarity = Literal["auto", "dark", "bright"]
 
-_RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of dots that are looked for [px], in an image of about _SEARCH px
-_SEARCH = 360
-_MOST = 2500  # dots beyond these, in order of contrast, are texture
-_BETWEEN = 0.4  # dots between a grid's lines, for each on them, from which on it is another grid
-_UNEVEN = 0.12  # a grid whose nodes are further from the middle of their neighbours (share of spacing) is chance
+_RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of the searched dots [px], in an image of about _SEARCH_SIZE px
+_SEARCH_SIZE = 360
+_MAX_DOTS = 2500  # weaker dots are texture
+_MAX_BETWEEN = 0.4  # limit of (dots between the rows and columns) / (dots of the grid)
+_MAX_IRREGULARITY = 0.12  # limit of `Lattice.irregularity`
 
 
 @dataclass(frozen=True)
-class Found:
-    """A grid of markers at rest, as the first image shows it. Lines run downwards, columns to the right."""
+class MarkerGrid:
+    """The grid of markers at rest in the first image. Rows run downwards, columns rightwards."""
 
-    look: Look
+    appearance: DotAppearance
     radius: float  # of a dot [px]
-    spacing: float  # between neighbours [px]
-    positions: NDArray[np.float64]  # (right, down) [px], shape (lines, columns, 2); unseen ones are interpolated
-    seen: NDArray[np.bool_]  # shape (lines, columns)
+    spacing: float  # of neighbouring markers [px]
+    positions: NDArray[np.float64]  # (right, down) [px], shape (rows, columns, 2); interpolated where not visible
+    visible: NDArray[np.bool_]  # shape (rows, columns)
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.seen.shape[0], self.seen.shape[1]
+        return self.visible.shape[0], self.visible.shape[1]
 
-    def scaled(self, factor: float) -> "Found":
-        """The same grid in an image made larger by `factor`, or smaller."""
-        places = (self.positions + 0.5) * factor - 0.5
-        return replace(self, radius=factor * self.radius, spacing=factor * self.spacing, positions=places)
+    def scaled(self, factor: float) -> "MarkerGrid":
+        """The same grid in the image scaled by `factor`."""
+        positions = (self.positions + 0.5) * factor - 0.5
+        return replace(self, radius=factor * self.radius, spacing=factor * self.spacing, positions=positions)
 
 
-def surroundings(spacing: float) -> int:
-    """Side of the box [px] that a dot is compared with: one period, so that a regular grid leaves no ripple."""
-    return max(round(spacing), 3) | 1
+@dataclass(frozen=True)
+class _Request:
+    """The grid that the caller expects."""
+
+    rows: int | None
+    cols: int | None
+    shapes: tuple[tuple[int, int], ...]  # accepted (rows, columns); empty: any
+    polarity: Polarity
 
 
 def find_grid(
@@ -52,154 +57,172 @@ def find_grid(
     cols: int | None = None,
     either_way: bool = True,
     polarity: Polarity = "auto",
-) -> Found:
+) -> MarkerGrid:
     """Finds the grid of markers in `image` (B G R).
 
-    With `rows` and `cols` the grid has that many lines and columns (with `either_way`, or the other way round);
-    lines beyond, which the image's border cuts, are left out. Without, every line that is mostly there counts.
-    Raises TrackerInitError when there is no grid, or one of other rows and columns than asked for; UsageError when no
-    grid can have these.
+    With `rows` and `cols`, the grid has this shape or, with `either_way`, the transposed one; further lines that the
+    image border cuts are ignored. Without them, the grid consists of all lines that are mostly visible. Raises
+    TrackerInitError when no grid or a grid of another shape is found, UsageError for impossible `rows` and `cols`.
     """
-    wanted = _wanted(rows, cols, either_way)
-    shrink = max(1, round(max(image.shape[:2]) / _SEARCH))
-    small = smaller(image, shrink)
-    looks = _looks(small, polarity)
-    best = _search(small, looks)
+    request = _Request(rows, cols, _accepted_shapes(rows, cols, either_way), polarity)
+    shrink = max(1, round(max(image.shape[:2]) / _SEARCH_SIZE))
+    small = downsample(image, shrink)
+    appearances = _candidate_appearances(small, polarity)
+    best = _search(small, appearances)
     if best is None:
-        raise _nothing(image, looks[0], polarity)
-    look, radius, spacing = best
-    # Once more, now that radius and spacing are known.
-    dots = _likely(find_dots(contrast(small, look, surroundings(spacing)), radius=radius, apart=0.4 * spacing))
-    lattice = grow(dots.centers)
-    refusal, part = _distrust(lattice, dots, polarity), None
-    if lattice is not None and not refusal:
-        refusal, part = _window(lattice, dots, rows, cols, wanted)
+        raise _no_grid_error(image, appearances[0], polarity)
+    appearance, radius, spacing = best
+    # Repeats the detection with the estimated radius and spacing.
+    response = local_contrast(small, appearance, _background_window(spacing))
+    dots = _plausible(detect_dots(response, radius=radius, min_distance=0.4 * spacing))
+    lattice = grow_lattice(dots.centers)
+    reason, part = _rejection_reason(lattice, dots, polarity), None
+    if lattice is not None and not reason:
+        reason, part = _select_part(lattice, dots, request)
     if part is None:
-        raise TrackerInitError(refusal, draw_seen(small, dots.centers, radius, lattice.dots if lattice else None))
-    return _found(look, part, dots).scaled(shrink)
+        raise TrackerInitError(reason, draw_detections(small, dots.centers, radius, lattice.dots if lattice else None))
+    return _marker_grid(appearance, part, dots).scaled(shrink)
 
 
-def _looks(image: NDArray[np.uint8], polarity: Polarity) -> tuple[Look, ...]:
-    """The looks to try, likely ones first: dots are few pixels, far from the mean on one side."""
+def _background_window(spacing: float) -> int:
+    """Side of the box of the local mean [px]: one period, so that a regular grid leaves no ripple."""
+    return max(round(spacing), 3) | 1
+
+
+def _candidate_appearances(image: NDArray[np.uint8], polarity: Polarity) -> tuple[DotAppearance, ...]:
+    """The appearances to try, likely ones first: dots are a minority of pixels, so the contrast is skewed."""
     if polarity != "auto":
         return DARK if polarity == "dark" else BRIGHT
-    stands_out = contrast(image, BRIGHT[0], round(5 * _RADII[2]))
-    return BRIGHT + DARK if float((stands_out**3).mean()) > 0 else DARK + BRIGHT
+    response = local_contrast(image, BRIGHT[0], round(5 * _RADII[2]))
+    return BRIGHT + DARK if float((response**3).mean()) > 0 else DARK + BRIGHT
 
 
-def _nothing(image: NDArray[np.uint8], look: Look, polarity: Polarity) -> TrackerInitError:
-    """The refusal of an image without a grid, by what stands out in it."""
+def _no_grid_error(image: NDArray[np.uint8], appearance: DotAppearance, polarity: Polarity) -> TrackerInitError:
+    """The error for an image without a grid, with the number of detected dots."""
     sizes = [
-        (r, find_dots(contrast(image, look, round(5 * r)), radius=r, apart=1.5 * r, least=0.1)) for r in _RADII[::2]
+        (
+            r,
+            detect_dots(local_contrast(image, appearance, round(5 * r)), radius=r, min_distance=1.5 * r, threshold=0.1),
+        )
+        for r in _RADII[::2]
     ]
     radius, dots = max(sizes, key=lambda size: len(size[1]))
-    if len(dots) > _MOST:
-        seen = f"{len(dots)} spots stand out, and a grid of markers has at most {_MOST}"
+    if len(dots) > _MAX_DOTS:
+        found = f"{len(dots)} dots detected, a grid of markers has at most {_MAX_DOTS}"
     elif len(dots) >= 9:
-        seen = f"{len(dots)} spots stand out, but they form no lines and columns"
+        found = f"{len(dots)} dots detected, they form no rows and columns"
     else:
-        seen = f"{len(dots) or 'no'} dots stand out, and a grid of markers has at least 3 × 3"
-    picture = draw_seen(image, dots.centers, radius, None)
-    return TrackerInitError(f"no grid of markers found in the image: {seen}{_hint(polarity)}", picture)
+        found = f"{len(dots) or 'no'} dots detected, a grid of markers has at least 3 × 3"
+    picture = draw_detections(image, dots.centers, radius, None)
+    return TrackerInitError(f"no grid of markers found in the image: {found}{_hint(polarity)}", picture)
 
 
 def _hint(polarity: Polarity) -> str:
-    other = {"dark": " (looked for dark dots only)", "bright": " (looked for bright dots only)", "auto": ""}
-    return f"{other[polarity]}; check light, focus and that it shows a gel"
+    restriction = {"dark": " (only dark dots were searched)", "bright": " (only bright dots were searched)", "auto": ""}
+    return f"{restriction[polarity]}; check illumination, focus and that the image shows a gel"
 
 
-def _wanted(rows: int | None, cols: int | None, either_way: bool) -> list[tuple[int, int]]:
+def _accepted_shapes(rows: int | None, cols: int | None, either_way: bool) -> tuple[tuple[int, int], ...]:
     if rows is None and cols is None:
-        return []
+        return ()
     if rows is None or cols is None:
         raise UsageError("give both rows and cols of the grid of markers, or neither")
     if min(rows, cols) < 3 or max(rows, cols) > 200:
         raise UsageError(f"a grid of markers has 3 to 200 rows and columns, got {rows} × {cols}")
-    return [(rows, cols), (cols, rows)] if either_way and rows != cols else [(rows, cols)]
+    return ((rows, cols), (cols, rows)) if either_way and rows != cols else ((rows, cols),)
 
 
-def _likely(dots: Dots) -> Dots:
-    """Without slivers and blots, and not more than can be meant."""
-    if len(dots) > _MOST:
-        dots = dots.only(np.sort(np.argsort(-dots.peaks, kind="stable")[:_MOST]))
+def _plausible(dots: DetectedDots) -> DetectedDots:
+    """The strongest dots, without those of unusual area."""
+    if len(dots) > _MAX_DOTS:
+        dots = dots.select(np.sort(np.argsort(-dots.peaks, kind="stable")[:_MAX_DOTS]))
     if len(dots) < 9:
         return dots
-    middle = np.median(dots.areas)
-    return dots.only((dots.areas > 0.3 * middle) & (dots.areas < 3 * middle))
+    median = np.median(dots.areas)
+    return dots.select((dots.areas > 0.3 * median) & (dots.areas < 3 * median))
 
 
-def _distrust(lattice: Lattice | None, dots: Dots, polarity: Polarity) -> str:
-    """Why this is no grid of markers; empty when it may be one."""
-    if lattice is None or lattice.unevenness > _UNEVEN:
+def _rejection_reason(lattice: Lattice | None, dots: DetectedDots, polarity: Polarity) -> str:
+    """The reason why `lattice` is not a grid of markers; empty if it may be one."""
+    if lattice is None or lattice.irregularity > _MAX_IRREGULARITY:
         return f"no regular grid of markers found in the image{_hint(polarity)}"
-    between = _between(lattice, dots)
-    if between > _BETWEEN * lattice.found:
+    between = _count_between(lattice, dots)
+    if between > _MAX_BETWEEN * lattice.dot_count:
         return (
-            f"{between} dots lie between the lines of the {lattice.found} that form a grid: "
-            "no markers, or a grid turned by more than 30° in the image"
+            f"{between} dots lie between the rows and columns of the {lattice.dot_count} that form a grid: "
+            "not markers, or a grid rotated by more than 30° in the image"
         )
     return ""
 
 
-def _between(lattice: Lattice, dots: Dots) -> int:
-    """How many dots lie among those of the grid but are none of them: of a grid of diagonals, as many as it has."""
-    number = lattice.dots[lattice.dots >= 0]
-    low, high = dots.centers[number].min(axis=0), dots.centers[number].max(axis=0)
-    among = ((dots.centers > low) & (dots.centers < high)).all(axis=1)
-    among[number] = False
-    return int(among.sum())
+def _count_between(lattice: Lattice, dots: DetectedDots) -> int:
+    """Number of dots inside the grid that do not belong to it. A grid of diagonals has as many as its own dots."""
+    index = lattice.dots[lattice.dots >= 0]
+    low, high = dots.centers[index].min(axis=0), dots.centers[index].max(axis=0)
+    between = ((dots.centers > low) & (dots.centers < high)).all(axis=1)
+    between[index] = False
+    return int(between.sum())
 
 
-def _radius(dots: Dots, lattice: Lattice) -> float:
+def _dot_radius(dots: DetectedDots, lattice: Lattice) -> float:
     return float(np.sqrt(np.median(dots.areas[lattice.dots[lattice.dots >= 0]]) / np.pi))
 
 
-def _full(lattice: Lattice, dots: Dots) -> NDArray[np.float64]:
-    """1 at nodes with a whole dot, a little at nodes with a cut one, 0 elsewhere, shape (lines, columns)."""
-    there = lattice.dots >= 0
-    return np.where(there, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
+def _completeness(lattice: Lattice, dots: DetectedDots) -> NDArray[np.float64]:
+    """1 at nodes with an entire dot, 0.01 at nodes with a cut one, 0 elsewhere, shape (rows, columns)."""
+    occupied = lattice.dots >= 0
+    return np.where(occupied, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
 
 
-def _search(image: NDArray[np.uint8], looks: tuple[Look, ...]) -> tuple[Look, float, float] | None:
-    """The look, radius and spacing [px] that give the best grid: many dots, few gaps, even steps, clear dots."""
+def _search(
+    image: NDArray[np.uint8], appearances: tuple[DotAppearance, ...]
+) -> tuple[DotAppearance, float, float] | None:
+    """Appearance, dot radius and spacing [px] of the best grid: many dots, few gaps, regular steps, high contrast."""
     best, best_score = None, 0.0
-    for look in looks:
+    for appearance in appearances:
         for radius in _RADII:
-            response = contrast(image, look, round(5 * radius))
-            dots = _likely(find_dots(response, radius=radius, apart=1.5 * radius))
-            lattice = grow(dots.centers)
-            if lattice is None or lattice.unevenness > _UNEVEN or _are_gaps(response, dots, lattice):
+            response = local_contrast(image, appearance, round(5 * radius))
+            dots = _plausible(detect_dots(response, radius=radius, min_distance=1.5 * radius))
+            lattice = grow_lattice(dots.centers)
+            if lattice is None or lattice.irregularity > _MAX_IRREGULARITY or _are_gaps(response, dots, lattice):
                 continue
-            full = _full(lattice, dots)
-            top, bottom, left, right = _trim(full)
-            inner = full[top:bottom, left:right]
-            texture = 1.5 * float(np.median(np.abs(response[::3, ::3]))) + 1e-3
-            clear = float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) / texture
-            share = float(inner.mean())
-            score = float(inner.sum()) * share * (1 - lattice.unevenness / _UNEVEN) * clear / (clear + 4)
+            score, certain = _score(response, dots, lattice)
             if score > best_score:
-                best, best_score = (look, _radius(dots, lattice), lattice.spacing), score
-            if clear > 4 and share > 0.85 and lattice.unevenness < 0.5 * _UNEVEN and inner.sum() > 0.8 * len(dots):
+                best, best_score = (appearance, _dot_radius(dots, lattice), lattice.spacing), score
+            if certain:
                 return best
     return best
 
 
-def _are_gaps(response: NDArray[np.float32], dots: Dots, lattice: Lattice) -> bool:
-    """Whether this is the grid of the gaps between dots, which are a little brighter than the mean of dots and gel.
+def _score(response: NDArray[np.float32], dots: DetectedDots, lattice: Lattice) -> tuple[float, bool]:
+    """Score of a grid, and whether the search can stop with it."""
+    completeness = _completeness(lattice, dots)
+    top, bottom, left, right = _trim(completeness)
+    inner = completeness[top:bottom, left:right]
+    texture = 1.5 * float(np.median(np.abs(response[::3, ::3]))) + 1e-3
+    clear = float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) / texture
+    share = float(inner.mean())
+    score = float(inner.sum()) * share * (1 - lattice.irregularity / _MAX_IRREGULARITY) * clear / (clear + 4)
+    regular = lattice.irregularity < 0.5 * _MAX_IRREGULARITY
+    return score, clear > 4 and share > 0.85 and regular and bool(inner.sum() > 0.8 * len(dots))
 
-    Then the opposite contrast, that of the dots, is by far the larger one.
+
+def _are_gaps(response: NDArray[np.float32], dots: DetectedDots, lattice: Lattice) -> bool:
+    """Whether `lattice` is the grid of the gaps between dots, which differ slightly from the mean of dots and gel.
+
+    The opposite contrast, that of the dots, is then much larger.
     """
     opposite = -float(np.quantile(response[::3, ::3], 0.01))
     return float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) < 0.5 * opposite
 
 
-def _trim(full: NDArray[np.float64]) -> tuple[int, int, int, int]:
-    """The part of the grid whose outer lines are mostly there: top, bottom, left, right."""
-    top, bottom, left, right = 0, full.shape[0], 0, full.shape[1]
+def _trim(completeness: NDArray[np.float64]) -> tuple[int, int, int, int]:
+    """The part of the grid whose outer lines are mostly complete: top, bottom, left, right."""
+    top, bottom, left, right = 0, completeness.shape[0], 0, completeness.shape[1]
     while bottom - top >= 3 and right - left >= 3:
-        part = full[top:bottom, left:right]
-        lines, columns = part.mean(axis=1), part.mean(axis=0)
-        edges = (lines[0], lines[-1], columns[0], columns[-1])
+        part = completeness[top:bottom, left:right]
+        rows, columns = part.mean(axis=1), part.mean(axis=0)
+        edges = (rows[0], rows[-1], columns[0], columns[-1])
         worst = int(np.argmin(edges))
         if edges[worst] >= 0.6:
             break
@@ -208,51 +231,50 @@ def _trim(full: NDArray[np.float64]) -> tuple[int, int, int, int]:
     return top, bottom, left, right
 
 
-def _best(full: NDArray[np.float64], rows: int, cols: int) -> tuple[float, int, int, float]:
-    """Most dots in a window of rows × cols: (how many, its top, its left, how many in the next best)."""
-    if rows > full.shape[0] or cols > full.shape[1]:
+def _best_window(completeness: NDArray[np.float64], rows: int, cols: int) -> tuple[float, int, int, float]:
+    """The window of rows × cols with the most dots: (dots, top, left, dots of the second best window)."""
+    if rows > completeness.shape[0] or cols > completeness.shape[1]:
         return 0.0, 0, 0, 0.0
-    total = np.pad(full.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    total = np.pad(completeness.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
     top, left = np.unravel_index(int(sums.argmax()), sums.shape)
     others = np.delete(sums.reshape(-1), int(sums.argmax()))
     return float(sums.max()), int(top), int(left), float(others.max()) if len(others) else 0.0
 
 
-def _window(
-    lattice: Lattice, dots: Dots, rows: int | None, cols: int | None, wanted: list[tuple[int, int]]
-) -> tuple[str, Lattice | None]:
-    """The part of `lattice` that is the printed grid; none, and why, when that is not clear."""
-    full = _full(lattice, dots)
-    top, bottom, left, right = _trim(full)
-    if not wanted:
+def _select_part(lattice: Lattice, dots: DetectedDots, request: _Request) -> tuple[str, Lattice | None]:
+    """The part of `lattice` that is the printed grid, or None and the reason when it is ambiguous."""
+    completeness = _completeness(lattice, dots)
+    top, bottom, left, right = _trim(completeness)
+    if not request.shapes:
         if bottom - top < 3 or right - left < 3:
-            return "the grid of markers in the image has fewer than 3 × 3 whole dots", None
-        return "", Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.unevenness)
-    size, window = max(((size, _best(full, *size)) for size in wanted), key=lambda choice: choice[1][0])
-    count, top_best, left_best, second = window
-    seen = f"the image shows {bottom - top} lines of {right - left} whole markers, not the {rows} × {cols} asked for"
+            return "the grid of markers in the image has fewer than 3 × 3 entire dots", None
+        return "", Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.irregularity)
+    windows = ((size, _best_window(completeness, *size)) for size in request.shapes)
+    size, (count, top_best, left_best, second) = max(windows, key=lambda choice: choice[1][0])
+    found = f"the image shows {bottom - top} rows of {right - left} entire markers"
+    found += f", expected {request.rows} × {request.cols}"
     if count < 0.7 * size[0] * size[1]:
-        return f"{seen}: correct rows and columns, or leave them out to have them found", None
+        return f"{found}: correct rows and columns, or leave them out to detect them", None
     if count - second < 0.25 * min(size):
-        return f"{seen}, and which lines to leave out is not clear: correct rows and columns", None
+        return f"{found}, and it is ambiguous which lines to ignore: correct rows and columns", None
     part = lattice.dots[top_best : top_best + size[0], left_best : left_best + size[1]]
-    return "", Lattice(part, lattice.spacing, lattice.unevenness)
+    return "", Lattice(part, lattice.spacing, lattice.irregularity)
 
 
-def _found(look: Look, lattice: Lattice, dots: Dots) -> Found:
-    number = lattice.dots
-    middle = float(np.median(dots.areas[number[number >= 0]]))
-    area = dots.areas[number]
-    seen = (number >= 0) & dots.inside[number] & (area > 0.4 * middle) & (area < 2.0 * middle)
-    positions = _interpolate(dots.centers[number], number >= 0)
-    return Found(look, float(np.sqrt(middle / np.pi)), lattice.spacing, positions, seen)
+def _marker_grid(appearance: DotAppearance, lattice: Lattice, dots: DetectedDots) -> MarkerGrid:
+    index = lattice.dots
+    median = float(np.median(dots.areas[index[index >= 0]]))
+    area = dots.areas[index]
+    visible = (index >= 0) & dots.inside[index] & (area > 0.4 * median) & (area < 2.0 * median)
+    positions = _interpolate(dots.centers[index], index >= 0)
+    return MarkerGrid(appearance, float(np.sqrt(median / np.pi)), lattice.spacing, positions, visible)
 
 
 def _interpolate(positions: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Fills in unknown nodes: the plane through all nodes, corrected by how the known neighbours deviate from it."""
-    line, column = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij")
-    terms = np.stack([np.ones_like(line), line, column, line * column], axis=-1)
-    plane = terms @ np.linalg.lstsq(terms[known], positions[known], rcond=None)[0]
-    off = fill(positions - plane, known)
-    return np.where(known[..., None], positions, plane + off)
+    """Interpolates unknown nodes: a bilinear fit to the known nodes plus the deviation of the neighbours from it."""
+    row, column = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij")
+    terms = np.stack([np.ones_like(row), row, column, row * column], axis=-1)
+    fit = terms @ np.linalg.lstsq(terms[known], positions[known], rcond=None)[0]
+    deviation = fill_from_neighbours(positions - fit, known)
+    return np.where(known[..., None], positions, fit + deviation)

@@ -1,7 +1,7 @@
-"""From loose dots to a grid: which dot is in which line and column.
+"""Arranges detected dots in a grid of rows and columns.
 
-The grid is grown from a regular spot outwards, each step guided by the local distances, so that it follows a lens's
-or the gel's distortion and goes around dots that are missing. It may be turned by up to about 30° in the image.
+The grid grows outwards from a regular region. Each step uses the local grid vectors, so that it follows the distortion
+of lens and gel and passes around missing dots. The grid may be rotated by up to about 30° in the image.
 """
 
 from dataclasses import dataclass
@@ -12,31 +12,31 @@ from scipy.spatial import cKDTree
 
 Points = NDArray[np.float64]
 
-_ANGLE = np.deg2rad(35)  # a neighbour to the right, or below, is looked for within this angle of the image's axes
-_NEAR = 0.3  # of the spacing: how far from the expected place a neighbour may be
-_SEEDS = 3  # regular spots from which growth is tried
+_ANGLE = np.deg2rad(35)  # largest angle between a step of the grid and the image axis
+_TOLERANCE = 0.3  # largest distance of a neighbour from its predicted position / spacing
+_SEEDS = 3  # start dots
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Dots arranged in lines (downwards) and columns (to the right)."""
+    """Dots arranged in rows (downwards) and columns (rightwards)."""
 
-    dots: NDArray[np.intp]  # number of the dot at each node, −1 where there is none, shape (lines, columns)
+    dots: NDArray[np.intp]  # index of the dot at each node, −1 without a dot, shape (rows, columns)
     spacing: float  # typical distance between neighbours [px]
-    unevenness: float  # median distance of a node from the middle of its neighbours, as a share of the spacing
+    irregularity: float  # median distance of a node from the midpoint of its neighbours / spacing
 
     @property
     def shape(self) -> tuple[int, int]:
         return self.dots.shape[0], self.dots.shape[1]
 
     @property
-    def found(self) -> int:
-        """How many nodes have a dot."""
+    def dot_count(self) -> int:
+        """Number of nodes with a dot."""
         return int((self.dots >= 0).sum())
 
 
-def grow(centers: Points) -> Lattice | None:
-    """The largest grid in `centers` [px], shape (n, 2); None when there is no 3 × 3 of them in order."""
+def grow_lattice(centers: Points) -> Lattice | None:
+    """The largest grid in `centers` [px], shape (n, 2), or None without a regular group of 3 × 3 dots."""
     if len(centers) < 9:
         return None
     tree = cKDTree(centers)
@@ -47,11 +47,11 @@ def grow(centers: Points) -> Lattice | None:
     for seed in _seeds(centers, tree, axes):
         if seed in best.values():
             continue
-        nodes = _flood(centers, tree, axes, seed)
+        nodes = _grow_from(centers, tree, axes, seed)
         if len(nodes) > len(best):
             best = nodes
         if 2 * len(best) > len(centers):
-            break  # no other grid can be larger
+            break  # no other grid is larger
     if len(best) < 9:
         return None
     index = np.array(list(best.keys()))
@@ -61,34 +61,34 @@ def grow(centers: Points) -> Lattice | None:
     if min(dots.shape) < 3:
         return None
     spacing = float(np.linalg.norm(axes, axis=1).mean())
-    return Lattice(dots, spacing, _unevenness(centers, dots) / spacing)
+    return Lattice(dots, spacing, _irregularity(centers, dots) / spacing)
 
 
-def neighbours(values: Points, known: NDArray[np.bool_]) -> tuple[Points, NDArray[np.bool_]]:
-    """Mean of the known ones among each node's eight neighbours, and where there are any.
+def neighbour_mean(values: Points, known: NDArray[np.bool_]) -> tuple[Points, NDArray[np.bool_]]:
+    """Weighted mean of the known ones of the eight neighbours of each node, and whether there are any.
 
-    `values` shape (lines, columns, 2), `known` (lines, columns); those next to it count twice those across.
+    `values` has shape (rows, columns, 2), `known` (rows, columns). Axis neighbours weigh twice as much as diagonals.
     """
     weight = np.zeros((known.shape[0] + 2, known.shape[1] + 2))
     weight[1:-1, 1:-1] = known
     padded = np.zeros((*weight.shape, 2))
     padded[1:-1, 1:-1] = np.where(known[..., None], values, 0.0)
-    # Sums along one axis, then along the other, with weights 1 2 1 but without the node itself.
+    # Separable sums with weights 1 2 1, without the node itself.
     total = _smooth(padded) - 4 * padded[1:-1, 1:-1]
     share = _smooth(weight[..., None])[..., 0] - 4 * weight[1:-1, 1:-1]
     return total / np.maximum(share, 1.0)[..., None], share > 0
 
 
 def _smooth(a: Points) -> Points:
-    lines = a[:-2] + 2 * a[1:-1] + a[2:]
-    return np.asarray(lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:])
+    rows = a[:-2] + 2 * a[1:-1] + a[2:]
+    return np.asarray(rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:])
 
 
-def fill(values: Points, known: NDArray[np.bool_]) -> Points:
-    """`values`, shape (lines, columns, 2), with unknown nodes filled from their neighbours, outwards."""
+def fill_from_neighbours(values: Points, known: NDArray[np.bool_]) -> Points:
+    """`values`, shape (rows, columns, 2), with unknown nodes filled outwards from their neighbours."""
     filled, have = np.where(known[..., None], values, 0.0), known.copy()
     while not have.all() and have.any():
-        mean, some = neighbours(filled, have)
+        mean, some = neighbour_mean(filled, have)
         new = some & ~have
         filled[new] = mean[new]
         have |= new
@@ -96,9 +96,9 @@ def fill(values: Points, known: NDArray[np.bool_]) -> Points:
 
 
 def _axes(centers: Points, tree: cKDTree) -> Points | None:
-    """Typical step to the right and typical step down [px], shape (2, 2)."""
-    _, near = tree.query(centers, k=min(9, len(centers)))
-    steps = centers[near[:, 1:]] - centers[:, None]
+    """Typical rightward step and typical downward step [px], shape (2, 2); None when too few dots have neighbours."""
+    _, nearest = tree.query(centers, k=min(9, len(centers)))
+    steps = centers[nearest[:, 1:]] - centers[:, None]
     length = np.linalg.norm(steps, axis=-1)
     axes = []
     for axis in (0, 1):
@@ -115,51 +115,51 @@ def _axes(centers: Points, tree: cKDTree) -> Points | None:
 
 
 def _seeds(centers: Points, tree: cKDTree, axes: Points) -> list[int]:
-    """The dots whose four neighbours are closest to where they belong; central ones first among equals."""
+    """Dots whose four neighbours are closest to their predicted positions, preferring central dots."""
     around = np.concatenate([axes, -axes])
     distance, _ = tree.query(centers[:, None] + around)
     error = distance.mean(axis=1) / np.linalg.norm(axes, axis=1).min()
     off = np.linalg.norm(centers - np.median(centers, axis=0), axis=1) / (np.ptp(centers, axis=0).max() + 1.0)
     order = np.argsort(error + 0.1 * off, kind="stable")
-    # Spread them: one in the first, one in the second, ... part of the ranking would miss separated grids.
+    # Every eighth dot of the ranking: consecutive ones are often neighbours.
     return [int(i) for i in order[: _SEEDS * 8 : 8]]
 
 
-def _flood(centers: Points, tree: cKDTree, axes: Points, seed: int) -> dict[tuple[int, int], int]:
-    """Grows from `seed`, one wave at a time; (line, column) → dot. Every node keeps its own local axes."""
+def _grow_from(centers: Points, tree: cKDTree, axes: Points, seed: int) -> dict[tuple[int, int], int]:
+    """Grows a grid from `seed` in waves; returns (row, column) → dot. Each node has its own local axes."""
     nodes = {(0, 0): seed}
-    taken = {seed}
+    used = {seed}
     local = {(0, 0): axes}
     wave = [(0, 0)]
-    tolerance = _NEAR * float(np.linalg.norm(axes, axis=1).min())
-    ways = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
-    along = np.array([[sign * (axis == 0), sign * (axis == 1)] for axis, sign in ways], dtype=float)
+    tolerance = _TOLERANCE * float(np.linalg.norm(axes, axis=1).min())
+    directions = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
+    along = np.array([[sign * (axis == 0), sign * (axis == 1)] for axis, sign in directions], dtype=float)
     while wave:
         here = centers[[nodes[node] for node in wave]]
         steps = np.einsum("ka,waj->wkj", along, np.array([local[node] for node in wave]))
-        distance, found = (a.reshape(-1) for a in tree.query(here[:, None] + steps))
-        tries = [(node, axis, sign) for node in wave for axis, sign in ways]
+        distance, nearest = (a.reshape(-1) for a in tree.query(here[:, None] + steps))
+        candidates = [(node, axis, sign) for node in wave for axis, sign in directions]
         wave = []
         for k in np.argsort(distance, kind="stable"):
             if distance[k] > tolerance:
                 break
-            (line, column), axis, sign = tries[k]
-            target = (line, column + sign) if axis == 0 else (line + sign, column)
-            dot = int(found[k])
-            if target in nodes or dot in taken:
+            (row, column), axis, sign = candidates[k]
+            target = (row, column + sign) if axis == 0 else (row + sign, column)
+            dot = int(nearest[k])
+            if target in nodes or dot in used:
                 continue
-            parent = local[(line, column)]
-            step = sign * (centers[dot] - centers[nodes[(line, column)]])
-            own = parent.copy()
-            own[axis] = 0.5 * (parent[axis] + step)
-            nodes[target], local[target] = dot, own
-            taken.add(dot)
+            parent = local[(row, column)]
+            step = sign * (centers[dot] - centers[nodes[(row, column)]])
+            updated = parent.copy()
+            updated[axis] = 0.5 * (parent[axis] + step)
+            nodes[target], local[target] = dot, updated
+            used.add(dot)
             wave.append(target)
     return nodes
 
 
-def _unevenness(centers: Points, dots: NDArray[np.intp]) -> float:
-    """Median distance of nodes from the middle of their two neighbours in a line or column [px]."""
+def _irregularity(centers: Points, dots: NDArray[np.intp]) -> float:
+    """Median distance of nodes from the midpoint of their two neighbours in a row or column [px]."""
     off = []
     for grid in (dots, dots.T):
         left, middle, right = grid[:-2], grid[1:-1], grid[2:]

@@ -1,7 +1,6 @@
-"""Where images come from: a folder, an image file, a video file, a recorded session, a stream's URL, a camera's number.
+"""Image sources: a folder, an image file, a video file, a recorded session, a stream or a local camera.
 
-A source has a length where that is known, and is iterated once. Nothing is opened before iteration starts. For the
-robot's cameras there are drivers; these sources are for looking at what one has.
+A source is opened when its iteration starts, and iterated once. The cameras of a robot have drivers in gelflow.real.
 """
 
 import os
@@ -25,8 +24,8 @@ from gelflow.session.records import SENSORS
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
-_PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # of the protocols that run over TCP
-# FFmpeg writes to the terminal by itself; OpenCV reads this when it uses FFmpeg for the first time.
+_PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
+# Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
@@ -34,37 +33,37 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 class SourceImage:
     """One image of a source."""
 
-    name: str  # of its file, or its number
+    name: str  # file name, or index in the source
     image: Image  # B G R, shape (height, width, 3)
-    stamp: float  # when it was taken [s]: from the start of a video or folder, otherwise robot time
-    data: bytes | None = None  # JPEG or PNG that `image` was decoded from, where there is one
+    stamp: float  # acquisition time [s]: from the start of a video or folder, otherwise robot time
+    data: bytes | None = None  # JPEG or PNG data of `image`, if any
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """A finite or endless sequence of images."""
+    """A finite or endless sequence of images; see `image_source`."""
 
-    text: str  # as the user wrote it
+    text: str  # location as given by the user
     kind: str  # "folder", "image", "video", "session", "stream" or "camera"
     files: tuple[Path, ...] = ()  # of a folder or an image
-    sensor: str = "left"  # whose images of a session
-    rate: float = 25.0  # of a folder's images, and of a video that does not say [Hz]
+    sensor: str = "left"  # of a session
+    rate: float = 25.0  # frame rate of a folder, and of a video without a rate [Hz]
     timeout: float = 5.0  # of a stream, for opening and for each image [s]
-    clock: Clock = field(default_factory=ScaledClock)  # stamps what is live
+    clock: Clock = field(default_factory=ScaledClock)  # time stamps of live images
 
     @property
     def live(self) -> bool:
-        """Whether it goes on until it is told to stop."""
+        """Whether the source is endless."""
         return self.kind in ("stream", "camera")
 
     def __iter__(self) -> Iterator[SourceImage]:
-        """One image after the other. Raises PeerError when one can not be had."""
+        """Iterates over the images. Raises PeerError when an image cannot be read."""
         if self.kind == "session":
             return self._from_session()
         return self._from_files() if self.files else self._from_capture()
 
     def count(self) -> int | None:
-        """How many images there will be, None when that is not known before."""
+        """Number of images, None if unknown."""
         if self.files:
             return len(self.files)
         if self.live:
@@ -86,7 +85,7 @@ class ImageSource:
             except PeerError as error:
                 raise PeerError(f"{file}: {error}") from None
             except OSError as error:
-                raise PeerError(f"{file} can not be read: {error.strerror}") from None
+                raise PeerError(f"{file} cannot be read: {error.strerror}") from None
 
     def _from_session(self) -> Iterator[SourceImage]:
         empty = True
@@ -119,66 +118,66 @@ class ImageSource:
         finally:
             capture.release()
         if number == 0:
-            raise PeerError(f"{self.kind} {self.text} opened, but gave no image")
+            raise PeerError(f"{self.kind} {self.text} was opened but gave no image")
         if self.live:
             raise PeerTimeout(
-                f"{self.kind} {self.text} ended after {number} images: it was closed, or silent for {self.timeout:g} s"
+                f"{self.kind} {self.text} ended after {number} images: closed, or no image within {self.timeout:g} s"
             )
 
     def _open(self) -> cv2.VideoCapture:
-        # OpenCV writes to the terminal by itself; what it says is in the error below.
+        # OpenCV logs to the terminal; the error below replaces its message.
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(0)
         try:
             if self.kind == "camera":
                 capture = cv2.VideoCapture(int(self.text))
-                advice = "is one connected, and does this user have the right to use it?"
+                advice = "check the connection and the access rights of this user"
             elif self.kind == "stream":
-                self._reach()
+                self._check_reachable()
                 limit = int(self.timeout * 1000)
                 options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
                 capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG, options)
                 advice = f"no video stream within {self.timeout:g} s; check address and port"
             else:
-                self._refuse_text()
+                self._check_not_text()
                 capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
-                advice = "it is neither an image nor a video that OpenCV reads"
+                advice = "not an image or a video that OpenCV can read"
         finally:
             cv2.utils.logging.setLogLevel(level)
         if not capture.isOpened():
             capture.release()
-            raise PeerError(f"{self.kind} {self.text} can not be opened: {advice}")
+            raise PeerError(f"{self.kind} {self.text} cannot be opened: {advice}")
         return capture
 
-    def _reach(self) -> None:
-        """Raises PeerError when nobody listens at the stream's address: sooner and clearer than the video library."""
+    def _check_reachable(self) -> None:
+        """Raises PeerError when the address of the stream is unreachable, faster than the video library does."""
         try:
             url = urlsplit(self.text)
             if url.scheme in _PORTS:
                 address = url.hostname or "", url.port or _PORTS[url.scheme]
                 socket.create_connection(address, timeout=self.timeout).close()
         except (OSError, ValueError) as error:
-            raise PeerError(f"stream {self.text} can not be opened: {error}; check address and port") from None
+            raise PeerError(f"stream {self.text} cannot be opened: {error}; check address and port") from None
 
-    def _refuse_text(self) -> None:
-        """Raises PeerError for a text file, which FFmpeg would draw letter by letter and call a video."""
+    def _check_not_text(self) -> None:
+        """Raises PeerError for a text file, which FFmpeg would render as a video of characters."""
         try:
             with Path(self.text).open("rb") as file:
                 start = file.read(4096)
         except OSError as error:
-            raise PeerError(f"{self.text} can not be read: {error.strerror}") from None
+            raise PeerError(f"{self.text} cannot be read: {error.strerror}") from None
         if start and b"\0" not in start and _is_text(start):
             raise PeerError(f"{self.text} is a text file, not an image or a video")
 
 
 def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> ImageSource:
-    """What `text` means: a number is a camera, scheme://... a stream, .mcap a session, otherwise a folder or a file.
+    """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
-    `sensor` chooses the images of a session; `rate` [Hz] gives those of a folder their stamps. Raises UsageError when
-    there is no such file or folder, or a folder without images.
+    `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder. Raises UsageError when the
+    file or folder does not exist, or the folder contains no images.
     """
     if not text:
-        raise UsageError("expected a folder, a file, a URL or a camera's number, got nothing")
+        raise UsageError("expected a folder, a file, a URL or a camera number, got an empty text")
     if sensor not in SENSORS:
         raise UsageError(f"sensor must be {' or '.join(SENSORS)}, got {sensor!r}")
     if not 0.01 <= rate <= 10000:
@@ -191,23 +190,23 @@ def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Imag
     if path.suffix.lower() == ".mcap":
         return ImageSource(text, "session", sensor=sensor)
     if path.is_dir():
-        files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural))
+        files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural_sort_key))
         if not files:
-            raise UsageError(f"folder {text} has no images (known are {', '.join(sorted(IMAGE_SUFFIXES))})")
+            raise UsageError(f"folder {text} contains no images (known suffixes: {', '.join(sorted(IMAGE_SUFFIXES))})")
         return ImageSource(text, "folder", files, rate=rate)
     if not path.exists():
-        raise UsageError(f"expected a folder, a file, a URL or a camera's number, got {text}, which does not exist")
+        raise UsageError(f"expected a folder, a file, a URL or a camera number; {text} does not exist")
     return ImageSource(text, "image", (path,)) if _is_image(path) else ImageSource(text, "video", rate=rate)
 
 
-def natural(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """A key that sorts 9.jpg before 10.jpg."""
+def natural_sort_key(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Sort key that orders 9.jpg before 10.jpg."""
     parts = re.split(r"([0-9]+)", path.name)
     return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts)
 
 
 def _is_text(start: bytes) -> bool:
-    """Whether a file that begins so is text; its last character may be cut off."""
+    """Whether `start`, the first bytes of a file, is UTF-8 text; the last character may be incomplete."""
     try:
         start.decode("utf-8")
     except UnicodeDecodeError as error:

@@ -1,10 +1,9 @@
-"""Markers followed through images: where each is, how far it moved from the first image, and whether it is seen.
+"""The marker tracker: position and displacement of the markers of one camera, image by image.
 
-The first image is the reference: the grid is found in it, and what a dot looks like; images in which nothing has moved
-yet make it finer. In every further image all dots
-are found anew, so nothing drifts; each is given to the marker that it belongs to, and fitted with the learned shape.
-The work on an image is native, see csrc: contrast.hpp finds, follow.hpp says whose, fit.hpp measures.
-No random numbers, no clock: the same images in the same order give the same numbers.
+The first image is the reference: it gives the grid of markers and the dot model. Images at rest that follow refine the
+reference. In each further image, all dots are detected again, which avoids drift, assigned to markers and fitted with
+the dot model. The C++ part in csrc processes each image: dot_detector.hpp detects, assignment.hpp assigns, dot_fit.hpp
+fits. Equal images in equal order give bit-identical results.
 """
 
 from dataclasses import dataclass
@@ -15,112 +14,109 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
-from gelflow.perception.detect import smaller
-from gelflow.perception.dot_model import learn
-from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.detect import downsample
+from gelflow.perception.dot_model import fit_dot_model
 from gelflow.perception.grid import Polarity, find_grid
 
-__all__ = ["MarkerTracker", "TrackerConfig", "TrackerInitError", "TrackingResult"]
-
-_LARGEST = 10.0  # radius of a dot [px]; in a larger image nothing is gained by more pixels, it is made smaller
+_MAX_RADIUS = 10.0  # of a dot [px]; larger images are downsampled, since more pixels add no accuracy
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """What is known of the markers before the first image."""
+    """Prior knowledge of the markers."""
 
-    rows: int | None = None  # lines of markers in the image; None: found
-    cols: int | None = None  # markers in a line; None: found
-    either_way: bool = True  # rows and cols may also be the other way round in the image
-    polarity: Polarity = "auto"  # dots darker or brighter than the gel
+    rows: int | None = None  # rows of markers in the image; None: detected
+    cols: int | None = None  # markers in a row; None: detected
+    either_way: bool = True  # rows and cols may be transposed in the image
+    polarity: Polarity = "auto"  # dots are "dark" or "bright" relative to the gel
 
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """The markers in one image, line by line from the top, each line from the left."""
+    """The markers in one image, row by row from the top, each row from the left."""
 
-    position: NDArray[np.float64]  # (right, down) [px], shape (markers, 2); where not valid, where it is expected
+    position: NDArray[np.float64]  # (right, down) [px], shape (markers, 2); predicted where not valid
     displacement: NDArray[np.float64]  # from rest [px], shape (markers, 2); NaN where neither valid nor inferred
     valid: NDArray[np.bool_]  # measured in this image, shape (markers,)
-    inferred: NDArray[np.bool_]  # not measured, guessed from its neighbours, shape (markers,)
-    quality: NDArray[np.float64]  # 0 to 1: how far the measurement can be believed; 0 where not valid, (markers,)
-    rows: int  # lines in the image
-    cols: int  # markers in a line
+    inferred: NDArray[np.bool_]  # not measured, interpolated from neighbours, shape (markers,)
+    quality: NDArray[np.float64]  # fraction of the dot edge that the fit explains, 0 where not valid, shape (markers,)
+    rows: int  # in the image
+    cols: int  # markers in a row
     spacing: float  # of the markers in the first image [px]
 
 
 @dataclass(frozen=True)
-class _Started:
-    """What the first image gave."""
+class _Reference:
+    """The tracker started with the first image."""
 
     tracker: Tracker
     size: tuple[int, int]  # height and width of the images [px]
-    shrink: int  # the native part sees images made smaller by this
+    shrink: int  # downsampling factor of the images for the C++ part
     rows: int
     cols: int
     spacing: float  # [px]
 
 
 class MarkerTracker:
-    """Follows the markers of one camera. The first image is the reference of all displacements."""
+    """Tracks the markers of one camera. Displacements are relative to the first image."""
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         self.config = TrackerConfig() if config is None else config
-        self._started: _Started | None = None
+        self._reference: _Reference | None = None
 
     @property
     def rest(self) -> NDArray[np.float64]:
-        """Where the markers are at rest (right, down) [px], shape (markers, 2), line by line.
+        """Positions of the markers at rest (right, down) [px], shape (markers, 2), row by row.
 
-        As long as nothing moves after the start, up to eight images, it is the mean of them, and so gets finer.
-        Raises UsageError before `start`.
+        They are the mean over up to eight images after the start, as long as nothing moves. Raises UsageError before
+        `start`.
         """
-        if self._started is None:
+        if self._reference is None:
             raise UsageError("the tracker has no rest positions yet: start it with an image at rest")
-        return _larger(self._started.tracker.rest(), self._started.shrink)
+        return _upscaled(self._reference.tracker.rest(), self._reference.shrink)
 
     def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> TrackingResult:
-        """Finds the grid in `image` (B G R, or grey) and takes it as the reference; displacements in it are zero.
+        """Finds the grid of markers in `image` (B G R or grey) and makes it the reference, with zero displacements.
 
-        `rows` and `cols` are lines and markers in a line; left out, the configuration's, and if it has none, found.
-        Raises TrackerInitError when the image shows no such grid, or not clearly; UsageError when it is no image.
+        `rows` and `cols` replace those of the configuration. Raises TrackerInitError when the image does not clearly
+        show such a grid, UsageError when `image` is not an image array.
         """
-        c = self.config
-        image = _colours(image)
-        rows, cols = (c.rows, c.cols) if rows is None and cols is None else (rows, cols)
-        found = find_grid(image, rows=rows, cols=cols, either_way=c.either_way, polarity=c.polarity)
-        shrink = max(1, int(np.ceil(found.radius / _LARGEST)))
-        tracker, learned = learn(smaller(image, shrink), found.scaled(1 / shrink))
-        rest = _larger(learned.rest, shrink)
-        size = (image.shape[0], image.shape[1])
-        rows, cols = found.shape
-        self._started = _Started(tracker, size, shrink, rows, cols, found.spacing)
-        none, seen = np.zeros_like(rest), learned.seen
-        return TrackingResult(rest, none, seen, ~seen, learned.quality, rows, cols, found.spacing)
+        config = self.config
+        image = _as_bgr(image)
+        rows, cols = (config.rows, config.cols) if rows is None and cols is None else (rows, cols)
+        grid = find_grid(image, rows=rows, cols=cols, either_way=config.either_way, polarity=config.polarity)
+        shrink = max(1, int(np.ceil(grid.radius / _MAX_RADIUS)))
+        tracker, model = fit_dot_model(downsample(image, shrink), grid.scaled(1 / shrink))
+        rest = _upscaled(model.rest, shrink)
+        rows, cols = grid.shape
+        self._reference = _Reference(tracker, (image.shape[0], image.shape[1]), shrink, rows, cols, grid.spacing)
+        still, visible = np.zeros_like(rest), model.visible
+        return TrackingResult(rest, still, visible, ~visible, model.quality, rows, cols, grid.spacing)
 
     def track(self, image: NDArray[np.uint8]) -> TrackingResult:
-        """The markers in the next image (B G R, or grey). The first call is `start`.
+        """The markers in the next image (B G R or grey). The first call is equivalent to `start`.
 
-        A marker that is not seen, or not for certain, is not valid. Raises PeerError when the image's size changes,
-        UsageError when it is no image.
+        Markers that are hidden or ambiguous are not valid. Raises PeerError when the image size changes, UsageError
+        when `image` is not an image array.
         """
-        started = self._started
-        if started is None:
+        reference = self._reference
+        if reference is None:
             return self.start(image)
-        image = _colours(image)
-        if image.shape[:2] != started.size:
-            got, expected = (f"{width} × {height} px" for height, width in (image.shape[:2], started.size))
-            raise PeerError(f"the image's size changed from {expected} to {got}: start the tracker anew for it")
-        shrink = started.shrink
-        position, displacement, valid, inferred, quality = started.tracker.track(smaller(image, shrink))
+        image = _as_bgr(image)
+        if image.shape[:2] != reference.size:
+            got, expected = (f"{width} × {height} px" for height, width in (image.shape[:2], reference.size))
+            raise PeerError(f"the image size changed from {expected} to {got}: start the tracker again")
+        shrink = reference.shrink
+        result = reference.tracker.track(downsample(image, shrink))
+        position, displacement = result.position, result.displacement
         if shrink > 1:
-            position, displacement = _larger(position, shrink), shrink * displacement
-        grid = started.rows, started.cols, started.spacing
-        return TrackingResult(position, displacement, valid, inferred, quality, *grid)
+            position, displacement = _upscaled(position, shrink), shrink * displacement
+        grid = reference.rows, reference.cols, reference.spacing
+        return TrackingResult(position, displacement, result.valid, result.inferred, result.quality, *grid)
 
 
-def _colours(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """`image` as B G R without gaps in memory. Raises UsageError when it is no image."""
+def _as_bgr(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """`image` as a contiguous B G R array. Raises UsageError when it is not an image array."""
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         got = f"values of type {image.dtype}" if isinstance(image, np.ndarray) else f"a {type(image).__name__}"
         raise UsageError(f"expected an image as an array of uint8, got {got}: decode or convert it first")
@@ -133,6 +129,6 @@ def _colours(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def _larger(position: NDArray[np.float64], shrink: int) -> NDArray[np.float64]:
-    """Places in a smaller image as places in the image [px]."""
+def _upscaled(position: NDArray[np.float64], shrink: int) -> NDArray[np.float64]:
+    """Positions in a downsampled image as positions in the original image [px]."""
     return (position + 0.5) * shrink - 0.5

@@ -1,4 +1,4 @@
-// The Python module gelflow.perception._tracker: thin, all checks of shapes are here.
+// The Python module gelflow.perception._tracker. All array shapes are checked here.
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
@@ -17,122 +17,154 @@ using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
 using Image = py::array_t<std::uint8_t, py::array::c_style>;
 
 template <class T>
-void expect(const Array<T>& array, py::ssize_t first, py::ssize_t second, const char* name) {
+void check_shape(const Array<T>& array, py::ssize_t first, py::ssize_t second, const char* name) {
   const bool fits = second ? array.ndim() == 2 && array.shape(0) == first && array.shape(1) == second
                            : array.ndim() == 1 && array.shape(0) == first;
-  if (!fits) throw std::invalid_argument(std::string(name) + " has another shape than the grid asks for");
+  if (!fits) throw std::invalid_argument(std::string(name) + " has a shape that does not fit the grid");
 }
 
-// A tracker with the lock that lets threads share it while the interpreter is free.
-struct Shared {
-  Tracker tracker;
-  std::mutex busy;
+// The fit of the first image.
+struct StartResult {
+  py::array_t<double> position, contrast, quality;
+};
 
-  explicit Shared(Setup setup) : tracker(std::move(setup)) {}
+// The markers in one image.
+struct TrackResult {
+  py::array_t<double> position, displacement;
+  py::array_t<bool> valid, inferred;
+  py::array_t<double> quality;
+};
+
+// A tracker with a lock, so that threads can share it while the interpreter lock is released.
+struct SharedTracker {
+  Tracker tracker;
+  std::mutex mutex;
+
+  explicit SharedTracker(TrackerSetup setup) : tracker(std::move(setup)) {}
 
   const std::uint8_t* pixels(const Image& image) const {
-    const Setup& setup = tracker.setup();
+    const TrackerSetup& setup = tracker.setup();
     if (image.ndim() != 3 || image.shape(0) != setup.height || image.shape(1) != setup.width || image.shape(2) != 3)
-      throw std::invalid_argument("expected an image of the setup's height and width with three channels");
+      throw std::invalid_argument("expected an image of the height and width of the setup with three channels");
     return image.data();
   }
 };
 
-Setup make_setup(int width, int height, int channel, bool bright, int rows, int cols, double spacing, double radius,
-                 double noise, const Array<float>& profile, float reach, const Array<double>& rest,
-                 const Array<bool>& seen, const Array<double>& oval, const Array<double>& contrast) {
-  const bool sound = width > 0 && height > 0 && rows > 0 && cols > 0 && channel >= 0 && channel <= 5 && radius > 0.5 &&
-                     radius < 16 && spacing > 2 * radius && spacing < 1e4 && noise >= 0 && reach > 0;
-  if (!sound) throw std::invalid_argument("a setting of the tracker is out of range");
+void check_marker(const TrackerSetup& setup, std::size_t m) {
+  const Ellipse& q = setup.ellipse[m];
+  const Point rest = setup.rest[m];
+  const double contrast = std::abs(setup.contrast[m]);
+  const bool definite = q.xx > 0 && q.xx < 16 && q.yy > 0 && q.yy < 16 && double(q.xx) * q.yy > double(q.xy) * q.xy;
+  const bool bounded = std::abs(rest.x) < 1e6 && std::abs(rest.y) < 1e6 && contrast > 1e-3 && contrast < 1e3;
+  if (!definite || !bounded) throw std::invalid_argument("position, ellipse or contrast of a marker is out of range");
+}
+
+TrackerSetup make_setup(int width, int height, int channel, bool bright, int rows, int cols, double spacing,
+                        double radius, double noise, const Array<float>& profile, float profile_reach,
+                        const Array<double>& rest, const Array<bool>& visible, const Array<double>& ellipse,
+                        const Array<double>& contrast) {
+  const bool in_range = width > 0 && height > 0 && rows > 0 && cols > 0 && channel >= 0 && channel <= 5 &&
+                        radius > 0.5 && radius < 16 && spacing > 2 * radius && spacing < 1e4 && noise >= 0 &&
+                        profile_reach > 0;
+  if (!in_range) throw std::invalid_argument("a setting of the tracker is out of range");
   const py::ssize_t n = py::ssize_t(rows) * cols;
-  expect(rest, n, 2, "rest"), expect(oval, n, 3, "oval"), expect(seen, n, 0, "seen");
-  expect(contrast, n, 0, "contrast"), expect(profile, Shape::steps + 1, 0, "profile");
-  Setup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}};
-  for (py::ssize_t i = 0; i <= Shape::steps; ++i) setup.shape.value[std::size_t(i)] = profile.at(i);
-  setup.shape.reach = reach;
+  check_shape(rest, n, 2, "rest"), check_shape(ellipse, n, 3, "ellipse"), check_shape(visible, n, 0, "visible");
+  check_shape(contrast, n, 0, "contrast"), check_shape(profile, DotProfile::steps + 1, 0, "profile");
+  TrackerSetup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}};
+  for (py::ssize_t i = 0; i <= DotProfile::steps; ++i) setup.profile.value[std::size_t(i)] = profile.at(i);
+  setup.profile.reach = profile_reach;
   for (py::ssize_t m = 0; m < n; ++m) {
     setup.rest.push_back({rest.at(m, 0), rest.at(m, 1)});
-    setup.seen.push_back(char(seen.at(m)));
-    setup.oval.push_back({float(oval.at(m, 0)), float(oval.at(m, 1)), float(oval.at(m, 2))});
+    setup.visible.push_back(char(visible.at(m)));
+    setup.ellipse.push_back({float(ellipse.at(m, 0)), float(ellipse.at(m, 1)), float(ellipse.at(m, 2))});
     setup.contrast.push_back(contrast.at(m));
-    const Oval& q = setup.oval.back();
-    const bool round = q.xx > 0 && q.xx < 16 && q.yy > 0 && q.yy < 16 && double(q.xx) * q.yy > double(q.xy) * q.xy;
-    const bool known = std::abs(rest.at(m, 0)) < 1e6 && std::abs(rest.at(m, 1)) < 1e6 &&
-                       std::abs(contrast.at(m)) > 1e-3 && std::abs(contrast.at(m)) < 1e3;
-    if (!round || !known) throw std::invalid_argument("a marker's place, oval or contrast is out of range");
+    check_marker(setup, std::size_t(m));
   }
   return setup;
 }
 
-py::tuple start(Shared& shared, const Image& image) {
+StartResult start(SharedTracker& shared, const Image& image) {
   const std::uint8_t* pixels = shared.pixels(image);
   {
-    py::gil_scoped_release free;
-    const std::lock_guard lock(shared.busy);
+    py::gil_scoped_release release;
+    const std::lock_guard lock(shared.mutex);
     shared.tracker.start(pixels);
   }
   const py::ssize_t n = shared.tracker.markers();
-  py::array_t<double> position({n, py::ssize_t(2)}), contrast(n), quality(n);
+  StartResult out{py::array_t<double>({n, py::ssize_t(2)}), py::array_t<double>(n), py::array_t<double>(n)};
   for (py::ssize_t m = 0; m < n; ++m) {
     const std::size_t i = std::size_t(m);
-    position.mutable_at(m, 0) = shared.tracker.places()[i].x, position.mutable_at(m, 1) = shared.tracker.places()[i].y;
-    contrast.mutable_at(m) = shared.tracker.contrasts()[i], quality.mutable_at(m) = shared.tracker.quality()[i];
-  }
-  return py::make_tuple(position, contrast, quality);
-}
-
-py::array_t<double> rest(Shared& shared) {
-  const std::lock_guard lock(shared.busy);
-  const std::vector<Point>& places = shared.tracker.setup().rest;
-  py::array_t<double> out({py::ssize_t(places.size()), py::ssize_t(2)});
-  for (std::size_t m = 0; m < places.size(); ++m) {
-    out.mutable_at(py::ssize_t(m), 0) = places[m].x, out.mutable_at(py::ssize_t(m), 1) = places[m].y;
+    const Point position = shared.tracker.positions()[i];
+    out.position.mutable_at(m, 0) = position.x, out.position.mutable_at(m, 1) = position.y;
+    out.contrast.mutable_at(m) = shared.tracker.contrasts()[i], out.quality.mutable_at(m) = shared.tracker.quality()[i];
   }
   return out;
 }
 
-py::tuple track(Shared& shared, const Image& image) {
+py::array_t<double> rest(SharedTracker& shared) {
+  const std::lock_guard lock(shared.mutex);
+  const std::vector<Point>& positions = shared.tracker.setup().rest;
+  py::array_t<double> out({py::ssize_t(positions.size()), py::ssize_t(2)});
+  for (std::size_t m = 0; m < positions.size(); ++m) {
+    out.mutable_at(py::ssize_t(m), 0) = positions[m].x, out.mutable_at(py::ssize_t(m), 1) = positions[m].y;
+  }
+  return out;
+}
+
+TrackResult track(SharedTracker& shared, const Image& image) {
   const std::uint8_t* pixels = shared.pixels(image);
   const py::ssize_t n = shared.tracker.markers();
-  py::array_t<double> position({n, py::ssize_t(2)}), displacement({n, py::ssize_t(2)}), quality(n);
-  py::array_t<bool> valid(n), inferred(n);
-  auto p = position.mutable_unchecked<2>(), d = displacement.mutable_unchecked<2>();
-  auto q = quality.mutable_unchecked<1>();
-  auto v = valid.mutable_unchecked<1>(), g = inferred.mutable_unchecked<1>();
+  TrackResult out{py::array_t<double>({n, py::ssize_t(2)}), py::array_t<double>({n, py::ssize_t(2)}),
+                  py::array_t<bool>(n), py::array_t<bool>(n), py::array_t<double>(n)};
+  auto position = out.position.mutable_unchecked<2>(), displacement = out.displacement.mutable_unchecked<2>();
+  auto quality = out.quality.mutable_unchecked<1>();
+  auto valid = out.valid.mutable_unchecked<1>(), inferred = out.inferred.mutable_unchecked<1>();
   {
-    py::gil_scoped_release free;
-    const std::lock_guard lock(shared.busy);
+    py::gil_scoped_release release;
+    const std::lock_guard lock(shared.mutex);
     Tracker& tracker = shared.tracker;
     tracker.track(pixels);
     const bool any = tracker.anything_valid();
+    const double nan = std::numeric_limits<double>::quiet_NaN();
     for (py::ssize_t m = 0; m < n; ++m) {
       const std::size_t i = std::size_t(m);
-      const Point place = tracker.places()[i], step = place - tracker.setup().rest[i];
-      const double nothing = std::numeric_limits<double>::quiet_NaN();
-      p(m, 0) = place.x, p(m, 1) = place.y;
-      d(m, 0) = any ? step.x : nothing, d(m, 1) = any ? step.y : nothing;
-      q(m) = tracker.quality()[i];
-      v(m) = tracker.quality()[i] > 0, g(m) = any && !v(m);
+      const Point now = tracker.positions()[i], moved = now - tracker.setup().rest[i];
+      position(m, 0) = now.x, position(m, 1) = now.y;
+      displacement(m, 0) = any ? moved.x : nan, displacement(m, 1) = any ? moved.y : nan;
+      quality(m) = tracker.quality()[i];
+      valid(m) = tracker.quality()[i] > 0, inferred(m) = any && !valid(m);
     }
   }
-  return py::make_tuple(position, displacement, valid, inferred, quality);
+  return out;
 }
 
 }  // namespace
 
 PYBIND11_MODULE(_tracker, module) {
   module.doc() = "The native part of the marker tracker.";
-  module.attr("PROFILE_STEPS") = Shape::steps;
-  py::class_<Shared>(module, "Tracker")
+  module.attr("PROFILE_STEPS") = DotProfile::steps;
+  py::class_<StartResult>(module, "StartResult")
+      .def_readonly("position", &StartResult::position)
+      .def_readonly("contrast", &StartResult::contrast)
+      .def_readonly("quality", &StartResult::quality);
+  py::class_<TrackResult>(module, "TrackResult")
+      .def_readonly("position", &TrackResult::position)
+      .def_readonly("displacement", &TrackResult::displacement)
+      .def_readonly("valid", &TrackResult::valid)
+      .def_readonly("inferred", &TrackResult::inferred)
+      .def_readonly("quality", &TrackResult::quality);
+  py::class_<SharedTracker>(module, "Tracker")
       .def(py::init([](int width, int height, int channel, bool bright, int rows, int cols, double spacing,
-                       double radius, double noise, const Array<float>& profile, float reach, const Array<double>& rest,
-                       const Array<bool>& seen, const Array<double>& oval, const Array<double>& contrast) {
-             return std::make_unique<Shared>(make_setup(width, height, channel, bright, rows, cols, spacing, radius,
-                                                        noise, profile, reach, rest, seen, oval, contrast));
+                       double radius, double noise, const Array<float>& profile, float profile_reach,
+                       const Array<double>& rest, const Array<bool>& visible, const Array<double>& ellipse,
+                       const Array<double>& contrast) {
+             return std::make_unique<SharedTracker>(make_setup(width, height, channel, bright, rows, cols, spacing,
+                                                               radius, noise, profile, profile_reach, rest, visible,
+                                                               ellipse, contrast));
            }),
            py::kw_only(), py::arg("width"), py::arg("height"), py::arg("channel"), py::arg("bright"), py::arg("rows"),
            py::arg("cols"), py::arg("spacing"), py::arg("radius"), py::arg("noise"), py::arg("profile"),
-           py::arg("reach"), py::arg("rest"), py::arg("seen"), py::arg("oval"), py::arg("contrast"))
+           py::arg("profile_reach"), py::arg("rest"), py::arg("visible"), py::arg("ellipse"), py::arg("contrast"))
       .def("start", &start, py::arg("image").noconvert())
       .def("rest", &rest)
       .def("track", &track, py::arg("image").noconvert());

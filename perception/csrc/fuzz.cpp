@@ -1,5 +1,5 @@
-// Random images through random trackers, for the sanitizers: `fuzz_tracker IMAGES [SEED]`. It ends at the first bad
-// access, undefined operation, or number that no image may lead to.
+// Fuzz test of the tracker with random setups and images, for the sanitizers: `fuzz_tracker IMAGES [SEED]`. Stops at the
+// first invalid memory access, undefined operation or invalid result.
 #include <cstdio>
 #include <cstdlib>
 #include <optional>
@@ -17,31 +17,31 @@ std::mt19937_64 generator;
 int whole(int low, int high) { return std::uniform_int_distribution<int>(low, high)(generator); }
 double real(double low, double high) { return std::uniform_real_distribution<double>(low, high)(generator); }
 
-Setup random_setup() {
-  Setup setup{};
+TrackerSetup random_setup() {
+  TrackerSetup setup{};
   setup.width = whole(1, 120), setup.height = whole(1, 90);
   setup.grid = {whole(3, 7), whole(3, 7)};
   setup.channel = Channel(whole(0, 5)), setup.bright = whole(0, 1) == 1;
   setup.radius = std::exp(real(std::log(0.6), std::log(15)));
   setup.spacing = setup.radius * real(2.01, 6);
   setup.noise = real(0, 0.2);
-  setup.shape.reach = float(real(1.5, 6));
-  for (std::size_t i = 0; i < setup.shape.value.size(); ++i)
-    setup.shape.value[i] = float(1 / (1 + std::exp(0.1 * (double(i) - 60))) + (whole(0, 3) ? 0 : real(-0.2, 0.2)));
-  const bool far = whole(0, 9) == 0;  // a grid that is nowhere near the image
+  setup.profile.reach = float(real(1.5, 6));
+  for (std::size_t i = 0; i < setup.profile.value.size(); ++i)
+    setup.profile.value[i] = float(1 / (1 + std::exp(0.1 * (double(i) - 60))) + (whole(0, 3) ? 0 : real(-0.2, 0.2)));
+  const bool far = whole(0, 9) == 0;  // a grid far outside the image
   for (int m = 0; m < setup.grid.size(); ++m) {
     const double x = (m % setup.grid.cols + 0.5) * setup.spacing, y = (m / setup.grid.cols + 0.5) * setup.spacing;
     setup.rest.push_back(far ? Point{real(-1e5, 1e5), real(-1e5, 1e5)} : Point{x + real(-2, 2), y + real(-2, 2)});
-    setup.seen.push_back(char(whole(0, 9) > 0));
+    setup.visible.push_back(char(whole(0, 9) > 0));
     const double q = 1 / (setup.radius * setup.radius);
-    setup.oval.push_back({float(q * real(0.3, 3)), float(q * real(-0.25, 0.25)), float(q * real(0.3, 3))});
+    setup.ellipse.push_back({float(q * real(0.3, 3)), float(q * real(-0.25, 0.25)), float(q * real(0.3, 3))});
     setup.contrast.push_back((setup.bright ? 1 : -1) * real(0.01, 2));
   }
   return setup;
 }
 
-// Noise, a flat colour, blocks, or dots where the grid is at rest, moved.
-void random_image(const Setup& setup, std::vector<std::uint8_t>& image) {
+// Noise, a uniform colour, blocks, or a displaced grid of dots.
+void random_image(const TrackerSetup& setup, std::vector<std::uint8_t>& image) {
   const int kind = whole(0, 5), level = whole(0, 255);
   const int other = whole(0, 1) ? whole(0, 255) : std::clamp(int(level * (1 + setup.contrast[0])), 0, 255);
   const double moved = setup.spacing * real(0, 1), dx = real(-1, 1) * moved, dy = real(-1, 1) * moved;
@@ -63,13 +63,13 @@ void random_image(const Setup& setup, std::vector<std::uint8_t>& image) {
 void check(const Tracker& tracker) {
   for (int m = 0; m < tracker.markers(); ++m) {
     const std::size_t i = std::size_t(m);
-    const Point place = tracker.places()[i];
+    const Point position = tracker.positions()[i];
     const double quality = tracker.quality()[i];
-    const bool sound = std::isfinite(place.x) && std::isfinite(place.y) && quality >= 0 && quality <= 1;
+    const bool sound = std::isfinite(position.x) && std::isfinite(position.y) && quality >= 0 && quality <= 1;
     const bool in_image =
-        place.x > 0 && place.y > 0 && place.x < tracker.setup().width && place.y < tracker.setup().height;
+        position.x > 0 && position.y > 0 && position.x < tracker.setup().width && position.y < tracker.setup().height;
     if (sound && (quality == 0 || in_image)) continue;
-    std::fprintf(stderr, "marker %d at (%g, %g) with quality %g\n", m, place.x, place.y, quality);
+    std::fprintf(stderr, "marker %d at (%g, %g) with quality %g\n", m, position.x, position.y, quality);
     std::abort();
   }
 }
@@ -85,7 +85,7 @@ int main(int argc, char** argv) {
     std::optional<Tracker> made;
     try {
       made.emplace(random_setup());
-    } catch (const std::invalid_argument&) {  // a shape without an edge is refused
+    } catch (const std::invalid_argument&) {  // the profile has no edge
       continue;
     }
     Tracker& tracker = *made;
@@ -101,5 +101,5 @@ int main(int argc, char** argv) {
       for (double quality : tracker.quality()) measured += quality > 0;
     }
   }
-  std::printf("%ld images through %ld trackers, %ld markers measured, nothing found\n", done, trackers, measured);
+  std::printf("%ld images through %ld trackers, %ld markers measured, no errors\n", done, trackers, measured);
 }

@@ -1,4 +1,4 @@
-// The one plane of a camera image in which dots stand out, with a margin around it.
+// One channel of a camera image with a margin around it.
 #pragma once
 
 #include <algorithm>
@@ -6,8 +6,8 @@
 #include <cstring>
 #include <vector>
 
-// A function compiled twice, for any processor and for those with AVX2, of which the loader takes the better one. Only
-// plain loops over plain arrays: what they call must be inlined. The sanitizers' build has one.
+// Compiles a function twice, for the baseline and for AVX2; the loader selects one. The functions that it calls must be
+// inlined. The sanitizer build has one version.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(GELFLOW_SANITIZE)
 #define GELFLOW_CLONES __attribute__((target_clones("default", "arch=x86-64-v3")))
 #else
@@ -25,11 +25,11 @@ GELFLOW_INLINE Point operator-(Point a, Point b) { return {a.x - b.x, a.y - b.y}
 GELFLOW_INLINE Point operator*(double s, Point a) { return {s * a.x, s * a.y}; }
 GELFLOW_INLINE double squared(Point a) { return a.x * a.x + a.y * a.y; }
 
-// What of the three colours is looked at; in the order of detect.py's PLANES.
+// The channel in which dots are detected, in the order of PLANES in detect.py.
 enum class Channel { grey, value, blue, green, red, chroma };
 
 struct Plane {
-  // Reading up to `margin` pixels beyond any side is allowed; what stands there means nothing.
+  // Reads up to `margin` pixels beyond each side are allowed; the values there are unspecified.
   static constexpr int margin = 96;
   int width, height, stride;
   std::vector<std::uint8_t> data;
@@ -40,9 +40,9 @@ struct Plane {
   std::uint8_t* row(int y) { return data.data() + std::size_t(y + margin) * stride + margin; }
 };
 
-// One line of B G R pixels. The weights of grey are those of JPEG's luminance, in 1/256.
-GELFLOW_CLONES inline void take_line(const std::uint8_t* __restrict bgr, std::uint8_t* __restrict out, int width,
-                                     Channel channel) {
+// Extracts the channel of one line of B G R pixels. The weights of grey are those of the JPEG luminance in 1/256.
+GELFLOW_CLONES inline void extract_line(const std::uint8_t* __restrict bgr, std::uint8_t* __restrict out, int width,
+                                        Channel channel) {
   switch (channel) {
     case Channel::grey:
       for (int x = 0; x < width; ++x)
@@ -65,9 +65,9 @@ GELFLOW_CLONES inline void take_line(const std::uint8_t* __restrict bgr, std::ui
   }
 }
 
-inline void take_plane(const std::uint8_t* bgr, Plane& plane, Channel channel) {
+inline void extract_plane(const std::uint8_t* bgr, Plane& plane, Channel channel) {
   for (int y = 0; y < plane.height; ++y)
-    take_line(bgr + std::size_t(3) * plane.width * y, plane.row(y), plane.width, channel);
+    extract_line(bgr + std::size_t(3) * plane.width * y, plane.row(y), plane.width, channel);
 }
 
 }  // namespace gelflow::perception

@@ -5,273 +5,277 @@
 namespace gelflow::perception {
 
 namespace {
-constexpr double least_quality = 0.35;       // of a fit that is believed
-constexpr double least_quality_lost = 0.55;  // the same where no dot stood out, only the neighbours say where to look
-constexpr double weakest = 0.35, strongest = 2.2;  // contrast that is believed, against that at rest
-constexpr double faintest = 0.3;                   // response of a dot, against the middle one at rest
-constexpr double fastest = 0.25;      // of the spacing per image: more is taken for a jump, not for a velocity
-constexpr double unquestioned = 0.8;  // quality from which on the neighbours are not asked
-constexpr double stray = 0.4;  // of the spacing: how far from its neighbours' word a perfect fit would be believed
-constexpr float oval_change = 0.1f;  // of an oval's curvature, that the coarse places of dots show for certain
-constexpr int relaxations = 8;
-constexpr int most_at_rest = 8;      // images that make the reference, if nothing moves before
-constexpr double rest_smooth = 0.3;  // largest share of what neighbours have in common, in the squares of noise
+constexpr double min_quality = 0.35;  // of an accepted fit
+constexpr double min_quality_undetected =
+    0.55;  // of an accepted fit at an interpolated position without a detected dot
+constexpr double min_contrast_ratio = 0.35, max_contrast_ratio = 2.2;  // accepted contrast / contrast at rest
+constexpr double min_response_ratio = 0.3;  // minimum response of a dot / median response at rest
+constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
+constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
+constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
+constexpr float ellipse_change = 0.1f;      // relative change of an ellipse that detected dots resolve
+constexpr int relaxation_steps = 8;
+constexpr int max_rest_images = 8;      // images averaged in the rest positions
+constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
 
-// As wide as makes the light's slope certain, but without the neighbours' dots.
+// Side of the fit window: wide enough to determine the background slope, without the neighbouring dots.
 int window_size(double radius, double spacing) {
-  const int wanted = int(std::ceil(3.8 * radius / lanes)) * lanes, most = int(0.85 * spacing / lanes) * lanes;
-  return std::clamp(wanted, lanes, std::clamp(most, lanes, Window::largest));
+  const int wanted = int(std::ceil(3.8 * radius / pack_size)) * pack_size,
+            most = int(0.85 * spacing / pack_size) * pack_size;
+  return std::clamp(wanted, pack_size, std::clamp(most, pack_size, Window::largest));
 }
 }  // namespace
 
-Tracker::Tracker(Setup setup)
+Tracker::Tracker(TrackerSetup setup)
     : setup_(std::move(setup)),
-      settings_{setup_.shape, window_size(setup_.radius, setup_.spacing), setup_.radius, setup_.noise},
-      inverse_(setup_.rest.size()),
+      settings_{setup_.profile, window_size(setup_.radius, setup_.spacing), setup_.radius, setup_.noise},
+      inverse_hessian_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
-      contrast_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
-      follow_(setup_.grid, setup_.spacing) {
+      detector_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
+      assignment_(setup_.grid, setup_.spacing) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m)
-    if (!normal_inverse(setup_.shape, setup_.oval[m], setup_.contrast[m], settings_.window, inverse_[m]))
-      throw std::invalid_argument("the shape of a dot does not tell where its centre is");
-  for (const Oval& q : setup_.oval) {  // half the ellipse's width and height, less what a blurred edge may lack
+    if (!inverse_hessian(setup_.profile, setup_.ellipse[m], setup_.contrast[m], settings_.window, inverse_hessian_[m]))
+      throw std::invalid_argument("the dot profile does not determine the centre of a dot");
+  for (const Ellipse& q : setup_.ellipse) {  // half width and half height, reduced by 10 % for a blurred edge
     const double area = double(q.xx) * q.yy - double(q.xy) * q.xy;
-    half_.push_back({0.9 * std::sqrt(q.yy / area), 0.9 * std::sqrt(q.xx / area)});
+    half_size_.push_back({0.9 * std::sqrt(q.yy / area), 0.9 * std::sqrt(q.xx / area)});
   }
-  places_ = before_ = setup_.rest;
-  oval_ = setup_.oval;
-  velocity_.resize(n), steps_.resize(n), next_.resize(n), offset_.resize(n);
+  positions_ = previous_ = setup_.rest;
+  ellipse_ = setup_.ellipse;
+  velocity_.resize(n), displacement_.resize(n), relaxed_.resize(n), detection_offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
-  known_.resize(n), filled_.resize(n), expected_.resize(n);
+  measured_.resize(n), filled_.resize(n), expected_.resize(n);
   dots_.reserve(2 * n + 64);
 }
 
 void Tracker::start(const std::uint8_t* bgr) {
-  take_plane(bgr, plane_, setup_.channel);
-  oval_ = setup_.oval;
+  extract_plane(bgr, plane_, setup_.channel);
+  ellipse_ = setup_.ellipse;
   anything_valid_ = false;
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
-    if (!setup_.seen[m]) continue;
-    const Fit found = fit(m, setup_.rest[m], 12);
+    if (!setup_.visible[m]) continue;
+    const DotFit found = fit(m, setup_.rest[m], 12);
     quality_[m] = found.quality, contrasts_[m] = found.contrast;
-    if (found.quality < least_quality || !is_inside(m, found.place)) {
-      setup_.seen[m] = 0, quality_[m] = 0;
+    if (found.quality < min_quality || !is_inside(m, found.position)) {
+      setup_.visible[m] = 0, quality_[m] = 0;
       continue;
     }
-    setup_.rest[m] = found.place, setup_.contrast[m] = found.contrast;
+    setup_.rest[m] = found.position, setup_.contrast[m] = found.contrast;
     anything_valid_ = true;
   }
-  places_ = setup_.rest;
-  at_rest_ = 1;
+  positions_ = setup_.rest;
+  rest_images_ = 1;
   std::fill(velocity_.begin(), velocity_.end(), Point{});
-  contrast_.find(plane_, 0.0f, 4 * setup_.rest.size() + 64, dots_);
-  std::vector<float> strength;
-  std::fill(offset_.begin(), offset_.end(), Point{});
+  detector_.detect(plane_, 0.0f, 4 * setup_.rest.size() + 64, dots_);
+  std::vector<float> responses;
+  std::fill(detection_offset_.begin(), detection_offset_.end(), Point{});
   for (const Dot& dot : dots_)
     for (std::size_t m = 0; m < setup_.rest.size(); ++m)
-      if (setup_.seen[m] && squared(dot.place - setup_.rest[m]) < setup_.radius * setup_.radius) {
-        strength.push_back(dot.response);
-        offset_[m] = setup_.rest[m] - dot.place;
+      if (setup_.visible[m] && squared(dot.position - setup_.rest[m]) < setup_.radius * setup_.radius) {
+        responses.push_back(dot.response);
+        detection_offset_[m] = setup_.rest[m] - dot.position;
       }
-  if (strength.empty()) return;
-  const auto middle = strength.begin() + std::ptrdiff_t(strength.size() / 2);
-  std::nth_element(strength.begin(), middle, strength.end());
-  least_ = float(faintest) * *middle;
+  if (responses.empty()) return;
+  const auto median = responses.begin() + std::ptrdiff_t(responses.size() / 2);
+  std::nth_element(responses.begin(), median, responses.end());
+  threshold_ = float(min_response_ratio) * *median;
 }
 
 void Tracker::track(const std::uint8_t* bgr) {
-  take_plane(bgr, plane_, setup_.channel);
-  contrast_.find(plane_, least_, 2 * setup_.rest.size() + 64, dots_);
-  before_ = places_;
-  for (std::size_t m = 0; m < places_.size(); ++m)
-    expected_[m] = char(setup_.seen[m] && is_inside(m, before_[m] + velocity_[m]));
-  measure(follow_.assign(dots_, before_, velocity_, expected_));
-  anything_valid_ = std::any_of(known_.begin(), known_.end(), [](char k) { return k != 0; });
-  if (at_rest_ > 0) refine_rest();
-  const double most = fastest * setup_.spacing;
-  for (std::size_t m = 0; m < places_.size(); ++m) {
-    const Point v = places_[m] - before_[m];
+  extract_plane(bgr, plane_, setup_.channel);
+  detector_.detect(plane_, threshold_, 2 * setup_.rest.size() + 64, dots_);
+  previous_ = positions_;
+  for (std::size_t m = 0; m < positions_.size(); ++m)
+    expected_[m] = char(setup_.visible[m] && is_inside(m, previous_[m] + velocity_[m]));
+  measure(assignment_.assign(dots_, previous_, velocity_, expected_));
+  anything_valid_ = std::any_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; });
+  if (rest_images_ > 0) refine_rest();
+  const double limit = max_velocity * setup_.spacing;
+  for (std::size_t m = 0; m < positions_.size(); ++m) {
+    const Point v = positions_[m] - previous_[m];
     const double length = std::sqrt(squared(v));
-    velocity_[m] = length <= most ? v : Point{};
+    velocity_[m] = length <= limit ? v : Point{};
   }
 }
 
-// As long as nothing has moved since the start, the reference becomes the mean of all images: one image's noise alone
-// would stay in every displacement. Noise differs from marker to marker, motion is shared by neighbours: of independent
-// noise, the mean of the eight around a marker has 0.12 times the squares of what differs from it.
+// While nothing moves after the start, the rest positions become the mean over the images, which reduces the noise that
+// the reference adds to each displacement. Noise is independent between markers and motion is common to neighbours: for
+// independent noise, the squared mean of the eight neighbours is 0.12 times the squared deviation from it.
 void Tracker::refine_rest() {
-  filled_ = known_;
-  double shared = 0, own = 0;
-  for (std::size_t m = 0; m < steps_.size(); ++m) steps_[m] = places_[m] - setup_.rest[m];
-  for (std::size_t m = 0; m < steps_.size(); ++m) {
+  filled_ = measured_;
+  double coherent = 0, independent = 0;
+  for (std::size_t m = 0; m < displacement_.size(); ++m) displacement_[m] = positions_[m] - setup_.rest[m];
+  for (std::size_t m = 0; m < displacement_.size(); ++m) {
     Point mean;
-    if (!known_[m] || !around(int(m), mean)) continue;
-    shared += squared(mean), own += squared(steps_[m] - mean);
+    if (!measured_[m] || !neighbour_mean(int(m), mean)) continue;
+    coherent += squared(mean), independent += squared(displacement_[m] - mean);
   }
-  if (!(shared < rest_smooth * own) || at_rest_ == most_at_rest) {
-    at_rest_ = 0;
+  if (!(coherent < rest_coherence * independent) || rest_images_ == max_rest_images) {
+    rest_images_ = 0;
     return;
   }
-  ++at_rest_;
-  for (std::size_t m = 0; m < steps_.size(); ++m)
-    if (known_[m]) setup_.rest[m] = setup_.rest[m] + (1.0 / at_rest_) * steps_[m];
+  ++rest_images_;
+  for (std::size_t m = 0; m < displacement_.size(); ++m)
+    if (measured_[m]) setup_.rest[m] = setup_.rest[m] + (1.0 / rest_images_) * displacement_[m];
 }
 
-// Fits the dots that markers own, then looks for the others where their neighbours say; guesses what is left.
-void Tracker::measure(const std::vector<int>& owner) {
+// Fits the assigned dots, then searches missing ones at interpolated positions, and infers the remaining markers.
+void Tracker::measure(const std::vector<int>& dot_of) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m) {
-    known_[m] = owner[m] >= 0;
-    if (known_[m]) places_[m] = dots_[std::size_t(owner[m])].place + offset_[m];
+    measured_[m] = dot_of[m] >= 0;
+    if (measured_[m]) positions_[m] = dots_[std::size_t(dot_of[m])].position + detection_offset_[m];
   }
   for (std::size_t m = 0; m < n; ++m) {
-    const Oval now = stretched(m);
-    if (differ(now, oval_[m])) oval_[m] = now;
+    const Ellipse now = deformed_ellipse(m);
+    if (differ(now, ellipse_[m])) ellipse_[m] = now;
   }
   for (std::size_t m = 0; m < n; ++m) {
     quality_[m] = 0;
-    if (!known_[m]) continue;
-    known_[m] = 0;
-    if (setup_.seen[m]) accept(m, fit(m, places_[m], 8), least_quality);
+    if (!measured_[m]) continue;
+    measured_[m] = 0;
+    if (setup_.visible[m]) accept(m, fit(m, positions_[m], 8), min_quality);
   }
-  drop_strays();
-  if (std::none_of(known_.begin(), known_.end(), [](char k) { return k != 0; })) {
-    places_ = before_;
+  reject_outliers();
+  if (std::none_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; })) {
+    positions_ = previous_;
     return;
   }
-  spread();
+  fill_missing();
   for (std::size_t m = 0; m < n; ++m) {
-    if (known_[m] || !setup_.seen[m]) continue;
-    const Fit found = fit(m, places_[m], 8);
-    if (is_free(int(m), found.place)) accept(m, found, least_quality_lost);
+    if (measured_[m] || !setup_.visible[m]) continue;
+    const DotFit found = fit(m, positions_[m], 8);
+    if (is_unoccupied(int(m), found.position)) accept(m, found, min_quality_undetected);
   }
-  drop_strays();
-  spread();
-  for (std::size_t m = 0; m < n; ++m) oval_[m] = stretched(m);
+  reject_outliers();
+  fill_missing();
+  for (std::size_t m = 0; m < n; ++m) ellipse_[m] = deformed_ellipse(m);
 }
 
-// Takes a fit as the marker's place when enough of the dot's edge was seen.
-void Tracker::accept(std::size_t marker, const Fit& found, double least) {
-  const double quality = believed(marker, found);
-  if (quality < least) return;
-  places_[marker] = found.place, quality_[marker] = quality, known_[marker] = 1;
+// Accepts a fit as the position of a marker if its quality reaches `threshold`.
+void Tracker::accept(std::size_t marker, const DotFit& found, double threshold) {
+  const double quality = accepted_quality(marker, found);
+  if (quality < threshold) return;
+  positions_[marker] = found.position, quality_[marker] = quality, measured_[marker] = 1;
 }
 
-// The oval of a marker's dot, which is stretched and turned as the gel around it is: by G = L₀ L⁻¹, where the columns of
-// L are the ways between its neighbours on either side, and L₀ those at rest, Q becomes GᵀQG.
-Oval Tracker::stretched(std::size_t marker) const {
+// The ellipse of a dot on the deformed gel: GᵀQG with G = L₀ L⁻¹, where the columns of L are the vectors between the
+// opposite neighbours of the marker, and L₀ are those at rest.
+Ellipse Tracker::deformed_ellipse(std::size_t marker) const {
   Point now[2], rest[2];
   for (int axis = 0; axis < 2; ++axis) {
     std::size_t ends[2];
     for (int side = 0; side < 2; ++side) {
-      const int other = setup_.grid.neighbour(int(marker), (axis ? Grid::downwards : Grid::to_the_right) + side);
+      const int other = setup_.grid.neighbour(int(marker), (axis ? Grid::downward : Grid::rightward) + side);
       ends[side] = other < 0 ? marker : std::size_t(other);
-      if (!known_[ends[side]]) return oval_[marker];
+      if (!measured_[ends[side]]) return ellipse_[marker];
     }
-    now[axis] = places_[ends[0]] - places_[ends[1]];
+    now[axis] = positions_[ends[0]] - positions_[ends[1]];
     rest[axis] = setup_.rest[ends[0]] - setup_.rest[ends[1]];
   }
   const double area = now[0].x * now[1].y - now[0].y * now[1].x;
-  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return oval_[marker];
+  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return ellipse_[marker];
   const double xx = (rest[0].x * now[1].y - rest[1].x * now[0].y) / area;
   const double xy = (rest[1].x * now[0].x - rest[0].x * now[1].x) / area;
   const double yx = (rest[0].y * now[1].y - rest[1].y * now[0].y) / area;
   const double yy = (rest[1].y * now[0].x - rest[0].y * now[1].x) / area;
-  const Oval& q = setup_.oval[marker];
+  const Ellipse& q = setup_.ellipse[marker];
   return {float(q.xx * xx * xx + 2 * q.xy * xx * yx + q.yy * yx * yx),
           float(q.xx * xx * xy + q.xy * (xx * yy + xy * yx) + q.yy * yx * yy),
           float(q.xx * xy * xy + 2 * q.xy * xy * yy + q.yy * yy * yy)};
 }
 
-// Whether two ovals differ by more than what the dots' places, as they are found by contrast, are uncertain by. Where
-// they do not, the last image's oval, from measured places, is the better one.
-bool Tracker::differ(const Oval& one, const Oval& two) {
-  const float most = oval_change * (two.xx + two.yy);
-  return std::abs(one.xx - two.xx) > most || std::abs(one.xy - two.xy) > most || std::abs(one.yy - two.yy) > most;
+// Whether two ellipses differ by more than the uncertainty of detected dots. Otherwise the ellipse of the last image,
+// from fitted positions, is more accurate.
+bool Tracker::differ(const Ellipse& one, const Ellipse& two) {
+  const float limit = ellipse_change * (two.xx + two.yy);
+  return std::abs(one.xx - two.xx) > limit || std::abs(one.xy - two.xy) > limit || std::abs(one.yy - two.yy) > limit;
 }
 
-Fit Tracker::fit(std::size_t marker, Point place, int passes) const {
-  if (!(place.x > -setup_.radius && place.y > -setup_.radius && place.x < setup_.width + setup_.radius &&
-        place.y < setup_.height + setup_.radius))
-    return {place, 0, 0};
-  return fit_dot(plane_, settings_, oval_[marker], inverse_[marker], setup_.contrast[marker], place, passes);
+DotFit Tracker::fit(std::size_t marker, Point position, int iterations) const {
+  if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
+        position.y < setup_.height + setup_.radius))
+    return {position, 0, 0};
+  return fit_dot(plane_, settings_, ellipse_[marker], inverse_hessian_[marker], setup_.contrast[marker], position,
+                 iterations);
 }
 
-// The quality of a fit, 0 where it is cut by the image's border or its contrast is not that of the marker.
-double Tracker::believed(std::size_t marker, const Fit& found) const {
-  const double growth = found.contrast / setup_.contrast[marker];
-  return is_inside(marker, found.place) && growth > weakest && growth < strongest ? found.quality : 0;
+// Quality of a fit, 0 if the image border cuts the dot or its contrast differs too much from that at rest.
+double Tracker::accepted_quality(std::size_t marker, const DotFit& found) const {
+  const double ratio = found.contrast / setup_.contrast[marker];
+  return is_inside(marker, found.position) && ratio > min_contrast_ratio && ratio < max_contrast_ratio ? found.quality
+                                                                                                       : 0;
 }
 
-// Whether the dot of a marker at `place` is not cut by the image's border.
-bool Tracker::is_inside(std::size_t marker, Point place) const {
-  const Point half = half_[marker];
-  return place.x > half.x && place.y > half.y && place.x < setup_.width - 1 - half.x &&
-         place.y < setup_.height - 1 - half.y;
+// Whether the dot of `marker` at `position` is entirely inside the image.
+bool Tracker::is_inside(std::size_t marker, Point position) const {
+  const Point half = half_size_[marker];
+  return position.x > half.x && position.y > half.y && position.x < setup_.width - 1 - half.x &&
+         position.y < setup_.height - 1 - half.y;
 }
 
-// Whether no marker next to `marker` was measured at this place.
-bool Tracker::is_free(int marker, Point place) const {
-  for (int way = 0; way < Grid::ways; ++way) {
-    const int other = setup_.grid.neighbour(marker, way);
-    if (other < 0 || !known_[std::size_t(other)]) continue;
-    if (squared(places_[std::size_t(other)] - place) < 2 * setup_.radius * setup_.radius) return false;
+// Whether no neighbour of `marker` was measured at `position`.
+bool Tracker::is_unoccupied(int marker, Point position) const {
+  for (int direction = 0; direction < Grid::directions; ++direction) {
+    const int other = setup_.grid.neighbour(marker, direction);
+    if (other < 0 || !measured_[std::size_t(other)]) continue;
+    if (squared(positions_[std::size_t(other)] - position) < 2 * setup_.radius * setup_.radius) return false;
   }
   return true;
 }
 
-// Gives up markers that are not where their neighbours say: the less of a dot's edge was seen, the closer it must be.
-void Tracker::drop_strays() {
-  for (std::size_t m = 0; m < steps_.size(); ++m) steps_[m] = places_[m] - setup_.rest[m];
-  filled_ = known_;
-  for (std::size_t m = 0; m < steps_.size(); ++m) {
-    Point told;
-    double discord;
-    if (!filled_[m] || quality_[m] > unquestioned || !foretold(int(m), told, discord)) continue;
-    const double most = stray * quality_[m] * quality_[m] * quality_[m] * setup_.spacing + discord;
-    if (squared(steps_[m] - told) > most * most) known_[m] = 0, quality_[m] = 0;
+// Rejects fits that differ from the extrapolation of the neighbours; the limit grows with the cube of the quality.
+void Tracker::reject_outliers() {
+  for (std::size_t m = 0; m < displacement_.size(); ++m) displacement_[m] = positions_[m] - setup_.rest[m];
+  filled_ = measured_;
+  for (std::size_t m = 0; m < displacement_.size(); ++m) {
+    Point predicted;
+    double deviation;
+    if (!filled_[m] || quality_[m] > trusted_quality || !extrapolate(int(m), predicted, deviation)) continue;
+    const double limit = outlier_distance * quality_[m] * quality_[m] * quality_[m] * setup_.spacing + deviation;
+    if (squared(displacement_[m] - predicted) > limit * limit) measured_[m] = 0, quality_[m] = 0;
   }
 }
 
-// The displacement of `marker` that the filled ones around it tell: the middle one of all that follow from two of them
-// in a line with it, on either side or on the same. Right for any displacement that changes linearly; `discord` is how
-// far the middle one of them is from that. False when there are fewer than three.
-bool Tracker::foretold(int marker, Point& told, double& discord) const {
+// Predicts the displacement of `marker` as the median of the linear interpolations and extrapolations from pairs of
+// filled neighbours in a line with it, exact for linear displacement fields. `deviation` is the median absolute
+// deviation. False when there are fewer than three predictions.
+bool Tracker::extrapolate(int marker, Point& predicted, double& deviation) const {
   std::array<double, 12> x, y;
   std::size_t n = 0;
   const auto filled = [&](int other) { return other >= 0 && filled_[std::size_t(other)]; };
-  const auto step = [&](int other) { return steps_[std::size_t(other)]; };
-  const auto tell = [&](Point p) { x[n] = p.x, y[n] = p.y, ++n; };
-  for (int way = 0; way < Grid::ways; ++way) {
-    const int near = setup_.grid.neighbour(marker, way), behind = setup_.grid.neighbour(marker, way, 2);
-    const int opposite = setup_.grid.neighbour(marker, way, -1);
+  const auto step = [&](int other) { return displacement_[std::size_t(other)]; };
+  const auto add = [&](Point p) { x[n] = p.x, y[n] = p.y, ++n; };
+  for (int direction = 0; direction < Grid::directions; ++direction) {
+    const int near = setup_.grid.neighbour(marker, direction), behind = setup_.grid.neighbour(marker, direction, 2);
+    const int opposite = setup_.grid.neighbour(marker, direction, -1);
     if (!filled(near)) continue;
-    if (way % 2 == 0 && filled(opposite)) tell(0.5 * (step(near) + step(opposite)));
-    if (filled(behind)) tell(2 * step(near) - step(behind));
+    if (direction % 2 == 0 && filled(opposite)) add(0.5 * (step(near) + step(opposite)));
+    if (filled(behind)) add(2 * step(near) - step(behind));
   }
   if (n < 3) return false;
-  const auto middle = [n](std::array<double, 12>& values) {
+  const auto median = [n](std::array<double, 12>& values) {
     std::nth_element(values.begin(), values.begin() + n / 2, values.begin() + n);
     return values[n / 2];
   };
-  told = {middle(x), middle(y)};
-  for (std::size_t i = 0; i < n; ++i) x[i] = std::abs(x[i] - told.x), y[i] = std::abs(y[i] - told.y);
-  discord = std::hypot(middle(x), middle(y));
+  predicted = {median(x), median(y)};
+  for (std::size_t i = 0; i < n; ++i) x[i] = std::abs(x[i] - predicted.x), y[i] = std::abs(y[i] - predicted.y);
+  deviation = std::hypot(median(x), median(y));
   return true;
 }
 
-// The mean displacement of the filled markers around one, those next to it with twice the weight of those across; false
-// when there are none.
-bool Tracker::around(int marker, Point& mean) const {
+// Mean displacement of the filled neighbours; axis neighbours have twice the weight of diagonal ones. False when there
+// are none.
+bool Tracker::neighbour_mean(int marker, Point& mean) const {
   Point sum{};
   double weight = 0;
-  for (int way = 0; way < Grid::ways; ++way) {
-    const int other = setup_.grid.neighbour(marker, way);
+  for (int direction = 0; direction < Grid::directions; ++direction) {
+    const int other = setup_.grid.neighbour(marker, direction);
     if (other < 0 || filled_[std::size_t(other)] != 1) continue;
-    const double share = way < Grid::straight ? 2 : 1;
-    sum = sum + share * steps_[std::size_t(other)];
+    const double share = direction < Grid::axis_directions ? 2 : 1;
+    sum = sum + share * displacement_[std::size_t(other)];
     weight += share;
   }
   if (weight == 0) return false;
@@ -279,29 +283,29 @@ bool Tracker::around(int marker, Point& mean) const {
   return true;
 }
 
-// Places of markers that are not known, from the displacement of their neighbours: outwards from the known ones, then
-// towards the mean of the neighbours.
-void Tracker::spread() {
+// Infers the positions of markers that were not measured: fills their displacements outwards from measured neighbours,
+// then relaxes them towards the mean of their neighbours.
+void Tracker::fill_missing() {
   const std::size_t n = setup_.rest.size();
-  for (std::size_t m = 0; m < n; ++m) steps_[m] = places_[m] - setup_.rest[m];
-  filled_ = known_;
+  for (std::size_t m = 0; m < n; ++m) displacement_[m] = positions_[m] - setup_.rest[m];
+  filled_ = measured_;
   const auto pass = [&](bool outwards) {
     bool changed = false;
     for (std::size_t m = 0; m < n; ++m) {
-      next_[m] = steps_[m];
-      if (known_[m] || (outwards && filled_[m])) continue;
-      if (!around(int(m), next_[m])) continue;
-      if (!filled_[m]) filled_[m] = 2, changed = true;  // counts from the next pass on
+      relaxed_[m] = displacement_[m];
+      if (measured_[m] || (outwards && filled_[m])) continue;
+      if (!neighbour_mean(int(m), relaxed_[m])) continue;
+      if (!filled_[m]) filled_[m] = 2, changed = true;  // used from the next pass on
     }
-    steps_.swap(next_);
+    displacement_.swap(relaxed_);
     for (char& f : filled_) f = char(f != 0);
     return changed;
   };
   while (pass(true)) {
   }
-  for (int i = 0; i < relaxations; ++i) pass(false);
+  for (int i = 0; i < relaxation_steps; ++i) pass(false);
   for (std::size_t m = 0; m < n; ++m)
-    if (!known_[m]) places_[m] = setup_.rest[m] + steps_[m];
+    if (!measured_[m]) positions_[m] = setup_.rest[m] + displacement_[m];
 }
 
 }  // namespace gelflow::perception

@@ -1,75 +1,75 @@
-// The markers of one camera, from image to image: dots by contrast, whose they are, where exactly, and what is guessed.
+// Tracks the markers of one camera: detects dots, assigns them to markers, fits their centres, infers missing markers.
 #pragma once
 
-#include "fit.hpp"
-#include "follow.hpp"
+#include "assignment.hpp"
+#include "dot_fit.hpp"
 
 namespace gelflow::perception {
 
-// What the start has learned; all vectors have one entry per marker, row by row.
-struct Setup {
+// The dot model of the first image. Vectors have one entry per marker, row by row.
+struct TrackerSetup {
   int width, height;
   Grid grid;
   Channel channel;
   bool bright;
   double spacing, radius;  // [px]
-  double noise;            // of a pixel, as a share of the light
-  Shape shape;
-  std::vector<Point> rest;       // [px]
-  std::vector<char> seen;        // whether there was a dot
-  std::vector<Oval> oval;        // its shape
-  std::vector<double> contrast;  // negative for dark dots
+  double noise;            // standard deviation of a pixel / background
+  DotProfile profile;
+  std::vector<Point> rest;       // position at rest [px]
+  std::vector<char> visible;     // whether the first image shows its dot
+  std::vector<Ellipse> ellipse;  // of its dot
+  std::vector<double> contrast;  // of its dot, negative for dark dots
 };
 
 class Tracker {
  public:
-  explicit Tracker(Setup setup);
+  explicit Tracker(TrackerSetup setup);
 
-  // Fits every marker of a first image where the setup says it is, and makes what it finds the rest. A marker whose
-  // dot does not have the common shape counts as not seen from then on.
+  // Fits the dot of each visible marker near its rest position; the fits become the rest positions and contrasts. A
+  // marker whose dot does not match the profile is not visible from then on.
   void start(const std::uint8_t* bgr);
-  // Follows the markers into the next image.
+  // Tracks the markers in the next image.
   void track(const std::uint8_t* bgr);
 
-  const Setup& setup() const { return setup_; }
+  const TrackerSetup& setup() const { return setup_; }
   int markers() const { return int(setup_.rest.size()); }
-  // Of the newest image; where neither valid nor inferred, where the marker was last.
-  const std::vector<Point>& places() const { return places_; }
-  const std::vector<double>& quality() const { return quality_; }  // 0 where not valid
+  // In the latest image; the last position of markers that are neither valid nor inferred [px].
+  const std::vector<Point>& positions() const { return positions_; }
+  const std::vector<double>& quality() const { return quality_; }  // 0 for markers that are not valid
   const std::vector<double>& contrasts() const { return contrasts_; }
   bool anything_valid() const { return anything_valid_; }
 
  private:
-  void measure(const std::vector<int>& owner);
-  void accept(std::size_t marker, const Fit& found, double least);
-  Oval stretched(std::size_t marker) const;
-  static bool differ(const Oval& one, const Oval& two);
-  Fit fit(std::size_t marker, Point place, int passes) const;
-  double believed(std::size_t marker, const Fit& fit) const;
-  bool is_inside(std::size_t marker, Point place) const;
-  bool is_free(int marker, Point place) const;
-  void drop_strays();
-  bool foretold(int marker, Point& told, double& discord) const;
-  bool around(int marker, Point& mean) const;
-  void spread();
+  void measure(const std::vector<int>& dot_of);
+  void accept(std::size_t marker, const DotFit& found, double threshold);
+  Ellipse deformed_ellipse(std::size_t marker) const;
+  static bool differ(const Ellipse& one, const Ellipse& two);
+  DotFit fit(std::size_t marker, Point position, int iterations) const;
+  double accepted_quality(std::size_t marker, const DotFit& fit) const;
+  bool is_inside(std::size_t marker, Point position) const;
+  bool is_unoccupied(int marker, Point position) const;
+  void reject_outliers();
+  bool extrapolate(int marker, Point& predicted, double& deviation) const;
+  bool neighbour_mean(int marker, Point& mean) const;
+  void fill_missing();
   void refine_rest();
 
-  Setup setup_;
+  TrackerSetup setup_;
   FitSettings settings_;
-  std::vector<Inverse> inverse_;
-  std::vector<Oval> oval_;  // of the markers as the gel is stretched now
+  std::vector<InverseHessian> inverse_hessian_;
+  std::vector<Ellipse> ellipse_;  // of the dots on the deformed gel
   Plane plane_;
-  Contrast contrast_;
-  Follow follow_;
-  float least_ = 0.02f;  // response of a dot
+  DotDetector detector_;
+  DotAssignment assignment_;
+  float threshold_ = 0.02f;  // minimum response of a dot
   std::vector<Dot> dots_;
-  std::vector<Point> half_;    // of a dot's width and height at rest
-  std::vector<Point> offset_;  // from a dot as found by contrast to its centre, at rest
-  std::vector<Point> places_, before_, velocity_, steps_, next_;
+  std::vector<Point> half_size_;  // half width and half height of a dot at rest, reduced by its blurred edge [px]
+  std::vector<Point> detection_offset_;  // from a detected dot to its fitted centre, at rest [px]
+  std::vector<Point> positions_, previous_, velocity_, displacement_, relaxed_;
   std::vector<double> quality_, contrasts_;
-  std::vector<char> known_, filled_, expected_;
+  std::vector<char> measured_, filled_, expected_;
   bool anything_valid_ = false;
-  int at_rest_ = 0;  // images that the reference is the mean of; 0 when it is final
+  int rest_images_ = 0;  // images averaged in the rest positions; 0 when these are final
 };
 
 }  // namespace gelflow::perception

@@ -124,9 +124,9 @@ def test_a_rectified_picture_shows_the_grid_straight() -> None:
 def test_a_pressed_gel_and_too_few_markers_are_refused() -> None:
     rest = camera(NODES, barrel=0.05, keystone=0.05, center=(159.5, 119.5))
     bump = np.exp(-((NODES - (3.0, -2.0)) ** 2).sum(axis=1) / 18)[:, None]
-    with pytest.raises(PeerError, match="is the gel untouched"):
+    with pytest.raises(PeerError, match="check that the gel is undamaged"):
         fitted(rest + bump * (6.0, 4.0))
-    with pytest.raises(PeerError, match="10 markers are seen, at least 16"):
+    with pytest.raises(PeerError, match="10 markers are visible, at least 16"):
         fitted(rest, np.arange(len(NODES)) < 10)
     with pytest.raises(UsageError, match="spacing"):
         fit_calibration(rest, ALL, rows=ROWS, cols=COLS, spacing_mm=0.0, size=SIZE)
@@ -146,12 +146,12 @@ def test_a_file_is_read_back_equal_and_never_overwritten(tmp_path: Path) -> None
         ({"format": 2}, "calibration format 2; this gelflow reads format 1: update"),
         ({"format": None}, "it has no format"),
         ({"zoom": 3}, "unknown keys ['zoom']"),
-        ({"matrix": [[1, 2], [3, 4]]}, "no mapping"),
-        ({"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]}, "no mapping"),
-        ({"radial": [0.1, "much"]}, "no mapping"),
-        ({"center": [float("nan"), 0.0]}, "no mapping"),
-        ({"width": "wide"}, "no mapping"),
-        ({"spacing_mm": -1.0}, "no mapping"),
+        ({"matrix": [[1, 2], [3, 4]]}, "not a valid image-to-gel mapping"),
+        ({"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 0]]}, "not a valid image-to-gel mapping"),
+        ({"radial": [0.1, "much"]}, "not a valid image-to-gel mapping"),
+        ({"center": [float("nan"), 0.0]}, "not a valid image-to-gel mapping"),
+        ({"width": "wide"}, "not a valid image-to-gel mapping"),
+        ({"spacing_mm": -1.0}, "not a valid image-to-gel mapping"),
     ],
 )
 def test_a_wrong_file_is_refused(tmp_path: Path, change: dict[str, object], expected: str) -> None:
@@ -167,7 +167,7 @@ def test_a_wrong_file_is_refused(tmp_path: Path, change: dict[str, object], expe
 def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "gel.json"
     path.write_bytes(text.encode("latin-1"))
-    with pytest.raises(UsageError, match="is no calibration"):
+    with pytest.raises(UsageError, match="is not a calibration"):
         load_calibration(path)
     with pytest.raises(UsageError, match="cannot read"):
         load_calibration(tmp_path / "none.json")

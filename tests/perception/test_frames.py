@@ -64,7 +64,7 @@ def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() 
     assert from_plain(CameraMount, json.loads(to_json(mount)), what="camera mount") == mount
     with pytest.raises(UsageError, match="not both"):
         CameraMount(rotation=270, calibration=calibration, pixels_per_mm=15.7)
-    with pytest.raises(UsageError, match="calibration is of 14 lines of 18 markers"):
+    with pytest.raises(UsageError, match="calibration is for 14 rows of 18 markers"):
         CameraMount(rotation=0, calibration=calibration)
 
 
@@ -75,9 +75,9 @@ def test_a_marker_not_seen_is_invalid_and_never_zero() -> None:
 
 
 def test_grids_and_mounts_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UsageError, match="expects 14 lines of 18"):
+    with pytest.raises(UsageError, match="expects 14 rows of 18"):
         tactile_frame([tracked()], [CameraMount(rotation=90)], stamp=0.0)
-    with pytest.raises(UsageError, match="one tracked image per mount"):
+    with pytest.raises(UsageError, match="one tracking result per mount"):
         tactile_frame([tracked()], [CameraMount(), CameraMount()], stamp=0.0)
     with pytest.raises(UsageError, match="same grid"):
         tactile_frame([tracked(), tracked()], [CameraMount(), CameraMount(pitch=1.5)], stamp=0.0)
@@ -98,7 +98,7 @@ def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
 def test_an_image_that_is_cut_off_is_told_so() -> None:
     renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
-    with pytest.raises(PeerError, match="cut off, or damaged"):
+    with pytest.raises(PeerError, match="truncated or damaged"):
         decode_image(data[: len(data) // 2])
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 
 from gelflow.errors import PeerError
-from gelflow.perception.tracker import TrackerInitError
+from gelflow.perception.errors import TrackerInitError
 
 
 @contextmanager

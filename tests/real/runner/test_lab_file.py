@@ -107,7 +107,7 @@ def test_a_calibration_is_named_from_where_the_lab_file_is(tmp_path: Path, examp
     save_lab(lab, tmp_path / "elsewhere" / "lab.toml", title="the same calibration")
     assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
     path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
-    assert "lab.toml, cameras.left: the calibration is of 18 lines of 14" in refused(tmp_path, path.read_text())
+    assert "lab.toml, cameras.left: the calibration is for 18 rows of 14" in refused(tmp_path, path.read_text())
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

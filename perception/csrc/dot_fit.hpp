@@ -1,0 +1,237 @@
+// Least-squares fit of the centre of a dot with a known profile.
+//
+// The image around a dot is modelled as a linear background times one plus the contrast of the dot times its profile:
+//
+//   m(x) = b (1 + β·(x − w)) (1 + a s(q)),   q = (x − p)ᵀ Q (x − p),
+//
+// with the window centre w, the profile s from the first image (1 inside, 0 outside; a table over q), and the ellipse Q
+// of the marker. The unknowns are the centre p, the contrast a, the background b and its slope β. The slope is required:
+// an unmodelled slope of 1 % per pixel shifts the centre by a quarter of a pixel.
+//
+// The residual r = I − m enters through ψ(r) = r / (1 + (r/k)²), which limits the influence of scratches, highlights,
+// bridges and neighbouring dots. With J = ∂m/∂(p, a, b, bβ) / b, the Gauss-Newton step is
+//
+//   δ = H⁻¹ Σ Jᵀ ψ(r)/b,   H = Σ JᵀJ.
+//
+// H is computed once per marker, for a dot at the centre of a pixel with its contrast at rest. This approximation
+// changes the convergence rate but not the solution of Σ Jᵀ ψ(r) = 0; an iteration then needs only six sums.
+#pragma once
+
+#include <array>
+#include <cmath>
+
+#include "image.hpp"
+
+namespace gelflow::perception {
+
+// Packs of eight pixels, with the vector extensions of GCC and Clang.
+typedef float FloatPack __attribute__((vector_size(32)));
+typedef std::int32_t IntPack __attribute__((vector_size(32)));
+constexpr int pack_size = 8;
+constexpr double coarse_tolerance = 0.1;  // step [px] down to which every second line suffices
+constexpr double tolerance = 0.015;       // converged: the next step would be about a tenth of this one [px]
+
+struct DotProfile {
+  static constexpr int steps = 256;
+  std::array<float, steps + 2> value;  // s at `steps` + 1 equidistant q from 0 to `reach`, then 0
+  float reach;                         // s = 0 for larger q
+};
+
+struct Ellipse {
+  float xx, xy, yy;  // Q [1/px²]
+};
+
+struct DotFit {
+  Point position;
+  double contrast = 0;  // a
+  double quality = 0;   // fraction of the edge of the dot that the profile explains, 0 to 1
+};
+
+// The pixels around a dot; the side `size` is a multiple of `pack_size`.
+struct Window {
+  static constexpr int largest = 48;
+  int left, top, size;
+  alignas(32) std::array<float, largest * largest> pixels;
+};
+
+GELFLOW_CLONES inline void copy_window(const std::uint8_t* __restrict first, int stride, int size,
+                                       float* __restrict pixels) {
+  for (int row = 0; row < size; ++row)
+    for (int x = 0; x < size; ++x) pixels[row * size + x] = float(first[row * stride + x]);
+}
+
+// Model parameters of one iteration, and the sums over the window.
+struct FitState {
+  int row_step;                  // distance of the lines that are used
+  float x, y;                    // centre of the dot relative to the window centre [px]
+  float a, b, slope_x, slope_y;  // contrast, background, and β
+  float k;                       // scale of the robust weight [grey levels]
+  double sums[6];                // Σ Jᵀψ, in the order of the unknowns
+  double edge, edge_weighted;    // Σ|∇s|², unweighted and with the robust weights
+  double weight;                 // sum of the robust weights
+};
+
+struct ProfileSample {
+  FloatPack s, gx, gy;  // profile and its derivative by p in window coordinates
+};
+
+GELFLOW_INLINE ProfileSample sample_profile(const DotProfile& profile, const Ellipse& ellipse, FloatPack dx, float dy) {
+  const float scale = float(DotProfile::steps) / profile.reach;
+  const FloatPack qx = ellipse.xx * dx + ellipse.xy * dy, qy = ellipse.xy * dx + ellipse.yy * dy;
+  FloatPack t = scale * (qx * dx + qy * dy);
+  t = t < float(DotProfile::steps) ? t : FloatPack{} + float(DotProfile::steps);
+  const IntPack index = __builtin_convertvector(t, IntPack);
+  const FloatPack part = t - __builtin_convertvector(index, FloatPack);
+  FloatPack low, high;
+  for (int l = 0; l < pack_size; ++l) {
+    low[l] = profile.value[std::size_t(index[l])];
+    high[l] = profile.value[std::size_t(index[l]) + 1];
+  }
+  const FloatPack slope = (high - low) * (-2 * scale);
+  return {low + part * (high - low), slope * qx, slope * qy};
+}
+
+GELFLOW_INLINE double sum_lanes(FloatPack v) {
+  double sum = 0;
+  for (int l = 0; l < pack_size; ++l) sum += double(v[l]);
+  return sum;
+}
+
+GELFLOW_CLONES inline void accumulate(const Window& window, int width, int height, const DotProfile& profile,
+                                      const Ellipse& ellipse, FitState& state) {
+  const float middle = 0.5f * float(window.size - 1), k2 = 1 / (state.k * state.k);
+  FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{};
+  const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
+  for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); row += state.row_step) {
+    const float y = float(row) - middle;
+    const float* line = &window.pixels[std::size_t(row * window.size)];
+    for (int start = 0; start < window.size; start += pack_size) {
+      const FloatPack x = ramp + (float(start) - middle);
+      FloatPack pixel;
+      std::memcpy(&pixel, line + start, sizeof pixel);
+      const FloatPack column = x + (middle + float(window.left));
+      const ProfileSample dot = sample_profile(profile, ellipse, x - state.x, y - state.y);
+      const FloatPack ink = 1 + state.a * dot.s;
+      const FloatPack r = pixel - state.b * (1 + state.slope_x * x + state.slope_y * y) * ink;
+      FloatPack w = 1 / (1 + r * r * k2);
+      const auto outside = (column < 0) | (column > float(width - 1));
+      w = outside ? FloatPack{} : w;
+      const FloatPack psi = w * r, square = dot.gx * dot.gx + dot.gy * dot.gy, lit = psi * ink;
+      px += psi * dot.gx;
+      py += psi * dot.gy;
+      pa += psi * dot.s;
+      pb += lit;
+      bx += lit * x;
+      by += lit * y;
+      edge += square;
+      edge_weighted += w * square;
+      weight += w;
+    }
+  }
+  const double share = 1.0 / state.b;
+  const double a = state.a;
+  const std::array<double, 6> sums = {a * sum_lanes(px), a * sum_lanes(py), sum_lanes(pa),
+                                      sum_lanes(pb),     sum_lanes(bx),     sum_lanes(by)};
+  for (int i = 0; i < 6; ++i) state.sums[i] = share * sums[std::size_t(i)];
+  state.edge = sum_lanes(edge), state.edge_weighted = sum_lanes(edge_weighted);
+  state.weight = sum_lanes(weight);
+}
+
+// H⁻¹ of a marker, row-major.
+using InverseHessian = std::array<double, 36>;
+
+// Inverts a symmetric positive definite matrix by Gauss-Jordan elimination; false when it is singular.
+inline bool invert(std::array<double, 36>& matrix, InverseHessian& inverse) {
+  inverse.fill(0);
+  for (int i = 0; i < 6; ++i) inverse[std::size_t(7 * i)] = 1;
+  for (std::size_t i = 0; i < 6; ++i) {
+    const double pivot = matrix[7 * i];
+    if (!(pivot > 1e-9)) return false;
+    for (std::size_t j = 0; j < 6; ++j) matrix[6 * i + j] /= pivot, inverse[6 * i + j] /= pivot;
+    for (std::size_t k = 0; k < 6; ++k) {
+      const double factor = matrix[6 * k + i];
+      if (k == i || factor == 0) continue;
+      for (std::size_t j = 0; j < 6; ++j) {
+        matrix[6 * k + j] -= factor * matrix[6 * i + j];
+        inverse[6 * k + j] -= factor * inverse[6 * i + j];
+      }
+    }
+  }
+  return true;
+}
+
+GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const Ellipse& ellipse, double contrast, int size,
+                                           InverseHessian& inverse) {
+  std::array<FloatPack, 36> sums{};
+  const float middle = 0.5f * float(size - 1);
+  const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
+  for (int row = 0; row < size; ++row)
+    for (int start = 0; start < size; start += pack_size) {
+      const FloatPack x = ramp + (float(start) - middle);
+      const float y = float(row) - middle, a = float(contrast);
+      const ProfileSample dot = sample_profile(profile, ellipse, x, y);
+      const FloatPack ink = 1 + a * dot.s;
+      const std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
+      for (std::size_t i = 0; i < 6; ++i)
+        for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += j[i] * j[l];
+    }
+  std::array<double, 36> h;
+  for (std::size_t i = 0; i < 6; ++i)
+    for (std::size_t l = 0; l <= i; ++l) h[6 * i + l] = h[6 * l + i] = sum_lanes(sums[6 * i + l]);
+  return invert(h, inverse);
+}
+
+struct FitSettings {
+  DotProfile profile;
+  int window;     // side of the window [px]
+  double radius;  // of a dot [px]
+  double noise;   // standard deviation of a pixel at rest / background
+};
+
+// Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed. The quality is 0
+// when the fit leaves the central part of the window or the contrast changes sign.
+inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Ellipse& ellipse,
+                      const InverseHessian& inverse, double rest_contrast, Point position, int max_iterations) {
+  const int size = settings.window;
+  const double middle = 0.5 * (size - 1), limit = 0.8 * settings.radius + 1;
+  Window window;
+  window.left = int(std::floor(position.x - middle + 0.5)), window.top = int(std::floor(position.y - middle + 0.5));
+  window.size = size;
+  const Point corner = {window.left + middle, window.top + middle}, begin = position - corner;
+  copy_window(plane.row(0) + std::ptrdiff_t(window.top) * plane.stride + window.left, plane.stride, size,
+              window.pixels.data());
+  // The mean along the border of the window is a sufficient initial value.
+  double background = 0;
+  for (int i = 0; i < size; ++i)
+    for (int edge : {i, size * (size - 1) + i, size * i, size * i + size - 1})
+      background += window.pixels[std::size_t(edge)];
+  background = std::max(4.0, background / (4 * size));
+  FitState state{};
+  state.x = float(begin.x), state.y = float(begin.y), state.a = float(rest_contrast), state.b = float(background);
+  bool coarse = true;
+  for (int number = 0; number < max_iterations; ++number) {
+    state.k = state.b * float(std::max(0.16 * std::abs(double(state.a)), 3 * settings.noise));
+    state.row_step = coarse ? 2 : 1;
+    accumulate(window, plane.width, plane.height, settings.profile, ellipse, state);
+    // H includes all pixels, the sums only those with weight.
+    const double scale = std::min(4.0, double(size * size) / std::max(state.weight, 1.0));
+    std::array<double, 6> step{};
+    for (std::size_t i = 0; i < 6; ++i)
+      for (std::size_t j = 0; j < 6; ++j) step[i] += scale * inverse[6 * i + j] * state.sums[j];
+    const double max_step = 0.5 * settings.radius;
+    step[0] = std::clamp(step[0], -max_step, max_step), step[1] = std::clamp(step[1], -max_step, max_step);
+    state.x += float(step[0]), state.y += float(step[1]), state.a += float(step[2]);
+    state.b = std::clamp(state.b * float(1 + std::clamp(step[3], -0.5, 1.0)), 1.0f, 512.0f);
+    state.slope_x += float(step[4]), state.slope_y += float(step[5]);
+    const bool diverged = !(std::abs(state.x - begin.x) < limit && std::abs(state.y - begin.y) < limit) ||
+                          !(state.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
+    if (diverged) return {position, 0, 0};
+    const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
+    if (!coarse && moved < tolerance) break;
+    coarse = coarse && moved > coarse_tolerance;
+  }
+  const double edge = std::max(state.edge, 1e-9);
+  return {corner + Point{state.x, state.y}, state.a, std::clamp(state.edge_weighted / edge, 0.0, 1.0)};
+}
+
+}  // namespace gelflow::perception
