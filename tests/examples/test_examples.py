@@ -42,6 +42,11 @@ def test_script_runs(script: str) -> None:
     assert re.fullmatch(LAST_LINE[script], last), last
 
 
+def test_the_python_block_of_the_readme_runs() -> None:
+    (block,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert run(["-c", block + "assert u.grad.abs().max() > 0"]) == "torch.Size([2, 1, 130, 3])\n"
+
+
 @pytest.mark.parametrize("notebook", sorted(path.name for path in EXAMPLES.glob("*.ipynb")))
 def test_notebook_runs_and_contains_its_pictures(notebook: str) -> None:
     cells = [cell for cell in json.loads((EXAMPLES / notebook).read_text())["cells"] if cell["cell_type"] == "code"]
