@@ -1,4 +1,4 @@
-"""The kinematic stand-ins against closed forms."""
+"""Kinematic plants against closed forms."""
 
 import math
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from gelflow.hardware_mocks.plant import ArmPlant, GripperPlant, KinematicArm, K
 
 
 @dataclass
-class HandClock:
-    """A clock that a test turns by hand."""
+class ManualClock:
+    """A clock that the test advances."""
 
     time: float = 0.0
 
@@ -27,7 +27,7 @@ class HandClock:
 
 
 def test_fingers_move_at_their_speed_and_stop_at_target_part_and_end() -> None:
-    clock = HandClock()
+    clock = ManualClock()
     gripper = KinematicGripper(clock, width=0.050)
     plant: GripperPlant = gripper
     plant.command_gripper(width=0.040, speed=0.020, force=30)
@@ -49,15 +49,15 @@ def test_fingers_move_at_their_speed_and_stop_at_target_part_and_end() -> None:
 
 def test_parts_that_do_not_fit_are_refused() -> None:
     with pytest.raises(UsageError, match="part_width"):
-        KinematicGripper(HandClock(), width=0.02, part_width=0.03)
+        KinematicGripper(ManualClock(), width=0.02, part_width=0.03)
     with pytest.raises(UsageError, match="width"):
-        KinematicGripper(HandClock(), width=0.12)
+        KinematicGripper(ManualClock(), width=0.12)
     with pytest.raises(UsageError, match="fit"):
-        KinematicGripper(HandClock(), width=0.02).set_part(0.03)
+        KinematicGripper(ManualClock(), width=0.02).set_part(0.03)
 
 
-def test_the_arm_lags_by_an_exponential_whatever_the_steps() -> None:
-    clock = HandClock()
+def test_arm_follows_with_exponential_lag_for_any_steps() -> None:
+    clock = ManualClock()
     upright = np.array([0.0, 1.0, 0.0, 0.0])
     arm: ArmPlant = KinematicArm(clock, position=np.zeros(3), quaternion=upright, lag=0.1)
     turned = np.array([0.0, math.cos(0.1), math.sin(0.1), 0.0])
@@ -73,8 +73,8 @@ def test_the_arm_lags_by_an_exponential_whatever_the_steps() -> None:
     assert abs(quaternion @ turned) == pytest.approx(1.0) and np.linalg.norm(quaternion) == pytest.approx(1.0)
 
 
-def test_a_pose_that_is_none_is_refused() -> None:
-    arm = KinematicArm(HandClock(), position=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
+def test_invalid_poses_are_refused() -> None:
+    arm = KinematicArm(ManualClock(), position=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]))
     for position, quaternion in (
         (np.array([0, 0, math.nan]), np.array([1.0, 0, 0, 0])),
         (np.zeros(2), np.array([1.0, 0, 0, 0])),
@@ -83,4 +83,4 @@ def test_a_pose_that_is_none_is_refused() -> None:
         with pytest.raises(UsageError):
             arm.command_arm(position, quaternion)
     with pytest.raises(UsageError, match="lag"):
-        KinematicArm(HandClock(), position=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]), lag=0.0)
+        KinematicArm(ManualClock(), position=np.zeros(3), quaternion=np.array([1.0, 0, 0, 0]), lag=0.0)

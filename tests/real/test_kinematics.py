@@ -1,4 +1,4 @@
-"""The IRB 120: its home pose, its DH table against a product of matrices, and inverse against forward."""
+"""Kinematics of the IRB 120: home pose, DH parameters against matrix products, inverse against forward."""
 
 import math
 
@@ -11,7 +11,7 @@ from gelflow.real import kinematics as k
 
 
 def matrix(joints: k.Joints) -> np.ndarray:
-    """The textbook product of 4 × 4 DH matrices, an independent route."""
+    """The product of 4 × 4 DH matrices, as an independent computation."""
     total = np.eye(4)
     table = [
         (0, 0.29, 0, -90),
@@ -35,14 +35,14 @@ def random_joints(rng: np.random.Generator, share: float = 0.98) -> k.Joints:
     return tuple(float(v) for v in rng.uniform(low * share, high * share))  # type: ignore[return-value]
 
 
-def test_home_flange() -> None:
+def test_flange_pose_at_home() -> None:
     position, quaternion = k.forward(k.HOME)
     assert position == pytest.approx((0.374, 0.0, 0.630), abs=1e-12)
-    # The flange looks forward: its z is the base's x.
+    # The z axis of the flange points along the x axis of the base.
     assert geometry.rotate(quaternion, (0.0, 0.0, 1.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
 
 
-def test_forward_is_the_product_of_dh_matrices() -> None:
+def test_forward_kinematics_equals_the_product_of_dh_matrices() -> None:
     rng = np.random.default_rng(0)
     for _ in range(200):
         joints = random_joints(rng)
@@ -52,7 +52,7 @@ def test_forward_is_the_product_of_dh_matrices() -> None:
         assert np.allclose(np.array(geometry.rotation_columns(quaternion)).T, expected[:3, :3], atol=1e-12)
 
 
-def test_inverse_finds_the_pose_and_the_joints_it_came_from() -> None:
+def test_inverse_kinematics_reproduces_pose_and_joint_angles() -> None:
     rng = np.random.default_rng(1)
     for _ in range(1000):
         joints = random_joints(rng)
@@ -66,8 +66,8 @@ def test_inverse_finds_the_pose_and_the_joints_it_came_from() -> None:
         assert not k.range_violation(elsewhere)
 
 
-def test_inverse_follows_a_path_without_a_jump() -> None:
-    """A straight move with the flange looking down: neighbours on the path are neighbours in joint space."""
+def test_inverse_kinematics_is_continuous_along_a_path() -> None:
+    """A straight motion with the flange pointing down gives a continuous path in joint space."""
     joints = k.inverse((0.40, -0.05, 0.30), (0.0, 0.0, 1.0, 0.0), near=k.HOME)
     for step in range(200):
         following = k.inverse((0.40, -0.05 + step * 5e-4, 0.30), (0.0, 0.0, 1.0, 0.0), near=joints)
@@ -75,25 +75,25 @@ def test_inverse_follows_a_path_without_a_jump() -> None:
         joints = following
 
 
-def test_inverse_keeps_joint_4_where_joints_4_and_6_are_one_axis() -> None:
+def test_inverse_kinematics_keeps_joint_4_at_the_wrist_singularity() -> None:
     joints = (0.3, 0.2, -0.4, 0.7, 0.0, -1.1)
     position, quaternion = k.forward(joints)
     assert np.allclose(k.inverse(position, quaternion, near=joints), joints, atol=1e-6)
 
 
-def test_joint_6_takes_the_turn_that_is_near() -> None:
+def test_joint_6_uses_the_nearest_turn() -> None:
     position, quaternion = k.forward((0.1, 0.2, 0.1, 0.4, 0.8, 0.5))
     for turns in (-1, 0, 1):
         near = (0.1, 0.2, 0.1, 0.4, 0.8, 0.5 + 2 * math.pi * turns)
         assert k.inverse(position, quaternion, near=near)[5] == pytest.approx(near[5], abs=1e-6)
 
 
-def test_quaternion_of_every_half_turn() -> None:
+def test_quaternions_of_half_turns() -> None:
     for q in ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)):
         assert geometry.angle_between(geometry.columns_quaternion(geometry.rotation_columns(q)), q) < 1e-12
 
 
-def test_frames_compose_and_invert() -> None:
+def test_poses_compose_and_invert() -> None:
     rng = np.random.default_rng(2)
     a, b = k.forward(random_joints(rng)), k.forward(random_joints(rng))
     position, quaternion = geometry.compose(geometry.invert(a), geometry.compose(a, b))
@@ -101,18 +101,18 @@ def test_frames_compose_and_invert() -> None:
     assert geometry.angle_between(quaternion, b[1]) < 1e-8
 
 
-def test_a_pose_out_of_reach_says_so() -> None:
+def test_pose_out_of_reach_is_reported() -> None:
     with pytest.raises(SafetyError, match=r"out of reach: its wrist is 1\.\d+ m from the shoulder"):
         k.inverse((1.2, 0.0, 0.3), (0.0, 0.0, 1.0, 0.0), near=k.HOME)
 
 
-def test_a_pose_out_of_range_names_the_joint() -> None:
-    """The flange looking straight back at the arm from far in front needs more than joint 5 has."""
+def test_pose_out_of_joint_range_names_the_joint() -> None:
+    """A flange far in front that points back at the arm exceeds the range of joint 5."""
     back = geometry.columns_quaternion(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)))
     with pytest.raises(SafetyError, match=r"joint \d would be at -?\d+\.\d°, its range is"):
         k.inverse((0.45, 0.0, 0.30), back, near=k.HOME)
 
 
-def test_ranges_are_those_of_the_robot() -> None:
+def test_joint_ranges_of_the_robot() -> None:
     assert k.range_violation((0.0, 0.0, math.radians(69.9), 0.0, 0.0, math.radians(-399))) == ""
     assert k.range_violation((0.0, 0.0, math.radians(70.5), 0.0, 0.0, 0.0)).startswith("joint 3 would be at 70.5°")

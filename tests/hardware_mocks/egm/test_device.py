@@ -1,4 +1,4 @@
-"""The mock robot against an independent EGM client: the one of the ABBRobotEGM package."""
+"""Mock arm against an independent EGM client, that of the ABBRobotEGM package."""
 
 import dataclasses
 import math
@@ -24,7 +24,7 @@ DOWN = np.array([0.0, 0.0, 1.0, 0.0])
 
 
 class Bench:
-    """A mock, and a foreign client that is told where to go."""
+    """A mock arm and an independent client."""
 
     def __init__(self, factor: float = 1.0, **changes: object) -> None:
         self.clock = ScaledClock(factor)
@@ -77,13 +77,13 @@ def bench() -> Iterator[Bench]:
         yield bench
 
 
-def test_sends_first_every_4_ms_and_waits_for_an_answer(bench: Bench) -> None:
+def test_feedback_is_sent_every_4_ms_before_any_answer(bench: Bench) -> None:
     states = [bench.receive() for _ in range(50)]
     assert np.allclose(at(states[0]), START, atol=1e-9)
     headers = [s.header for s in states]  # type: ignore[attr-defined]
     assert {h.mtype for h in headers} == {2}
     assert (np.diff([h.seqno for h in headers]) == 1).all()
-    # Cycles that a busy computer missed show in the controller's time, which goes on.
+    # The controller's time continues over cycles that a busy computer missed.
     ticks = np.diff([h.tm for h in headers])
     assert np.median(ticks) == 4
     assert (ticks % 4 == 0).all()
@@ -94,14 +94,14 @@ def test_sends_first_every_4_ms_and_waits_for_an_answer(bench: Bench) -> None:
     assert len(last.joint_angles) == 6  # type: ignore[attr-defined]
 
 
-def test_follows_with_lag_and_reports_convergence_after_a_second(bench: Bench) -> None:
+def test_arm_follows_with_lag_and_reports_convergence_after_a_second(bench: Bench) -> None:
     goal = START + np.array([0.004, 0.002, -0.003])
     state = bench.answer(goal, lambda s: bool(np.linalg.norm(at(s) - goal) < 1e-6))
     assert bench.mock.report.state == "running"
     assert not state.mci_convergence_met  # type: ignore[attr-defined]
     arrived = state.header.tm  # type: ignore[attr-defined]
     state = bench.answer(goal, lambda s: bool(s.mci_convergence_met))  # type: ignore[attr-defined]
-    # The last of the way was within the condition already, so a little less than a second.
+    # The last part of the motion already meets the condition, so the time is a little less than one second.
     assert 500 <= state.header.tm - arrived <= 1100  # type: ignore[attr-defined]
 
 
@@ -130,12 +130,12 @@ def test_default_joint_speed_is_one_degree_a_second() -> None:
         assert change.max() == pytest.approx(seconds * 1.0, rel=0.1)
 
 
-def test_without_answers_egm_ends_and_is_started_again_with_a_new_count(bench: Bench) -> None:
+def test_egm_ends_without_answers_and_restarts_with_a_new_message_count(bench: Bench) -> None:
     goal = START + np.array([0.02, 0, 0])
     bench.answer(goal, lambda s: bool(at(s)[0] > START[0] + 0.001))
     bench.until_report(lambda r: r.state == "ended")  # type: ignore[attr-defined]
     assert bench.mock.report.reason == "no answer for 1.0 s"
-    # Until then it went to the last reference, as a controller does.
+    # Until then the arm moves to the last reference, as with a real controller.
     stood = bench.plant.arm_pose()[0]
     assert np.allclose(stood, goal, atol=1e-6)
     bench.until_report(lambda r: r.state == "waiting" and r.sessions == 2)  # type: ignore[attr-defined]
@@ -144,7 +144,7 @@ def test_without_answers_egm_ends_and_is_started_again_with_a_new_count(bench: B
     bench.answer(START, lambda s: bool(np.linalg.norm(at(s) - START) < 1e-6))
 
 
-def test_silent_robot_is_not_heard_for_that_long(bench: Bench) -> None:
+def test_silence_fault_stops_the_feedback_for_its_duration(bench: Bench) -> None:
     bench.receive()
     bench.mock.silence(0.4)
     while bench.client.receive_from_robot(timeout=0)[0]:
@@ -161,7 +161,7 @@ def test_reference_out_of_range_ends_egm(bench: Bench) -> None:
     )
 
 
-def test_datagrams_that_are_no_references_are_counted(bench: Bench) -> None:
+def test_invalid_datagrams_are_counted(bench: Bench) -> None:
     state = bench.receive()
     address = bench.client.egm_addr
     for data in (b"", b"garbage", b"\x00" * 100):
@@ -171,17 +171,17 @@ def test_datagrams_that_are_no_references_are_counted(bench: Bench) -> None:
     assert np.allclose(at(state), START)
 
 
-def test_motors_and_rapid_show_in_the_messages(bench: Bench) -> None:
+def test_motor_and_rapid_states_appear_in_the_feedback(bench: Bench) -> None:
     bench.answer(START, lambda s: bench.mock.report.state == "running")
     bench.mock.motors(False)
     bench.answer(START, lambda s: not s.motors_on)  # type: ignore[attr-defined]
     bench.mock.motors(True)
     bench.mock.rapid(False)
     bench.answer(START, lambda s: s.motors_on and not s.rapid_running)  # type: ignore[attr-defined]
-    assert bench.mock.report.reason == "motors off", "the first reason is the one that ended it"
+    assert bench.mock.report.reason == "motors off", "the first reason ended EGM"
 
 
-def test_several_threads_may_ask(bench: Bench) -> None:
+def test_report_is_thread_safe(bench: Bench) -> None:
     counts: list[int] = []
 
     def ask() -> None:
@@ -195,14 +195,14 @@ def test_several_threads_may_ask(bench: Bench) -> None:
     assert len(counts) == 80
 
 
-def test_a_plant_out_of_reach_is_said_at_the_start() -> None:
+def test_plant_out_of_reach_is_reported_at_the_start() -> None:
     clock = ScaledClock()
     plant = KinematicArm(clock, position=START + 1.0, quaternion=DOWN)
     with pytest.raises(UsageError, match=r"the mock arm cannot start at the pose of its plant: .*out of reach"):
         MockEgmArm(plant, clock=clock).start()
 
 
-def test_a_mock_that_is_not_running_says_so(bench: Bench) -> None:
+def test_calls_on_a_stopped_mock_raise_usage_error(bench: Bench) -> None:
     with pytest.raises(UsageError, match="already running"):
         bench.mock.start()
     bench.mock.stop()
@@ -212,7 +212,7 @@ def test_a_mock_that_is_not_running_says_so(bench: Bench) -> None:
     bench.receive()
 
 
-def test_a_dead_controller_is_noticed(bench: Bench) -> None:
+def test_killed_controller_is_detected(bench: Bench) -> None:
     assert bench.mock.pid is not None
     os.kill(bench.mock.pid, signal.SIGKILL)
     with pytest.raises(PeerError, match="the mock controller's process has ended"):
@@ -222,6 +222,6 @@ def test_a_dead_controller_is_noticed(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("changes", [{"lag": 0.0}, {"port": 0}, {"comm_timeout": -1.0}])
-def test_settings_that_make_no_sense_are_refused(changes: dict[str, float]) -> None:
+def test_invalid_settings_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         MockEgmConfig(**changes)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The mock WSG-50 on its wires, spoken to by a client that shares no code with the driver or its codec."""
+"""Mock WSG-50 on pty and TCP, with a client that shares no code with the driver and its codec."""
 
 import os
 import select
@@ -17,13 +17,13 @@ from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 
 CLOCK = ScaledClock(5.0)
-PATIENT = 10.0  # a time-out that only a failing test reaches [s, wall]
+PATIENT = 10.0  # time-out that only a failing test reaches [s, wall]
 HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE = range(0x20, 0x27)
 SUCCESS, PENDING, DENIED, FAILED, BLOCKED, RANGE = 0, 26, 16, 18, 29, 28
 
 
 def checksum(data: bytes) -> int:
-    """Bit by bit, as a check of the table: low byte in, high byte down, polynomial 0x1021 from the top."""
+    """Bitwise computation of the checksum, with polynomial 0x1021, independent of the table."""
     crc = 0xFFFF
     for byte in data:
         value = ((crc ^ byte) & 0xFF) << 8
@@ -33,14 +33,14 @@ def checksum(data: bytes) -> int:
     return crc
 
 
-def frame(command: int, layout: str = "<", *values: float | bytes) -> bytes:
+def packet(command: int, layout: str = "<", *values: float | bytes) -> bytes:
     payload = struct.pack(layout, *values)
     head = b"\xaa\xaa\xaa" + struct.pack("<BH", command, len(payload)) + payload
     return head + struct.pack("<H", checksum(head))
 
 
 class Client:
-    """Blocking, byte by byte, strict: any byte out of place fails the test."""
+    """A blocking, strict client: any unexpected byte fails the test."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -65,13 +65,13 @@ class Client:
         return command, struct.unpack_from("<H", rest)[0], rest[2:-2]
 
     def ask(self, command: int, layout: str = "<", *values: float | bytes) -> tuple[int, bytes]:
-        self.send(frame(command, layout, *values))
+        self.send(packet(command, layout, *values))
         answered, status, data = self.reply()
         assert answered == command
         return status, data
 
     def result(self, command: int, layout: str = "<", *values: float | bytes) -> int:
-        """The final status of a motion that must be pending first."""
+        """The final status of a motion, which must be pending first."""
         status, _ = self.ask(command, layout, *values)
         assert status == PENDING
         answered, status, _ = self.reply()
@@ -118,7 +118,7 @@ Wire = Callable[[MockWsgGripper], AbstractContextManager[Client]]
 WIRES = pytest.mark.parametrize("wire", [line, port])
 
 
-def test_known_frames_get_their_known_answers() -> None:
+def test_known_requests_get_known_replies() -> None:
     with serving() as (mock, _), line(mock) as client:
         client.send(bytes.fromhex("aa aa aa 20 01 00 00 8f 83"))
         assert client.exactly(10) == bytes.fromhex("aa aa aa 20 02 00 1a 00 fc 32")
@@ -149,10 +149,10 @@ def test_home_move_grasp_release(wire: Wire) -> None:
         assert client.grasp_state() == 0
 
 
-def test_a_grasp_needs_contact_within_its_band() -> None:
+def test_grasp_requires_contact_within_its_band() -> None:
     with serving(width=0.060) as (mock, plant), line(mock) as client:
         assert client.result(HOME, "<B", 0) == SUCCESS
-        assert client.result(GRASP, "<ff", 30.0, 400.0) == FAILED  # nothing there
+        assert client.result(GRASP, "<ff", 30.0, 400.0) == FAILED  # no part
         assert client.grasp_state() == 2 and client.width() == pytest.approx(27, abs=0.3)
         assert client.flags() & 1 << 18
         assert client.result(RELEASE, "<ff", 110.0, 400.0) == SUCCESS
@@ -165,7 +165,7 @@ def test_a_grasp_needs_contact_within_its_band() -> None:
         assert client.result(MOVE, "<Bff", 0, 20.0, 400.0) == BLOCKED
 
 
-def test_a_part_that_is_gone_is_lost() -> None:
+def test_removed_part_is_reported_as_lost() -> None:
     with serving() as (mock, plant), line(mock) as client:
         client.result(HOME, "<B", 1)
         plant.set_part(0.025)
@@ -182,12 +182,12 @@ def test_a_part_that_is_gone_is_lost() -> None:
         assert client.grasp_state() == 3
 
 
-def test_fast_stop_locks_until_acknowledged_and_a_stop_ends_a_motion() -> None:
+def test_fast_stop_locks_until_acknowledged_and_stop_ends_a_motion() -> None:
     with serving() as (mock, _), line(mock) as client:
         assert client.result(HOME, "<B", 1) == SUCCESS
         assert client.ask(MOVE, "<Bff", 0, 10.0, 5.0)[0] == PENDING
         assert client.ask(MOVE, "<Bff", 0, 50.0, 5.0)[0] == 4  # ALREADY_RUNNING
-        client.send(frame(STOP))
+        client.send(packet(STOP))
         assert {client.reply()[:2], client.reply()[:2]} == {(MOVE, 19), (STOP, SUCCESS)}  # CMD_ABORTED
         assert client.flags() & 1 << 6 and client.width() > 100
         assert client.ask(FAST_STOP)[0] == SUCCESS
@@ -206,11 +206,11 @@ def test_fast_stop_locks_until_acknowledged_and_a_stop_ends_a_motion() -> None:
         assert client.result(MOVE, "<Bff", 0, 100.0, 400.0) == SUCCESS
 
 
-def test_an_unannounced_close_raises_fast_stop_and_an_announced_one_does_not() -> None:
+def test_only_an_unannounced_close_raises_fast_stop() -> None:
     with serving() as (mock, _):
         with port(mock) as client:
             assert client.ask(0x07)[0] == SUCCESS
-        with port(mock) as client:  # the next one comes in when the first is gone
+        with port(mock) as client:  # a client is accepted after the previous one has disconnected
             assert not client.flags() & 1 << 12
         end = time.monotonic() + PATIENT
         while not mock.fast_stopped:
@@ -225,7 +225,7 @@ def test_an_unannounced_close_raises_fast_stop_and_an_announced_one_does_not() -
             assert client.result(HOME, "<B", 1) == SUCCESS
 
 
-def test_a_second_client_is_turned_away_and_the_first_is_served_on() -> None:
+def test_second_client_is_rejected() -> None:
     with serving() as (mock, _), port(mock) as client:
         client.flags()
         with socket.create_connection(mock.tcp_address, PATIENT) as second:
@@ -233,15 +233,15 @@ def test_a_second_client_is_turned_away_and_the_first_is_served_on() -> None:
         assert client.width() == 50.0
 
 
-def test_periodic_updates_come_between_replies_and_end_when_asked() -> None:
+def test_periodic_updates_are_sent_between_replies_until_cancelled() -> None:
     with serving() as (mock, _), line(mock) as client:
         assert client.ask(0x44, "<BH", 1, 10)[0] == SUCCESS
-        client.send(frame(HOME, "<B", 1))
+        client.send(packet(HOME, "<B", 1))
         seen = [client.reply()[:2]]
         while seen[-1] != (HOME, SUCCESS):
             seen.append(client.reply()[:2])
         assert (HOME, PENDING) in seen and seen.count((0x44, SUCCESS)) > 20
-        client.send(frame(0x44, "<BH", 0, 10) + frame(0x06, "<2s", b"hi"))
+        client.send(packet(0x44, "<BH", 0, 10) + packet(0x06, "<2s", b"hi"))
         while (answer := client.reply())[0] == 0x44:
             pass
         assert answer == (0x06, SUCCESS, b"hi")
@@ -249,12 +249,12 @@ def test_periodic_updates_come_between_replies_and_end_when_asked() -> None:
         assert not ready
 
 
-def test_on_change_updates_keep_quiet_until_something_changes() -> None:
+def test_on_change_updates_are_sent_only_after_a_change() -> None:
     with serving() as (mock, _), line(mock) as client:
         assert client.ask(0x43, "<BH", 3, 100)[0] == SUCCESS
         ready, _, _ = select.select([client.descriptor], [], [], 0.2)
         assert not ready
-        client.send(frame(HOME, "<B", 1))
+        client.send(packet(HOME, "<B", 1))
         answers = [client.reply()]
         while answers[-1][:2] != (HOME, SUCCESS):
             answers.append(client.reply())
@@ -263,7 +263,7 @@ def test_on_change_updates_keep_quiet_until_something_changes() -> None:
         assert 2 <= len(widths) <= 14 and widths == sorted(widths)
 
 
-def test_soft_limits_hold_and_homing_clears_them() -> None:
+def test_soft_limits_apply_until_homing_clears_them() -> None:
     with serving() as (mock, _), line(mock) as client:
         client.result(HOME, "<B", 1)
         assert client.ask(0x34, "<ff", 20.0, 10.0)[0] == RANGE
@@ -292,19 +292,19 @@ def test_soft_limits_hold_and_homing_clears_them() -> None:
         (HOME, "<B", (3,), 24),
         (0x30, "<f", (99.0,), RANGE),
         (0x32, "<f", (81.0,), RANGE),
-        (0x38, "<", (), 1),  # no force fingers
+        (0x38, "<", (), 1),  # no force-measuring fingers
         (0x43, "<BH", (1, 9), RANGE),
         (0x43, "<BH", (2, 50), 24),
         (0x77, "<", (), 14),
     ],
 )
-def test_wrong_requests_get_their_status(command: int, layout: str, values: tuple[float, ...], status: int) -> None:
+def test_invalid_requests_get_their_status(command: int, layout: str, values: tuple[float, ...], status: int) -> None:
     with serving() as (mock, _), line(mock) as client:
         assert client.result(HOME, "<B", 1) == SUCCESS
         assert client.ask(command, layout, *values)[0] == status
 
 
-def test_descriptions() -> None:
+def test_device_info_limits_and_settings() -> None:
     with serving() as (mock, _), line(mock) as client:
         assert struct.unpack("<BBHI", client.ask(0x50)[1])[0] == 1
         limits = struct.unpack("<8f", client.ask(0x53)[1])
@@ -314,9 +314,9 @@ def test_descriptions() -> None:
         assert client.ask(0x46)[0] == SUCCESS and len(client.ask(0x46)[1]) == 2
 
 
-def test_bad_bytes_are_survived() -> None:
+def test_corrupted_bytes_are_tolerated() -> None:
     with serving() as (mock, _), line(mock) as client:
-        good = frame(0x06, "<4s", b"echo")
+        good = packet(0x06, "<4s", b"echo")
         client.send(good[:-1] + bytes([good[-1] ^ 1]))
         assert client.reply()[:2] == (0x06, 11)  # CHECKSUM_ERROR
         client.send(b"\x00\xaa\xaagarbage\xff\xaa" + good)
@@ -324,26 +324,26 @@ def test_bad_bytes_are_survived() -> None:
         for byte in good:
             client.send(bytes([byte]))
         assert client.reply() == (0x06, SUCCESS, b"echo")
-        client.send(b"\xaa\xaa\xaa\x06\x40")  # half a header, and then silence
+        client.send(b"\xaa\xaa\xaa\x06\x40")  # an incomplete header
         time.sleep(CLOCK.wall(1.5))
         client.send(good)
         assert client.reply() == (0x06, SUCCESS, b"echo")
 
 
-def test_a_device_without_checksums_takes_zeros() -> None:
+def test_device_without_checksums_accepts_zeros() -> None:
     with serving(config=MockWsgConfig(crc=False)) as (mock, _), line(mock) as client:
-        client.send(frame(STOP)[:-2] + b"\0\0")
+        client.send(packet(STOP)[:-2] + b"\0\0")
         assert client.exactly(10) == b"\xaa\xaa\xaa" + struct.pack("<BHHH", STOP, 2, SUCCESS, 0)
 
 
-def test_a_device_in_a_hurry_says_overrun_to_all_but_a_stop() -> None:
+def test_fast_commands_get_overrun_except_stop() -> None:
     with serving(config=MockWsgConfig(shortest_command_interval=5.0)) as (mock, _), line(mock) as client:
         assert client.ask(0x50)[0] == SUCCESS
         assert client.ask(0x50)[0] == 27
         assert client.ask(STOP)[0] == SUCCESS
 
 
-def test_wrong_use_of_the_mock_is_named() -> None:
+def test_misuse_of_the_mock_raises_usage_error() -> None:
     plant = KinematicGripper(CLOCK)
     with pytest.raises(UsageError, match="pty"):
         MockWsgGripper(plant, clock=CLOCK, serial=False)

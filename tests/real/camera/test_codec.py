@@ -1,4 +1,4 @@
-"""The MJPEG parser, without any I/O: whatever the cuts and whatever the damage, only whole images come out."""
+"""MJPEG parser without I/O: only complete images are extracted, for any split and any damage of the stream."""
 
 import itertools
 import time
@@ -50,7 +50,7 @@ PIECES = (
 
 
 @given(st.lists(IMAGES, max_size=5), st.booleans(), st.sampled_from([b"\r\n", b"\n"]), st.lists(st.integers(0, 4000)))
-def test_every_image_is_found_however_the_stream_is_cut(
+def test_every_image_is_extracted_for_any_split_of_the_stream(
     images: list[bytes], with_length: bool, newline: bytes, cuts: list[int]
 ) -> None:
     parts = [part(image, length=len(image) if with_length else None, newline=newline) for image in images]
@@ -59,29 +59,31 @@ def test_every_image_is_found_however_the_stream_is_cut(
 
 
 @given(st.lists(st.sampled_from(PIECES), max_size=12), st.lists(st.integers(0, 4000)))
-def test_garbage_is_parsed_alike_in_any_cuts_and_gives_only_whole_images(pieces: list[bytes], cuts: list[int]) -> None:
+def test_result_with_garbage_is_independent_of_the_split_and_contains_complete_images_only(
+    pieces: list[bytes], cuts: list[int]
+) -> None:
     data = b"".join(pieces)
     assert parse(data, cuts) == parse(data)
     assert all(image.startswith(b"\xff\xd8") and image.endswith(b"\xff\xd9") for image in parse(data)[0])
 
 
 @given(st.binary(max_size=300), st.integers(0, 2))
-def test_the_stream_is_found_again_after_any_garbage(noise: bytes, kind: int) -> None:
+def test_parser_resynchronizes_after_garbage(noise: bytes, kind: int) -> None:
     before = [b"", b"--" + BOUNDARY + b"\r\n", part(jpeg(1), length=5000)[:80]][kind]
     images, _ = parse(before + noise + b"".join(part(jpeg(n), length=44) for n in (7, 8, 9)) + b"--" + BOUNDARY)
-    assert images[-2:] == [jpeg(8), jpeg(9)]  # the noise may spoil the part that follows it
+    assert images[-2:] == [jpeg(8), jpeg(9)]  # the noise may damage the following part
 
 
-def test_an_image_with_a_length_is_given_out_with_its_last_byte() -> None:
+def test_image_with_a_length_is_complete_with_its_last_byte() -> None:
     parser = codec.MultipartParser(BOUNDARY)
     data = part(jpeg(1), length=44)
     assert parser.feed(data[:-3]) == []
     assert parser.feed(data[-3:-2]) == [jpeg(1)]
 
 
-def test_a_part_that_was_cut_off_costs_one_image() -> None:
+def test_truncated_part_costs_one_image() -> None:
     cut = part(jpeg(1)[:20], length=44)
-    for lost in range(30):  # also when the promised length ends within the next boundary
+    for lost in range(30):  # also when the announced length ends within the next boundary
         short = part(jpeg(1)[: 44 - lost], length=44)
         images, damaged = parse(short + part(jpeg(2), length=44) + part(jpeg(3), length=44))
         assert images[-2:] == [jpeg(2), jpeg(3)]
@@ -89,19 +91,19 @@ def test_a_part_that_was_cut_off_costs_one_image() -> None:
     assert parse(cut + part(jpeg(2)) + b"--" + BOUNDARY) == ([jpeg(2)], 1)
 
 
-def test_a_wrong_length_costs_one_image() -> None:
+def test_wrong_length_costs_one_image() -> None:
     for length in (43, 30, 9000, 10**8):
         images, damaged = parse(part(jpeg(1), length=length) + part(jpeg(2), length=44))
         assert (images, damaged) in [([jpeg(2)], 1), ([jpeg(1), jpeg(2)], 0)]
     assert parse(part(jpeg(1), length=0) + part(jpeg(2), length=44)) == ([jpeg(1), jpeg(2)], 0)
 
 
-def test_what_is_no_jpeg_is_left_out() -> None:
+def test_parts_that_are_not_jpeg_are_skipped() -> None:
     page = b"<html>camera is busy</html>"
     assert parse(part(page, length=len(page)) + part(page) + part(jpeg(2), length=44)) == ([jpeg(2)], 2)
 
 
-def test_padding_and_extra_dashes() -> None:
+def test_padding_and_extra_dashes_are_accepted() -> None:
     padded = jpeg(1) + bytes(20)
     assert parse(part(padded, length=len(padded))) == ([padded], 0)
     dashed = part(jpeg(1), dashes=b"----") + part(jpeg(2), dashes=b"----") + b"----" + BOUNDARY
@@ -117,10 +119,10 @@ def test_endless_garbage_needs_bounded_memory_and_time() -> None:
             assert parser.feed(b"\0" * 1_000_000) == []
         assert len(parser._buffer) <= codec.MAX_PART + 1_000_000
         assert parser.feed(part(jpeg(1), length=44) + part(jpeg(2), length=44))[-1] == jpeg(2)
-        assert time.monotonic() - started < 20  # a quadratic search would need hours
+        assert time.monotonic() - started < 20  # a quadratic search takes hours
 
 
-def test_heads() -> None:
+def test_response_head_is_parsed_when_complete() -> None:
     data = b'HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary="--abc"\r\n\r\nrest'
     for length in range(len(data) - 4):
         assert codec.parse_head(data[:length]) is None
@@ -141,7 +143,7 @@ def test_heads() -> None:
         (b"HTTP/1.0 200 OK\r\n" + b"X: y\r\n" * 5000, PeerError, "longer"),
     ],
 )
-def test_wrong_answers_are_named(data: bytes, kind: type[PeerError], says: str) -> None:
+def test_invalid_responses_are_reported(data: bytes, kind: type[PeerError], says: str) -> None:
     with pytest.raises(kind, match=says) as caught:
         head = codec.parse_head(data)
         assert head is not None

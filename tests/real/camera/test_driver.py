@@ -1,4 +1,4 @@
-"""Cameras over real HTTP and, for OpenCV's side, from a file: newest frames, faults, no hanging."""
+"""Camera drivers over HTTP and, for OpenCV, from a file: newest images, faults, time-outs."""
 
 import socket
 import threading
@@ -19,11 +19,11 @@ from gelflow.protocols import Camera, CameraImage
 from gelflow.real.camera.driver import MjpegCamera, UvcCamera, open_camera
 
 CLOCK = ScaledClock(1.0)
-PATIENT = 10.0  # a time-out that only a failing test reaches [s]
+PATIENT = 10.0  # time-out that only a failing test reaches [s]
 
 
 class Source:
-    """JPEGs that get brighter one by one; some are filled up with zeros, as some cameras' are."""
+    """JPEGs with increasing brightness; some are padded with zeros, as those of some cameras."""
 
     def __init__(self) -> None:
         self.made: list[bytes] = []
@@ -43,7 +43,7 @@ def served(rate: float = 100.0) -> Iterator[tuple[MockMjpegCamera, Source]]:
 
 @contextmanager
 def raw_server(answer: bytes, *, close: bool = False) -> Iterator[str]:
-    """A server that sends these bytes to whoever connects, and then nothing."""
+    """A server that sends these bytes to every client, and then nothing."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         links: list[socket.socket] = []
 
@@ -68,7 +68,7 @@ def raw_server(answer: bytes, *, close: bool = False) -> Iterator[str]:
         thread.join(2)
 
 
-def test_frames_arrive_as_they_were_sent_in_order_and_stamped() -> None:
+def test_images_arrive_unchanged_in_order_and_with_stamps() -> None:
     seen: list[CameraImage] = []
     with served() as (server, source):
         before = CLOCK.now()
@@ -86,7 +86,7 @@ def test_frames_arrive_as_they_were_sent_in_order_and_stamped() -> None:
     assert order == sorted(order)
 
 
-def test_latest_is_the_newest_and_a_slow_reader_skips() -> None:
+def test_latest_returns_the_newest_image_and_slow_readers_skip_images() -> None:
     with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=PATIENT) as camera:
         first = camera.latest()
         deadline = time.monotonic() + PATIENT
@@ -106,13 +106,13 @@ def test_two_clients_and_a_snapshot_share_one_source() -> None:
             urllib.request.urlopen(server.url.replace("stream", "dance"), timeout=PATIENT)
 
 
-def test_nobody_looks_nothing_is_drawn() -> None:
+def test_no_image_is_created_without_a_client() -> None:
     with served() as (server, source):
         time.sleep(0.1)
         assert source.made == [] and server.clients == 0
 
 
-def test_a_stall_is_told_by_name_and_frames_may_come_again() -> None:
+def test_stall_is_reported_and_later_images_are_used() -> None:
     with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=0.3) as camera:
         image = camera.next(3, PATIENT)
         server.stall()
@@ -127,7 +127,7 @@ def test_a_stall_is_told_by_name_and_frames_may_come_again() -> None:
         assert camera.next(image.sequence, PATIENT).sequence > image.sequence
 
 
-def test_a_closed_stream_stays_closed_until_reconnect() -> None:
+def test_closed_stream_requires_a_reconnect() -> None:
     with served() as (server, _), MjpegCamera(server.url, "left", CLOCK, timeout=PATIENT) as camera:
         image = camera.next(-1, PATIENT)
         server.drop_clients()
@@ -138,11 +138,11 @@ def test_a_closed_stream_stays_closed_until_reconnect() -> None:
             with pytest.raises(PeerError, match="closed the stream"):
                 camera.latest()
         camera.reconnect()
-        assert camera.latest().sequence > image.sequence  # numbers never repeat within a session
+        assert camera.latest().sequence > image.sequence  # sequence numbers are unique within a session
 
 
 @pytest.mark.parametrize("how", ["truncated", "length"])
-def test_damaged_frames_are_left_out_and_counted(how: Corruption) -> None:
+def test_damaged_images_are_skipped_and_counted(how: Corruption) -> None:
     seen: list[CameraImage] = []
     with served() as (server, source), MjpegCamera(server.url, "left", CLOCK, on_image=seen.append) as camera:
         image = camera.next(3, PATIENT)
@@ -153,7 +153,7 @@ def test_damaged_frames_are_left_out_and_counted(how: Corruption) -> None:
         assert {image.data for image in seen} <= set(source.made)
 
 
-def test_noise_within_an_image_comes_through_as_received() -> None:
+def test_noise_within_an_image_is_passed_on_unchanged() -> None:
     seen: list[CameraImage] = []
     with served() as (server, source), MjpegCamera(server.url, "left", CLOCK, on_image=seen.append) as camera:
         server.corrupt(1, how="garbage")
@@ -161,7 +161,7 @@ def test_noise_within_an_image_comes_through_as_received() -> None:
     assert len([image for image in seen if image.data not in source.made]) == 1
 
 
-def test_a_source_that_fails_ends_the_streams_and_is_raised() -> None:
+def test_failing_source_ends_the_streams_and_is_raised_by_close() -> None:
     def broken() -> bytes:
         raise ValueError("no gel")
 
@@ -172,7 +172,7 @@ def test_a_source_that_fails_ends_the_streams_and_is_raised() -> None:
         server.close()
 
 
-def test_an_address_that_nobody_answers() -> None:
+def test_unreachable_address_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     with pytest.raises(PeerError, match=rf"cannot reach http://127.0.0.1:{port}/") as caught:
@@ -190,18 +190,18 @@ def test_an_address_that_nobody_answers() -> None:
         (b"HTTP/1.0 200 OK\r\nContent-Type: text/html\r\n\r\n", PeerError, "text/html"),
     ],
 )
-def test_other_servers_are_told_apart(answer: bytes, kind: type[PeerError], says: str) -> None:
+def test_other_servers_are_reported(answer: bytes, kind: type[PeerError], says: str) -> None:
     with raw_server(answer) as url, pytest.raises(kind, match=says) as caught:
         MjpegCamera(url, "left", CLOCK, connect_timeout=0.3 if kind is PeerTimeout else PATIENT).open()
     assert url in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_server_that_closes_before_it_answers() -> None:
+def test_server_that_closes_before_it_answers_is_reported() -> None:
     with raw_server(b"", close=True) as url, pytest.raises(PeerError, match=r"before it answered|failed"):
         MjpegCamera(url, "left", CLOCK, connect_timeout=PATIENT).open()
 
 
-def test_half_a_frame_and_then_nothing_is_a_timeout() -> None:
+def test_incomplete_image_is_a_timeout() -> None:
     head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x123\r\n\r\n"
     half = b"--x123\r\nContent-Length: 500\r\n\r\n\xff\xd8half"
     with raw_server(head + half) as url, MjpegCamera(url, "left", CLOCK, timeout=0.2) as camera:
@@ -211,7 +211,7 @@ def test_half_a_frame_and_then_nothing_is_a_timeout() -> None:
             camera.next(-1, 0.1)
 
 
-def test_a_camera_is_used_only_when_open() -> None:
+def test_camera_must_be_open() -> None:
     with served() as (server, _):
         camera = MjpegCamera(server.url, "left", CLOCK)
         with pytest.raises(UsageError, match="open it first"):
@@ -228,7 +228,7 @@ def test_a_camera_is_used_only_when_open() -> None:
         camera.close()
 
 
-def test_what_the_recorder_raises_reaches_the_camera_s_user() -> None:
+def test_errors_of_the_recorder_are_raised_to_the_caller() -> None:
     def full(image: CameraImage) -> None:
         raise PeerError("the disk is full")
 
@@ -238,7 +238,7 @@ def test_what_the_recorder_raises_reaches_the_camera_s_user() -> None:
                 camera.next(-1, PATIENT)
 
 
-def test_frames_come_no_faster_than_their_rate_in_robot_time() -> None:
+def test_image_rate_is_in_robot_time() -> None:
     clock, source = ScaledClock(10.0), Source()
     begun = clock.now()
     server = MockMjpegCamera(source, clock, rate=20)
@@ -250,12 +250,12 @@ def test_frames_come_no_faster_than_their_rate_in_robot_time() -> None:
 @pytest.mark.parametrize(
     "url", ["ftp://host/", "http://", "http://host:port/", "http://user:word@host/", "http://ho st/", "http://höst/"]
 )
-def test_wrong_addresses(url: str) -> None:
+def test_invalid_addresses_are_refused(url: str) -> None:
     with pytest.raises(UsageError, match="camera left"):
         MjpegCamera(url, "left", CLOCK)
 
 
-def test_wrong_sources_and_settings() -> None:
+def test_invalid_sources_and_settings_are_refused() -> None:
     with pytest.raises(UsageError, match="uvc:INDEX"):
         open_camera("left.jpg", "left", CLOCK)
     with pytest.raises(UsageError, match="timeout"):
@@ -269,13 +269,13 @@ def test_wrong_sources_and_settings() -> None:
             server.corrupt(how="painted")  # type: ignore[arg-type]
 
 
-def test_a_device_that_is_not_there(capfd: pytest.CaptureFixture[str]) -> None:
+def test_missing_device_is_reported(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(PeerError, match="video device 97"):
         open_camera("uvc:97", "left", CLOCK)
     assert capfd.readouterr().err == ""
 
 
-def test_pixels_of_a_device_are_kept_without_loss(tmp_path: Path) -> None:
+def test_pixels_of_a_device_are_stored_without_loss(tmp_path: Path) -> None:
     path = tmp_path / "gel.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
     assert writer.isOpened()
@@ -298,7 +298,7 @@ def test_pixels_of_a_device_are_kept_without_loss(tmp_path: Path) -> None:
         assert image.encoding == "png" and decoded is not None and np.array_equal(decoded, pixels)
 
 
-def test_jpeg_bytes_of_a_device_are_handed_on() -> None:
+def test_jpeg_bytes_of_a_device_are_passed_on() -> None:
     camera = UvcCamera(0, "left", CLOCK)
     jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
     buffer = np.frombuffer(jpeg + bytes(100), np.uint8).reshape(1, -1)

@@ -1,4 +1,4 @@
-"""EGM messages: units, refusal of what is not one, and agreement with the schema read field by field."""
+"""EGM messages: units, round trips, refusal of invalid data, and agreement with the schema field by field."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ FEEDBACK = EgmFeedback(
 )
 
 
-def test_feedback_on_the_wire_is_in_millimetres_and_degrees() -> None:
+def test_feedback_is_encoded_in_millimetres_and_degrees() -> None:
     message = egm_pb2.EgmRobot.FromString(encode_robot(FEEDBACK))
     assert (message.header.seqno, message.header.tm, message.header.mtype) == (7, 1234, 2)
     measured = message.feedBack
@@ -38,7 +38,7 @@ def test_feedback_on_the_wire_is_in_millimetres_and_degrees() -> None:
     assert (message.motorState.state, message.mciState.state, message.rapidExecState.state) == (1, 3, 2)
 
 
-def test_feedback_survives_the_wire() -> None:
+def test_feedback_round_trip() -> None:
     for states in ({}, {"motors": "off"}, {"mci": "error"}, {"rapid": "stopped"}, {"converged": True}):
         sent = dataclasses.replace(FEEDBACK, **states)
         received = decode_robot(encode_robot(sent))
@@ -49,7 +49,7 @@ def test_feedback_survives_the_wire() -> None:
             assert getattr(received, name) == getattr(sent, name)
 
 
-def test_reference_survives_the_wire_as_type_3() -> None:
+def test_reference_round_trip_has_message_type_3() -> None:
     sent = EgmReference(sequence=9, time=2.5, position=(0.4, 0.1, 0.2), quaternion=(0.0, 0.6, 0.8, 0.0))
     data = encode_sensor(sent)
     message = egm_pb2.EgmSensor.FromString(data)
@@ -67,9 +67,9 @@ def test_counters_wrap_at_32_bits() -> None:
     assert (received.sequence, received.time) == (3, 0.005)
 
 
-def test_trouble_names_what_stands_in_the_way() -> None:
+def test_stop_reason_names_the_cause() -> None:
     assert FEEDBACK.stop_reason == ""
-    # Undefined is what a controller says of a running RAPID after its restart.
+    # After a restart, a controller reports a running RAPID program as undefined.
     assert dataclasses.replace(FEEDBACK, rapid="undefined").stop_reason == ""
     assert dataclasses.replace(FEEDBACK, motors="off").stop_reason == "motors off"
     assert dataclasses.replace(FEEDBACK, rapid="stopped").stop_reason == "RAPID stopped"
@@ -84,8 +84,8 @@ def test_euler_angles_override_the_quaternion_of_a_reference() -> None:
     assert received.quaternion == pytest.approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
 
 
-def test_euler_angles_sent_are_those_of_the_quaternion() -> None:
-    """Feedback carries both; a reference made of its Euler angles must be the same orientation."""
+def test_encoded_euler_angles_match_the_quaternion() -> None:
+    """Feedback contains both; a reference with its Euler angles must have the same orientation."""
     rng = np.random.default_rng(3)
     for _ in range(50):
         q = rng.normal(size=4)
@@ -129,12 +129,12 @@ def _message(change: str) -> bytes:
         ("no position", "got an incomplete pose"),
     ],
 )
-def test_unusable_feedback_is_refused(change: str, text: str) -> None:
+def test_invalid_feedback_is_refused(change: str, text: str) -> None:
     with pytest.raises(PeerError, match=text):
         decode_robot(_message(change))
 
 
-def test_unusable_references_are_refused() -> None:
+def test_invalid_references_are_refused() -> None:
     with pytest.raises(PeerError, match="that are not one"):
         decode_sensor(encode_robot(FEEDBACK))
     empty = egm_pb2.EgmSensor()
@@ -150,10 +150,10 @@ def test_unusable_references_are_refused() -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=300), st.integers(0, 400), st.integers(0, 255))
-def test_garbage_is_refused_and_nothing_else_is_raised(noise: bytes, place: int, value: int) -> None:
+def test_arbitrary_bytes_raise_only_peer_errors(noise: bytes, position: int, value: int) -> None:
     whole = bytearray(encode_robot(FEEDBACK))
-    whole[place % len(whole)] = value
-    for data in (noise, bytes(whole), bytes(whole[: place % len(whole)])):
+    whole[position % len(whole)] = value
+    for data in (noise, bytes(whole), bytes(whole[: position % len(whole)])):
         for decode in (decode_robot, decode_sensor):
             try:
                 decode(data)

@@ -1,4 +1,4 @@
-"""The EGM state machine, cycle by cycle, without process, socket or clock."""
+"""The reference generator of EGM, cycle by cycle, without process, socket or clock."""
 
 import dataclasses
 import itertools
@@ -36,7 +36,7 @@ def target(position: tuple[float, float, float], *, expires: float = math.inf, *
 
 
 class Robot:
-    """Feeds a generator; the robot is where the last reference was, `lag` cycles ago."""
+    """Feeds a reference generator; the pose of the robot is the reference of `lag` cycles ago."""
 
     def __init__(self, config: EgmConfig = CONFIG, lag: int = 4) -> None:
         self.generator = ReferenceGenerator(config)
@@ -66,26 +66,26 @@ class Robot:
         return [f"{event.kind}: {event.text}" for event in self.generator.events]
 
 
-def test_first_reference_is_the_feedback_and_nothing_moves_without_a_target() -> None:
+def test_first_reference_equals_the_feedback_and_nothing_moves_without_a_target() -> None:
     robot = Robot()
     flags = robot.step(50)
     assert all(sent == (START, DOWN) for sent in robot.sent)
     assert flags == EgmFlag.MOTORS_ON | EgmFlag.FOLLOWING | EgmFlag.HOLD
 
 
-def test_before_the_controller_follows_the_reference_goes_with_the_feedback() -> None:
+def test_reference_equals_the_feedback_until_the_controller_follows() -> None:
     generator = ReferenceGenerator(CONFIG)
     for cycle, x in enumerate((0.40, 0.41, 0.42), start=1):
         generator.observe(feedback(cycle, (x, 0.0, 0.3), mci="stopped"), cycle * CYCLE)
         assert generator.advance(cycle * CYCLE)[0] == ((x, 0.0, 0.3), DOWN)
     generator.observe(feedback(4, (0.421, 0.0, 0.3)), 4 * CYCLE)
     assert generator.advance(4 * CYCLE)[0] == ((0.421, 0.0, 0.3), DOWN)
-    # From now on it is frozen, even if the arm should sag.
+    # From now on the reference is frozen, even if the arm sags.
     generator.observe(feedback(5, (0.4205, 0.0, 0.3)), 5 * CYCLE)
     assert generator.advance(5 * CYCLE)[0] == ((0.421, 0.0, 0.3), DOWN)
 
 
-def test_reaches_the_target_exactly_within_the_bounds_of_speed_and_ramp() -> None:
+def test_target_is_reached_exactly_within_the_bounds_of_speed_and_ramp() -> None:
     robot = Robot()
     robot.step()
     turned = (0.0, math.sin(0.05), math.cos(0.05), 0.0)  # 0.1 rad about the tool's z
@@ -98,9 +98,9 @@ def test_reaches_the_target_exactly_within_the_bounds_of_speed_and_ramp() -> Non
     turns = np.array([angle_between(a[1], b[1]) for a, b in itertools.pairwise(robot.sent)])
     assert steps.max() <= CONFIG.max_speed * CYCLE * (1 + 1e-9)
     assert turns.max() <= CONFIG.max_turn_speed * CYCLE * (1 + 1e-6)
-    # The turn takes longer than the way here (0.1 rad at 10°/s), so it alone runs at full speed.
+    # The rotation takes longer than the translation (0.1 rad at 10°/s), so only the rotation runs at full speed.
     assert turns.max() == pytest.approx(CONFIG.max_turn_speed * CYCLE, rel=1e-3)
-    # No jump in speed is larger than the ramp's, but for the last one onto the target.
+    # The change of speed is bounded by the ramp, except for the last step to the target.
     assert np.abs(np.diff(steps[:-1])).max() <= CONFIG.max_speed * CYCLE * (CYCLE / CONFIG.ramp_time) * 2.5
     # A straight line.
     along = np.array(goal.position) - START
@@ -108,8 +108,8 @@ def test_reaches_the_target_exactly_within_the_bounds_of_speed_and_ramp() -> Non
     assert np.abs(off).max() < 1e-12
 
 
-def test_slow_target_moves_at_its_own_speed() -> None:
-    """The descent: 0.5 mm/s is 2 µm a cycle."""
+def test_slow_target_moves_at_its_speed() -> None:
+    """The descent at 0.5 mm/s advances 2 µm per cycle."""
     robot = Robot()
     robot.step()
     robot.generator.post(target((0.40, 0.0, 0.299), speed=0.5e-3), robot.now)
@@ -118,7 +118,7 @@ def test_slow_target_moves_at_its_own_speed() -> None:
     assert np.diff(heights)[-100:] == pytest.approx(np.full(100, -2e-6), rel=1e-6)
 
 
-def test_renewing_a_target_goes_on_without_stopping_and_turning_back_starts_from_rest() -> None:
+def test_renewed_target_keeps_the_speed_and_reversed_target_starts_from_rest() -> None:
     robot = Robot()
     robot.step()
     for _ in range(20):
@@ -132,7 +132,7 @@ def test_renewing_a_target_goes_on_without_stopping_and_turning_back_starts_from
     assert -CONFIG.max_speed * CYCLE * CYCLE / CONFIG.ramp_time * 1.01 <= back < 0
 
 
-def test_expired_target_holds_where_the_reference_is() -> None:
+def test_expired_target_freezes_the_reference() -> None:
     robot = Robot()
     robot.step()
     robot.generator.post(target((0.44, 0.0, 0.30), expires=robot.now + 0.1), robot.now)
@@ -147,7 +147,7 @@ def test_expired_target_holds_where_the_reference_is() -> None:
 
 
 def test_reference_waits_for_a_robot_that_does_not_follow() -> None:
-    robot = Robot(lag=10**6)  # stands still
+    robot = Robot(lag=10**6)  # does not move
     robot.step()
     robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
     flags = robot.step(500)
@@ -159,7 +159,7 @@ def test_reference_waits_for_a_robot_that_does_not_follow() -> None:
     ("field", "value", "reason"),
     [("motors", "off", "motors off"), ("rapid", "stopped", "RAPID stopped"), ("mci", "error", "EGM motion error")],
 )
-def test_a_controller_that_stops_latches_until_reset(field: str, value: str, reason: str) -> None:
+def test_stopped_controller_latches_until_reset(field: str, value: str, reason: str) -> None:
     robot = Robot()
     robot.step(5)
     robot.generator.post(target((0.42, 0.0, 0.30)), robot.now)
@@ -167,7 +167,7 @@ def test_a_controller_that_stops_latches_until_reset(field: str, value: str, rea
     count = len(robot.sent)
     robot.step(1, **{field: value})
     assert robot.generator.latched == reason
-    # All is well again, and new targets come: still nothing is sent.
+    # The controller is ready again and new targets arrive: still nothing is sent.
     for _ in range(20):
         robot.step()
         robot.generator.post(target((0.42, 0.0, 0.30)), robot.now)
@@ -175,7 +175,7 @@ def test_a_controller_that_stops_latches_until_reset(field: str, value: str, rea
     robot.generator.reset(robot.now)
     here = robot.sent[-robot.lag]
     robot.step(20)
-    assert robot.sent[-1] == here, "after a reset the reference is the feedback, and no old target is taken up"
+    assert robot.sent[-1] == here, "after a reset the reference equals the feedback, and no earlier target is followed"
 
 
 def test_sequence_restart_latches_while_following() -> None:
@@ -186,7 +186,7 @@ def test_sequence_restart_latches_while_following() -> None:
     assert robot.generator.advance(robot.now) == (None, robot.generator.flags | EgmFlag.LATCHED)
 
 
-def test_sequence_restart_before_following_is_taken_as_the_new_start() -> None:
+def test_sequence_restart_before_following_is_accepted() -> None:
     generator = ReferenceGenerator(CONFIG)
     generator.observe(feedback(500, mci="stopped"), 1.0)
     assert generator.observe(feedback(0, time=3.0, mci="stopped"), 1.004)
@@ -221,14 +221,14 @@ def test_stale_feedback_holds_then_stops() -> None:
     assert "no EGM message for 0.101 s" in robot.generator.latched
 
 
-def test_age_counts_from_the_message_before_also_when_a_message_brings_it_to_light() -> None:
+def test_late_message_after_a_silence_latches() -> None:
     robot = Robot()
     robot.step(3)
     robot.generator.observe(feedback(4), robot.now + 0.5)
     assert "no EGM message for 0.5" in robot.generator.latched
 
 
-def test_the_first_reason_of_a_stop_stays() -> None:
+def test_first_stop_reason_is_kept() -> None:
     robot = Robot()
     robot.step()
     robot.generator.latch("the operator said so", robot.now)
@@ -253,7 +253,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("wrong", "text"), WRONG)
-def test_a_wrong_target_is_refused_and_the_arm_holds(wrong: Target, text: str) -> None:
+def test_invalid_target_is_refused_and_the_arm_holds(wrong: Target, text: str) -> None:
     robot = Robot()
     robot.step()
     robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
@@ -265,13 +265,13 @@ def test_a_wrong_target_is_refused_and_the_arm_holds(wrong: Target, text: str) -
     refusals = [event for event in robot.events() if event.startswith("refused: target refused: ")]
     assert len(refusals) == 1
     assert text in refusals[0]
-    # Not latched: a right one goes on.
+    # Not latched: a valid target is followed.
     robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
     robot.step(30)
     assert robot.sent[-1] != before
 
 
-def test_a_step_too_far_is_refused() -> None:
+def test_target_beyond_the_largest_step_is_refused() -> None:
     config = dataclasses.replace(CONFIG, max_step=0.002)
     now = feedback(1)
     tool, here = tool_frame(now), (START, DOWN)
@@ -280,8 +280,8 @@ def test_a_step_too_far_is_refused() -> None:
         check_target(config, target((0.4021, 0.0, 0.30)), reference=here, tool=tool, feedback=now)
 
 
-def test_a_target_out_of_joint_range_is_refused() -> None:
-    """Joint 6 stands near its end: a turn that is small elsewhere is out of range here, or a whole turn away."""
+def test_target_out_of_joint_range_is_refused() -> None:
+    """Near the end of joint 6 a small rotation is out of range, or a whole turn away."""
     for end, turns in ((395, "joint 6 at 43.0"), (-395, "joint 6 at -43.0")):
         joints = (*inverse(START, DOWN, near=HOME)[:5], math.radians(end))
         position, quaternion = forward(joints)
@@ -298,8 +298,8 @@ def test_a_target_out_of_joint_range_is_refused() -> None:
             check(end + math.copysign(8, end))
 
 
-def test_a_tool_in_the_flange_is_taken_into_account() -> None:
-    """With a tool of 0.2 m the controller reports the tool's tip; the joints are those of the flange."""
+def test_tool_frame_is_taken_into_account() -> None:
+    """With a tool of 0.2 m the controller reports the tool tip; the joint angles describe the flange."""
     joints = inverse(START, DOWN, near=HOME)
     tip = (0.40, 0.0, 0.10)
     now = EgmFeedback(1, 0.0, tip, DOWN, joints)
@@ -312,7 +312,7 @@ def test_a_tool_in_the_flange_is_taken_into_account() -> None:
         check_target(config, target((0.8, 0.0, 0.1)), reference=(tip, DOWN), tool=tool_frame(now), feedback=now)
 
 
-def test_a_controller_whose_pose_contradicts_its_joints_is_not_followed() -> None:
+def test_pose_that_contradicts_the_joint_angles_is_refused() -> None:
     first = feedback(1)
     moved = dataclasses.replace(feedback(2), position=(0.40, 0.01, 0.30))
     text = r"10\.0 mm and 0\.0° from the forward kinematics of its joints: EGM must run in wobj0"
@@ -331,7 +331,7 @@ def test_a_controller_whose_pose_contradicts_its_joints_is_not_followed() -> Non
         {"ramp_time": -1.0},
     ],
 )
-def test_settings_that_make_no_sense_are_refused(changes: dict[str, object]) -> None:
+def test_invalid_settings_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         dataclasses.replace(CONFIG, **changes)  # type: ignore[arg-type]
 
@@ -352,7 +352,7 @@ near = st.floats(min_value=-0.06, max_value=0.06)
         max_size=12,
     )
 )
-def test_whatever_is_posted_the_reference_stays_in_the_box_and_within_the_bounds(
+def test_references_stay_within_workspace_and_speed_limits_for_arbitrary_targets(
     posts: list[tuple[tuple[float, float, float], float, float, int]],
 ) -> None:
     robot = Robot()

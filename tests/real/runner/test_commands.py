@@ -1,4 +1,4 @@
-"""`gelflow mock`, `run`, `demo` and `replay` as a user starts them, the mock robot in a process of its own."""
+"""`gelflow mock`, `run`, `demo` and `replay` as command lines, with the mock robot in a separate process."""
 
 import json
 import socket
@@ -21,7 +21,7 @@ FACTOR = 4.0
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    """A policy that knows nothing, but is a policy."""
+    """An untrained policy."""
     rng = np.random.default_rng(0)
     architecture = Architecture(hidden=(8, 8))
     shapes = tensor_shapes(architecture, INSERTION)
@@ -31,7 +31,7 @@ def checkpoint(tmp_path: Path) -> Path:
     return path
 
 
-def test_mock_and_dry_run(tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with mock_robot(factor=FACTOR, seed=9) as (lab_path, truth):
         lab = load_lab(lab_path)
         assert lab.clock_factor == FACTOR and lab.gripper.address.startswith("serial:")
@@ -47,10 +47,10 @@ def test_mock_and_dry_run(tmp_path: Path, checkpoint: Path, capsys: pytest.Captu
             assert json.load(answer) == {"next_seed": 17}
         assert ask(truth)["waited"] >= 0
     with pytest.raises(PeerError, match="does not tell the truth"):
-        ask(truth)  # it ended with its user
+        ask(truth)  # the mock robot has ended
 
 
-def test_demo_inserts_draws_records_and_its_session_replays(
+def test_demo_inserts_a_part_and_its_session_replays(
     tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
@@ -66,7 +66,7 @@ def test_demo_inserts_draws_records_and_its_session_replays(
     assert "decisions identical; largest difference: action 0" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_mock_that_can_not_start_says_why(capsys: pytest.CaptureFixture[str]) -> None:
+def test_mock_reports_why_it_cannot_start(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert main(["mock", "--tcp-port", port]) == 2
@@ -74,7 +74,7 @@ def test_a_mock_that_can_not_start_says_why(capsys: pytest.CaptureFixture[str]) 
     assert port in told and told.count("\n") == 1
 
 
-def test_the_demo_says_when_its_mock_does_not_start() -> None:
+def test_demo_reports_a_mock_that_does_not_start() -> None:
     with pytest.raises(PeerError, match="did not start"), mock_robot(factor=-3.0, seed=0):
         pass
 
@@ -87,7 +87,7 @@ def test_the_demo_says_when_its_mock_does_not_start() -> None:
         (["mock", "--factor", "0"], "clock factor 0.0 is outside 0.01 to 1000"),
     ],
 )
-def test_wrong_options_are_refused_in_one_line(
+def test_invalid_options_give_a_one_line_error(
     arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == 2

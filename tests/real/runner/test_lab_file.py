@@ -1,4 +1,4 @@
-"""Lab files: what is wrong is named in one line, with file, table, key and the nearest valid keys."""
+"""Lab files: errors name file, table, key and the nearest valid keys in one line."""
 
 import re
 from pathlib import Path
@@ -31,7 +31,7 @@ def refused(tmp_path: Path, text: str) -> str:
     return message
 
 
-def test_the_example_is_read_and_its_commented_keys_show_the_defaults(tmp_path: Path, example: str) -> None:
+def test_commented_keys_of_the_example_show_the_defaults(tmp_path: Path, example: str) -> None:
     lab = load_lab(EXAMPLE)
     assert lab.descent.speed == 0.5e-3 and lab.clock_factor == 1.0
     path = tmp_path / "all.toml"
@@ -39,14 +39,14 @@ def test_the_example_is_read_and_its_commented_keys_show_the_defaults(tmp_path: 
     assert load_lab(path) == lab
 
 
-def test_the_example_shows_every_key(tmp_path: Path, example: str) -> None:
+def test_example_contains_every_key(tmp_path: Path, example: str) -> None:
     saved = tmp_path / "saved.toml"
     save_lab(load_lab(EXAMPLE), saved, title="all keys")
     shown = set(re.findall(r"^(?:# )?(\w+) = ", example, flags=re.M))
     assert set(re.findall(r"^(\w+) = ", saved.read_text(), flags=re.M)) == shown
 
 
-def test_what_is_saved_is_read_back_equal(tmp_path: Path) -> None:
+def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
     lab = load_lab(EXAMPLE)
     save_lab(lab, tmp_path / "deep" / "lab.toml", title="round trip")
     assert load_lab(tmp_path / "deep" / "lab.toml") == lab
@@ -91,12 +91,12 @@ def test_what_is_saved_is_read_back_equal(tmp_path: Path) -> None:
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, example: str, old: str, new: str, expected: str) -> None:
+def test_errors_name_the_key(tmp_path: Path, example: str, old: str, new: str, expected: str) -> None:
     assert old in example
     assert expected in refused(tmp_path, example.replace(old, new, 1))
 
 
-def test_a_calibration_is_named_from_where_the_lab_file_is(tmp_path: Path, example: str) -> None:
+def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: str) -> None:
     matrix = ((13.0, 0.0, 0.0), (0.0, 13.0, 0.0), (0.0, 0.0, 1.0))
     calibration = Calibration(320, 427, 18, 14, 1.4, matrix, (-0.1,), (159.5, 213.0), 0.1, 0.2)
     save_calibration(calibration, tmp_path / "left.json")
@@ -110,12 +110,12 @@ def test_a_calibration_is_named_from_where_the_lab_file_is(tmp_path: Path, examp
     assert "lab.toml, cameras.left: the calibration is for 18 rows of 14" in refused(tmp_path, path.read_text())
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no such file: .*none\.toml"):
         load_lab(tmp_path / "none.toml")
 
 
-def test_tool_and_gripper_poses_are_each_others_reverse() -> None:
+def test_tool_and_gripper_poses_are_inverse_to_each_other() -> None:
     lab: Lab = load_lab(EXAMPLE)
     gripper = Pose(np.array([0.3, -0.1, 0.2]), yaw_quaternion(0.4))
     tool = lab.tool_pose(gripper)

@@ -1,4 +1,4 @@
-"""The supervisor: a wrong target is refused, never clamped; a latch holds."""
+"""Supervisor: invalid targets are refused, never clamped; latches persist."""
 
 import math
 from pathlib import Path
@@ -27,7 +27,7 @@ def check(target: Pose, previous: Pose | None = None, *, speed: float = 0.01, tu
     return Supervisor(LAB).check(target, before, speed=speed, turn_speed=turn_speed)
 
 
-def test_a_good_target_goes_on_unchanged() -> None:
+def test_valid_target_is_not_changed() -> None:
     target = gripper(0.015, -0.015, 0.026, math.radians(15))
     tool = check(target)
     back = LAB.gripper_pose(tool.position, tool.quaternion)
@@ -50,12 +50,12 @@ def test_a_good_target_goes_on_unchanged() -> None:
         (Pose(gripper().position, np.array([math.cos(0.01), math.sin(0.01), 0.0, 0.0])), "tilt"),
     ],
 )
-def test_a_target_outside_is_refused(target: Pose, named: str) -> None:
+def test_target_outside_the_workspace_is_refused(target: Pose, named: str) -> None:
     with pytest.raises(SafetyError, match=named):
         check(target)
 
 
-def test_too_far_and_too_fast_are_refused() -> None:
+def test_large_steps_and_high_speeds_are_refused() -> None:
     with pytest.raises(SafetyError, match=r"step 57 mm is more than 50 mm"):
         check(gripper(height=0.059), gripper(height=0.002))
     with pytest.raises(SafetyError, match=r"speed 21 mm/s is more than 20 mm/s"):
@@ -67,7 +67,7 @@ def test_too_far_and_too_fast_are_refused() -> None:
             check(gripper(), speed=speed)
 
 
-def test_a_latch_holds_and_keeps_its_first_reason() -> None:
+def test_latch_keeps_its_first_reason() -> None:
     supervisor = Supervisor(LAB)
     supervisor.latch("emergency stop")
     supervisor.latch("something later")
@@ -85,7 +85,7 @@ def test_a_latch_holds_and_keeps_its_first_reason() -> None:
         ({"operating_mode": "manual full"}, "manual full"),
     ],
 )
-def test_what_makes_an_arm_unfit(values: dict[str, object], reason: str) -> None:
+def test_arm_states_that_forbid_motion(values: dict[str, object], reason: str) -> None:
     good = {"motors_on": True, "running": True, "operating_mode": "auto", "fault": ""}
     state = ArmState(np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(6), 0.0, **{**good, **values})  # type: ignore[arg-type]
     assert reason in not_ready_reason(state) and bool(not_ready_reason(state)) == bool(reason)

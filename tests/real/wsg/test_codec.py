@@ -1,4 +1,4 @@
-"""The WSG-50 codec against frames that are known to be good, and its decoder against everything else."""
+"""WSG-50 codec: known packets, and the decoder with arbitrary data."""
 
 import itertools
 import math
@@ -36,7 +36,7 @@ KNOWN_REPLIES = {
 
 
 @pytest.mark.parametrize("text", [*KNOWN_REQUESTS, *KNOWN_REPLIES])
-def test_a_known_frame_is_encoded_and_decoded(text: str) -> None:
+def test_known_packets_are_encoded_and_decoded(text: str) -> None:
     raw = bytes.fromhex(text)
     message = KNOWN_REQUESTS.get(text) or KNOWN_REPLIES[text]
     assert message.encode() == raw
@@ -49,26 +49,26 @@ def test_a_known_frame_is_encoded_and_decoded(text: str) -> None:
         assert event == message
 
 
-def test_the_checksum_is_not_the_standard_ccitt_one() -> None:
+def test_checksum_differs_from_ccitt_false() -> None:
     assert crc16(b"\xaa\xaa\xaa") == 0x50F5
-    assert crc16(b"123456789") != 0x29B1  # CCITT-FALSE's check value
+    assert crc16(b"123456789") != 0x29B1  # check value of CCITT-FALSE
 
 
-def test_without_checksum_zeros_are_sent_and_taken() -> None:
+def test_zeros_replace_the_checksum_when_it_is_switched_off() -> None:
     raw = codec.home(1).encode(crc=False)
     assert raw[-2:] == b"\0\0"
     assert Decoder(plausible=plausible_request, check_crc=False).feed(raw) == [codec.home(1)]
     assert Decoder(plausible=plausible_request).feed(raw) == [Corrupt(Command.HOME)]
 
 
-def test_lengths_are_metres_above_the_wire_and_millimetres_on_it() -> None:
+def test_lengths_are_encoded_in_millimetres() -> None:
     assert struct.unpack("<ff", codec.grasp(0.0255, 0.03).payload) == pytest.approx((25.5, 30.0))
     assert struct.unpack("<ff", codec.release(0.11, 0.42).payload) == (110.0, 420.0)
     assert codec.pre_position(0.05, 0.1).payload[0] == 0  # flags
     assert codec.set_force_limit(40.0).payload == struct.pack("<f", 40.0)
 
 
-def test_every_status_and_grasp_state_has_its_name() -> None:
+def test_status_and_grasp_state_names() -> None:
     assert [status.value for status in Status] == list(range(31))
     assert Status(18) is Status.CMD_FAILED and Status(29) is Status.AXIS_BLOCKED and Status(26) is Status.CMD_PENDING
     labels = ["idle", "grasping", "no part", "part lost", "holding", "releasing", "positioning", "error"]
@@ -76,34 +76,34 @@ def test_every_status_and_grasp_state_has_its_name() -> None:
 
 
 @pytest.mark.parametrize("period", [0.009, 10.0, -1.0, math.nan])
-def test_a_period_the_device_does_not_take_is_refused(period: float) -> None:
+def test_period_outside_the_device_range_is_refused(period: float) -> None:
     with pytest.raises(UsageError, match="period"):
         codec.request_updates(Command.WIDTH, UpdateMode.PERIODIC, period)
 
 
-def test_a_frame_that_does_not_fit_is_refused() -> None:
-    for frame in (Packet(256), Packet(-1), Packet(Command.LOOP, bytes(65536))):
+def test_packet_with_too_large_id_or_payload_is_refused() -> None:
+    for packet in (Packet(256), Packet(-1), Packet(Command.LOOP, bytes(65536))):
         with pytest.raises(UsageError):
-            frame.encode()
+            packet.encode()
 
 
-def test_replies_that_the_tables_do_not_know_are_the_peers_fault() -> None:
-    for frame, text in (
+def test_unknown_replies_raise_peer_error() -> None:
+    for packet, text in (
         (Packet(0x99, b"\0\0"), "0x99"),
         (Packet(Command.STOP, b"\0"), "without a status"),
         (Packet(Command.STOP, struct.pack("<H", 31)), "status 31"),
     ):
         with pytest.raises(PeerError, match=text):
-            parse_reply(frame)
+            parse_reply(packet)
     with pytest.raises(PeerError, match="4"):
         Reply(Command.WIDTH, Status.SUCCESS, b"").values()
     with pytest.raises(PeerError, match="not a number"):
         codec.reply(Command.WIDTH, Status.SUCCESS, math.nan).values()
 
 
-# ------------------------------------------------------------------ the decoder, in any weather
+# Decoder with arbitrary data
 
-FRAMES = st.one_of(
+PACKETS = st.one_of(
     st.sampled_from([codec.reply(c, Status.CMD_PENDING).encode() for c in Command]),
     st.floats(0, 110, width=32).map(lambda width: codec.reply(Command.WIDTH, Status.SUCCESS, width).encode()),
     st.integers(0, 2**32 - 1).map(lambda flags: codec.reply(Command.SYSTEM_STATE, Status.SUCCESS, flags).encode()),
@@ -111,8 +111,8 @@ FRAMES = st.one_of(
 )
 
 
-def cut(data: bytes, places: list[int]) -> list[bytes]:
-    edges = [0, *sorted(place % (len(data) + 1) for place in places), len(data)]
+def split(data: bytes, positions: list[int]) -> list[bytes]:
+    edges = [0, *sorted(position % (len(data) + 1) for position in positions), len(data)]
     return [data[a:b] for a, b in itertools.pairwise(edges)]
 
 
@@ -121,25 +121,25 @@ def decoded(chunks: list[bytes]) -> list[Packet | Corrupt]:
     return [event for chunk in chunks for event in decoder.feed(chunk)]
 
 
-@given(st.lists(FRAMES, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
-def test_frames_survive_any_cutting(frames: list[bytes], places: list[int]) -> None:
-    events = decoded(cut(b"".join(frames), places))
-    assert [event.encode() for event in events if isinstance(event, Packet)] == frames
+@given(st.lists(PACKETS, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
+def test_packets_are_decoded_from_portions_of_any_size(packets: list[bytes], positions: list[int]) -> None:
+    events = decoded(split(b"".join(packets), positions))
+    assert [event.encode() for event in events if isinstance(event, Packet)] == packets
 
 
-@given(FRAMES, st.binary(max_size=60), st.lists(st.integers(0, 10_000), max_size=20))
-def test_a_frame_behind_garbage_is_found(frame: bytes, garbage: bytes, places: list[int]) -> None:
+@given(PACKETS, st.binary(max_size=60), st.lists(st.integers(0, 10_000), max_size=20))
+def test_packet_after_garbage_is_decoded(packet: bytes, garbage: bytes, positions: list[int]) -> None:
     decoder = Decoder(plausible=plausible_reply)
-    events = [event for chunk in cut(garbage + frame, places) for event in decoder.feed(chunk)]
-    for _ in range(len(garbage) + len(frame)):  # the time-out of a frame that garbage promised
+    events = [event for chunk in split(garbage + packet, positions) for event in decoder.feed(chunk)]
+    for _ in range(len(garbage) + len(packet)):  # the time-out of a packet announced by garbage
         if not decoder.waiting:
             break
         events += decoder.expire()
-    assert any(isinstance(event, Packet) and event.encode() == frame for event in events)
+    assert any(isinstance(event, Packet) and event.encode() == packet for event in events)
 
 
 @given(st.lists(st.binary(max_size=50), max_size=20))
-def test_garbage_never_hangs_and_never_makes_a_frame_with_a_wrong_checksum(chunks: list[bytes]) -> None:
+def test_garbage_neither_blocks_nor_yields_packets_with_a_wrong_checksum(chunks: list[bytes]) -> None:
     decoder = Decoder(plausible=plausible_reply)
     for chunk in chunks:
         for event in decoder.feed(chunk):
@@ -151,11 +151,11 @@ def test_garbage_never_hangs_and_never_makes_a_frame_with_a_wrong_checksum(chunk
     assert decoder.waiting == 0
 
 
-@given(FRAMES, st.integers(0, 10_000), st.integers(1, 255))
-def test_a_changed_byte_never_passes(frame: bytes, place: int, change: int) -> None:
-    bad = bytearray(frame)
-    bad[place % len(frame)] ^= change
-    assert not any(isinstance(event, Packet) and event.encode() == frame for event in decoded([bytes(bad)]))
+@given(PACKETS, st.integers(0, 10_000), st.integers(1, 255))
+def test_changed_byte_is_always_detected(packet: bytes, position: int, change: int) -> None:
+    bad = bytearray(packet)
+    bad[position % len(packet)] ^= change
+    assert not any(isinstance(event, Packet) and event.encode() == packet for event in decoded([bytes(bad)]))
     good = codec.reply(Command.FORCE, Status.SUCCESS, 12.5).encode()
     decoder = Decoder(plausible=plausible_reply)
     events = decoder.feed(bytes(bad) + good)
@@ -164,9 +164,9 @@ def test_a_changed_byte_never_passes(frame: bytes, place: int, change: int) -> N
     assert any(isinstance(event, Packet) and event.encode() == good for event in events)
 
 
-@given(FRAMES, st.integers(1, 10_000))
-def test_half_a_frame_does_not_swallow_the_next(frame: bytes, length: int) -> None:
-    half = frame[: length % len(frame)]
+@given(PACKETS, st.integers(1, 10_000))
+def test_incomplete_packet_does_not_hide_the_next_one(packet: bytes, length: int) -> None:
+    half = packet[: length % len(packet)]
     good = codec.reply(Command.WIDTH, Status.SUCCESS, 42.0).encode()
     decoder = Decoder(plausible=plausible_reply)
     events = decoder.feed(half + good)
@@ -175,16 +175,16 @@ def test_half_a_frame_does_not_swallow_the_next(frame: bytes, length: int) -> No
     assert any(isinstance(event, Packet) and event.encode() == good for event in events)
 
 
-def test_duplicates_are_two_frames_and_one_preamble_byte_too_many_is_nothing() -> None:
-    frame = codec.reply(Command.WIDTH, Status.SUCCESS, 50.0).encode()
-    assert len(decoded([frame + frame])) == 2
-    assert decoded([b"\xaa" + frame]) == decoded([frame])
-    assert decoded([bytes([byte]) for byte in b"\xaa\xaa" + frame]) == decoded([frame])
+def test_duplicates_are_two_packets_and_an_extra_preamble_byte_is_ignored() -> None:
+    packet = codec.reply(Command.WIDTH, Status.SUCCESS, 50.0).encode()
+    assert len(decoded([packet + packet])) == 2
+    assert decoded([b"\xaa" + packet]) == decoded([packet])
+    assert decoded([bytes([byte]) for byte in b"\xaa\xaa" + packet]) == decoded([packet])
 
 
-def test_a_length_no_reply_has_is_not_waited_for() -> None:
-    frame = codec.reply(Command.WIDTH, Status.SUCCESS, 50.0).encode()
+def test_implausible_length_is_not_awaited() -> None:
+    packet = codec.reply(Command.WIDTH, Status.SUCCESS, 50.0).encode()
     huge = b"\xaa\xaa\xaa\x43\xff\xff"
     decoder = Decoder(plausible=plausible_reply)
-    assert len(decoder.feed(huge + frame)) == 1
+    assert len(decoder.feed(huge + packet)) == 1
     assert decoder.discarded == len(huge) and decoder.waiting == 0

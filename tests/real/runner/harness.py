@@ -1,0 +1,101 @@
+"""Shared helpers of the insertion-runner tests."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.cli.commands.mock import lab_for
+from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.observation import FlowMap
+from gelflow.real.runner.run_plan import RunPlan
+from gelflow.session.reader import SessionReader
+from gelflow.task import INSERTION
+
+FACTOR = 4.0
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class OraclePolicy:
+    """A policy that reads the ground truth and corrects two thirds of the misalignment."""
+
+    def __init__(self, robot: MockRobot, *, answer: Callable[[], None] = lambda: None) -> None:
+        self._robot, self._answer = robot, answer
+        self._planar_pose = np.zeros(3)
+        self.seen: list[FlowMap] = []
+
+    def reset(self) -> None:
+        self._planar_pose = np.zeros(3)
+
+    def act(self, observation: FlowMap) -> NDArray[np.float64]:
+        self.seen.append(observation)
+        self._answer()
+        x, y, yaw = self._robot.cell.truth()["part"]["misalignment"]
+        back, here = -yaw, -self._planar_pose[2]
+        wanted = np.array([-np.cos(back) * x + np.sin(back) * y, -np.sin(back) * x - np.cos(back) * y, -yaw])
+        dx, dy, turn = wanted - self._planar_pose
+        local = [np.cos(here) * dx - np.sin(here) * dy, np.sin(here) * dx + np.cos(here) * dy, turn]
+        correction = np.array(local) * 2 / 3
+        self._planar_pose = INSERTION.corrected(self._planar_pose, correction)
+        return correction
+
+
+def mean_displacement(robot: MockRobot) -> NDArray[np.float64]:
+    """Present mean displacement of each pad's markers along the finger [mm]."""
+    return np.array([robot.cell.marker_displacement(finger)[:, 0].mean() for finger in (0, 1)])
+
+
+def plan_for(robot: MockRobot, folder: Path, policy: Any, **changes: Any) -> RunPlan:
+    lab = changes.pop("lab", None) or lab_for(robot)
+    return RunPlan(lab=lab, policy=policy, task=INSERTION, session=folder / "session.mcap", **changes)
+
+
+def events(path: Path) -> list[tuple[str, Any]]:
+    with SessionReader(path) as session:
+        return [(record.value["name"], record.value["values"]) for record in session.records(["/event"])]
+
+
+def in_background(work: Callable[[], Any]) -> Callable[[], Any]:
+    """Run `work` in a thread; the returned function waits for it and raises its exception."""
+    outcome: list[Any] = []
+
+    def run() -> None:
+        try:
+            outcome.append(work())
+        except BaseException as error:  # noqa: BLE001 - raised in the test's thread
+            outcome.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+
+    def finish() -> Any:
+        thread.join(120)
+        assert not thread.is_alive(), "the run did not end"
+        if isinstance(outcome[0], BaseException):
+            raise outcome[0]
+        return outcome[0]
+
+    return finish
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "the condition was not met in time"
+        time.sleep(0.01)
+
+
+def moving(robot: MockRobot) -> bool:
+    """Whether a part is held and being lowered."""
+    part = robot.cell.truth()["part"]
+    return part is not None and part["phase"] == "gripped" and part["height"] < 0.0315

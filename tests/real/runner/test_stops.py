@@ -1,0 +1,103 @@
+"""Insertion runner against the mock robot: stale data, faults and interrupts stop the arm."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
+
+from gelflow.cli.commands.mock import lab_for
+from gelflow.errors import GelflowError
+from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.real.runner.lab_file import save_lab
+from gelflow.real.runner.run_plan import run_insertions
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [
+        (lambda robot: robot.cameras[1].stall(), "camera right"),
+        (lambda robot: robot.cameras[0].drop_clients(), "camera left"),
+        (lambda robot: robot.arm.silence(60.0), "pose is"),
+        (lambda robot: robot.arm.motors(False), "motors"),
+        (lambda robot: robot.gripper.raise_fast_stop(), "FAST"),
+    ],
+    ids=["frames stall", "stream ends", "poses stall", "motors off", "fast stop"],
+)
+def test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run(
+    robot: MockRobot, tmp_path: Path, fault: Callable[[MockRobot], None], expected: str
+) -> None:
+    plan = plan_for(robot, tmp_path, OraclePolicy(robot))
+    finish = in_background(lambda: run_insertions(plan))
+    wait_for(lambda: moving(robot))
+    fault(robot)
+    with pytest.raises(GelflowError) as error:
+        finish()
+    assert expected.lower() in str(error.value).lower() and "\n" not in str(error.value)
+
+    # The arm is at rest, no more references are sent, and the part is still held.
+    answers = robot.arm.report.answers
+    before = robot.cell.arm_pose()[0]
+    time.sleep(0.3)
+    assert robot.arm.report.answers == answers
+    assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-6)
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
+    assert robot.cell.gripper_state()[2] > 10
+    # The recording is complete and contains the reason.
+    recorded = dict(events(plan.session))
+    assert expected.lower() in recorded["stopped"]["reason"].lower()
+
+
+def test_interrupt_stops_the_arm_and_closes_the_recording(robot: MockRobot, tmp_path: Path) -> None:
+    lab = lab_for(robot)
+    save_lab(lab, tmp_path / "lab.toml", title="test")
+    script = tmp_path / "run.py"
+    script.write_text(_RUN_UNTIL_INTERRUPTED)
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path)], stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": _SOURCE}
+    )
+    try:
+        wait_for(lambda: moving(robot) or process.poll() is not None)
+        assert process.poll() is None, process.communicate()[1].decode()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, errors.decode()
+    recorded = dict(events(tmp_path / "session.mcap"))  # an incomplete file is refused
+    assert "KeyboardInterrupt" in recorded["arm stopped"]["reason"]
+    assert not robot.gripper.fast_stopped
+    answers = robot.arm.report.answers
+    time.sleep(0.2)
+    assert robot.arm.report.answers == answers
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
+
+
+_SOURCE = str(Path(__file__).resolve().parents[3] / "src")
+
+
+_RUN_UNTIL_INTERRUPTED = """
+import signal
+import sys
+from pathlib import Path
+import numpy as np
+from gelflow.real.runner.lab_file import load_lab
+from gelflow.real.runner.run_plan import RunPlan, run_insertions
+from gelflow.task import INSERTION
+
+class Still:
+    def reset(self): pass
+    def act(self, observation): return np.zeros(3)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for background processes
+folder = Path(sys.argv[1])
+try:
+    run_insertions(RunPlan(load_lab(folder / "lab.toml"), Still(), INSERTION, folder / "session.mcap", insertions=9))
+except KeyboardInterrupt:
+    sys.exit(130)
+"""

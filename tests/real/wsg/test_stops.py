@@ -1,0 +1,172 @@
+"""WSG-50 driver: stops, faults, dry runs and recording errors, with the mock on a pty and on TCP."""
+
+import threading
+import time
+from collections.abc import Mapping
+
+import pytest
+from tests.real.wsg.harness import (
+    CLOCK,
+    CONFIG,
+    PATIENT,
+    CommandRecord,
+    Relay,
+    connected,
+    eventually,
+    in_thread,
+    mock,
+    unmodified,
+    wait_for_error,
+)
+
+from gelflow.errors import PeerError, SafetyError
+from gelflow.protocols import GripperState
+from gelflow.real.transport import transport_for
+from gelflow.real.wsg.config import WsgConfig
+from gelflow.real.wsg.constants import Command
+from gelflow.real.wsg.driver import WsgGripper
+
+MOTION_IDS = {Command.HOME, Command.PRE_POSITION, Command.STOP, Command.FAST_STOP, Command.GRASP, Command.RELEASE}
+
+
+def test_fast_stop_forbids_motion_until_acknowledged() -> None:
+    with connected() as (gripper, server, _, record):
+        gripper.home()
+        server.raise_fast_stop()
+        eventually(lambda: gripper.state().fault == "FAST_STOP", "FAST STOP did not appear in the state")
+        with pytest.raises(SafetyError, match="FAST_STOP"):
+            gripper.home()
+        with pytest.raises(SafetyError, match="FAST_STOP"):
+            gripper.move(width=0.05, speed=0.1)
+        assert "acknowledge fault" not in record.names and server.fast_stopped
+        gripper.acknowledge_fault()
+        assert gripper.state().fault == "" and not server.fast_stopped
+        gripper.move(width=0.100, speed=0.4)
+        gripper.fast_stop()
+        eventually(lambda: gripper.state().fault == "FAST_STOP", "FAST STOP did not appear in the state")
+
+
+def test_stop_from_another_thread_ends_a_motion_and_a_second_motion_is_refused() -> None:
+    with connected() as (gripper, _, _, _):
+        gripper.home()
+        thread, errors = in_thread(lambda: gripper.move(width=0.010, speed=0.005))
+        eventually(lambda: gripper.state().grasp == "positioning", "the move did not start")
+        with pytest.raises(SafetyError, match="in progress"):
+            gripper.release(width=0.110, speed=0.1)
+        gripper.stop()
+        thread.join(PATIENT)
+        assert len(errors) == 1 and "CMD_ABORTED" in str(errors[0])
+        assert gripper.state().width > 0.09
+
+
+def test_close_during_a_motion_stops_the_fingers() -> None:
+    with connected() as (gripper, _, plant, _):
+        gripper.home()
+        thread, errors = in_thread(lambda: gripper.move(width=0.010, speed=0.005))
+        eventually(lambda: gripper.state().grasp == "positioning", "the move did not start")
+        gripper.close()
+        thread.join(PATIENT)
+        assert errors
+        width = plant.gripper_state()[0]
+        time.sleep(0.05)
+        assert plant.gripper_state()[0] == width > 0.09
+
+
+def test_close_with_a_held_part_keeps_the_grip() -> None:
+    with connected() as (gripper, server, plant, record):
+        gripper.home()
+        plant.set_part(0.040)
+        gripper.grasp(width=0.040, speed=0.4, force=20)
+        gripper.close()
+        assert record.names[-2:] == ["grasp", "disconnect"]
+        with WsgGripper(transport_for(server.addresses[0], clock=CLOCK), clock=CLOCK, config=CONFIG) as other:
+            assert other.state().grasp == "holding" and other.state().force == 20
+            with pytest.raises(SafetyError, match="may be held"):
+                other.home()
+
+
+def test_unannounced_disconnect_leaves_fast_stop_and_the_held_part() -> None:
+    with mock() as (server, plant):
+        relay = Relay(server.tcp_address, unmodified)
+        first = WsgGripper(transport_for(relay.address, clock=CLOCK), clock=CLOCK, config=CONFIG)
+        first.connect()
+        first.home()
+        plant.set_part(0.040)
+        first.grasp(width=0.040, speed=0.4, force=20)
+        relay.close()  # as if the cable were unplugged
+        with pytest.raises(PeerError, match=r"closed|broke"):
+            wait_for_error(first)
+        with pytest.raises(PeerError, match=r"closed|broke"):
+            first.move(width=0.05, speed=0.1)
+        first.close()
+        eventually(lambda: server.fast_stopped, "the device did not detect the disconnect")
+        with WsgGripper(transport_for(server.addresses[1], clock=CLOCK), clock=CLOCK, config=CONFIG) as second:
+            assert second.state().fault == "FAST_STOP"
+            second.acknowledge_fault()
+            with pytest.raises(SafetyError, match="may be held"):  # it reports idle, but the fingers press
+                second.home()
+            plant.set_part(None)
+            second.home(part_removed=True)
+
+
+def test_dry_run_sends_no_motion() -> None:
+    with mock() as (server, plant):
+        with WsgGripper(transport_for(server.addresses[1], clock=CLOCK), clock=CLOCK, config=CONFIG) as gripper:
+            gripper.home()
+        relay = Relay(server.tcp_address, unmodified)
+        record = CommandRecord()
+        dry = WsgConfig(reply_timeout=20, stale_after=20, dry_run=True)
+        with WsgGripper(
+            transport_for(relay.address, clock=CLOCK), clock=CLOCK, config=dry, on_command=record.command
+        ) as gripper:
+            width = gripper.state().width
+            gripper.home()
+            gripper.grasp(width=0.1, speed=0.1, force=20)
+            gripper.release(width=0.110, speed=0.1)
+            gripper.move(width=0.1, speed=0.1)
+            gripper.stop()
+            with pytest.raises(SafetyError):
+                gripper.move(width=0.2, speed=0.1)
+        relay.close()
+        assert record.names == ["home", "grasp", "release", "move", "stop", "disconnect"]
+        assert not MOTION_IDS & set(relay.ids()) and Command.SET_FORCE_LIMIT not in relay.ids()
+        assert plant.gripper_state()[0] == pytest.approx(width)
+        assert not server.fast_stopped
+
+
+def test_command_that_cannot_be_recorded_is_not_sent() -> None:
+    def full(name: str, values: Mapping[str, float]) -> None:
+        raise PeerError(f"the disk is full: {name}")
+
+    with mock() as (server, plant):
+        gripper = WsgGripper(
+            transport_for(server.addresses[0], clock=CLOCK), clock=CLOCK, config=CONFIG, on_command=full
+        )
+        with gripper:
+            with pytest.raises(PeerError, match="disk is full: home"):
+                gripper.home()
+            assert plant.gripper_state()[0] == 0.050
+        assert not server.fast_stopped
+
+
+def test_measurement_that_cannot_be_recorded_ends_the_link_after_a_stop() -> None:
+    full = threading.Event()
+
+    def record(state: GripperState) -> None:
+        if full.is_set():
+            raise PeerError("the disk is full")
+
+    with mock() as (server, plant):
+        transport = transport_for(server.addresses[1], clock=CLOCK)
+        with WsgGripper(transport, clock=CLOCK, config=CONFIG, on_measurement=record) as gripper:
+            gripper.home()
+            thread, errors = in_thread(lambda: gripper.move(width=0.010, speed=0.005))
+            eventually(lambda: gripper.state().grasp == "positioning", "the move did not start")
+            full.set()
+            thread.join(PATIENT)
+            assert "disk is full" in str(errors[0])
+            with pytest.raises(PeerError, match="disk is full"):
+                gripper.state()
+            eventually(lambda: plant.gripper_state()[1] == 0.0, "the fingers were not stopped")
+            assert plant.gripper_state()[0] > 0.05
+        eventually(lambda: not server.fast_stopped, "the disconnect was not announced")
