@@ -25,6 +25,8 @@ GROUPS = {
     "broad phase": (
         "find_candidate_points",
         "find_neighbors",
+        "select_candidates",
+        "gather_point_data",
         "covers",
         "for_candidate_points",
         "for_candidate_leaves",
@@ -41,12 +43,12 @@ GROUPS = {
         ),
         *("pair_frame", "move_mount"),
     ),
-    "dynamics": ("inverse_dynamics", "free_body", "subtract_joint_forces", "actuator_pull"),
+    "dynamics": ("inverse_dynamics", "free_body", "subtract_joint_forces", "actuator_force"),
     "kinematics": (
         *("forward_", "integrate_to_trial_state", "integrate", "quaternion"),
         *("axis_rotation", "right_jacobian", "position_by", "sincos"),
     ),
-    "solver": ("factorize", "invert", "solve", "newton", "evaluate", "relative"),
+    "solver": ("factorize", "invert", "solve", "newton", "evaluate", "relative_norm"),
 }
 
 

@@ -1,4 +1,5 @@
-// By how much the mean lever arm of a body that turns differs from that at the step's end (arc_correction.hpp).
+// Correction of the moment arm of a rotating body: the mean over a step less the one at the step's end
+// (arc_correction.hpp).
 #pragma once
 
 #include "math/spatial.hpp"

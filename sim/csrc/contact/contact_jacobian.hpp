@@ -9,7 +9,7 @@
 // Columns stand side by side in packs of neighbouring dofs; those that do not belong to the pair are zero.
 #pragma once
 
-#include "contact/pair_frame.hpp"
+#include "geometry/pair_frame.hpp"
 
 namespace gelflow {
 

@@ -1,5 +1,6 @@
-// Which branches a step took: touching or not, stick or slip, clipped or not. Two runs with equal signatures lie on the
-// same smooth piece of the simulator's function; a finite difference is only meaningful there.
+// Contact mode signature: which points are in contact, stick or slide, and which actuators are clipped. Two runs with
+// equal signatures lie on the same smooth piece of the simulator's function; finite differences are meaningful only
+// there.
 #pragma once
 
 #include "solver/step.hpp"
@@ -15,10 +16,10 @@ class ModeHash {
   std::uint64_t hash_ = 0xcbf29ce484222325ULL;
 };
 
-// The face of the shape that the point is nearest to, as told by the normal: by its signs where faces are flat, by its
-// zeros where they are curved (the ends and the side of a cylinder or capsule).
+// Code of the shape's face nearest to a point, by the normal: by its signs where faces are flat, by its zeros where they
+// are curved (the ends and the side of a cylinder or capsule).
 template <class T>
-std::uint64_t face(const V3<T>& normal, bool curved) {
+std::uint64_t face_code(const V3<T>& normal, bool curved) {
   std::uint64_t code = curved ? 1 : 0;
   for (int a = 0; a < 3; ++a) {
     const int sign = normal[a] > T(0) ? 1 : normal[a] < T(0) ? 2 : 0;
@@ -27,42 +28,29 @@ std::uint64_t face(const V3<T>& normal, bool curved) {
   return code;
 }
 
-// Signature of the step that ended in (q, v), with the anchors from before it. Markers count where `markers` is true
-// or where they carry memory.
+// Adds the modes of the active points of a pair. Needs the kinematics of the state in w.
 template <class T>
-std::uint64_t contact_mode_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
-                                     const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
-  ModeHash hash;
-  forward_state<true, T>(m, params, q, nullptr, v, w);
-  int pair = 0;
-  const auto visit = [&](const ContactPack<T>& t) {
+void add_contact_modes(const PairFrame<T>& frame, const PointCloud& cloud, const ContactSettings<T>& settings, int pair,
+                       ModeHash& hash) {
+  for_contact_points<false, T>(frame, cloud, settings, [&](const ContactPack<T>& t) {
     PointForce<Pack<T>> force;
     point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
-    const auto pulls = dot(force.force, t.at.n);
+    const auto normal_force = dot(force.force, t.at.n);
     t.for_each_active([&](int k, int i) {
       hash.add((static_cast<std::uint64_t>(pair) << 32) + static_cast<std::uint64_t>(i));
-      hash.add(face<T>(lane3<T>(t.at.n, k), t.at.form != HessianForm::zero) * 16 +
+      hash.add(face_code<T>(lane3<T>(t.at.n, k), t.at.form != HessianForm::zero) * 16 +
                (lane(t.at.d, k) < T(-1e-6) ? 8 : 0) + (is_set(force.sliding, k) ? 4 : 0) +
-               (is_set(t.has_anchor, k) ? 2 : 0) + (lane(pulls, k) > T(0) ? 0 : 1));
+               (is_set(t.has_anchor, k) ? 2 : 0) + (lane(normal_force, k) > T(0) ? 0 : 1));
     });
-  };
-  for (const Contact& contact : m.contacts) {
-    ++pair;
-    const PointSet& set = m.point_sets[contact.points];
-    const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    for_contact_points<false, T>(frame, set.cloud, contact_settings<T>(m, contact, params, anchors, anchored), visit);
-  }
-  for (const Pad& pad : m.pads) {
-    for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
-      ++pair;
-      if (!markers && pad.anchor < 0) continue;
-      const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
-      for_contact_points<false, T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored), visit);
-    }
-  }
+  });
+}
+
+// Adds which controls and actuator forces are clipped, the modes of dry friction, and the joint limits that are active.
+template <class T>
+void add_joint_modes(const Model& m, const T* params, const T* q, const T* v, const T* u, ModeHash& hash) {
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
-    hash.add(static_cast<std::uint64_t>(actuator_pull<T>(actuator, params + actuator.param, u[a], q, v).clipped));
+    hash.add(static_cast<std::uint64_t>(actuator_force<T>(actuator, params + actuator.param, u[a], q, v).clipped));
   }
   for (const Joint& joint : m.joints) {
     const T* p = params + joint.param;
@@ -70,9 +58,33 @@ std::uint64_t contact_mode_signature(const Model& m, const T* params, const T* q
       hash.add(v[k] > T(friction_creep) ? 1 : v[k] < T(-friction_creep) ? 2 : 0);
     }
     if (joint.has_quaternion()) continue;
-    const LimitPush<T> push = limit_push<T>(p, q[joint.q], v[joint.v]);
-    hash.add(push.force > T(0) ? 1 : push.force < T(0) ? 2 : 0);
+    const LimitForce<T> limit = limit_force<T>(p, q[joint.q], v[joint.v]);
+    hash.add(limit.force > T(0) ? 1 : limit.force < T(0) ? 2 : 0);
   }
+}
+
+// Signature of the step that ended in (q, v), with the anchors from before it. Markers are included where `markers` is
+// true and where they have anchors.
+template <class T>
+std::uint64_t contact_mode_signature(const Model& m, const T* params, const T* q, const T* v, const V3<T>* anchors,
+                                     const std::uint8_t* anchored, const T* u, bool markers, Workspace<T>& w) {
+  ModeHash hash;
+  forward_state<true, T>(m, params, q, nullptr, v, w);
+  int pair = 0;
+  for (const Contact& contact : m.contacts) {
+    const PointSet& set = m.point_sets[contact.points];
+    add_contact_modes<T>(pair_frame<T>(params, set.mount, m.shapes[contact.shape], w), set.cloud,
+                         contact_settings<T>(m, contact, params, anchors, anchored), ++pair, hash);
+  }
+  for (const Pad& pad : m.pads) {
+    for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
+      ++pair;
+      if (!markers && pad.anchor < 0) continue;
+      add_contact_modes<T>(pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w), pad.cloud,
+                           contact_settings<T>(pad, s, params, anchors, anchored), pair, hash);
+    }
+  }
+  add_joint_modes<T>(m, params, q, v, u, hash);
   return hash.value();
 }
 

@@ -1,21 +1,21 @@
-// What a shape says of a point.
+// Signed distance, gradient and Hessian at a point.
 #pragma once
 
-#include "math/simd_pack.hpp"
+#include "math/vec3.hpp"
 
 namespace gelflow {
 
-// How the distance bends: not at all; as around a point; with a normal of unit length; as a smooth field whose gradient
-// is only nearly so.
+// Form of the Hessian H: zero (flat faces); isotropic about the normal, κ (1 − n nᵀ) (spheres); general; general, of a
+// smooth field whose gradient n has only nearly unit length (grids).
 enum class HessianForm : std::uint8_t { zero, isotropic, general, field };
 
 template <class P>
 struct Distance {
   P d;
   Vec3<P> n;
-  P curvature;       // round: H = bow (1 − n nᵀ)
-  Mat3<P> hessian;   // only written where the distance bends and is not round
-  HessianForm form;  // of the shape's kind, the same for all its points
+  P curvature;       // κ, isotropic form only
+  Mat3<P> hessian;   // general and field form only
+  HessianForm form;  // the same for all points of a shape
 
   GELFLOW_INLINE Vec3<P> hessian_times(const Vec3<P>& a) const {
     return form == HessianForm::isotropic ? curvature * (a - dot(n, a) * n) : hessian * a;

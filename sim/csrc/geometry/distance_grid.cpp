@@ -8,7 +8,7 @@ namespace gelflow {
 
 namespace {
 
-constexpr int most_coefficients = 1 << 30;
+constexpr int max_coefficients = 1 << 30;
 
 template <class Visit>
 void for_cells(const std::array<int, 3>& n, Visit&& visit) {
@@ -29,32 +29,34 @@ bool may_be_negative(const DistanceGrid& g, int i, int j, int k) {
   return false;
 }
 
-// One pass over the cells in memory's order, or against it: each is at most one further than those it comes after.
+// One pass of the distance transform over the cells, in memory order or in reverse: each cell is at most one farther than
+// its neighbours before it.
 void sweep(DistanceGrid& g, int direction) {
   const std::array<int, 3>& n = g.cells;
   for_cells(n, [&](int i, int j, int k) {
     if (direction < 0) i = n[0] - 1 - i, j = n[1] - 1 - j, k = n[2] - 1 - k;
-    std::uint8_t& own = g.clearance[static_cast<std::size_t>(g.cell(i, j, k))];
-    for (int step = 0; step < 13; ++step) {  // the 13 of 26 neighbours that lie before
+    std::uint8_t& clearance = g.clearance[static_cast<std::size_t>(g.cell(i, j, k))];
+    for (int step = 0; step < 13; ++step) {  // the 13 of 26 neighbours before this cell
       const int di = direction * (step / 9 - 1), dj = direction * (step / 3 % 3 - 1), dk = direction * (step % 3 - 1);
       const int x = i + di, y = j + dj, z = k + dk;
       if (x < 0 || x >= n[0] || y < 0 || y >= n[1] || z < 0 || z >= n[2]) continue;
-      const int near = g.clearance[static_cast<std::size_t>(g.cell(x, y, z))] + 1;
-      if (near < own) own = static_cast<std::uint8_t>(near);
+      const int via_neighbor = g.clearance[static_cast<std::size_t>(g.cell(x, y, z))] + 1;
+      if (via_neighbor < clearance) clearance = static_cast<std::uint8_t>(via_neighbor);
     }
   });
 }
 
 }  // namespace
 
-DistanceGrid::DistanceGrid(const std::array<int, 3>& n, const V3<double>& lowest, double edge, std::vector<float> given)
-    : cells(n), origin(lowest), spacing(edge), coefficients(std::move(given)) {
+DistanceGrid::DistanceGrid(const std::array<int, 3>& n, const V3<double>& lower_corner, double edge,
+                           std::vector<float> values)
+    : cells(n), origin(lower_corner), spacing(edge), coefficients(std::move(values)) {
   double size = 1;
   for (const int along : cells) {
     if (along < 3) throw std::invalid_argument("a distance grid needs at least 3 cells along each axis");
     size *= along + 3;
   }
-  if (size > most_coefficients) throw std::invalid_argument("a distance grid has at most 2^30 coefficients");
+  if (size > max_coefficients) throw std::invalid_argument("a distance grid has at most 2^30 coefficients");
   if (static_cast<double>(coefficients.size()) != size) {
     throw std::invalid_argument("a distance grid needs cells + 3 coefficients along each axis");
   }

@@ -1,5 +1,5 @@
-// A shape given by its signed distances on a regular grid: the coefficients of a tri-cubic B-spline, shared by all
-// environments. What is done with them stands in grid_shape.hpp.
+// A signed distance grid: the coefficients of a tri-cubic B-spline, shared by all environments. Its evaluation is in
+// grid_shape.hpp.
 #pragma once
 
 #include <array>
@@ -11,16 +11,16 @@
 namespace gelflow {
 
 struct DistanceGrid {
-  std::array<int, 3> cells;         // the box that the spline is known on; nothing outside it is touched
+  std::array<int, 3> cells;         // of the box where the spline is defined; points outside are not in contact
   V3<double> origin;                // its lowest corner
-  double spacing;                   // edge of a cell
-  std::vector<float> coefficients;  // cells + 3 along each axis, z fastest; single precision: nanometres on a decimetre
+  double spacing;                   // edge length of a cell [m]
+  std::vector<float> coefficients;  // cells + 3 along each axis, z fastest; single precision resolves nanometres
 
-  // Per cell: how many cells away, diagonal steps counting one, the nearest one is in which the spline may be negative;
-  // at most 255. A cell where all 64 coefficients are positive is not among those: the spline is a mean of them.
+  // Per cell: Chebyshev distance in cells to the nearest cell in which the spline may be negative, at most 255. Where all
+  // 64 coefficients of a cell are positive the spline is positive, as their weighted mean.
   std::vector<std::uint8_t> clearance;
 
-  // Throws std::invalid_argument where the numbers make no grid, or the shape reaches the grid's border.
+  // Throws std::invalid_argument if the data is inconsistent or the shape reaches the border of the grid.
   DistanceGrid(const std::array<int, 3>& cells, const V3<double>& origin, double spacing,
                std::vector<float> coefficients);
 

@@ -1,13 +1,13 @@
-// The distance to a shape that a grid describes (meshes).
+// Evaluation of a signed distance grid (meshes).
 //
-// With u = (x/s − o)/h the place in cells (o the grid's origin, h its spacing, s the scale that the shape is taken at),
-// i = ⌊u⌋ per axis and t = u − i, the spline and its derivatives are
+// With u = (x/s − o)/h the position in cells (o the grid's origin, h its spacing, s the scale of the shape), i = ⌊u⌋ per
+// axis and t = u − i, the spline and its derivatives are
 //     φ = Σ c_{i+a, j+b, k+c} B_a(t_x) B_b(t_y) B_c(t_z),   a, b, c = 0…3
 //     d = s φ,   n = φ'/h,   H = φ''/(h² s)
 // with the four pieces of the cubic B-spline (s' = 1 − t)
 //     B = s'³/6,  2/3 − t² + t³/2,  2/3 − s'² + s'³/2,  t³/6
-// φ has continuous second derivatives everywhere. n is the gradient of d to the last bit, and not of unit length: the
-// better the grid resolves the shape the nearer ‖n‖ is to 1.
+// φ has continuous second derivatives. n is the exact gradient of d and not of unit length: the better the grid resolves
+// the shape, the closer ‖n‖ is to 1.
 #pragma once
 
 #include <cmath>
@@ -39,10 +39,55 @@ GELFLOW_INLINE void spline_basis(const P& t, SplineBasis<P>& p) {
   p.second[3] = t;
 }
 
-// The cell of a place along one axis; what is outside (or not a number) counts to the nearest (or first) cell.
+// Index of the cell at position u along one axis, clamped to the grid; the first cell for NaN.
 GELFLOW_INLINE int grid_cell(double u, int cells) {
-  const double most = cells - 1;
-  return static_cast<int>(u > 0 ? (u < most ? u : most) : 0.0);
+  const double last = cells - 1;
+  return static_cast<int>(u > 0 ? (u < last ? u : last) : 0.0);
+}
+
+// The spline and its derivatives in cells, not yet scaled.
+template <class P>
+struct SplineSums {
+  P value;
+  Vec3<P> gradient;
+  P xx, yy, zz, xy, xz, yz;
+};
+
+// Sums over the 4 × 4 × 4 coefficients from start[lane] on, one axis after the other.
+template <class P>
+GELFLOW_INLINE void sum_spline(const DistanceGrid& g, const float* const* start, const SplineBasis<P>& px,
+                               const SplineBasis<P>& py, const SplineBasis<P>& pz, SplineSums<P>& sums) {
+  const P zero(0.0);
+  sums.value = zero;
+  sums.gradient = zero3<P>();
+  sums.xx = sums.yy = sums.zz = sums.xy = sums.xz = sums.yz = zero;
+  for (int i = 0; i < 4; ++i) {
+    P plane = zero, by_y = zero, by_z = zero, by_yy = zero, by_yz = zero, by_zz = zero;
+    for (int j = 0; j < 4; ++j) {
+      const std::ptrdiff_t row = i * g.stride(0) + j * g.stride(1);
+      P line = zero, line_z = zero, line_zz = zero;
+      for (int k = 0; k < 4; ++k) {
+        const P c = gather<P>(start, row + k);
+        line += pz.value[k] * c;
+        line_z += pz.first[k] * c;
+        line_zz += pz.second[k] * c;
+      }
+      plane += py.value[j] * line;
+      by_y += py.first[j] * line;
+      by_yy += py.second[j] * line;
+      by_z += py.value[j] * line_z;
+      by_yz += py.first[j] * line_z;
+      by_zz += py.value[j] * line_zz;
+    }
+    sums.value += px.value[i] * plane;
+    sums.gradient += Vec3<P>{px.first[i] * plane, px.value[i] * by_y, px.value[i] * by_z};
+    sums.xx += px.second[i] * plane;
+    sums.xy += px.first[i] * by_y;
+    sums.xz += px.first[i] * by_z;
+    sums.yy += px.value[i] * by_yy;
+    sums.yz += px.value[i] * by_yz;
+    sums.zz += px.value[i] * by_zz;
+  }
 }
 
 template <class P>
@@ -65,55 +110,27 @@ GELFLOW_INLINE void grid_distance(const DistanceGrid& g, const P& scale, const V
     }
     spline_basis<P>(u - cell, along[a]);
   }
-  const SplineBasis<P>&px = along[0], &py = along[1], &pz = along[2];
-  P value = zero;
-  Vec3<P> slope = zero3<P>();
-  P xx = zero, yy = zero, zz = zero, xy = zero, xz = zero, yz = zero;
-  for (int i = 0; i < 4; ++i) {
-    P plane = zero, by_y = zero, by_z = zero, by_yy = zero, by_yz = zero, by_zz = zero;
-    for (int j = 0; j < 4; ++j) {
-      const std::ptrdiff_t row = i * g.stride(0) + j * g.stride(1);
-      P line = zero, line_z = zero, line_zz = zero;
-      for (int k = 0; k < 4; ++k) {
-        const P c = gather<P>(start, row + k);
-        line += pz.value[k] * c;
-        line_z += pz.first[k] * c;
-        line_zz += pz.second[k] * c;
-      }
-      plane += py.value[j] * line;
-      by_y += py.first[j] * line;
-      by_yy += py.second[j] * line;
-      by_z += py.value[j] * line_z;
-      by_yz += py.first[j] * line_z;
-      by_zz += py.value[j] * line_zz;
-    }
-    value += px.value[i] * plane;
-    slope += Vec3<P>{px.first[i] * plane, px.value[i] * by_y, px.value[i] * by_z};
-    xx += px.second[i] * plane;
-    xy += px.first[i] * by_y;
-    xz += px.first[i] * by_z;
-    yy += px.value[i] * by_yy;
-    yz += px.value[i] * by_yz;
-    zz += px.value[i] * by_zz;
-  }
-  const P once(T(1 / g.spacing)), twice = per_cell * once;
-  out.d = select(within, scale * value, one);
-  out.n = select3<P>(within, once * slope, {one, zero, zero});
-  const P bends = select(within, twice, zero);
-  out.hessian = bends * Mat3<P>{{xx, xy, xz}, {xy, yy, yz}, {xz, yz, zz}};
+  SplineSums<P> sums;
+  sum_spline<P>(g, start, along[0], along[1], along[2], sums);
+  const P per_meter(T(1 / g.spacing));
+  out.d = select(within, scale * sums.value, one);
+  out.n = select3<P>(within, per_meter * sums.gradient, {one, zero, zero});
+  const P second_scale = select(within, per_cell * per_meter, zero);
+  out.hessian =
+      second_scale * Mat3<P>{{sums.xx, sums.xy, sums.xz}, {sums.xy, sums.yy, sums.yz}, {sums.xz, sums.yz, sums.zz}};
   out.form = HessianForm::field;
 }
 
-// For culling: no point where the spline is negative is nearer than this. From outside the grid's box everything in it
-// is at least as far as from the nearest point of the box.
+// Lower bound of the distance to any point where the spline is negative, for culling. Outside the grid's box the distance
+// to the box bounds it.
 template <class T>
 __attribute__((noinline)) T grid_bound(const DistanceGrid& g, const T& scale, const V3<T>& x) {
   const double edge = g.spacing * real_part(scale);
   double squared = 0;
   int cell[3];
   for (int a = 0; a < 3; ++a) {
-    const double u = real_part(x[a]) / edge - g.origin[a] / g.spacing, most = g.cells[a];
-    const double beyond = u < 0 ? -u : u > most ? u - most : 0.0;
+    const double u = real_part(x[a]) / edge - g.origin[a] / g.spacing, upper = g.cells[a];
+    const double beyond = u < 0 ? -u : u > upper ? u - upper : 0.0;
     squared += beyond * beyond;
     cell[a] = grid_cell(u, g.cells[a]);
   }

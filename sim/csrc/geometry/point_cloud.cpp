@@ -1,4 +1,3 @@
-// Points sorted in space, and the blocks that are skipped whole.
 #include "geometry/point_cloud.hpp"
 
 #include <algorithm>
@@ -11,7 +10,8 @@ namespace {
 constexpr int leaf_size = 8;
 constexpr int leaves_per_group = 16;
 
-// Sorts indices [begin, end) so that every run of `leaf` is compact: split the longest axis at a multiple of it.
+// Sorts the indices [begin, end) so that every run of `leaf` points is compact: splits the longest axis recursively, at a
+// multiple of `leaf`.
 void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& order, int begin, int end, int leaf) {
   const int n = end - begin;
   if (n <= leaf) return;
@@ -23,9 +23,9 @@ void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& orde
   int axis = 0;
   (high - low).maxCoeff(&axis);
   int unit = leaf;
-  while (unit * 2 < n) unit *= 2;  // the left half is a full subtree: groups of leaves stay contiguous
+  while (unit * 2 < n) unit *= 2;  // the left half is a full subtree, so groups of leaves stay contiguous
   const int middle = begin + unit;
-  // Ties are broken by the index, so that the order is the same with every standard library.
+  // Ties are broken by index, so that the order does not depend on the standard library.
   std::nth_element(order.begin() + begin, order.begin() + middle, order.begin() + end, [&](int a, int b) {
     const double pa = points[a][axis], pb = points[b][axis];
     return pa < pb || (pa == pb && a < b);
@@ -36,35 +36,36 @@ void sort_in_space(const std::vector<V3<double>>& points, std::vector<int>& orde
   sort_in_space(points, order, middle, end, leaf);
 }
 
-// The middles of fours of points that follow one another in a row, as in a grid of markers; none where not all do.
-std::vector<V3<double>> middles_of_fours(const std::vector<V3<double>>& points) {
-  std::vector<V3<double>> middles;
-  if (points.size() % 4 != 0) return middles;
+// Midpoints of groups of four consecutive points, if each group lies in a row like the markers of a grid; else empty.
+std::vector<V3<double>> quad_midpoints(const std::vector<V3<double>>& points) {
+  std::vector<V3<double>> midpoints;
+  if (points.size() % 4 != 0) return midpoints;
   for (std::size_t i = 0; i < points.size(); i += 4) {
     const V3<double> first = points[i + 1] - points[i];
     for (int k = 2; k < 4; ++k) {
       const V3<double> next = points[i + k] - points[i + k - 1];
       if ((next - first).norm() > 0.5 * first.norm()) return {};
     }
-    middles.push_back(0.5 * (points[i] + points[i + 3]));
+    midpoints.push_back(0.5 * (points[i] + points[i + 3]));
   }
-  return middles;
+  return midpoints;
 }
 
-// Indices of points, sorted in space in leaves. Fours stay together, so that what belongs to them is moved at once.
+// Indices of the points in spatial order. Groups of four in a row stay together, so that their data is loaded and stored
+// at once.
 std::vector<int> sorted_in_space(const std::vector<V3<double>>& points) {
-  const std::vector<V3<double>> middles = middles_of_fours(points);
-  std::vector<int> order(middles.empty() ? points.size() : middles.size());
+  const std::vector<V3<double>> midpoints = quad_midpoints(points);
+  std::vector<int> order(midpoints.empty() ? points.size() : midpoints.size());
   std::iota(order.begin(), order.end(), 0);
   const int count = static_cast<int>(order.size());
-  if (middles.empty()) {
+  if (midpoints.empty()) {
     sort_in_space(points, order, 0, count, leaf_size);
     return order;
   }
-  sort_in_space(middles, order, 0, count, leaf_size / 4);
+  sort_in_space(midpoints, order, 0, count, leaf_size / 4);
   std::vector<int> all;
-  for (const int four : order) {
-    for (int k = 0; k < 4; ++k) all.push_back(4 * four + k);
+  for (const int quad : order) {
+    for (int k = 0; k < 4; ++k) all.push_back(4 * quad + k);
   }
   return all;
 }
@@ -81,7 +82,7 @@ Sphere bounding_sphere(const PointCloud::Coordinates& points, int begin, int end
   }
   Sphere sphere{0.5 * (low + high), 0};
   for (int i = begin; i < end; ++i) sphere.radius = std::max(sphere.radius, (points[i] - sphere.center).norm());
-  sphere.radius *= 1 + 1e-6;  // also covers the rounding of single precision
+  sphere.radius *= 1 + 1e-6;  // covers the rounding errors of single precision
   return sphere;
 }
 
@@ -109,20 +110,20 @@ void PointCloud::Coordinates::pad() {
   for (std::vector<double>* axis : {&x, &y, &z}) axis->resize(axis->size() + padding);
 }
 
-PointCloud::PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& given_weights) {
-  const int n = static_cast<int>(given.size());
-  original = sorted_in_space(given);
+PointCloud::PointCloud(const std::vector<V3<double>>& unsorted, const std::vector<double>& unsorted_weights) {
+  const int n = static_cast<int>(unsorted.size());
+  original = sorted_in_space(unsorted);
   for (const int i : original) {
-    points.add(given[i]);
-    weights.push_back(given_weights[i]);
-    extent = std::max(extent, given[i].norm());
+    points.add(unsorted[i]);
+    weights.push_back(unsorted_weights[i]);
+    extent = std::max(extent, unsorted[i].norm());
   }
   for (int begin = 0; begin < n; begin += leaf_size) {
     const int end = std::min(begin + leaf_size, n);
     add_block(leaves, bounding_sphere(points, begin, end), begin, end);
   }
   const int leaf_count = leaves.count();
-  for (const double radius : leaves.radius) spacing += radius / (2 * leaf_count);  // a leaf is 2 × 4 points, or so
+  for (const double radius : leaves.radius) spacing += radius / (2 * leaf_count);  // a leaf has about 2 × 4 points
   for (int begin = 0; begin < leaf_count; begin += leaves_per_group) {
     const int end = std::min(begin + leaves_per_group, leaf_count);
     add_block(groups, bounding_sphere(points, leaves.begin[begin], leaves.end[end - 1]), begin, end);

@@ -26,14 +26,14 @@ struct PointCloud {
   };
   Coordinates points;             // sorted
   std::vector<double> weights;    // sorted
-  std::vector<V3<double>> areas;  // sorted; of weights that are areas, by the axis across them; empty: they are not
-  std::vector<int> original;      // sorted index → index as given
+  std::vector<V3<double>> areas;  // sorted; normal components of the areas, empty if weights are not areas
+  std::vector<int> original;      // index in the scene of each sorted point
   Blocks leaves, groups;
   double extent = 0;   // distance of the farthest point from the origin of the body's frame [m]
   double spacing = 0;  // between neighbours, about [m]
 
   PointCloud() = default;
-  PointCloud(const std::vector<V3<double>>& given, const std::vector<double>& weights);
+  PointCloud(const std::vector<V3<double>>& points, const std::vector<double>& weights);
   int size() const { return static_cast<int>(original.size()); }
 
   // Single-precision copies of the coordinates and weights, for loops that read all points.

@@ -1,9 +1,9 @@
-// What this processor can do, asked before the core is chosen (sim/_core.py): compiled for any processor.
+// CPU feature detection, by which sim/_core.py chooses the build of the core. Compiled for the baseline instruction set.
 #include <pybind11/pybind11.h>
 
 namespace {
 
-// Whether code compiled for x86-64-v3 runs here: processor and operating system both know AVX2 and its companions.
+// Whether the CPU and the operating system support x86-64-v3 (AVX2, FMA, BMI).
 bool runs_v3() {
 #if defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
   __builtin_cpu_init();

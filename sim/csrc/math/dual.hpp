@@ -1,6 +1,6 @@
-// Forward-mode dual numbers a + b ε, ε² = 0. The whole core is instantiated with them once, so that its analytic
-// derivatives can be compared with exact ones. Every comparison but equality is decided by the real part alone: a dual run takes
-// the same branches as the real run.
+// Dual numbers a + b ε, ε² = 0, for forward-mode differentiation. The core is instantiated with them to verify its
+// analytic derivatives. Order comparisons use the real part only, so that a dual run takes the same branches as the real
+// run.
 #pragma once
 
 #include <Eigen/Core>
@@ -10,10 +10,10 @@ namespace gelflow {
 
 struct Dual {
   double a = 0;  // value
-  double b = 0;  // derivative along the one direction that was seeded
+  double b = 0;  // derivative along the seeded direction
 
   Dual() = default;
-  Dual(double value) : a(value) {}  // implicit on purpose: constants mix freely with duals
+  Dual(double value) : a(value) {}  // implicit, so that constants mix with duals
   Dual(double value, double derivative) : a(value), b(derivative) {}
 
   Dual& operator+=(const Dual& o) { return *this = Dual(a + o.a, b + o.b); }
@@ -32,7 +32,7 @@ struct Dual {
   friend bool operator>(const Dual& x, const Dual& y) { return x.a > y.a; }
   friend bool operator<=(const Dual& x, const Dual& y) { return x.a <= y.a; }
   friend bool operator>=(const Dual& x, const Dual& y) { return x.a >= y.a; }
-  // Equality looks at both parts: a linear solver that skips zeros must not skip a zero with a derivative.
+  // Equality compares both parts: a linear solver that skips zeros must not skip a zero with a derivative.
   friend bool operator==(const Dual& x, const Dual& y) { return x.a == y.a && x.b == y.b; }
   friend bool operator!=(const Dual& x, const Dual& y) { return !(x == y); }
 };

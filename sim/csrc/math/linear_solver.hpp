@@ -1,6 +1,7 @@
-// A few dense linear equations. Up to `small` of them: the inverse, by Gauss and Jordan, since one matrix serves several
-// right-hand sides, each of which is then a product without a chain of divisions. More, or numbers that don't come in
-// packs: Gauss's elimination. Both with row pivots, a pack of columns at a time.
+// Small dense linear systems. Up to `max_inverse_size` equations are solved with the inverse matrix (Gauss-Jordan
+// elimination): one matrix serves several right-hand sides, and a product has no chain of dependent divisions. Larger
+// systems, and scalars without SIMD packs, use LU factorization. Both pivot rows and process one pack of columns at a
+// time.
 #pragma once
 
 #include <utility>
@@ -12,7 +13,7 @@ namespace gelflow {
 
 constexpr int max_inverse_size = 16;
 
-// Brings the row with the largest number in column k, of those not yet used, to place k.
+// Partial pivoting: swaps row k with the row from k on whose entry in column k has the largest magnitude.
 template <class T, class Rows>
 T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
   using std::abs;
@@ -31,7 +32,7 @@ T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
   return row;
 }
 
-// Replaces the first n columns of `a`, which are so many packs, by those of its inverse.
+// Replaces the first n columns of `a`, stored in `packs` packs per row, by the inverse (Gauss-Jordan elimination).
 template <int packs, class T, class Rows>
 void invert(Rows& a, int n, std::vector<int>& pivots) {
   using P = Pack<T>;
@@ -41,14 +42,14 @@ void invert(Rows& a, int n, std::vector<int>& pivots) {
   P column[packs];
   for (int i = 0; i < packs * width; ++i) set_lane(column[i / width], i % width, T(i));
   for (int k = 0; k < n; ++k) {
-    T* const pivot_values = pivot_row<T>(a, n, k, pivots);
-    const P inverse(T(1) / pivot_values[k]);
-    Mask<P> in_column[packs];  // column k, which is to be that of the inverse
+    T* const pivot_row_k = pivot_row<T>(a, n, k, pivots);
+    const P inverse(T(1) / pivot_row_k[k]);
+    Mask<P> in_column[packs];  // selects column k, which becomes that of the inverse
     P pivot[packs];
     for (int p = 0; p < packs; ++p) {
       in_column[p] = !(column[p] < P(T(k))) && !(column[p] > P(T(k)));
-      pivot[p] = select(in_column[p], inverse, inverse * load<P>(pivot_values + p * width));
-      store(pivot[p], pivot_values + p * width);
+      pivot[p] = select(in_column[p], inverse, inverse * load<P>(pivot_row_k + p * width));
+      store(pivot[p], pivot_row_k + p * width);
     }
     for (int i = 0; i < n; ++i) {
       if (i == k) continue;
@@ -78,32 +79,32 @@ bool uses_inverse(int n) {
   return pack_width<T> > 1 && n <= max_inverse_size;
 }
 
-// Makes `a`, whose rows are longer than n by a pack or more, ready for `solve`. Where it is singular, what that finds is
-// not finite.
+// Factorizes (or inverts) `a` in place for `solve`. Rows are padded by at least one pack. For a singular matrix `solve`
+// returns values that are not finite.
 template <class T, class Rows>
 void factorize(Rows& a, int n, std::vector<int>& pivots) {
   if constexpr (pack_width<T> > 1) {
     if (uses_inverse<T>(n)) return invert<T>(a, n, pivots);
   }
-  // P A = L U; on the diagonal stands 1/U.
+  // P A = L U; the diagonal stores 1/U.
   using P = Pack<T>;
   const std::ptrdiff_t stride = a.outerStride();
   T* const start = a.data();
   for (int k = 0; k < n; ++k) {
-    T* const pivot_values = pivot_row<T>(a, n, k, pivots);
-    pivot_values[k] = T(1) / pivot_values[k];
+    T* const pivot_row_k = pivot_row<T>(a, n, k, pivots);
+    pivot_row_k[k] = T(1) / pivot_row_k[k];
     for (int i = k + 1; i < n; ++i) {
       T* const row = start + i * stride;
-      row[k] *= pivot_values[k];
+      row[k] *= pivot_row_k[k];
       const P factor(row[k]);
       for (int j = k + 1; j < n; j += pack_width<T>) {
-        store(load<P>(row + j) - factor * load<P>(pivot_values + j), row + j);
+        store(load<P>(row + j) - factor * load<P>(pivot_row_k + j), row + j);
       }
     }
   }
 }
 
-// x = A⁻¹ b, from what `factorize` left.
+// x = A⁻¹ b, with `a` and `pivots` from `factorize`.
 template <class T, class Rows>
 void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<T>& x) {
   const std::ptrdiff_t stride = a.outerStride();
@@ -111,20 +112,20 @@ void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<
   if (uses_inverse<T>(n)) {
     using P = Pack<T>;
     constexpr int width = pack_width<T>;
-    T right[max_inverse_size + NativePack<float>::width];
-    std::copy(b, b + n, right);
-    std::fill(right + n, right + n + width, T(0));
+    T rhs[max_inverse_size + NativePack<float>::width];
+    std::copy(b, b + n, rhs);
+    std::fill(rhs + n, rhs + n + width, T(0));
     for (int i = 0; i < n; i += width) {
       P sums[width];
       for (int k = 0; k < width; ++k) {
         const T* const row = start + std::min(i + k, n - 1) * stride;
-        P sum = load<P>(row) * load<P>(right);
-        for (int j = width; j < n; j += width) sum += load<P>(row + j) * load<P>(right + j);
+        P sum = load<P>(row) * load<P>(rhs);
+        for (int j = width; j < n; j += width) sum += load<P>(row + j) * load<P>(rhs + j);
         sums[k] = sum;
       }
-      T sums_out[width];
-      sum_lanes(sums, width, sums_out);
-      std::copy(sums_out, sums_out + std::min(width, n - i), x.data() + i);
+      T products[width];
+      sum_lanes(sums, width, products);
+      std::copy(products, products + std::min(width, n - i), x.data() + i);
     }
     return;
   }

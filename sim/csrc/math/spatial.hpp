@@ -1,8 +1,8 @@
 // Spatial (6-D) vectors and rotations.
 //
-// A motion vector is (angular, linear) with the linear part taken AT THE ORIGIN of the frame it is written in: the
-// velocity of a point x is linear + angular × x. A force vector is (moment about the origin, force). Their dot product
-// is power.
+// A motion vector is (angular, linear); the linear part is the velocity at the origin of the frame in which the vector is
+// expressed: a point x has the velocity linear + angular × x. A force vector is (moment about the origin, force). Their
+// dot product is power.
 #pragma once
 
 #include <Eigen/Core>
@@ -10,7 +10,7 @@
 
 #include "math/dual.hpp"
 
-// The small functions of the inner loops: left alone, the compiler calls them.
+// For small functions of inner loops, which the compiler would not inline on its own.
 #define GELFLOW_INLINE __attribute__((always_inline)) inline
 #define GELFLOW_LOOP_BODY __attribute__((always_inline))
 
@@ -31,7 +31,8 @@ using VX = Eigen::Matrix<T, Eigen::Dynamic, 1>;
 template <class T>
 using MX = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic>;
 
-// What places in the world are written in: in single precision their differences would be lost (`Batch<float>`).
+// The scalar type of positions in the world: double in single precision too, where differences of positions would be
+// lost to rounding (`Batch<float>`).
 template <class T>
 struct PositionScalarOf {
   using type = T;
@@ -43,7 +44,7 @@ struct PositionScalarOf<float> {
 template <class T>
 using PositionScalar = typename PositionScalarOf<T>::type;
 
-// The same numbers as those of type T.
+// The matrix cast to scalars of type T; no copy if they are already.
 template <class T, class Matrix>
 GELFLOW_INLINE decltype(auto) as(const Matrix& x) {
   if constexpr (std::is_same_v<T, typename Matrix::Scalar>) {
@@ -66,7 +67,7 @@ GELFLOW_INLINE M3<T> skew(const V3<T>& a) {
   return m;
 }
 
-// [x]× A, without the zeros.
+// [x]× A without products by zero.
 template <class T>
 GELFLOW_INLINE M3<T> cross_columns(const V3<T>& x, const M3<T>& a) {
   M3<T> r;
@@ -100,14 +101,14 @@ GELFLOW_INLINE T dot6(const V6<T>& a, const V6<T>& b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5];
 }
 
-// Motion × motion: the rate of change of y when it is carried along by x.
+// Motion × motion: the rate of change of y, fixed in a frame that moves with x.
 template <class T>
 GELFLOW_INLINE V6<T> cross_motion(const V6<T>& x, const V6<T>& y) {
   const V3<T> w = top(x), v = bottom(x), yw = top(y), yv = bottom(y);
   return stack<T>(cross(w, yw), cross(w, yv) + cross(v, yw));
 }
 
-// Motion ×* force: the rate of change of f when it is carried along by x.
+// Motion ×* force: the rate of change of f, fixed in a frame that moves with x.
 template <class T>
 GELFLOW_INLINE V6<T> cross_force(const V6<T>& x, const V6<T>& f) {
   const V3<T> w = top(x), v = bottom(x), n = top(f), l = bottom(f);
@@ -130,7 +131,7 @@ V4<T> quaternion_product(const V4<T>& p, const V4<T>& q) {
           p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1], p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]};
 }
 
-// sin(θ/2)/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of θ² : even functions of θ, so that θ = 0 is an ordinary point.
+// sin(θ/2)/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ and cos(θ/2) as functions of θ², which are smooth at θ = 0.
 template <class T>
 struct RotationSeries {
   T half_sinc, one_minus_cos, theta_minus_sin, half_cos;
@@ -138,7 +139,7 @@ struct RotationSeries {
     using std::cos;
     using std::sin;
     using std::sqrt;
-    if (real_part(squared) < 1e-4) {  // the next terms are below 1e-19
+    if (real_part(squared) < 1e-4) {  // power series; the next terms are below 1e-19
       const T s = squared;
       const auto over = [&](double divisor) { return T(s * T(1 / divisor)); };
       half_sinc = T(0.5) - over(48) * (T(1) - over(80) * (T(1) - over(168)));
@@ -155,7 +156,7 @@ struct RotationSeries {
   }
 };
 
-// exp of a rotation vector as a unit quaternion.
+// Unit quaternion of a rotation vector (exponential map).
 template <class T>
 V4<T> quaternion_exp(const V3<T>& phi) {
   const RotationSeries<T> s(phi.squaredNorm());

@@ -1,6 +1,6 @@
-// Reverse-mode numbers: what is computed with them is written down on a tape, and one pass back over it gives the
-// gradient of a weighted sum of results by every number that was watched. The core is instantiated with them to ask for
-// gradients by physical parameters: on request only, so that nothing else pays for it.
+// Taped numbers for reverse-mode differentiation. Operations are recorded on a tape; one backward pass over it computes
+// the gradient of a weighted sum of results with respect to all variables. The core is instantiated with them for
+// gradients with respect to physical parameters, which are computed on request only.
 #pragma once
 
 #include <Eigen/Core>
@@ -11,13 +11,13 @@ namespace gelflow {
 
 class Tape {
  public:
-  // A new entry with partial derivatives da, db by the entries a, b (−1: none); returns its index.
+  // Adds an entry with partial derivatives da, db with respect to the entries a, b (−1: none); returns its index.
   int add(int a, double da, int b, double db) {
     entries_.push_back({a, b, da, db});
     return static_cast<int>(entries_.size()) - 1;
   }
   void clear() { entries_.clear(); }
-  // weights: of the results, one per entry; on return the gradient by every entry.
+  // Backward pass. weights: those of the results, one per entry; on return the gradient with respect to every entry.
   void back(std::vector<double>& weights) const {
     for (int i = static_cast<int>(entries_.size()) - 1; i >= 0; --i) {
       const double w = weights[i];
@@ -29,7 +29,7 @@ class Tape {
   }
   std::size_t size() const { return entries_.size(); }
 
-  // The tape of this thread.
+  // The tape of the calling thread.
   static Tape& current() {
     thread_local Tape tape;
     return tape;
@@ -45,10 +45,10 @@ class Tape {
 
 struct Taped {
   double a = 0;
-  int entry = -1;  // on the tape; −1: a constant
+  int entry = -1;  // index on the tape; −1: a constant
 
   Taped() = default;
-  Taped(double value) : a(value) {}  // implicit on purpose: constants mix freely
+  Taped(double value) : a(value) {}  // implicit, so that constants mix with taped numbers
   Taped(double value, int i, double di, int j = -1, double dj = 0) : a(value) {
     if (i >= 0 || j >= 0) entry = Tape::current().add(i, di, j, dj);
   }

@@ -4,6 +4,7 @@
 #include <utility>
 #include <vector>
 
+#include "math/simd_pack.hpp"
 #include "model/model.hpp"
 
 namespace gelflow {
@@ -86,11 +87,11 @@ struct CandidatePoints {
 template <class T>
 struct ContactJacobian {
   explicit ContactJacobian(int capacity)
-      : s(capacity), y(capacity), force_q(capacity), force_v(capacity), axis_wrench(capacity) {}
+      : s(capacity), y(capacity), wrench_by_q(capacity), wrench_by_v(capacity), axis_wrench(capacity) {}
   const PackedDofs* dofs = nullptr;
-  int n = 0;                                  // columns, a whole number of packs
-  SixPacks<T> s, y;                           // S and Y, signs applied
-  SixPacks<T> force_q, force_v, axis_wrench;  // what their displacements change (contact.hpp)
+  int n = 0;                                          // columns, a whole number of packs
+  SixPacks<T> s, y;                                   // S and Y, signs applied
+  SixPacks<T> wrench_by_q, wrench_by_v, axis_wrench;  // what their displacements change (contact_forces.hpp)
 };
 
 // What a step's residual needs beside v_t.

@@ -71,8 +71,8 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na > 0) {
     const T length = r.start(u).length();
-    contact_anchors_vjp<true, T>(m, params, length, r.bdf2, r.anchors.data(), r.anchored.data(), w, g.anchors.data(),
-                                 g.v, g.q, g.v, by_anchor.data());
+    contact_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+                           by_anchor.data());
     marker_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                           by_anchor.data());
   }
@@ -100,8 +100,7 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
     g.history.segment(m.nv, m.nv) = by_earlier - by_v_star / T(3);
   }
   if (m.na > 0) {
-    contact_anchors_vjp<false, T>(m, params, r.h, r.bdf2, r.anchors.data(), r.anchored.data(), w, nullptr, c, g.q, g.v,
-                                  by_anchor.data());
+    residual_anchors_vjp<T>(m, params, r.h, r.bdf2, r.anchors.data(), r.anchored.data(), w, c, by_anchor.data());
     g.anchors.swap(by_anchor);
   }
 }

@@ -1,5 +1,5 @@
-// Newton's method for the velocity after a step: full steps first, then a search along the line, and where something
-// saturates, by way of softer friction and servos.
+// Newton's method for the velocity after a step: full steps first, then a backtracking line search, and continuation in
+// the stiff saturating forces where both fail.
 #pragma once
 
 #include <algorithm>
@@ -11,16 +11,17 @@ namespace gelflow {
 
 enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
 
-// Size of the residual relative to impulses.
+// √Σ (g_k / s_k)², the residual relative to impulses s; infinity where it is not finite.
 template <class T>
-double relative(const VX<T>& residual, const VX<T>& impulses, int n) {
+double relative_norm(const VX<T>& residual, const VX<T>& impulses, int n) {
   double total = 0;
   if constexpr (std::is_floating_point_v<T>) {
     using P = Pack<double>;
-    const P least(1e-30);
+    const P smallest(1e-30);
     P squares(0.0);
-    for (int k = 0; k < n; k += pack_width<double>) {  // behind the last stand zeros
-      const P impulse = load<P>(&impulses[k]), value = load<P>(&residual[k]) / select(impulse > least, impulse, least);
+    for (int k = 0; k < n; k += pack_width<double>) {  // both vectors are padded with zeros
+      const P impulse = load<P>(&impulses[k]);
+      const P value = load<P>(&residual[k]) / select(impulse > smallest, impulse, smallest);
       squares += value * value;
     }
     total = sum(squares);
@@ -33,18 +34,19 @@ double relative(const VX<T>& residual, const VX<T>& impulses, int n) {
   return std::isfinite(total) ? std::sqrt(total) : std::numeric_limits<double>::infinity();
 }
 
-// Whether the residual may be rounding errors alone: those of the impulses, of the momenta before the step (whose moments
-// are taken about the world's origin), and of what one rounding unit of every position and velocity makes.
+// Whether the residual may consist of rounding errors alone. The bound per row is the sum of the rounding errors of the
+// impulses, of the momenta before the step (with moments about the world's origin), and of the effect of one rounding
+// unit of every position and velocity.
 template <class T>
 bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
                        const Workspace<T>& w) {
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
-  double reach = 0, turn = 1, mass = 0, speed = 0, spin = 0;  // turn: of the largest angle, or of a quaternion
+  double reach = 0, angle = 1, mass = 0, speed = 0, spin = 0;  // angle: the largest one, 1 for a quaternion
   for (const V3<PositionScalar<T>>& position : w.position) {
     for (int a = 0; a < 3; ++a) reach = std::max(reach, std::abs(real_part(position[a])));
   }
   for (const Joint& joint : m.joints) {
-    if (joint.type == JointType::hinge) turn = std::max(turn, std::abs(real_part(from.q0[joint.q])));
+    if (joint.type == JointType::hinge) angle = std::max(angle, std::abs(real_part(from.q0[joint.q])));
   }
   for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
   for (int k = 0; k < m.nv; ++k) {
@@ -53,148 +55,244 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
   }
   const double momentum = mass * (speed + reach * spin) * (1 + real_part(from.h) * spin);
   for (int i = 0; i < m.nv; ++i) {
-    double own = m.angular[i] ? reach * momentum : momentum, stiffness = 0;
+    double velocity_terms = m.angular[i] ? reach * momentum : momentum, position_terms = 0;
     for (int j = 0; j < m.nv; ++j) {
-      stiffness += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? turn : reach);
-      own += std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
+      position_terms += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? angle : reach);
+      velocity_terms +=
+          std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
     }
-    const double bound = unit * (stiffness + own + real_part(w.impulses[i]));
+    const double bound = unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
   }
   return true;
 }
 
-// Solves one substep; on success `v` is v_t, w.q and w.increment are those of it; where there are anchors, w holds the
-// kinematics of (w.q, v) too.
-// `polish` more Newton updates follow convergence (dual numbers need three for their derivative part).
+// Solves g(v_t) = 0 for one substep. On success `v` is v_t, w.q and w.increment belong to it; where there are anchors, w
+// also holds the kinematics of (w.q, v). `polish` further Newton updates follow convergence (dual numbers need three for
+// their derivative part).
 //
-// The first iterations take full steps whether the residual shrinks or not: contacts switch on and off, the residual is
-// close to piecewise linear, and a full step into the right piece often makes the residual larger before the next one
-// solves it, while a search along the line would stop at the first edge. Where that does not lead home, the search
-// starts from the best point seen. Where the search gets stuck at an edge, the derivatives just past it say where to go.
+// Globalization. The first iterations take full steps even where the residual grows: contacts switch on and off, so the
+// residual is close to piecewise linear; a full step into the right piece often increases the residual before the next
+// one solves it, while a line search would stop at the first kink. If full steps do not converge, a line search starts
+// from the best iterate. If the line search gets stuck at a kink, the next direction uses the Jacobian just past it.
 //
-// An update with derivatives of an earlier one shrinks the residual by some factor and not to its square, and so ends
-// nearer to the tolerance: a margin makes up for it. In single precision there is no room for one. Who asks for the
-// last digits gets them.
+// Jacobian reuse. After an update that decreased the residual strongly, the factorized Jacobian serves one more update,
+// which costs a quarter. Such an update converges linearly and ends nearer to the tolerance, so double precision
+// tightens the tolerance by a safety factor; single precision has no room for one. Tight tolerances disable Jacobian
+// reuse.
 //
-// Where the residual is within the tolerance, or a tenth of what such an update leaves would be, one more update follows
-// whose residual is not measured, unless it has plenty of room already, or anchors move on from there: it costs little,
-// and takes an error away that would else add up over many steps.
+// Unchecked final update. Where the residual is within the tolerance, or is expected to be within a tenth of it after an
+// update with the reused Jacobian, one more update is applied without evaluating its residual, unless the residual is
+// far below the tolerance already or anchors depend on the result. It is cheap and removes an error that would otherwise
+// accumulate over many steps.
+template <class T>
+class NewtonSolver {
+ public:
+  NewtonSolver(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
+               Workspace<T>& w)
+      : m_(m),
+        params_(params),
+        from_(from),
+        v_(v),
+        iterations_(iterations),
+        w_(w),
+        tolerance_(tolerance_of(m, from)),
+        inexact_(std::is_floating_point_v<T> && tolerance_ > exact_below),
+        polish_(polish) {}
+
+  GELFLOW_INLINE Status solve() {
+    if (!evaluate_start()) return Status::not_finite;
+    for (int k = 0; k <= m_.max_iterations; ++k) {
+      const Convergence test = test_convergence(k);
+      if (test.converged && polish_-- <= 0) return Status::ok;
+      if (k == m_.max_iterations || iterations_ >= m_.max_step_iterations) {
+        return test.skips_check && test.within_tolerance ? Status::ok : Status::newton;
+      }
+      compute_direction(test.reuses_jacobian && !test.converged);
+      if (is_final(test)) {
+        if (w_.direction.allFinite()) return apply_final_update();
+        if (test.within_tolerance) return Status::ok;  // the Jacobian is singular
+      }
+      const bool search = k >= full_steps && !test.converged;
+      const bool decreased = take_step(search, test.converged);
+      keep_best(k + 1 == full_steps && !test.converged);
+      if (search && !at_floor_ && is_stalled(k, decreased)) break;
+    }
+    return Status::newton;
+  }
+
+ private:
+  static constexpr int full_steps = 6, stall_window = 6, max_reuse_iteration = 6, max_backtracks = 12;
+  static constexpr double reuse_decrease = 0.15, final_fraction = 0.1, exact_below = 1e-9, armijo = 1e-4;
+  static constexpr bool single_precision = !std::is_same_v<T, PositionScalar<T>>;
+  static constexpr double safety = single_precision ? 1.0 : 0.1, far_below = safety * safety;
+
+  struct Convergence {
+    bool reuses_jacobian;  // the factorized Jacobian is good enough for one more update
+    bool skips_check;      // the residual of the next update need not be evaluated
+    bool within_tolerance;
+    bool converged;
+    double residual;  // relative to the impulses at this iterate
+  };
+
+  // At least 1000 (double) or 100 (single precision) rounding units; loose while the continuation factor is below 1.
+  static double tolerance_of(const Model& m, const StepStart<T>& from) {
+    constexpr double units = single_precision ? 100 : 1000;
+    const double tolerance =
+        std::max(m.tolerance, units * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
+    return from.continuation < 1 ? std::max(tolerance, 1e-3) : tolerance;
+  }
+
+  GELFLOW_INLINE void evaluate_at_v(bool jacobian, CacheState cache) {
+    if (jacobian) {
+      evaluate<true, T>(m_, params_, from_, v_.data(), cache, true, w_);
+    } else {
+      evaluate<false, T>(m_, params_, from_, v_.data(), cache, true, w_);
+    }
+    jacobian_current_ = jacobian;
+  }
+  GELFLOW_INLINE void measure(bool jacobian) {
+    evaluate_at_v(jacobian, CacheState::current);
+    norm_ = relative_norm(w_.residual, w_.residual_scale, m_.nv);
+  }
+
+  // Residual and Jacobian at the initial guess, whose impulses scale all residuals. False where not finite.
+  GELFLOW_INLINE bool evaluate_start() {
+    evaluate_at_v(true, from_.cache);
+    w_.residual_scale = w_.impulses;
+    norm_ = relative_norm(w_.residual, w_.residual_scale, m_.nv);
+    best_norm_ = previous_norm_ = stall_norm_ = norm_;
+    if (!std::isfinite(norm_)) return false;
+    w_.best = v_;
+    return true;
+  }
+
+  GELFLOW_INLINE Convergence test_convergence(int k) const {
+    Convergence test;
+    test.reuses_jacobian =
+        inexact_ && !jacobian_current_ && k <= max_reuse_iteration && norm_ < reuse_decrease * previous_norm_;
+    test.skips_check = inexact_ && m_.na == 0 && polish_ <= 0 && (jacobian_current_ || test.reuses_jacobian);
+    test.residual = relative_norm(w_.residual, w_.impulses, m_.nv);
+    test.within_tolerance = test.residual <= (jacobian_reused_ ? safety : 1.0) * tolerance_;
+    test.converged = at_floor_ || (test.skips_check ? test.residual <= far_below * tolerance_ : test.within_tolerance);
+    return test;
+  }
+
+  // direction = J⁻¹ g, with the Jacobian at v or, where `reuse`, the factorized one of the previous update.
+  GELFLOW_INLINE void compute_direction(bool reuse) {
+    jacobian_reused_ = reuse;
+    if (!reuse) {
+      if (!jacobian_current_) measure(true);
+      factorize<T>(w_.tangent, m_.nv, w_.pivots);
+    }
+    gelflow::solve<T>(w_.tangent, m_.nv, w_.pivots, w_.residual.data(), w_.direction);
+  }
+
+  // Whether the next update is the last one, by the residual that it is expected to leave.
+  GELFLOW_INLINE bool is_final(const Convergence& test) const {
+    return test.skips_check && (test.residual <= tolerance_ ||
+                                (jacobian_reused_ && norm_ * (norm_ / previous_norm_) <= final_fraction * tolerance_));
+  }
+  GELFLOW_INLINE Status apply_final_update() {
+    ++iterations_;
+    v_ -= w_.direction;
+    integrate_to_trial_state<T>(m_, from_, v_.data(), w_);
+    return Status::ok;
+  }
+
+  // Takes the full step, or with `search` the first halved one with sufficient decrease. Returns whether the residual
+  // decreased sufficiently. Past a kink, steps start from the iterate before it.
+  GELFLOW_INLINE bool take_step(bool search, bool converged) {
+    if (past_kink_) {
+      w_.direction += w_.start - v_;
+    } else {
+      w_.start = v_;
+      previous_norm_ = norm_;
+    }
+    ++iterations_;
+    double fraction = 1;
+    for (int halvings = 0; halvings <= max_backtracks; ++halvings, fraction *= 0.5) {
+      v_ = w_.start - w_.direction * T(fraction);
+      measure(false);
+      const bool decreased = norm_ <= (1 - armijo * fraction) * previous_norm_, finite = std::isfinite(norm_);
+      if (converged) return decreased;
+      at_floor_ = norm_ > 0.5 * previous_norm_ && finite && at_rounding_floor<T>(m_, params_, from_, v_, w_);
+      if (decreased || at_floor_ || (finite && !search)) return decreased;
+    }
+    return false;
+  }
+
+  // Remembers the best iterate; the line search starts from it after the last full step.
+  GELFLOW_INLINE void keep_best(bool full_steps_end) {
+    if (norm_ < best_norm_) {
+      best_norm_ = norm_;
+      w_.best = v_;
+    } else if (full_steps_end && !at_floor_) {
+      v_ = w_.best;
+      stall_norm_ = best_norm_;
+      measure(true);
+    }
+  }
+
+  // Whether the line search makes no progress: no decrease past a kink either, or less than half in `stall_window`
+  // iterations.
+  GELFLOW_INLINE bool is_stalled(int k, bool decreased) {
+    if (!decreased && (past_kink_ || !std::isfinite(norm_))) return true;
+    past_kink_ = !decreased;
+    if ((k - full_steps) % stall_window != stall_window - 1) return false;
+    if (best_norm_ > 0.5 * stall_norm_) return true;
+    stall_norm_ = best_norm_;
+    return false;
+  }
+
+  const Model& m_;
+  const T* const params_;
+  const StepStart<T>& from_;
+  VX<T>& v_;
+  int& iterations_;
+  Workspace<T>& w_;
+  const double tolerance_;
+  const bool inexact_;  // Jacobian reuse and the unchecked final update are allowed
+  int polish_;
+
+  double norm_ = 0, previous_norm_ = 0;    // of the residual at v, and before the last step
+  double best_norm_ = 0, stall_norm_ = 0;  // the smallest so far, now and when progress was last checked
+  bool at_floor_ = false;                  // the residual is at the rounding floor
+  bool past_kink_ = false;                 // v lies just past a kink; steps start from w.start before it
+  bool jacobian_current_ = false;          // w holds the derivatives at v
+  bool jacobian_reused_ = false;           // by the last update
+};
+
 template <class T>
 Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
-  constexpr int full_steps = 6, patience = 6, most_old = 6;
-  constexpr double quick = 0.15, enough = 0.1, exacting = 1e-9;
-  constexpr double margin = std::is_same_v<T, PositionScalar<T>> ? 0.1 : 1.0, plenty = margin * margin;
-  constexpr double least =
-      std::is_same_v<T, PositionScalar<T>> ? 1000 : 100;  // rounding units; places are better than single
-  const double own = std::max(m.tolerance, least * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
-  const double tolerance = from.continuation < 1 ? std::max(own, 1e-3) : own;
-  const bool inexact = std::is_floating_point_v<T> && tolerance > exacting;
-  bool fresh = false;  // w holds the derivatives at v
-  const auto look = [&](bool derivatives, CacheState cache) {
-    if (derivatives) {
-      evaluate<true, T>(m, params, from, v.data(), cache, true, w);
-    } else {
-      evaluate<false, T>(m, params, from, v.data(), cache, true, w);
-    }
-    fresh = derivatives;
-  };
-  const auto measure = [&](bool derivatives) {
-    look(derivatives, CacheState::current);
-    return relative(w.residual, w.residual_scale, m.nv);
-  };
-  look(true, from.cache);
-  w.residual_scale = w.impulses;  // what residuals are compared by
-  double size = relative(w.residual, w.residual_scale, m.nv), best = size, before = size, mark = size;
-  if (!std::isfinite(size)) return Status::not_finite;
-  w.best = v;
-  bool settled = false;  // no better residual can be had
-  bool past = false;     // v lies just past an edge; the search goes on from w.start before it
-  bool old = false;      // the last update was made with the derivatives of an earlier one
-  for (int k = 0; k <= m.max_iterations; ++k) {
-    // Where an update made the residual that much smaller, its derivatives do for one more, which costs a quarter.
-    const bool again = inexact && !fresh && k <= most_old && size < quick * before;
-    const bool unmeasured = inexact && m.na == 0 && polish <= 0 && (fresh || again);
-    const double left = relative(w.residual, w.impulses, m.nv);
-    const bool would_do = left <= (old ? margin : 1.0) * tolerance;
-    const bool converged = settled || (unmeasured ? left <= plenty * tolerance : would_do);
-    if (converged && polish-- <= 0) return Status::ok;
-    if (k == m.max_iterations || iterations >= m.max_step_iterations) {
-      return unmeasured && would_do ? Status::ok : Status::newton;
-    }
-    old = again && !converged;
-    const bool last = unmeasured && (left <= tolerance || (old && size * (size / before) <= enough * tolerance));
-    if (!fresh && !old) size = measure(true);
-    if (!old) factorize<T>(w.tangent, m.nv, w.pivots);
-    solve<T>(w.tangent, m.nv, w.pivots, w.residual.data(), w.direction);
-    if (last && w.direction.allFinite()) {
-      ++iterations;
-      v -= w.direction;
-      integrate_to_trial_state<T>(m, from, v.data(), w);
-      return Status::ok;
-    }
-    if (last && would_do) return Status::ok;  // the matrix is singular
-    if (past) {
-      w.direction += w.start - v;
-    } else {
-      w.start = v;
-      before = size;
-    }
-    ++iterations;
-    const bool search = k >= full_steps && !converged;
-    double fraction = 1;
-    bool better = false;
-    for (int tries = 0; tries < 13; ++tries, fraction *= 0.5) {
-      v = w.start - w.direction * T(fraction);
-      size = measure(false);
-      better = size <= (1 - 1e-4 * fraction) * before;
-      if (converged) break;
-      settled = size > 0.5 * before && std::isfinite(size) && at_rounding_floor<T>(m, params, from, v, w);
-      if (better || settled || (std::isfinite(size) && !search)) break;
-    }
-    if (size < best) {
-      best = size;
-      w.best = v;
-    } else if (k + 1 == full_steps && !settled && !converged) {
-      v = w.best;
-      mark = best;
-      size = measure(true);
-    }
-    if (!search || settled) continue;
-    if (!better && (past || !std::isfinite(size))) break;
-    past = !better;
-    if ((k - full_steps) % patience == patience - 1) {
-      if (best > 0.5 * mark) break;
-      mark = best;
-    }
-  }
-  return Status::newton;
+  return NewtonSolver<T>(m, params, from, polish, v, iterations, w).solve();
 }
 
-// Where Newton did not converge. Mostly something saturates: points stick below a tiny speed and slip above it, a servo
-// follows within a tiny error and pulls with its limit beyond. Full steps jump back and forth over that narrow range,
-// and a search gets stuck beside it. So k_t, k_s and the gains start soft, which makes the range wide, and grow to what
-// they are, each solution being the next one's start.
+// Continuation (homotopy), where Newton's method did not converge. The usual cause is saturation: points stick below a
+// tiny slip speed and slide above it; a servo follows within a tiny error and pulls with its force limit beyond. Full
+// steps jump back and forth over that narrow range, and a line search gets stuck beside it. So k_t, k_s and the gains
+// are scaled by a factor that starts small, which widens the range, and grows to 1; each solution is the next initial
+// guess.
 template <class T>
 Status newton_by_continuation(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
                               int& iterations, Workspace<T>& w) {
-  constexpr double softest = 1e-8, least_growth = 1.3;
-  StepStart<T> soft = from;
-  VX<T> reached = v;
+  constexpr double smallest = 1e-8, min_growth = 1.3;
+  StepStart<T> scaled = from;
+  VX<T> solution = v;
   double solved = 0, growth = 100;
-  for (soft.continuation = softest;;) {
-    v = reached;
-    const Status status = newton<T>(m, params, soft, soft.continuation < 1 ? 0 : polish, v, iterations, w);
+  for (scaled.continuation = smallest;;) {
+    v = solution;
+    const Status status = newton<T>(m, params, scaled, scaled.continuation < 1 ? 0 : polish, v, iterations, w);
     if (status == Status::ok) {
-      if (soft.continuation == 1) return status;
-      reached = v;
-      solved = soft.continuation;
+      if (scaled.continuation == 1) return status;
+      solution = v;
+      solved = scaled.continuation;
     } else {
       growth = std::sqrt(growth);
-      if (solved == 0 || growth < least_growth) return status;
+      if (solved == 0 || growth < min_growth) return status;
     }
-    soft.continuation = std::min(1.0, solved * growth);
+    scaled.continuation = std::min(1.0, solved * growth);
   }
 }
 

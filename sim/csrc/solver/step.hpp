@@ -12,6 +12,7 @@
 #include <bit>
 #include <cstring>
 
+#include "contact/contact_anchors.hpp"
 #include "contact/tactile.hpp"
 #include "solver/newton.hpp"
 

@@ -1,11 +1,11 @@
-// One ordered pair: the points of a first body, seen from the frame of a shape on a second body. There everything depends
-// on the relative pose and the relative twist V = V₁ − V₂ only.
+// Relative pose and twist of a pair: the points of a first body in the frame of a shape on a second body. Distances and
+// forces depend on the relative pose and the relative twist V = V₁ − V₂ only.
 #pragma once
 
 #include <type_traits>
 
-#include "contact/contact_law.hpp"
 #include "dynamics/kinematics.hpp"
+#include "geometry/distance_bound.hpp"
 
 namespace gelflow {
 
@@ -21,13 +21,13 @@ struct PairFrame {
   ShapeKind kind;
   V3<T> local;     // in the first body's frame: a sphere's centre, a plane's normal
   T plane_height;  // height of the first body's origin above a plane
-  // Where the points are scaled (then `rotation` holds that too):
+  // Scaled points (`rotation` includes the scale):
   bool scaled;
-  T max_scale;        // the largest scale
-  V3<T> area_growth;  // by how much faces across x, y, z are larger, less 1
+  T max_scale;        // the largest of the three
+  V3<T> area_growth;  // relative increase of areas across x, y, z
 
-  // Whether points of the first body may be nearer to the shape than `reach`. May say yes to one that just is not; costs
-  // less than the points' places in the shape's frame.
+  // Conservative test whether points of the first body may be nearer to the shape than `reach`; cheaper than their
+  // positions in the shape's frame.
   template <bool scaled, class P>
   GELFLOW_INLINE Mask<P> may_reach(const Vec3<P>& c, const P& reach) const {
     if (!scaled && kind == ShapeKind::sphere) {
@@ -39,7 +39,7 @@ struct PairFrame {
     return distance_bound<P, T>(kind, size, grid, broadcast<P>(rotation) * c + broadcast<P>(offset)) < reach;
   }
 
-  // Not finite where a parameter is not: then no point touches, and that must not pass for no contact.
+  // Not finite where a parameter is not: no point is active then, which must not be mistaken for no contact.
   T finiteness_probe() const {
     const bool rounded = kind == ShapeKind::rounded_box || kind == ShapeKind::rounded_cylinder;
     return offset[0] + offset[1] + offset[2] + size[0] + size[1] + size[2] + (rounded ? size[3] : T(0));
@@ -51,7 +51,7 @@ struct PairFrame {
   }
 };
 
-// Whether these numbers are others than the nominal ones. Numbers that carry derivatives always are.
+// Whether values differ from the nominal ones; always true for values with derivatives.
 template <class T>
 GELFLOW_INLINE bool differs_from_nominal(const T* numbers, const V3<double>& nominal) {
   if constexpr (!std::is_floating_point_v<T>) return true;
@@ -63,9 +63,10 @@ M3<T> rotation_exp(const T* turn) {
   return rotation_of<T>(quaternion_exp<T>(vec3(turn)));
 }
 
-// With R, p the nominal frame in the body and Params' place p', turn φ, scale S, a point x of the body moves to
+// With R, p the nominal frame in the body and the parameters position p', rotation φ and scale S, a point x of the body
+// moves to
 //     x' = p' + R exp(φ) S Rᵀ (x − p) = A x + b,    A − 1 = R (exp(φ) S − 1) Rᵀ,    b = (p' − p) − (A − 1) p
-// (written so that nothing is rounded where nothing moves): the body's pose ∘ (A, b) takes the body's place.
+// (without rounding errors where nothing moves). Composes the body's pose with (A, b).
 template <class T>
 __attribute__((noinline)) void move_mount(const T* pose, const Mount& mount, M3<PositionScalar<T>>& rotation,
                                           V3<PositionScalar<T>>& position, PairFrame<T>& f) {

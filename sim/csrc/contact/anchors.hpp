@@ -1,0 +1,48 @@
+// Update of the anchors of one cloud, the memory of elastic friction, and its vector-Jacobian product.
+#pragma once
+
+#include "contact/contact_points.hpp"
+
+namespace gelflow {
+
+// Anchors after an accepted step at the candidate points; `next` and `next_set` may be the arrays that are read.
+template <class T>
+void advance_anchors(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
+                     const ContactSettings<T>& settings, int cloud_size, V3<T>* next, std::uint8_t* next_set) {
+  std::fill(next_set, next_set + cloud_size, 0);
+  for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
+    PointForce<Pack<T>> force;
+    point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.h), force, t.x, t.anchor, t.has_anchor);
+    t.for_each_active([&](int k, int i) {
+      next[i] = lane3<T>(anchor, k);
+      next_set[i] = 1;
+    });
+  });
+}
+
+// Vector-Jacobian product of `advance_anchors`: adds the gradients with respect to the relative pose, the relative twist
+// and the anchors before the step.
+template <class T, class Points>
+void anchors_vjp(const PairFrame<T>& frame, const Points& points, const ContactSettings<T>& settings,
+                 const V3<T>* by_next, V6<T>& by_pose, V6<T>& by_twist, V3<T>* by_anchor) {
+  using P = Pack<T>;
+  Vec3<P> rotation = zero3<P>(), translation = rotation, angular = rotation, linear = rotation;
+  for_contact_points<true, T>(frame, points, settings, [&](const ContactPack<T>& t) {
+    Vec3<P> lambda = zero3<P>();
+    t.for_each_active([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
+    const PointGradient<P> g = next_anchor_vjp(t.law, P(settings.h), t.at, t.v, t.e, t.has_anchor, lambda);
+    const Vec3<P> by_point = g.x - cross(broadcast<P>(frame.angular), g.v);
+    rotation += cross(t.center, by_point);
+    translation += by_point;
+    angular += cross(t.x, g.v);
+    linear += g.v;
+    t.for_each_active([&](int k, int i) {
+      if (is_set(t.has_anchor, k)) by_anchor[i] += lane3<T>(g.anchor, k);
+    });
+  });
+  by_pose += stack<T>(sum3<T>(rotation), sum3<T>(translation));
+  by_twist += stack<T>(sum3<T>(angular), sum3<T>(linear));
+}
+
+}  // namespace gelflow

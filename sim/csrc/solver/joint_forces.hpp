@@ -1,0 +1,142 @@
+// Generalized forces in joint space: damping, dry friction, springs, limits and actuators.
+#pragma once
+
+#include "model/workspace.hpp"
+
+namespace gelflow {
+
+// Dry friction in a joint is viscous below this speed [m/s or rad/s].
+constexpr double friction_creep = 1e-3;
+
+// A joint limit is a damped spring that never outs; p: the joint's parameters.
+template <class T>
+struct LimitForce {
+  T force, by_q, by_v;
+};
+template <class T>
+LimitForce<T> limit_force(const T* p, const T& value, const T& v) {
+  const bool above = value > p[5], below = value < p[4];
+  if (!above && !below) return {T(0), T(0), T(0)};
+  const T force = p[6] * (value - (above ? p[5] : p[4])) + p[7] * v;
+  if (above ? force > T(0) : force < T(0)) return {force, p[6], p[7]};
+  return {T(0), T(0), T(0)};
+}
+
+// Force of an actuator and its derivatives by control, length and speed (gear times those of the joint).
+template <class T>
+struct ActuatorForce {
+  T force, by_u, by_length, by_speed;
+  int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
+};
+template <class T, class Q>
+ActuatorForce<T> actuator_force(const Actuator& actuator, const T* p, const T& u, const Q* q, const T* v,
+                                double continuation = 1) {
+  const T gear = p[0], kp = p[1], kd = p[2];
+  ActuatorForce<T> out{T(0), T(1), T(0), T(0), 0};
+  T bias = T(0);
+  switch (actuator.kind) {
+    case ActuatorKind::motor:
+      break;
+    case ActuatorKind::position:
+      out = {T(0), kp, -kp, -kd, 0};
+      break;
+    case ActuatorKind::velocity:
+      out = {T(0), kd, T(0), -kd, 0};
+      break;
+    case ActuatorKind::general:
+      out = {T(0), p[7], -kp, -kd, 0};
+      bias = p[8];
+      break;
+  }
+  const T gain = out.by_u;
+  T control = u;
+  if (u < p[5] || u > p[6]) {
+    out.clipped = u < p[5] ? 1 : 2;
+    control = u < p[5] ? p[5] : p[6];
+    out.by_u = T(0);
+  }
+  out.force =
+      gain * control + bias + out.by_length * (gear * T(q[actuator.q])) + out.by_speed * (gear * v[actuator.dof]);
+  if (continuation < 1) {
+    out.force *= T(continuation);
+    out.by_length *= T(continuation);
+    out.by_speed *= T(continuation);
+  }
+  if (out.force < p[3] || out.force > p[4]) {
+    const bool below = out.force < p[3];
+    return {below ? p[3] : p[4], T(0), T(0), T(0), out.clipped | (below ? 4 : 8)};
+  }
+  return out;
+}
+
+// Damping, dry friction and armature of all dofs of a joint.
+template <bool derivatives, class T>
+GELFLOW_INLINE void add_dof_forces(const Joint& joint, const T* p, const T& h, const T* v, const T& creep,
+                                   bool add_impulses, Workspace<T>& w) {
+  using std::abs;
+  const T damping = p[0], armature = p[1];
+  for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
+    w.residual[k] += h * damping * v[k];
+    if constexpr (derivatives) w.by_v(k, k) += h * damping;
+    if (p[8] != T(0)) {
+      const bool slides = abs(v[k]) > creep;
+      const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / creep * v[k]);
+      w.residual[k] += h * force;
+      if (add_impulses) w.impulses[k] += h * p[8];
+      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / creep);
+    }
+    if (armature != T(0)) {
+      w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
+      if constexpr (derivatives) {
+        w.by_v(k, k) += armature;
+        w.mass(k, k) += armature;
+      }
+    }
+  }
+}
+
+// Spring and limit of a slide or hinge.
+template <bool derivatives, class T>
+GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const T* p, const T& h, const PositionScalar<T>* q,
+                                         const T* v, Workspace<T>& w) {
+  const T stiffness = p[2], springref = p[3];
+  const int k = joint.v;
+  const T value(q[joint.q]);
+  w.residual[k] += h * stiffness * (value - springref);
+  if constexpr (derivatives) w.by_q(k, k) += h * stiffness;
+  const LimitForce<T> limit = limit_force<T>(p, value, v[k]);
+  w.residual[k] += h * limit.force;
+  if constexpr (derivatives) {
+    w.by_q(k, k) += h * limit.by_q;
+    w.by_v(k, k) += h * limit.by_v;
+  }
+}
+
+// Adds −h f and its derivatives to the residual, f the forces of joints and actuators.
+template <bool derivatives, class T>
+void subtract_joint_forces(const Model& m, const T* params, const T& h, const PositionScalar<T>* q, const T* v,
+                           const T* u, double continuation, bool add_impulses, Workspace<T>& w) {
+  using std::abs;
+  const T creep(friction_creep / continuation);
+  for (const Joint& joint : m.joints) {
+    const T* p = params + joint.param;
+    add_dof_forces<derivatives, T>(joint, p, h, v, creep, add_impulses, w);
+    if (!joint.has_quaternion()) add_spring_and_limit<derivatives, T>(joint, p, h, q, v, w);
+  }
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) {
+    const Actuator& actuator = m.actuators[a];
+    const T* p = params + actuator.param;
+    const T gear = p[0];
+    const int k = actuator.dof;
+    const ActuatorForce<T> out = actuator_force<T>(actuator, p, u[a], q, v, continuation);
+    w.residual[k] -= h * gear * out.force;
+    if (add_impulses) w.impulses[k] += h * abs(gear * out.force);
+    if constexpr (derivatives) {
+      w.by_u[a] = -h * gear * out.by_u;
+      w.by_q(k, k) -= h * gear * gear * out.by_length;
+      w.by_v(k, k) -= h * gear * gear * out.by_speed;
+    }
+  }
+}
+
+}  // namespace gelflow
