@@ -1,31 +1,138 @@
-"""The `gelflow` command as a whole: help for everything, and readers that stop reading."""
+"""The `gelflow` command as a whole: help, common options, JSON output, closed pipes."""
 
+import json
+import re
 import subprocess
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gelflow.cli.main import COMMANDS, main
+from gelflow.clock import ScaledClock
+from gelflow.protocols import CameraImage
+from gelflow.session import SessionRecorder
 
 MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
+COMMON_OPTIONS = {
+    "train": {"--json", "--out", "--seed", "--preset"},
+    "eval": {"--json", "--seed", "--preset", "--checkpoint"},
+    "track": {"--json", "--out"},
+    "calibrate-camera": {"--json", "--out"},
+    "run": {"--json", "--out", "--checkpoint"},
+    "replay": {"--json", "--out", "--checkpoint"},
+    "recover": {"--json", "--out"},
+    "mock": {"--json", "--out", "--seed", "--preset"},
+    "render": {"--json", "--out", "--seed"},
+    "bench": {"--json", "--out", "--quick", "--repeats"},
+    "tradeoff": {"--json", "--out", "--quick", "--repeats"},
+    "describe": {"--json", "--preset", "--repeats"},
+    "demo": {"--json", "--out", "--seed", "--preset", "--quick", "--checkpoint"},
+}
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself_in_80_columns(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
+def help_text(command: str, capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as ended:
         main([command, "--help"])
     assert ended.value.code == 0
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_80_columns(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert max(map(len, help_text(command, capsys).splitlines())) <= 80
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_accept_the_common_options(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    options = set(re.findall(r"^  (--[a-z-]+)", help_text(command, capsys), re.MULTILINE))
+    common = set().union(*COMMON_OPTIONS.values())
+    assert options & common == COMMON_OPTIONS[command]
+
+
+def test_common_options_have_the_same_help_everywhere(capsys: pytest.CaptureFixture[str]) -> None:
+    texts: dict[str, set[str]] = {}
+    for command in COMMANDS:
+        words = " ".join(help_text(command, capsys).split())
+        for option in ("--json", "--preset", "--quick"):
+            if found := re.search(rf" {option}(?: NAME)? ([^-\]\[|]+?)(?= --|$)", words.split("options:")[1]):
+                texts.setdefault(option, set()).add(found[1])
+    assert {option: len(found) for option, found in texts.items()} == {"--json": 1, "--preset": 1, "--quick": 1}
+
+
+def printed_json(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> dict[str, Any]:
+    """The result of a command with `--json`: one object, and nothing else on standard output."""
+    capsys.readouterr()
+    assert main([*arguments, "--json"]) == status
+    printed = json.loads(capsys.readouterr().out)
+    assert isinstance(printed, dict)
+    return printed
+
+
+def test_json_of_the_perception_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images, table, fit = tmp_path / "images", tmp_path / "table.csv", tmp_path / "gel.json"
+    rendered = printed_json(
+        capsys, "render", "--out", str(images), "--frames", "3", "--markers", "63", "--motion", "rest"
+    )
+    assert rendered == {"images": 3, "out": str(images), "truth": str(images / "truth.npz")}
+    tracked = printed_json(capsys, "track", str(images), "--out", str(table))
+    assert tracked["images"] == 3 and tracked["rows"] * tracked["cols"] == 63 and tracked["files"] == [str(table)]
+    assert tracked["tracked_share"] > 0.9 and tracked["jitter_px"] is None
+    calibrated = printed_json(capsys, "calibrate-camera", str(images), "--spacing-mm", "2", "--out", str(fit))
+    assert calibrated["calibration"] == str(fit) and calibrated["residual_px"] < 0.2
+
+
+def test_json_of_describe_and_bench(capsys: pytest.CaptureFixture[str]) -> None:
+    assert printed_json(capsys, "describe", "pushing", "--no-timing")["times"] is None
+    record = printed_json(capsys, "bench", "scenes", "--quick", "--repeats", "1")
+    assert record["format"] == 1 and record["scenes"]["outside"] == []
+
+
+def test_json_of_recover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, target = tmp_path / "session.mcap", tmp_path / "recovered.mcap"
+    with SessionRecorder(path, ScaledClock()) as recorder:
+        recorder.metadata({"who": "test"})
+        recorder.image(0, CameraImage(bytes(100), 0.0, 1))
+    path.write_bytes(path.read_bytes()[:-10])
+    report = printed_json(capsys, "recover", str(path), "--out", str(target))
+    assert report["path"] == str(target) and report["messages"] == 2
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
-def test_a_reader_that_stops_ends_the_command_without_a_word(form: list[str]) -> None:
+def test_a_closed_pipe_ends_the_command_silently(form: list[str]) -> None:
     arguments = ["describe", "insertion", "--no-timing", *form]
     command = subprocess.Popen([*MAIN, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert command.stdout is not None and command.stderr is not None
     command.stdout.close()
     assert command.stderr.read() == b""
     assert command.wait() == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["eval", "insertion", "--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (["mock", "--seed", "-1"], "--seed must be at least 0, got -1"),
+        (["describe", "insertion", "--repeats", "0"], "--repeats must be at least 1, got 0"),
+        (["track", "none", "--out", "film.gif"], "--out film.gif: the suffix must be one of .csv, .mcap, .mp4"),
+    ],
+)
+def test_wrong_options_exit_with_2_and_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"gelflow {arguments[0]}: ") and message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("code", ["import gelflow", "from gelflow.cli.main import main; main(['--version'])"])
+def test_import_and_version_load_no_third_party_package(code: str) -> None:
+    """Both are fast because they load the standard library only."""
+    heavy = {"numpy", "scipy", "torch", "cv2", "mujoco", "matplotlib", "rich", "gymnasium"}
+    program = f"import sys\ntry: exec({code!r})\nexcept SystemExit: pass\nprint(sorted({heavy!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"

@@ -14,10 +14,10 @@ from gelflow.perception.synthetic.sequences import GelSequence
 
 
 def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
-    command = "--preset hard --set contrast=0.4 --set bridges=3 --set cut_row=yes --field twist --frames 6 --peak 0.8"
+    command = "--flaws hard --set contrast=0.4 --set bridges=3 --set cut_row=yes --field twist --frames 6 --peak 0.8"
     folder, video = tmp_path / "images", tmp_path / "images.mjpeg"
     for out in (folder, video):
-        assert main(["render", str(out), *command.split(), "--markers", "63", "--seed", "4"]) == 0
+        assert main(["render", "--out", str(out), *command.split(), "--markers", "63", "--seed", "4"]) == 0
     look = make_appearance("hard", markers=63, seed=4, contrast=0.4, bridges=3, cut_row=True)
     drawn = list(GelSequence(look, "twist", frames=6, peak=0.8))
     for file in (folder / "truth.npz", tmp_path / "images.npz"):
@@ -47,7 +47,7 @@ def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
 def test_wrong_input_is_told_in_one_line(
     wrong: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["render", str(tmp_path / "out"), *wrong]) == 2
+    assert main(["render", "--out", str(tmp_path / "out"), *wrong]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
@@ -55,7 +55,7 @@ def test_wrong_input_is_told_in_one_line(
 
 def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.txt").write_text("mine")
-    assert main(["render", str(tmp_path), "--frames", "1"]) == 2
+    assert main(["render", "--out", str(tmp_path), "--frames", "1"]) == 2
     assert "exists and would be overwritten" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.cli.track_output import Step
-from gelflow.cli.track_summary import Summary
 from gelflow.observation import Grid
 from gelflow.perception.calibration import load_calibration
+from gelflow.perception.output.summary import TrackingSummary
+from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.sources import SourceImage
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
@@ -57,7 +57,7 @@ def test_a_source_that_is_no_image_is_told_in_one_line(source: str, tmp_path: Pa
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("sechs Gramm, 5 µm\n" * 300)
     (tmp_path / "zeros.mp4").write_bytes(bytes(5000))
-    status, error = track(str(tmp_path / source), "--csv", str(tmp_path / "out.csv"))
+    status, error = track(str(tmp_path / source), "--out", str(tmp_path / "out.csv"))
     assert status == 2
     assert error.startswith("gelflow track: ")
     assert error.count("\n") == 1
@@ -76,7 +76,7 @@ def test_what_is_written_is_what_was_drawn(tmp_path: Path, capsys: pytest.Captur
     fit, table, video, session = (tmp_path / name for name in ("gel.json", "t.csv", "o.mkv", "s.mcap"))
     assert main(["calibrate-camera", str(folder), "--spacing-mm", "2.2", "--out", str(fit)]) == 0
     assert load_calibration(fit).residual_px < 0.1 and fit.with_suffix(".png").exists()
-    outputs = ["--csv", str(table), "--overlay", str(video), "--mcap", str(session)]
+    outputs = ["--out", str(table), "--out", str(video), "--out", str(session)]
     assert main(["track", str(folder), "--calibration", str(fit), *outputs, "--rate", "10"]) == 0
     told = capsys.readouterr().out
     for words in ("48: 8 rows of 6", "100.0 %", "rest jitter", "0.64", "a second tracked"):
@@ -96,7 +96,7 @@ def test_what_is_written_is_what_was_drawn(tmp_path: Path, capsys: pytest.Captur
         assert reader.counts()["/left/image"] == len(records) == 12
     assert np.allclose(records[-1]["displacement_mm"][0], [-field(11)[0, 1], field(11)[0, 0]], atol=0.02)
     # Tracked once more from the recording: the same numbers.
-    assert main(["track", str(session), "--csv", str(tmp_path / "again.csv")]) == 0
+    assert main(["track", str(session), "--out", str(tmp_path / "again.csv")]) == 0
     same = [(a["x_px"], a["dx_px"], a["quality"]) for a in rows_of(tmp_path / "again.csv")]
     assert same == [(a["x_px"], a["dx_px"], a["quality"]) for a in rows]
 
@@ -107,7 +107,7 @@ def test_a_killed_run_leaves_files_that_can_be_read(tmp_path: Path) -> None:
     for number in range(12, 3000):  # far more than it will get to
         (folder / f"{number}.jpg").hardlink_to(files[number % 12])
     table, video, session = (tmp_path / name for name in ("t.csv", "o.mkv", "s.mcap"))
-    outputs = ["--csv", str(table), "--overlay", str(video), "--mcap", str(session)]
+    outputs = ["--out", str(table), "--out", str(video), "--out", str(session)]
     run = subprocess.Popen([*MAIN, "track", str(folder), *outputs], stdout=subprocess.DEVNULL)
     while not table.exists() or table.stat().st_size < 600_000:  # about 130 images
         assert run.poll() is None
@@ -127,7 +127,7 @@ def test_a_killed_run_leaves_files_that_can_be_read(tmp_path: Path) -> None:
 def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
     table, fit = tmp_path / "t.csv", tmp_path / "gel.json"
-    assert main(["track", str(tmp_path / "blank.png"), "--csv", str(table)]) == 2
+    assert main(["track", str(tmp_path / "blank.png"), "--out", str(table)]) == 2
     assert main(["calibrate-camera", str(tmp_path / "blank.png"), "--spacing-mm", "1.4", "--out", str(fit)]) == 2
     told = capsys.readouterr().err.splitlines()
     for line, file in zip(told, (table, fit), strict=True):
@@ -140,9 +140,9 @@ def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, caps
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--csv", "notes.txt"], "notes.txt exists; name a new file"),
-        (["--overlay", "film.gif"], "suffix must be one of .mp4, .mkv, .avi"),
-        (["--csv", "none/t.csv"], "the folder none does not exist"),
+        (["--out", "notes.csv"], "notes.csv exists; name a new file"),
+        (["--out", "film.gif"], "suffix must be one of .csv, .mcap, .mp4, .mkv, .avi"),
+        (["--out", "none/t.csv"], "the folder none does not exist"),
         (["--calibration", "none.json"], "cannot read none.json"),
         (["--calibration", "other.json"], "for images of 320 × 427 px, this one has 240 × 320"),
         (["--sensor", "middle"], "sensor must be left or right"),
@@ -159,21 +159,21 @@ def test_wrong_options_are_told(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     draw(Path("images"), 1)
-    Path("notes.txt").write_text("mine")
+    Path("notes.csv").write_text("mine")
     if "other.json" in options:
         Path("big.jpg").write_bytes(FastGelRenderer().encode(FastGelRenderer().render(np.zeros((252, 2)))))
         assert main(["calibrate-camera", "big.jpg", "--spacing-mm", "1.4", "--out", "other.json"]) == 0
     assert main(["track", "images", *options]) == 2
-    assert expected in capsys.readouterr().err and Path("notes.txt").read_text() == "mine"
+    assert expected in capsys.readouterr().err and Path("notes.csv").read_text() == "mine"
 
 
 def test_jitter_is_the_noise_and_not_the_motion() -> None:
     rng = np.random.default_rng(0)
     rest = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2) * 20.0
-    summary, yes = Summary(), np.ones(130, dtype=bool)
+    summary, yes = TrackingSummary(), np.ones(130, dtype=bool)
     for number in range(60):
         shake = rng.normal(0, 1.0, 2)  # of the whole camera
         moved = 0.05 * number * np.sin(rest / 100) + shake + rng.normal(0, 0.03, rest.shape)
         tracked = TrackingResult(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
-        summary.add(Step(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
+        summary.add(TrackedImage(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
     assert summary.jitter() == pytest.approx(0.03, rel=0.2)

@@ -35,7 +35,9 @@ def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsy
     assert main(arguments) == 2
     assert "already holds a trained policy" in capsys.readouterr().err
     assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "4", "--envs", "4", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
+    printed = json.loads(capsys.readouterr().out)
+    rows = printed["results"]
+    assert printed["task"] == "insertion" and printed["checkpoint"] == str(made)
     assert [row["name"].split(",")[0] for row in rows] == ["policy", "policy", "random", "random"]
     assert all(row["episodes"] == 4 and 0 <= row["success_95"][0] <= row["success_95"][1] <= 1 for row in rows)
     assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "2"]) == 0

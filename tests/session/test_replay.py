@@ -265,7 +265,7 @@ def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command_says_identical(real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     picture = tmp_path / "maps.png"
-    assert main(["replay", str(real_session), "--picture", str(picture)]) == 0
+    assert main(["replay", str(real_session), "--out", str(picture)]) == 0
     out = capsys.readouterr().out
     with SessionReader(real_session) as session:
         actions = {tuple(decision.action) for decision in session.decisions()}
@@ -303,7 +303,7 @@ def test_the_command_s_wrong_input(real_session: Path, capsys: pytest.CaptureFix
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
         ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
         ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
-        ([str(real_session), "--picture", str(tmp_path / "no folder" / "a.png")], "cannot write the picture"),
+        ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "cannot write the picture"),
     ]:
         assert main(["replay", *arguments]) == 2
         error = capsys.readouterr().err

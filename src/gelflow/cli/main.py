@@ -1,7 +1,7 @@
-"""Entry point of the `gelflow` command: finds the sub-command, prints any of our errors as one line.
+"""Entry point of the `gelflow` command: runs a sub-command and prints any gelflow error as one line.
 
-A sub-command is a module in this folder with `configure(parser)` and `run(args) -> int`; it is imported only when
-asked for, so that `gelflow --help` needs neither torch nor OpenCV.
+A sub-command is a module of `gelflow.cli.commands` with `configure(parser)` and `run(args) -> int`. Only the requested
+one is imported, so that `gelflow --help` loads neither torch nor OpenCV.
 """
 
 import argparse
@@ -11,37 +11,38 @@ import sys
 from collections.abc import Sequence
 
 from gelflow import __version__
+from gelflow.cli.exit_codes import ERROR, INTERRUPTED, NEGATIVE_RESULT
 from gelflow.errors import GelflowError
 
-# command → (what it does in one line). The module is gelflow.cli.commands.<command>, with _ for -.
+# Command → description in one line. Its module is gelflow.cli.commands.<command>, with _ for -.
 COMMANDS = {
     "train": "train a policy in simulation",
-    "eval": "success of a policy in simulation, beside random actions",
-    "track": "track markers on tactile images: a folder, a video, a stream or a camera",
-    "calibrate-camera": "millimetres in a camera's images, from one image of the gel at rest",
-    "run": "run the insertion policy on the robot, or on the mock robot",
-    "replay": "run a recorded session through tracker and policy again and compare the decisions",
-    "recover": "salvage what a killed recorder left behind",
-    "mock": "start the mock robot: gripper, arm and two cameras on the wire",
-    "render": "draw images of a gel with known truth: what tracking is tried on",
-    "bench": "measure speed",
-    "tradeoff": "what accuracy costs on a scene: settings by speed and error, and the presets among them",
-    "describe": "what a scene models, what it leaves out and why, its size, and where a step's time goes",
-    "demo": "the main job on the mock robot: five insertions, pictures, a session",
+    "eval": "measure the success of a policy in simulation, and that of random actions",
+    "track": "track markers in tactile images: a folder, a video, a stream or a camera",
+    "calibrate-camera": "calibrate a camera in millimetres from one image of the gel at rest",
+    "run": "run the insertion policy on the robot or on the mock robot",
+    "replay": "recompute the decisions of a recorded session and compare them",
+    "recover": "copy the complete records of an unfinished or damaged session",
+    "mock": "start the mock robot: gripper, arm and two cameras with their network protocols",
+    "render": "render gel images with known marker positions",
+    "bench": "measure the speed of the simulator and the tracker",
+    "tradeoff": "measure speed and error of a scene for many settings and for the presets",
+    "describe": "describe a scene: model, omissions, size, and time of a step",
+    "demo": "insert five parts with the mock robot, with pictures and a recorded session",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one sub-command; returns its exit status (0 done, 1 a negative result, 2 an error, 130 interrupted)."""
+    """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    chosen = next((a for a in arguments if not a.startswith("-")), None)
+    requested = next((a for a in arguments if not a.startswith("-")), None)
     parser = argparse.ArgumentParser(prog="gelflow", description="Sim-to-real for tactile manipulation.")
     parser.add_argument("--version", action="version", version=f"gelflow {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     module = None
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if name == chosen:
+        if name == requested:
             module = importlib.import_module(f"gelflow.cli.commands.{name.replace('-', '_')}")
             module.configure(sub)
     args = parser.parse_args(arguments)
@@ -50,12 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = int(module.run(args))
         sys.stdout.flush()
         return status
-    except BrokenPipeError:  # the reader has seen enough, as in `gelflow … | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python still wants to flush
-        return 1  # as rich's console has it
+    except BrokenPipeError:  # the reader has closed the pipe, as in `gelflow … | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
+        return NEGATIVE_RESULT
     except GelflowError as error:
         print(f"gelflow {args.command}: {error}", file=sys.stderr)
-        return 2
+        return ERROR
     except KeyboardInterrupt:
         print(f"gelflow {args.command}: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED

@@ -127,8 +127,8 @@ def test_the_baselines_follow_small_motion() -> None:
 
 
 def test_a_short_run_fits_the_terminal_and_lands_in_a_file(tmp_path: Path) -> None:
-    file, picture = tmp_path / "tracking.json", tmp_path / "tracking.png"
-    command = ["bench", "tracking", "--quick", "--repeats", "1", "--json", str(file), "--picture", str(picture)]
+    file, picture = tmp_path / "bench.json", tmp_path / "tracking.png"
+    command = ["bench", "tracking", "--quick", "--repeats", "1", "--out", str(tmp_path)]
     with contextlib.redirect_stdout(io.StringIO()) as out:
         main(command)
     assert max(map(len, out.getvalue().splitlines())) <= 100

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.cli.commands.mock import lab_for
+from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
 from gelflow.real.runner.run_plan import RunPlan

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gelflow.cli.commands.demo import ask, mock_robot
 from gelflow.cli.main import main
+from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.errors import PeerError
 from gelflow.policies.checkpoint import save_checkpoint
 from gelflow.policies.networks import Architecture, tensor_shapes
@@ -45,9 +45,9 @@ def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: p
         request = urllib.request.Request(f"{truth}?seed=17", method="POST")
         with urllib.request.urlopen(request, timeout=10) as answer:
             assert json.load(answer) == {"next_seed": 17}
-        assert ask(truth)["waited"] >= 0
-    with pytest.raises(PeerError, match="does not tell the truth"):
-        ask(truth)  # the mock robot has ended
+        assert true_state(truth)["waited"] >= 0
+    with pytest.raises(PeerError, match="does not answer"):
+        true_state(truth)  # the mock robot has ended
 
 
 def test_demo_inserts_a_part_and_its_session_replays(

@@ -9,8 +9,8 @@ import pytest
 from tests.real.runner.harness import OraclePolicy, free_port, plan_for
 from tests.real.wsg.harness import Relay, unmodified
 
-from gelflow.cli.commands.mock import lab_for
 from gelflow.cli.main import main
+from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError, PeerTimeout, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab import Lab

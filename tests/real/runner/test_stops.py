@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
 
-from gelflow.cli.commands.mock import lab_for
+from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab_file import save_lab

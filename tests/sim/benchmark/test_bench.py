@@ -12,6 +12,7 @@ import pytest
 
 from gelflow.cli.commands.bench import MEASUREMENTS, conclude
 from gelflow.cli.main import main
+from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.geometry import angles_between
 from gelflow.measurement.startup import measure_startup
@@ -42,16 +43,16 @@ SIMULATED = [name for name in MEASUREMENTS if name != "tracking"]
 def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Folder with the file and the picture of a short run of all simulator measurements, and the printed output."""
     folder = tmp_path_factory.mktemp("bench")
-    command = ["bench", *SIMULATED, "--quick", "--repeats", "1", "--json", str(folder / "speed.json")]
+    command = ["bench", *SIMULATED, "--quick", "--repeats", "1"]
     with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert main([*command, "--picture", str(folder / "growth.png")]) == 0
+        assert main([*command, "--out", str(folder)]) == 0
     return folder, out.getvalue()
 
 
 def test_output_fits_the_terminal_and_one_file_holds_all_results(everything: tuple[Path, str]) -> None:
     folder, out = everything
     assert max(map(len, out.splitlines())) <= 80
-    record = json.loads((folder / "speed.json").read_text("utf-8"))
+    record = json.loads((folder / "bench.json").read_text("utf-8"))
     assert record["format"] == 1 and record["processor"] and record["versions"]["mujoco"]
     assert [name for name in record if name in MEASUREMENTS] == SIMULATED
     for name in SIMULATED:
@@ -61,7 +62,7 @@ def test_output_fits_the_terminal_and_one_file_holds_all_results(everything: tup
 
 
 def test_every_timed_run_has_an_accuracy_check(everything: tuple[Path, str]) -> None:
-    record = json.loads((everything[0] / "speed.json").read_text("utf-8"))
+    record = json.loads((everything[0] / "bench.json").read_text("utf-8"))
     checks = [run["check"] for name in ("rolling", "scenes", "gradients", "batch") for run in record[name]["results"]]
     checks += [size["check"] for sweep in record["growth"]["results"] for size in sweep["sizes"]]
     for one in checks:
@@ -163,7 +164,7 @@ def test_all_markers_are_in_contact_on_every_shape() -> None:
 
 
 def test_single_precision_is_close_to_double_and_not_equal(everything: tuple[Path, str]) -> None:
-    results = json.loads((everything[0] / "speed.json").read_text("utf-8"))["precision"]["results"]
+    results = json.loads((everything[0] / "bench.json").read_text("utf-8"))["precision"]["results"]
     assert len(results) == 2 * len(SCENES)
     for result in results:
         assert 0 < result["position"] < 1e-6 and 0 < result["turn"] < 1e-5
@@ -191,9 +192,9 @@ def test_inaccurate_run_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     lines = check_accuracy(run, loose, scene.describe_to).violations("insertion")
     assert len(lines) == 1 and lines[0].startswith("insertion: ")
     report = Report("scenes", "title", (), [], "note", [], lines)
-    assert conclude([report]) == 1
-    assert capsys.readouterr().out == f"outside: {lines[0]}\n"
-    assert conclude([]) == 0
+    assert conclude([report], Output()) == 1
+    assert capsys.readouterr().out == f"outside the bounds: {lines[0]}\n"
+    assert conclude([], Output()) == 0
 
 
 def test_angles_between_quaternions() -> None:
@@ -228,7 +229,7 @@ def test_invalid_arguments_give_one_line_errors(capsys: pytest.CaptureFixture[st
     for wrong, message in (
         (["rolling", "--repeats", "0"], "--repeats must be at least 1, got 0"),
         (["roling"], "no measurement 'roling'; did you mean 'rolling'?"),
-        (["rolling", "--picture", "x.png"], "--picture draws growth or tracking: ask for one"),
+        (["rolling", "--out", __file__], "cannot create the folder"),
     ):
         assert main(["bench", *wrong]) == 2
         error = capsys.readouterr().err

@@ -9,6 +9,7 @@ import pytest
 
 from gelflow.cli.commands.tradeoff import short, show
 from gelflow.cli.main import main
+from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.tradeoff.picture import front
 from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds
@@ -29,7 +30,7 @@ from gelflow.sim.scene import PRESET_NAMES, load_scene, scene_names
 
 def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     picture = tmp_path / "new" / "pushing.png"
-    assert main(["tradeoff", "pushing", "--quick", "--repeats", "1", "--json", "--picture", str(picture)]) == 0
+    assert main(["tradeoff", "pushing", "--quick", "--repeats", "1", "--json", "--out", str(picture)]) == 0
     found = json.loads(capsys.readouterr().out)
     assert picture.stat().st_size > 10_000
     measurements = {measurement["setting"]["name"]: measurement for measurement in found["measurements"]}
@@ -48,7 +49,7 @@ def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str],
     )
     changes = {name: Errors(**change) for name, change in found["changes"].items()}
     del found["processor"]
-    show(Tradeoff(**{**found, "measurements": rows, "changes": changes}), "pushing")
+    show(Tradeoff(**{**found, "measurements": rows, "changes": changes}), "pushing", Output())
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
     assert "…" not in out and all(name in out for name in measurements)

@@ -1,16 +1,18 @@
-"""`gelflow bench`: how fast simulator and tracker are, beside others, and whether what was timed was right."""
+"""`gelflow bench`: speed of the simulator and the tracker compared with others, with checks of the timed results."""
 
 import argparse
 import json
-from collections.abc import Sequence
-from importlib import metadata
+from collections.abc import Callable, Sequence
+from importlib import import_module, metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import TaskID
 from rich.table import Table
 
+from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
+from gelflow.cli.options import add_json, add_out, add_quick, add_repeats
+from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,16 +20,16 @@ if TYPE_CHECKING:
 
 WIDTH = 80
 MEASUREMENTS = {
-    "rolling": "the ball rolling run, beside MuJoCo and the paper's simulator",
-    "scenes": "each scene on its motion",
-    "gradients": "forwards, and forwards and backwards",
-    "batch": "many environments on one core and on all",
-    "markers": "a marker's reading and its gradient, for each shape",
-    "precision": "single precision beside double, errors and speed",
-    "tracking": "marker tracking: errors on images with known truth, speed, beside Lucas-Kanade and dense flow",
-    "growth": "time against bodies, touching points, markers, environments",
+    "rolling": "the ball rolling motion, compared with MuJoCo and the paper's simulator",
+    "scenes": "each scene on its reference motion",
+    "gradients": "forward pass, and forward with backward pass",
+    "batch": "many environments on one core and on all cores",
+    "markers": "reading of a marker and its gradient, for each shape",
+    "precision": "single and double precision: errors and speed",
+    "tracking": "marker tracking: errors on images with known truth and speed, beside Lucas-Kanade and dense flow",
+    "growth": "time over the number of bodies, contact points, markers and environments",
 }
-_LONG = ("tracking", "growth")  # these only run when they are named
+_LONG = ("tracking", "growth")  # measured only on request
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -37,22 +39,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         metavar="WHAT",
         help="; ".join(f"{name}: {text}" for name, text in MEASUREMENTS.items())
-        + f". Without any: all but {' and '.join(_LONG)}, quick",
+        + f". Default: all except {' and '.join(_LONG)}, quick",
     )
-    parser.add_argument("--quick", action="store_true", help="fewer sizes, shorter runs, fewer repeats")
-    parser.add_argument(
-        "--repeats", type=int, metavar="N", help="timed runs of each, of which the median counts (15; quick: 5)"
-    )
-    parser.add_argument("--markdown", action="store_true", help="print tables for a document")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything to a file, with the machine")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw growth or tracking (PNG)")
+    add_quick(parser)
+    add_repeats(parser, "timed runs of each case; results are medians (15; quick: 5)")
+    parser.add_argument("--markdown", action="store_true", help="print the tables as Markdown")
     parser.add_argument(
         "--paper-model", type=Path, metavar="FILE", help="tactile_pad.xml of the paper's simulator, if it is installed"
     )
+    add_out(parser, "folder for bench.json, and the pictures growth.png and tracking.png", folder=True)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure; prints tables. 1 when a timed run was too far from its converged twin."""
+    """Measure and print tables. A negative result: a timed run was too far from its converged reference."""
     from gelflow.measurement.machine import processor
     from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, BenchmarkOptions
     from gelflow.toml_tables import suggestion
@@ -64,117 +64,107 @@ def run(args: argparse.Namespace) -> int:
     for name in args.what:
         if name not in MEASUREMENTS:
             raise UsageError(f"no measurement {name!r}; {suggestion(name, tuple(MEASUREMENTS))}")
-    wanted = list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]
-    if args.picture is not None and ("growth" in wanted) == ("tracking" in wanted):
-        raise UsageError("--picture draws growth or tracking: ask for one, as in gelflow bench growth --picture g.png")
-    console = Console(width=WIDTH)
-    console.print(f"{processor()}. Medians of {repeats} repeats, all of one table taken in turn.", highlight=False)
+    if args.out is not None:
+        _make_folder(args.out)
+    output = Output(args.json, width=WIDTH)
+    output.console.print(f"{processor()}. Medians of {repeats} repeats; the cases of a table run in turn.")
     reports: list[Report] = []
-    for name in wanted:
+    for name in list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]:
         with _Bar() as bar:
-            found = _measure(name, BenchmarkOptions(quick=quick, repeats=repeats, progress=bar), args)
-        for report in found:
-            _show(console, report, markdown=args.markdown)
-        reports += found
-    if args.json is not None:
-        _write(args.json, reports, quick=quick, repeats=repeats)
-        print(args.json)
-    return conclude(reports)
+            options = BenchmarkOptions(quick=quick, repeats=repeats, progress=bar)
+            measured = _measure(name, options, args)
+        for report in measured:
+            _show(output, report, markdown=args.markdown)
+        reports += measured
+    record = _record(reports, quick=quick, repeats=repeats)
+    if args.out is not None:
+        file = args.out / "bench.json"
+        file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        output.text(f"written: {file}")
+    output.result(record)
+    return conclude(reports, output)
 
 
-def conclude(reports: "Sequence[Report]") -> int:
-    """Say which timed runs were wrong; 1 when there was one."""
-    outside = [line for report in reports for line in report.violations]
-    for line in outside:
-        print(f"outside: {line}")
-    return 1 if outside else 0
+def conclude(reports: "Sequence[Report]", output: Output) -> int:
+    """Print the violated bounds and return the exit code."""
+    violations = [line for report in reports for line in report.violations]
+    for line in violations:
+        output.text(f"outside the bounds: {line}")
+    return NEGATIVE_RESULT if violations else SUCCESS
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"--out {folder}: cannot create the folder: {error.strerror}") from None
 
 
 def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -> "list[Report]":
-    if name == "rolling":
-        from gelflow.sim.benchmark.speed.rolling import measure_rolling
-
-        return [measure_rolling(options, paper_model=args.paper_model)]
-    if name == "scenes":
-        from gelflow.sim.benchmark.speed.scenes import measure_scenes
-
-        return [measure_scenes(options)]
-    if name == "gradients":
-        from gelflow.sim.benchmark.speed.gradients import measure_gradients
-
-        return [measure_gradients(options)]
-    if name == "batch":
-        from gelflow.sim.benchmark.speed.batch import measure_batch
-
-        return [measure_batch(options)]
-    if name == "markers":
-        from gelflow.sim.benchmark.speed.markers import measure_markers
-
-        return [measure_markers(options)]
-    if name == "precision":
-        from gelflow.sim.benchmark.speed.precision import measure_precision
-
-        return [measure_precision(options)]
     if name == "tracking":
-        return _measure_tracking(options, args.picture)
+        return _measure_tracking(options, args.out)
+    if name == "growth":
+        return [_measure_growth(options, args.out)]
+    measure: Callable[..., Report] = getattr(import_module(f"gelflow.sim.benchmark.speed.{name}"), f"measure_{name}")
+    more = {"paper_model": args.paper_model} if name == "rolling" else {}
+    return [measure(options, **more)]
+
+
+def _measure_growth(options: "BenchmarkOptions", folder: Path | None) -> "Report":
     from gelflow.sim.benchmark.speed.growth import measure_growth
 
-    report, found = measure_growth(options)
-    if args.picture is not None:
+    report, series = measure_growth(options)
+    if folder is not None:
         from gelflow.sim.benchmark.speed.growth_picture import draw
 
-        draw(found, args.picture)
-    return [report]
+        draw(series, folder / "growth.png")
+    return report
 
 
-def _measure_tracking(options: "BenchmarkOptions", picture: Path | None) -> "list[Report]":
+def _measure_tracking(options: "BenchmarkOptions", folder: Path | None) -> "list[Report]":
     from gelflow.perception.benchmark.tracking import measure_tracking
 
     reports = measure_tracking(options)
-    if picture is not None:
+    if folder is not None:
         from gelflow.perception.benchmark.curves import draw, measure_curves
 
         curves = measure_curves(options)
-        draw(curves, picture)
+        draw(curves, folder / "tracking.png")
         reports.append(curves)
     return reports
 
 
-def _show(console: Console, report: "Report", *, markdown: bool) -> None:
-    if markdown:  # not through rich, which would fold its lines
+def _show(output: Output, report: "Report", *, markdown: bool) -> None:
+    if markdown:
         heads = [report.columns, ["---", *["---:"] * (len(report.columns) - 1)]]
-        print("", *("| " + " | ".join(row) + " |" for row in (*heads, *report.rows)), "", report.note, sep="\n")
+        rows = ["| " + " | ".join(row) + " |" for row in (*heads, *report.rows)]
+        for line in ("", *rows, "", report.note):
+            output.text(line)
         return
     table = Table(title=report.title, title_justify="left", box=None, padding=(0, 2, 0, 0), pad_edge=False)
     for i, column in enumerate(report.columns):
         table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
     for row in report.rows:
         table.add_row(*row)
-    console.print()
-    console.print(table)
-    console.print(report.note, style="dim", highlight=False)
+    output.console.print()
+    output.console.print(table)
+    output.console.print(report.note, style="dim")
 
 
-def _write(file: Path, reports: "Sequence[Report]", *, quick: bool, repeats: int) -> None:
+def _record(reports: "Sequence[Report]", *, quick: bool, repeats: int) -> dict[str, Any]:
     from gelflow.measurement.machine import processor
     from gelflow.sim.benchmark import versions
 
     version = versions() | {"opencv-contrib-python-headless": metadata.version("opencv-contrib-python-headless")}
     record = {"format": 1, "processor": processor(), "versions": version, "quick": quick, "repeats": repeats}
-    record |= {report.name: report.to_dict() for report in reports}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return record | {report.name: report.to_dict() for report in reports}
 
 
 class _Bar:
-    """A bar on the terminal, drawn only between timed runs: a thread of its own would disturb them."""
+    """A progress bar without a refresh thread, which would disturb the timed runs."""
 
     def __init__(self) -> None:
-        errors = Console(stderr=True)  # what is piped out of the command stays clean
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        self._progress = Progress(
-            *columns, console=errors, transient=True, auto_refresh=False, disable=not errors.is_terminal
-        )
+        self._progress = progress_bar(auto_refresh=False)
         self._task: TaskID | None = None
 
     def __enter__(self) -> "_Bar":
@@ -185,12 +175,14 @@ class _Bar:
         self._progress.stop()
 
     def begin(self, what: str, total: int) -> None:
+        """Start a new bar for `total` cases."""
         if self._task is not None:
             self._progress.remove_task(self._task)
         self._task = self._progress.add_task(what, total=total)
         self._progress.refresh()
 
     def advance(self) -> None:
+        """One case is finished."""
         assert self._task is not None
         self._progress.advance(self._task)
         self._progress.refresh()

@@ -1,283 +1,256 @@
-"""`gelflow demo`: the mock robot and the insertion policy, end to end on the wire: table, pictures, a session."""
+"""`gelflow demo`: insertions with the mock robot over its network protocols; a table, pictures and a session."""
 
 import argparse
-import contextlib
-import json
 import math
-import socket
-import subprocess
 import sys
-import tempfile
 import time
-import urllib.error
-import urllib.request
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.table import Table
 
-from gelflow.cli.presets import PRESET_HELP
-from gelflow.errors import GelflowError, PeerError, UsageError
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.insertion_text import ATTEMPT_HEADER, attempt_line, insertion_to_json
+from gelflow.cli.mock_process import mock_robot, true_state
+from gelflow.cli.options import (
+    add_checkpoint,
+    add_json,
+    add_out,
+    add_preset,
+    add_quick,
+    add_seed,
+    check_at_least,
+)
+from gelflow.cli.output import Output, progress_bar
+from gelflow.errors import GelflowError, UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
+    from gelflow.policies.evaluation import EvaluationResult
     from gelflow.policies.networks import NetworkPolicy
-    from gelflow.protocols import Policy
     from gelflow.real.runner.insertion_runner import Attempt, Insertion
+    from gelflow.real.runner.lab import Lab
 
-_START_LIMIT = 60.0  # for the mock robot to be up [s, wall]
-_TELL_WAIT = 0.1  # of the wall time, in which the simulation did not keep up
-_COMPARED = 100  # parts in simulation alone
+_DELAY_NOTE = 0.1  # share of the wall time that robot time must have waited for a note below the table
+_EPISODES = 100  # parts in simulation without the mock robot
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--insertions", type=int, default=5, metavar="N", help="how many parts (default 5)")
-    parser.add_argument("--factor", type=float, default=5.0, help="robot time over wall time (default 5)")
-    parser.add_argument("--seed", type=int, default=1, help="of the first part's misalignment (default 1)")
-    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="the policy; default: gelflow's own")
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="folder (default out/demo)")
-    parser.add_argument("--no-real-time", action="store_true", help="leave out the one insertion at factor 1")
+    """Options of the command."""
+    parser.add_argument("--insertions", type=int, default=5, metavar="N", help="number of parts (default %(default)s)")
+    parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
+    parser.add_argument("--no-real-time", action="store_true", help="omit the last insertion, which runs at factor 1")
+    add_checkpoint(parser)
+    add_quick(parser)
+    add_seed(parser, default=1)
+    add_preset(parser)
+    add_out(parser, "folder for pictures and sessions", default=Path("out/demo"), folder=True)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    """Insert the parts, show the results, and compare with the same policy in simulation."""
     from gelflow.policies.checkpoint import default_checkpoint, load_policy
 
-    if args.insertions < 1:
-        raise UsageError(f"--insertions must be at least 1, got {args.insertions}")
-    # The default of 5 ms lets a computing thread keep those waiting that watch gripper and cameras.
+    check_at_least(args, insertions=1, seed=0)
+    # With the default of 5 ms a computing thread delays the threads of gripper and cameras.
     sys.setswitchinterval(5e-4)
-    console = Console(highlight=False)
+    output = Output(args.json)
     checkpoint = args.checkpoint or default_checkpoint()
     policy = load_policy(checkpoint, task=INSERTION)
     _clear(args.out)
-    title = f"Insertions on the mock robot, {args.factor:g} times as fast as the clock"
-    done = demonstrate(
-        console,
-        policy,
-        checkpoint,
-        out=args.out,
-        count=args.insertions,
-        factor=args.factor,
-        seed=args.seed,
-        preset=args.preset,
-        title=title,
-    )
-    console.print(table(done, title))
-    if not args.no_real_time and done.trouble is None:
-        real = demonstrate(
-            console, policy, checkpoint, out=args.out, count=1, factor=1.0, seed=args.seed + args.insertions,
-            preset=args.preset, title="One more in real time (factor 1)", name="session-real-time",
+    count = 1 if args.quick else args.insertions
+    plan = _Series(
+        policy, checkpoint, args.out, count=count, factor=args.factor, seed=args.seed, preset=args.preset,
+        title=f"Insertions with the mock robot at {args.factor:g} times real time",
+    )  # fmt: skip
+    results = [_run_series(output, plan)]
+    if not (args.no_real_time or args.quick) and results[0].error is None:
+        plan = _Series(
+            policy, checkpoint, args.out, count=1, factor=1.0, seed=args.seed + count, preset=args.preset,
+            title="One more in real time (factor 1)", name="session-real-time", pictures="insertion-real-time",
         )  # fmt: skip
-        console.print(table(real, "One more in real time (factor 1)"))
-        done = replace(done, trouble=real.trouble)
-    session = args.out / "session.mcap"
-    said = sum(one.result.inserted for one in done.shown)
-    true = sum(one.truth["inserted"] for one in done.shown)
-    count = len(done.shown)
-    console.print(
-        f"inserted: {said} of {count} as the robot says, {true} of {count} in truth; {done.wall:.0f} s in all."
+        results.append(_run_series(output, plan))
+    first = results[0]
+    robot, truth = (sum(part) for part in zip(*first.successes(), strict=True)) if first.insertions else (0, 0)
+    parts = len(first.insertions)
+    output.text(
+        f"inserted: {robot} of {parts} as measured by the robot, {truth} of {parts} in truth; {first.wall:.0f} s."
     )
-    with console.status("the same policy in simulation alone"):
-        console.print(in_simulation(policy, preset=args.preset), soft_wrap=True)
-    console.print(f"pictures of what the policy saw: {args.out}/insertion-*.png", soft_wrap=True)
-    console.print(f"the session is {session}; make its decisions again with:", soft_wrap=True)
-    console.print(f"  gelflow replay {session}", soft_wrap=True)
-    if done.trouble is not None:
-        raise done.trouble
-    return 0
+    evaluations = [] if args.quick else _in_simulation(output, policy, preset=args.preset)
+    session = args.out / "session.mcap"
+    output.text(f"pictures of what the policy saw: {args.out}/insertion-*.png")
+    output.text(f"the session is {session}; recompute its decisions with:")
+    output.text(f"  gelflow replay {session}")
+    output.result(_to_json(session, results, evaluations))
+    for result in results:
+        if result.error is not None:
+            raise result.error
+    return SUCCESS
 
 
 @dataclass(frozen=True)
-class Shown:
-    """One insertion, as the robot saw it and as it was."""
+class _Series:
+    """Insertions with one mock robot, recorded in one session."""
 
-    result: "Insertion"
-    truth: dict[str, Any]  # of its part: see hardware_mocks/simulated_cell/cell.py
+    policy: "NetworkPolicy"
+    checkpoint: Path
+    out: Path
+    count: int
+    factor: float
+    seed: int
+    preset: str | None
+    title: str
+    name: str = "session"
+    pictures: str = "insertion"
 
 
 @dataclass(frozen=True)
-class Demonstration:
-    """All insertions of one session."""
+class _SeriesResult:
+    """Results of a series: each insertion with the true state of its part."""
 
-    shown: list[Shown]
-    wall: float  # [s]
-    slack: str  # empty, or how fast the simulation was instead
-    trouble: GelflowError | None  # what ended it before all parts were tried
+    insertions: list[tuple["Insertion", dict[str, Any]]]
+    wall: float  # duration [s]
+    note: str  # empty, or the speed that the simulation reached instead of `factor`
+    error: GelflowError | None  # the error that ended the series early
+
+    def successes(self) -> list[tuple[bool, bool]]:
+        """For each part: inserted as measured by the robot, and in truth."""
+        return [(insertion.inserted, bool(part["inserted"])) for insertion, part in self.insertions]
 
 
-def demonstrate(
-    console: Console,
-    policy: "Policy",
-    checkpoint: Path,
-    *,
-    out: Path,
-    count: int,
-    factor: float,
-    seed: int,
-    preset: str | None = None,
-    title: str,
-    name: str = "session",
-) -> Demonstration:
-    """Start a mock robot, insert `count` parts through its wires, record, draw; the truth is asked beside the wires."""
-    from gelflow.cli.commands.run import ATTEMPT_HEADER, attempt_line
-    from gelflow.cli.pictures import draw_insertion
+@dataclass
+class _Observer:
+    """Prints the attempts of a series and collects the true state of each part."""
+
+    output: Output
+    truth_url: str
+    insertions: list[tuple["Insertion", dict[str, Any]]] = field(default_factory=list)
+    _seeds: dict[int, int] = field(default_factory=dict)  # by part
+
+    def on_attempt(self, number: int, attempt: "Attempt") -> None:
+        self._seeds[number] = true_state(self.truth_url)["parts"][-1]["seed"]
+        self.output.text(attempt_line(number, attempt))
+
+    def on_insertion(self, result: "Insertion") -> None:
+        # The newest part may already be the next one: parts are identified by their seed.
+        parts = {part["seed"]: part for part in true_state(self.truth_url)["parts"]}
+        self.insertions.append((result, parts[self._seeds.get(result.number, max(parts))]))
+        self.output.text(f"{result.number + 1:6d}  {result.outcome} after {result.duration:.0f} s of robot time")
+
+
+def _run_series(output: Output, series: _Series) -> _SeriesResult:
+    """Start a mock robot, insert the parts, draw the pictures, and print the table."""
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
     begun = time.monotonic()
-    shown: list[Shown] = []
-    with mock_robot(factor=factor, seed=seed, preset=preset) as (lab_path, truth_url):
+    with mock_robot(factor=series.factor, seed=series.seed, preset=series.preset) as (lab_path, truth_url):
         lab = load_lab(lab_path)
-        console.print(f"[bold]{title}[/]\n{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
-        console.print(ATTEMPT_HEADER, markup=False)
-
-        seeds: dict[int, int] = {}
-
-        def tell(number: int, attempt: "Attempt") -> None:
-            seeds[number] = ask(truth_url)["parts"][-1]["seed"]
-            console.print(attempt_line(number, attempt), markup=False)
-
-        def finish(result: "Insertion") -> None:
-            # The hand may hold out the next part already.
-            parts = {part["seed"]: part for part in ask(truth_url)["parts"]}
-            shown.append(Shown(result, parts[seeds.get(result.number, max(parts))]))
-            console.print(f"{result.number + 1:6d}  {result.outcome} after {result.duration:.0f} s of the robot's time")
-
+        output.console.print(f"[bold]{series.title}[/]")
+        output.text(f"{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
+        output.text(ATTEMPT_HEADER)
+        observer = _Observer(output, truth_url)
         plan = RunPlan(
             lab=lab,
-            policy=policy,
+            policy=series.policy,
             task=INSERTION,
-            session=out / f"{name}.mcap",
-            checkpoint=checkpoint,
-            insertions=count,
-            on_attempt=tell,
-            on_insertion=finish,
+            session=series.out / f"{series.name}.mcap",
+            checkpoint=series.checkpoint,
+            insertions=series.count,
+            on_attempt=observer.on_attempt,
+            on_insertion=observer.on_insertion,
         )
-        trouble = None
+        error = None
         try:
             run_insertions(plan)
-        except GelflowError as error:
-            trouble = error  # what was done until then is shown first
-        truth = ask(truth_url)
+        except GelflowError as caught:
+            error = caught  # raised after the results so far are shown
+        waited = true_state(truth_url)["waited"] / series.factor
     wall = time.monotonic() - begun
+    note = ""
+    if waited > _DELAY_NOTE * wall:
+        note = f"this computer reached {series.factor * (1 - waited / wall):.1f} times real time"
+    result = _SeriesResult(observer.insertions, wall, note, error)
+    _draw(result, lab, series)
+    output.console.print(_table(result, series.title))
+    return result
+
+
+def _draw(result: _SeriesResult, lab: "Lab", series: _Series) -> None:
+    from gelflow.real.runner.insertion_picture import draw_insertion
+
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
-    prefix = "insertion" if name == "session" else "insertion-real-time"
-    for one in shown:
-        draw_insertion(one.result, mounts, INSERTION, out / f"{prefix}-{one.result.number + 1}.png")
-    waited = truth["waited"] / factor
-    slack = ""
-    if waited > _TELL_WAIT * wall:
-        real = factor * (1 - waited / wall)
-        slack = f"this computer managed {real:.1f} times as fast as the clock"
-    return Demonstration(shown, wall, slack, trouble)
+    for insertion, _ in result.insertions:
+        draw_insertion(insertion, mounts, INSERTION, series.out / f"{series.pictures}-{insertion.number + 1}.png")
 
 
-def table(done: Demonstration, title: str) -> Table:
-    """Misalignment, attempts, the robot's view, the truth, time."""
-    view = Table(title=title, caption=done.slack or None)
+def _table(result: _SeriesResult, title: str) -> Table:
+    """Misalignment, attempts, outcome as measured by the robot and in truth, time."""
+    view = Table(title=title, caption=result.note or None)
     view.add_column("part", justify="right")
     view.add_column("misalignment\nx, y [mm], yaw [°]", justify="right")
     view.add_column("attempts", justify="right")
-    view.add_column("robot says")
+    view.add_column("robot")
     view.add_column("truth")
-    view.add_column("time [s]\nrobot", justify="right")
-    for one in done.shown:
-        x, y, yaw = one.truth["misalignment"]
-        inside = one.truth["inserted"]
+    view.add_column("robot time\n[s]", justify="right")
+    for insertion, part in result.insertions:
+        x, y, yaw = part["misalignment"]
         view.add_row(
-            str(one.result.number + 1),
+            str(insertion.number + 1),
             f"{1e3 * x:+.1f}, {1e3 * y:+.1f}, {math.degrees(yaw):+.1f}",
-            str(len(one.result.attempts)),
-            one.result.outcome,
-            "inserted" if inside else "not inserted",
-            f"{one.result.duration:.0f}",
-            style=None if inside and one.result.inserted else "red",
+            str(len(insertion.attempts)),
+            insertion.outcome,
+            "inserted" if part["inserted"] else "not inserted",
+            f"{insertion.duration:.0f}",
+            style=None if part["inserted"] and insertion.inserted else "red",
         )
     return view
 
 
-def in_simulation(policy: "NetworkPolicy", *, preset: str | None = None) -> str:
-    """How the policy does without wires and cameras, and what luck would do: the figures that the demo's compare to."""
+def _in_simulation(output: Output, policy: "NetworkPolicy", *, preset: str | None) -> "list[EvaluationResult]":
+    """Success in simulation without protocols and cameras, of the policy and of random corrections."""
     from gelflow.policies.environment import make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 
-    attempts = make_insertion_env(_COMPARED, preset=preset)
-    reach = policy.network.architecture.reach
-    ways = (NetworkActor(policy.network, _COMPARED), RandomActor(reach, _COMPARED, 0))
-    own, random = (evaluate("", way, attempts, episodes=_COMPARED, seed=1) for way in ways)
-    return (
-        f"in simulation alone, {_COMPARED} parts: this policy {own.success:.0%} in {own.attempts:.1f} attempts,"
+    env = make_insertion_env(_EPISODES, preset=preset)
+    actors: dict[str, NetworkActor | RandomActor] = {
+        "policy": NetworkActor(policy.network, _EPISODES),
+        "random": RandomActor(policy.network.architecture.reach, _EPISODES, 0),
+    }
+    results = []
+    with progress_bar() as progress:
+        bar = progress.add_task("the same policy in simulation", total=len(actors))
+        for name, actor in actors.items():
+            results.append(evaluate(name, actor, env, episodes=_EPISODES, seed=1))
+            progress.advance(bar)
+    own, random = results
+    output.text(
+        f"in simulation, {_EPISODES} parts: this policy {own.success:.0%} in {own.attempts:.1f} attempts,"
         f" random corrections {random.success:.0%}."
     )
+    return results
 
 
-@contextlib.contextmanager
-def mock_robot(*, factor: float, seed: int, preset: str | None = None) -> Iterator[tuple[Path, str]]:
-    """A mock robot in a process of its own: its lab file, and where it tells the truth.
-
-    Raises PeerError with its last words when it does not start.
-    """
-    truth_port = _free_port(socket.SOCK_STREAM)
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as words:
-        lab = Path(folder) / "lab.toml"
-        command = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
-        options = {
-            "--lab-out": lab, "--factor": factor, "--seed": seed, "--truth-port": truth_port,
-            "--egm-port": _free_port(socket.SOCK_DGRAM),
-        }  # fmt: skip
-        if preset is not None:
-            options["--preset"] = preset
-        words_of = [str(word) for option in options.items() for word in option]
-        process = subprocess.Popen(
-            [sys.executable, "-c", command, "mock", "--attached", *words_of],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=words,
-        )
-        try:
-            _await_file(lab, process, words)
-            yield lab, f"http://127.0.0.1:{truth_port}/truth"
-        finally:
-            assert process.stdin is not None
-            process.stdin.close()  # it ends when its input does
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def ask(url: str) -> dict[str, Any]:
-    """The truth, from the mock's side channel. Raises PeerError when nobody answers."""
-    try:
-        with urllib.request.urlopen(url, timeout=10) as answer:
-            return dict(json.load(answer))
-    except (urllib.error.URLError, OSError, ValueError) as error:
-        raise PeerError(f"the mock robot does not tell the truth at {url}: {error}") from error
-
-
-def _await_file(path: Path, process: subprocess.Popen[bytes], words: Any) -> None:
-    end = time.monotonic() + _START_LIMIT
-    while not path.exists():
-        if process.poll() is not None or time.monotonic() > end:
-            words.seek(0)
-            lines = words.read().decode(errors="replace").strip().splitlines()
-            raise PeerError(f"the mock robot did not start: {lines[-1] if lines else 'no reason given'}")
-        time.sleep(0.05)
-
-
-def _free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+def _to_json(session: Path, results: list[_SeriesResult], evaluations: "list[EvaluationResult]") -> dict[str, Any]:
+    return {
+        "session": session,
+        "series": [
+            {
+                "insertions": [insertion_to_json(insertion) | {"truth": part} for insertion, part in result.insertions],
+                "seconds": result.wall,
+                "note": result.note,
+                "error": None if result.error is None else str(result.error),
+            }
+            for result in results
+        ],
+        "simulation": {result.name: result.success for result in evaluations},
+    }
 
 
 def _clear(out: Path) -> None:
-    """A demonstration replaces the one before; only what a demonstration writes is removed."""
+    """Remove the files of an earlier demo, and no others."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for pattern in ("session*.mcap", "insertion-*.png"):

@@ -1,19 +1,18 @@
-"""`gelflow describe SCENE`: what a scene models, what it leaves out, how large it is, and where a step's time goes."""
+"""`gelflow describe SCENE`: model, omissions and size of a scene, and the time of a step."""
 
 import argparse
 import dataclasses
-import json
 from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
+from rich.console import Group
 from rich.markup import escape
 from rich.padding import Padding
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.tree import Tree
 
-from gelflow.cli.presets import PRESET_HELP
-from gelflow.errors import UsageError
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import add_json, add_preset, add_repeats, check_at_least
+from gelflow.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
     from gelflow.sim.benchmark.describe import (
@@ -32,40 +31,37 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a scene that comes with gelflow, or a TOML file")
-    parser.add_argument("--friction", choices=["viscous", "elastic"], help="law, instead of the scene's own")
-    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
-    parser.add_argument("--no-timing", action="store_true", help="leave the measured times out")
-    parser.add_argument("--repeats", type=int, default=60, metavar="N", help="timed repeats (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="print an object instead of text")
+    parser.add_argument("scene", metavar="SCENE", help="name of a scene shipped with gelflow, or a TOML file")
+    parser.add_argument("--friction", choices=["viscous", "elastic"], help="friction law (default: that of the scene)")
+    parser.add_argument("--no-timing", action="store_true", help="omit the measured times")
+    add_repeats(parser, "timed repeats (%(default)s)", default=60)
+    add_preset(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Describe, then measure; prints text, or JSON."""
-    if args.repeats < 1:
-        raise UsageError(f"--repeats must be at least 1, got {args.repeats}")
+    """Describe the scene and measure its step times."""
+    check_at_least(args, repeats=1)
     from gelflow.sim.benchmark.describe import describe
     from gelflow.sim.scene import load_scene
 
+    output = Output(args.json)
     scene = load_scene(args.scene, preset=args.preset, friction=args.friction)
     description = describe(scene)
-    if args.json:
+    if output.json:
         times = None if args.no_timing else dataclasses.asdict(_measured(scene, args.repeats))
-        print(json.dumps(dataclasses.asdict(description) | {"times": times}, indent=2, allow_nan=False))
-        return 0
-    console = Console(highlight=False)
-    console.print(tree(description), _not_modelled(description), _size(description.size))
+        output.result(dataclasses.asdict(description) | {"times": times})
+        return SUCCESS
+    output.console.print(tree(description), _not_modelled(description), _size(description.size))
     if not args.no_timing:
-        console.print(_times(_measured(scene, args.repeats)))
-    return 0
+        output.console.print(_times(_measured(scene, args.repeats)))
+    return SUCCESS
 
 
 def _measured(scene: "Scene", repeats: int) -> "StepTimes":
     from gelflow.sim.benchmark.step_times import measure
 
-    bar = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    errors = Console(stderr=True)  # what is piped out of the command stays clean
-    with Progress(*bar, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+    with progress_bar() as progress:
         task = progress.add_task("timing", total=repeats)
         return measure(scene, repeats=repeats, done=lambda: progress.advance(task))
 

@@ -1,16 +1,15 @@
-"""`gelflow eval insertion`: success of a policy in simulation, beside random actions."""
+"""`gelflow eval insertion`: success of a policy in simulation, compared with random actions."""
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 
-from gelflow.cli.presets import PRESET_HELP
-from gelflow.errors import UsageError
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import add_checkpoint, add_json, add_preset, add_seed, check_at_least
+from gelflow.cli.output import Output, progress_bar
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
@@ -19,19 +18,18 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion"], help="what was learned")
-    parser.add_argument("--checkpoint", type=Path, help="the policy's file (default: the one that comes with gelflow)")
-    parser.add_argument("--episodes", type=int, default=200, metavar="N", help="parts to insert (default 200)")
-    parser.add_argument("--envs", type=int, default=64, metavar="N", help="simulated robots side by side (default 64)")
-    parser.add_argument("--seed", type=int, default=1, help="decides every random number (default 1)")
-    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("task", choices=["insertion"], help="task of the policy")
+    add_checkpoint(parser)
+    parser.add_argument("--episodes", type=int, default=200, metavar="N", help="parts to insert (default %(default)s)")
+    parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
+    add_seed(parser, default=1)
+    add_preset(parser)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; prints a table, or JSON."""
-    if args.envs < 1 or args.episodes < 1 or args.seed < 0:
-        raise UsageError("--envs and --episodes must be at least 1, --seed at least 0")
+    """Evaluate the policy and random actions, then print a table."""
+    check_at_least(args, envs=1, episodes=1, seed=0)
     from gelflow.policies.checkpoint import default_checkpoint, load_policy
 
     path = args.checkpoint or default_checkpoint()
@@ -39,36 +37,35 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 
-    console = Console()
+    output = Output(args.json)
     count = min(args.envs, args.episodes)
     plain, noisy = (make_insertion_env(count, noise=noise, preset=args.preset) for noise in (None, FlowMapNoise()))
     reach = network.architecture.reach
-    ways: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
+    cases: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
         ("policy", NetworkActor(network, count), plain),
         ("policy, noisy flow maps", NetworkActor(network, count), noisy),
         ("random, policy's reach", RandomActor(reach, count, args.seed), plain),
         ("random, full range", RandomActor(INSERTION.action_scale, count, args.seed), plain),
     ]
     results = []
-    with console.status("evaluating") as status:
-        for name, actor, attempts in ways:
-            status.update(f"evaluating: {name}")
-            results.append(evaluate(name, actor, attempts, episodes=args.episodes, seed=args.seed))
-    if args.json:
-        print(json.dumps([_plain(result, str(path)) for result in results], indent=2))
+    with progress_bar() as progress:
+        bar = progress.add_task("evaluating", total=len(cases))
+        for name, actor, env in cases:
+            progress.update(bar, description=f"evaluating: {name}")
+            results.append(evaluate(name, actor, env, episodes=args.episodes, seed=args.seed))
+            progress.advance(bar)
+    if output.json:
+        output.result({"task": args.task, "checkpoint": path, "results": [_plain(result) for result in results]})
     else:
-        console.print(_table(results, path, args.episodes))
-    return 0
+        output.console.print(_table(results, path, args.episodes))
+    return SUCCESS
 
 
-def _plain(result: "EvaluationResult", path: str) -> dict[str, object]:
-    low, high = result.confidence_interval()
-    attempts = result.attempts if result.successes else None
+def _plain(result: "EvaluationResult") -> dict[str, object]:
     return dataclasses.asdict(result) | {
-        "attempts": attempts,
+        "attempts": result.attempts if result.successes else None,
         "success": result.success,
-        "success_95": [low, high],
-        "checkpoint": path,
+        "success_95": list(result.confidence_interval()),
     }
 
 

@@ -1,26 +1,34 @@
-"""`gelflow recover`: salvage what a killed recorder left behind."""
+"""`gelflow recover`: copy the complete records of an unfinished or damaged session."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 
-from rich.console import Console
-
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import add_json, add_out
+from gelflow.cli.output import Output, progress_bar
 from gelflow.session.recovery import recover
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, help="the unfinished or damaged session")
-    parser.add_argument("--output", type=Path, help="the new session; default: FILE with .recovered.mcap at its end")
+    """Options of the command."""
+    parser.add_argument("session", type=Path, metavar="SESSION", help="the unfinished or damaged session")
+    add_out(parser, "the new session; default: the name of SESSION with .recovered.mcap at its end")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    target = args.output or args.file.with_name(f"{args.file.stem}.recovered.mcap")
-    report = recover(args.file, target)
-    console = Console(highlight=False)
-    console.print(f"{report.messages} records over {report.duration:.2f} s of robot time are whole", markup=False)
+    """Recover the session, then print the number of recovered and lost records."""
+    output = Output(args.json)
+    target = args.out or args.session.with_name(f"{args.session.stem}.recovered.mcap")
+    with progress_bar() as progress:
+        progress.add_task("recovering", total=None)
+        report = recover(args.session, target)
+    output.text(f"recovered: {report.messages} records over {report.duration:.2f} s of robot time")
     if report.lost_bytes:
-        console.print(f"lost: {report.lost_bytes} bytes of a record that was cut off at the end", markup=False)
+        output.text(f"lost: {report.lost_bytes} bytes of an incomplete record at the end")
     if report.damaged_chunks:
-        console.print(f"lost: {report.damaged_chunks} chunks or records with damaged contents", markup=False)
-    console.print(f"written: {report.path}", markup=False, soft_wrap=True)
-    return 0
+        output.text(f"lost: {report.damaged_chunks} chunks or records with damaged contents")
+    output.text(f"written: {report.path}")
+    output.result(dataclasses.asdict(report))
+    return SUCCESS

@@ -1,4 +1,4 @@
-"""`gelflow replay`: make the decisions of a session again from its recorded images, and compare."""
+"""`gelflow replay`: recompute the decisions of a session from its recorded images and compare them."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
+from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
+from gelflow.cli.options import add_checkpoint, add_json, add_out
+from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
 from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
@@ -20,37 +21,45 @@ from gelflow.task import InsertionTask
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("session", type=Path, help="a recorded session (.mcap)")
-    parser.add_argument("--checkpoint", type=Path, help="the policy; default: the one that the session ran")
-    parser.add_argument("--picture", type=Path, help="also draw the flow maps and corrections into this .png")
+    """Options of the command."""
+    parser.add_argument("session", type=Path, metavar="SESSION", help="a recorded session (.mcap)")
+    add_checkpoint(parser, default="the policy of the session")
+    add_out(parser, "a picture (.png) of flow maps and corrections")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    """Replay the session and print the differences. A negative result: a decision differs, or there is none."""
     from gelflow.policies.checkpoint import load_policy
 
-    console = Console(highlight=False)
+    output = Output(args.json)
     with SessionReader(args.session) as session:
         description = session.description()
-        task, perception = _wiring(description)
+        task, perception = _perception(description)
         policy = load_policy(args.checkpoint or _recorded_checkpoint(description), task=task)
-        _tell_differences(console, description, args.checkpoint)
-        made = replay(session, perception=perception, policy=policy, task=task)
+        notes = _notes(description, args.checkpoint)
+        for note in notes:
+            output.text(f"note: {note}")
         total = session.counts().get("/decision", 0)
-        comparisons = list(track(made, "replaying", total=total, console=console, transient=True))
+        comparisons = []
+        with progress_bar(count=True) as progress:
+            bar = progress.add_task("replaying", total=total)
+            for comparison in replay(session, perception=perception, policy=policy, task=task):
+                comparisons.append(comparison)
+                progress.advance(bar)
     if not comparisons:
-        console.print("The session holds no decision: there is nothing to compare.")
-        return 1
-    console.print(_table(comparisons))
-    if args.picture:
+        output.text("The session contains no decision: there is nothing to compare.")
+        output.result({"decisions": [], "identical": False, "notes": notes})
+        return NEGATIVE_RESULT
+    if args.out:
         from gelflow.session.decision_picture import draw_decisions
 
-        draw_decisions([comparison.recorded for comparison in comparisons], task.grid, args.picture)
-        console.print(f"picture: {args.picture}", markup=False, soft_wrap=True)
-    return _verdict(console, comparisons)
+        draw_decisions([comparison.recorded for comparison in comparisons], task.grid, args.out)
+    return _show(output, comparisons, notes, args.out)
 
 
-def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
-    """Task and perception as the session describes them. Raises PeerError when the description lacks a part."""
+def _perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
+    """Task and perception of the session's description. Raises PeerError when the description lacks a part."""
     from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
     from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 
@@ -62,7 +71,7 @@ def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPi
         raise PeerError(f"the session's description lacks {error}; record it with describe_session") from error
 
     class Tracker:
-        """The marker tracker, fed with the bytes that the camera sent."""
+        """The marker tracker on compressed images."""
 
         def __init__(self, sensor: int) -> None:
             self._tracker = MarkerTracker(configs[sensor])
@@ -73,14 +82,14 @@ def _wiring(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPi
         def track(self, data: bytes) -> TrackingResult:
             return self._tracker.track(decode_image(data))
 
-    def frame(trackeds: Sequence[TrackingResult], stamp: float) -> TactileFrame:
-        return tactile_frame(trackeds, mounts, stamp)
+    def frame(tracked: Sequence[TrackingResult], stamp: float) -> TactileFrame:
+        return tactile_frame(tracked, mounts, stamp)
 
     return task, PerceptionPipeline(Tracker, frame)
 
 
 def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
-    """The file of the policy that the session ran: where it was, or the one that comes with gelflow if it is that."""
+    """The checkpoint of the session, at its recorded path or shipped with gelflow."""
     from gelflow.policies.checkpoint import default_checkpoint
 
     recorded = description.get("checkpoint")
@@ -90,39 +99,65 @@ def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
         if path.is_file() and file_digest(path) == recorded["digest"]:
             return path
     wanted = f"{recorded['path']} (SHA-256 {recorded['digest'][:12]}…)"
-    raise UsageError(f"the session ran {wanted}, which is not there or has changed; name the file with --checkpoint")
+    raise UsageError(f"the session ran {wanted}, which is missing or has changed; name the file with --checkpoint")
 
 
-def _tell_differences(console: Console, description: Mapping[str, Any], checkpoint: Path | None) -> None:
+def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]:
+    """Differences between the recording and this replay that may change the decisions."""
+    notes = []
     recorded = description.get("checkpoint")
     if checkpoint and recorded and file_digest(checkpoint) != recorded["digest"]:
-        console.print(f"note: {checkpoint} is not the policy that the session ran", markup=False)
-    here = software_versions()
+        notes.append(f"{checkpoint} is not the policy that the session ran")
+    installed = software_versions()
     for name, version in description.get("versions", {}).items():
-        if here.get(name) != version:
-            console.print(f"note: recorded with {name} {version}, here is {here.get(name, 'none')}", markup=False)
+        if installed.get(name) != version:
+            notes.append(f"recorded with {name} {version}, installed is {installed.get(name, 'none')}")
+    return notes
+
+
+def _show(output: Output, comparisons: Sequence[Comparison], notes: list[str], picture: Path | None) -> int:
+    """Print the comparison and return the exit code."""
+    action = max(comparison.action_difference for comparison in comparisons)
+    flow = max(comparison.flow_difference for comparison in comparisons)
+    wrong = sum(not comparison.identical for comparison in comparisons)
+    count = len(comparisons)
+    verdict = f"{wrong} of {count} decisions differ" if wrong else f"all {count} decisions identical"
+    if output.json:
+        decisions = [
+            {
+                "insertion": comparison.recorded.insertion,
+                "attempt": comparison.recorded.attempt,
+                "recorded_action": comparison.recorded.action,
+                "action": comparison.action,
+                "action_difference": comparison.action_difference,
+                "flow_difference": comparison.flow_difference,
+            }
+            for comparison in comparisons
+        ]
+        output.result({"decisions": decisions, "identical": not wrong, "notes": notes, "picture": picture})
+    else:
+        output.console.print(_table(comparisons))
+        if picture:
+            output.text(f"picture: {picture}")
+        output.text(f"{verdict}; largest difference: action {action:.3g} [m, rad], flow map {flow:.3g}")
+    return NEGATIVE_RESULT if wrong else SUCCESS
 
 
 def _table(comparisons: Sequence[Comparison]) -> Table:
-    table = Table(title="Decisions as recorded, and how far those made again differ (Δ)", box=SIMPLE_HEAD)
+    table = Table(title="Recorded decisions, and differences (Δ) of the recomputed ones", box=SIMPLE_HEAD)
     for name in ("insertion", "attempt", "images", "x mm", "y mm", "yaw °", "Δ action", "Δ map"):
         table.add_column(name, justify="right", no_wrap=True)
-    for made in comparisons:
-        one = made.recorded
-        dx, dy, turn = one.action * (1e3, 1e3, 180 / np.pi)
-        numbers = (f"{one.insertion}", f"{one.attempt}", f"{sum(map(len, one.tracked))}")
+    for comparison in comparisons:
+        recorded = comparison.recorded
+        dx, dy, turn = recorded.action * (1e3, 1e3, 180 / np.pi)
+        numbers = (f"{recorded.insertion}", f"{recorded.attempt}", f"{sum(map(len, recorded.tracked))}")
         table.add_row(
-            *numbers, f"{dx:+.3f}", f"{dy:+.3f}", f"{turn:+.3f}", f"{made.action_difference:.3g}",
-            f"{made.flow_difference:.3g}", style=None if made.identical else "red",
-        )  # fmt: skip
+            *numbers,
+            f"{dx:+.3f}",
+            f"{dy:+.3f}",
+            f"{turn:+.3f}",
+            f"{comparison.action_difference:.3g}",
+            f"{comparison.flow_difference:.3g}",
+            style=None if comparison.identical else "red",
+        )
     return table
-
-
-def _verdict(console: Console, comparisons: Sequence[Comparison]) -> int:
-    action = max(made.action_difference for made in comparisons)
-    flow = max(made.flow_difference for made in comparisons)
-    wrong = sum(not made.identical for made in comparisons)
-    count = len(comparisons)
-    verdict = f"{wrong} of {count} decisions differ" if wrong else f"all {count} decisions identical"
-    console.print(f"{verdict}; largest difference: action {action:.3g} [m, rad], flow map {flow:.3g}", markup=False)
-    return 1 if wrong else 0

@@ -1,44 +1,52 @@
-"""`gelflow run insertion`: the insertion policy on the robot that a lab file describes, or on the mock robot."""
+"""`gelflow run insertion`: run the insertion policy on the robot of a lab file, or on the mock robot."""
 
 import argparse
 import datetime
-import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table
 
+from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
+from gelflow.cli.insertion_text import (
+    ATTEMPT_HEADER,
+    attempt_line,
+    insertion_table,
+    insertion_to_json,
+    preflight_table,
+)
+from gelflow.cli.options import add_checkpoint, add_json, add_out, check_at_least
+from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
-    from gelflow.real.runner.insertion_runner import Attempt, Insertion
     from gelflow.real.runner.motion_executor import MotionExecutor
-    from gelflow.real.runner.preflight import PreflightItem
     from gelflow.real.runner.run_plan import RunPlan
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("job", choices=("insertion",), help="what to run")
-    parser.add_argument("--lab", type=Path, required=True, metavar="FILE", help="the lab file (docs/guide/robot.md)")
-    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="the policy; default: gelflow's own")
-    parser.add_argument("--insertions", type=int, default=1, metavar="N", help="how many parts (default 1)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the recording (default sessions/DATE-TIME)")
+    """Options of the command."""
+    parser.add_argument("task", choices=("insertion",), help="task to run")
+    parser.add_argument("--lab", type=Path, required=True, metavar="FILE", help="lab file (docs/guide/robot.md)")
+    add_checkpoint(parser)
+    parser.add_argument("--insertions", type=int, default=1, metavar="N", help="number of parts (default %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="connect, check and read; send no motion")
+    add_out(parser, "folder of the recording (default sessions/DATE-TIME)", folder=True)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
+    """Run the insertions and print each attempt. A negative result: a part was not inserted."""
     from gelflow.policies.checkpoint import default_checkpoint, load_policy
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
-    if args.insertions < 1:
-        raise UsageError(f"--insertions must be at least 1, got {args.insertions}")
-    # The default of 5 ms lets a computing thread keep those waiting that watch gripper and cameras.
+    check_at_least(args, insertions=1)
+    # With the default of 5 ms a computing thread delays the threads of gripper and cameras.
     sys.setswitchinterval(5e-4)
-    console = Console(highlight=False)
+    output = Output(args.json)
     lab = load_lab(args.lab)
     checkpoint = args.checkpoint or default_checkpoint()
     policy = load_policy(checkpoint, task=INSERTION)
@@ -51,64 +59,43 @@ def run(args: argparse.Namespace) -> int:
         session=session,
         checkpoint=checkpoint,
         insertions=args.insertions,
-        operator=(lambda motion: _Prompt(console, motion)) if lab.part.presentation == "prompt" else None,
-        on_preflight=lambda items: console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n"),
-        on_attempt=lambda number, attempt: console.print(attempt_line(number, attempt), markup=False),
+        operator=(lambda motion: _Prompt(output.console, motion)) if lab.part.presentation == "prompt" else None,
+        on_preflight=lambda items: output.console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n"),
+        on_attempt=lambda number, attempt: output.text(attempt_line(number, attempt)),
     )
     if args.dry_run:
-        return _dry_run(console, plan)
+        return _dry_run(output, plan)
     results = run_insertions(plan)
-    console.print(_table(results))
-    console.print(f"recorded: {session}; replay it with: gelflow replay {session}", markup=False, soft_wrap=True)
-    return 0 if all(result.inserted for result in results) else 1
+    output.console.print(insertion_table(results))
+    output.text(f"recorded: {session}; replay it with: gelflow replay {session}")
+    output.result({"session": session, "insertions": [insertion_to_json(result) for result in results]})
+    return SUCCESS if all(result.inserted for result in results) else NEGATIVE_RESULT
 
 
-def preflight_table(items: "list[PreflightItem]") -> Table:
-    """What was checked before anything moved."""
-    table = Table(title="Preflight", show_header=False, box=None)
-    for item in items:
-        table.add_row("[green]ok[/]" if item.good else "[red]no[/]", item.name, item.text)
-    return table
-
-
-ATTEMPT_HEADER = "  part  try   x [mm]   y [mm]  yaw [°]  depth [mm]  shear [mm]"
-
-
-def attempt_line(number: int, attempt: "Attempt") -> str:
-    """One attempt in one line, under `ATTEMPT_HEADER`."""
-    x, y, yaw = attempt.planar_pose
-    where = f"{1e3 * x:+9.1f}{1e3 * y:+9.1f}{math.degrees(yaw):+9.1f}"
-    felt = f"{1e3 * attempt.depth:12.2f}{attempt.shear:12.3f}"
-    outcome = (
-        "in the hole" if attempt.inserted else "stopped by touch" if attempt.stopped_by_contact else "not in the hole"
-    )
-    return f"{number + 1:6d}{attempt.number + 1:5d}{where}{felt}  {outcome}"
-
-
-def _table(results: "list[Insertion]") -> Table:
-    table = Table(title="Insertions, as the robot sees them")
-    for name in ("part", "attempts", "outcome", "time [s]"):
-        table.add_column(name, justify="left" if name == "outcome" else "right")
-    for result in results:
-        count = str(len(result.attempts))
-        table.add_row(str(result.number + 1), count, result.outcome, f"{result.duration:.0f}")
-    return table
-
-
-def _dry_run(console: Console, plan: "RunPlan") -> int:
+def _dry_run(output: Output, plan: "RunPlan") -> int:
     from gelflow.real.runner.run_plan import dry_run
 
-    found = dry_run(plan)
-    console.print(preflight_table(found.items))
-    console.print("targets of a run, checked: " + "; ".join(found.targets), markup=False)
-    flow = f"largest shear at rest: {found.observation.divisor:.3f} {found.observation.unit}, at least the floor"
-    console.print(f"{flow}; the policy would answer {found.action.round(5).tolist()} [m, m, rad]", markup=False)
-    console.print("dry run: nothing was moved.")
-    return 0
+    made = dry_run(plan)
+    output.console.print(preflight_table(made.items))
+    output.text("checked targets of a run: " + "; ".join(made.targets))
+    flow = f"divisor of the flow map at rest: {made.observation.divisor:.3f} {made.observation.unit}"
+    output.text(f"{flow}; correction of the policy: {made.action.round(5).tolist()} [m, m, rad]")
+    output.text("dry run: nothing was moved.")
+    output.result(
+        {
+            "session": plan.session,
+            "preflight": made.items,
+            "targets": made.targets,
+            "divisor": made.observation.divisor,
+            "unit": made.observation.unit,
+            "correction": made.action,
+        }
+    )
+    return SUCCESS
 
 
 class _Prompt:
-    """A person at the terminal hands the parts over."""
+    """Operator that hands over the parts and confirms at the terminal."""
 
     def __init__(self, console: Console, motion: "MotionExecutor") -> None:
         self._console, self._motion = console, motion
@@ -123,5 +110,5 @@ class _Prompt:
         try:
             self._console.input(f"[bold]{text}[/] ")
         except EOFError:
-            raise UsageError('the lab file says presentation = "prompt", but nobody can press Enter here') from None
+            raise UsageError('the lab file says presentation = "prompt", but standard input is closed') from None
         self._motion.wait(0.0)

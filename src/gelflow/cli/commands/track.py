@@ -1,128 +1,171 @@
-"""`gelflow track`: follow the markers of recorded or live tactile images; write and draw what was found."""
+"""`gelflow track`: track the markers of recorded or live tactile images; write tables, recordings and overlays."""
 
 import argparse
 import itertools
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
-from gelflow.cli.refused import picture_of_refusal
-from gelflow.cli.track_output import CODECS, PICTURES, CsvOutput, McapOutput, Output, OverlayOutput, Step
-from gelflow.cli.track_summary import Summary
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import add_json, check_at_least
+from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, load_calibration
+from gelflow.perception.output.init_error import picture_of_init_error
+from gelflow.perception.output.summary import TrackingSummary
+from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
 from gelflow.perception.sources import ImageSource, SourceImage, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """The options of `gelflow track`."""
-    parser.add_argument("source", help="folder of images, image, video, session (.mcap), stream URL, camera's number")
-    parser.add_argument("--rows", type=int, help="lines of markers (default: found)")
-    parser.add_argument("--cols", type=int, help="markers in a line (default: found); rows and cols may be swapped")
+    """Options of the command."""
+    parser.add_argument(
+        "source", help="folder of images, image, video, session (.mcap), stream URL, or number of a camera"
+    )
+    parser.add_argument("--rows", type=int, metavar="N", help="rows of markers (default: detected)")
+    parser.add_argument(
+        "--cols", type=int, metavar="N", help="markers in a row (default: detected); rows and cols may be swapped"
+    )
     polarity = parser.add_mutually_exclusive_group()
-    polarity.add_argument("--dark", action="store_true", help="dots are darker than the gel (default: found)")
-    polarity.add_argument("--bright", action="store_true", help="dots are brighter than the gel (default: found)")
-    parser.add_argument("--calibration", type=Path, metavar="FILE", help="of gelflow calibrate-camera: millimetres too")
-    parser.add_argument("--overlay", type=Path, metavar="FILE", help="video (.mkv, .avi, .mp4), or .png of the last")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="table: one row per image and marker")
-    parser.add_argument("--mcap", type=Path, metavar="FILE", help="recording of the images and their markers")
+    polarity.add_argument("--dark", action="store_true", help="dots are darker than the gel (default: detected)")
+    polarity.add_argument("--bright", action="store_true", help="dots are brighter than the gel (default: detected)")
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="result of gelflow calibrate-camera: adds millimetres"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="new file, repeatable; the suffix selects the content: .csv table, .mcap recording, .mkv, .avi, .mp4 "
+        "overlay video, .png, .jpg last overlay",
+    )
     parser.add_argument("--images", type=int, metavar="N", help="stop after N images (default: at the end, or Ctrl-C)")
-    parser.add_argument("--rate", type=float, default=25.0, metavar="HZ", help="of a folder's images (%(default)s)")
-    parser.add_argument("--sensor", default="left", help="of a session: left or right (%(default)s)")
-    parser.add_argument("--magnify", type=float, default=3.0, help="length of the arrows drawn (%(default)s times)")
+    parser.add_argument(
+        "--rate", type=float, default=25.0, metavar="HZ", help="rate of a folder's images (%(default)s)"
+    )
+    parser.add_argument("--sensor", default="left", help="sensor of a session: left or right (%(default)s)")
+    parser.add_argument(
+        "--magnify", type=float, default=3.0, metavar="X", help="length of the overlay's arrows (%(default)s times)"
+    )
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Tracks, writes what was asked for, prints a summary."""
+    """Track all images, write the requested files and print a summary."""
     _check(args)
+    output = Output(args.json)
     source = image_source(args.source, sensor=args.sensor, rate=args.rate)
     polarity = "dark" if args.dark else "bright" if args.bright else "auto"
     tracker = MarkerTracker(TrackerConfig(rows=args.rows, cols=args.cols, polarity=polarity))  # type: ignore[arg-type]
     calibration = load_calibration(args.calibration) if args.calibration else None
-    console, summary, begin = Console(highlight=False), Summary(), time.perf_counter()
+    summary, begin = TrackingSummary(), time.perf_counter()
     try:
-        _follow(source, tracker, calibration, summary, args, console)
+        _track(source, tracker, calibration, summary, args)
     except KeyboardInterrupt:
         if not source.live or not summary.images:
             raise
     finally:
-        # What was tracked before an error or Ctrl-C is written, and told.
+        # An error or Ctrl-C keeps the results of the images before it.
         if summary.images:
-            console.print(summary.table(time.perf_counter() - begin, [str(file) for file in _files(args)]))
-    return 0
+            _show(output, summary, time.perf_counter() - begin, args.out)
+    return SUCCESS
 
 
 def _check(args: argparse.Namespace) -> None:
-    if (args.images is not None and args.images < 1) or not args.magnify > 0:
-        raise UsageError("--images must be at least 1, --magnify above 0")
-    known = (*CODECS, *PICTURES)
-    if args.overlay is not None and args.overlay.suffix.lower() not in known:
-        raise UsageError(f"--overlay {args.overlay}: its suffix must be one of {', '.join(known)}")
-    for file in _files(args):
+    check_at_least(args, images=1)
+    if not args.magnify > 0:
+        raise UsageError(f"--magnify must be above 0, got {args.magnify}")
+    for file in args.out:
+        check_suffix(file)
         if file.exists():
             raise UsageError(f"{file} exists; name a new file")
         if not file.parent.is_dir():
             raise UsageError(f"{file}: the folder {file.parent} does not exist")
 
 
-def _follow(
+def _track(
     source: ImageSource,
     tracker: MarkerTracker,
     calibration: Calibration | None,
-    summary: Summary,
+    summary: TrackingSummary,
     args: argparse.Namespace,
-    console: Console,
 ) -> None:
     total = source.count()
     if args.images is not None:
         total = args.images if total is None else min(total, args.images)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        ExitStack() as open_files,
-        Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress,
-    ):
+    with ExitStack() as open_files, progress_bar(count=True) as progress:
         bar = progress.add_task("tracking", total=total)
-        outputs: list[Output] = []
+        writers: list[TrackWriter] = []
         for number, frame in enumerate(itertools.islice(source, args.images)):
             if number == 0 and calibration is not None:
                 calibration.check_size(frame.image)
             begin = time.perf_counter()
-            with picture_of_refusal(next(_files(args), Path("track"))):
+            with picture_of_init_error((args.out or [Path("track")])[0]):
                 tracked = tracker.track(frame.image)
             seconds = time.perf_counter() - begin
             if number == 0:
-                # Not before: a start that is refused leaves no empty files.
-                outputs = [open_files.enter_context(closing(one)) for one in _outputs(args, calibration)]
-            step = _step(number, frame, tracked, calibration)
-            for output in outputs:
-                output.add(step)
+                # Files are created after the first image: a failed start leaves no empty files.
+                writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration)]
+            step = _tracked_image(number, frame, tracked, calibration)
+            for writer in writers:
+                writer.add(step)
             summary.add(step, seconds)
             progress.advance(bar)
 
 
-def _files(args: argparse.Namespace) -> Iterator[Path]:
-    """The files that were asked for."""
-    return (file for file in (args.overlay, args.csv, args.mcap) if file is not None)
+def _writers(args: argparse.Namespace, calibration: Calibration | None) -> list[TrackWriter]:
+    description = {"source": args.source, "calibration": calibration, "versions": software_versions()}
+    return [
+        open_writer(
+            file,
+            sensor=args.sensor,
+            magnify=args.magnify,
+            millimetres=calibration is not None,
+            description=description,
+        )
+        for file in args.out
+    ]
 
 
-def _outputs(args: argparse.Namespace, calibration: Calibration | None) -> Iterator[Output]:
-    if args.overlay is not None:
-        yield OverlayOutput(args.overlay, magnify=args.magnify)
-    if args.csv is not None:
-        yield CsvOutput(args.csv, millimetres=calibration is not None)
-    if args.mcap is not None:
-        description = {"source": args.source, "calibration": calibration, "versions": software_versions()}
-        yield McapOutput(args.mcap, args.sensor, description)
-
-
-def _step(number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None) -> Step:
+def _tracked_image(
+    number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None
+) -> TrackedImage:
     if calibration is None:
-        return Step(number, frame, tracked)
+        return TrackedImage(number, frame, tracked)
     displacement = calibration.displacement_mm(tracked.position, tracked.displacement)
-    return Step(number, frame, tracked, calibration.to_mm(tracked.position), displacement)
+    return TrackedImage(number, frame, tracked, calibration.to_mm(tracked.position), displacement)
+
+
+def _show(output: Output, summary: TrackingSummary, wall: float, files: list[Path]) -> None:
+    """Print the summary; `wall` is the duration of the run [s]."""
+    values = summary.to_json()
+    if output.json:
+        output.result(values | {"seconds": wall, "files": files})
+        return
+    markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
+    table = Table(show_header=False)
+    table.add_row("images", str(values["images"]))
+    table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")
+    worst = f"in the worst image {100 * values['tracked_share_min']:.1f} %"
+    table.add_row("tracked", f"{100 * values['tracked_share']:.1f} % ({worst})")
+    table.add_row("inferred", f"{100 * values['inferred_share']:.1f} %, from neighbours")
+    jitter = values["jitter_px"]
+    quiet = f"{jitter:.3f} px, in the quietest quarter of the images" if jitter is not None else "too few images"
+    table.add_row("rest jitter", quiet)
+    largest, largest_mm = values["largest_displacement_px"], values["largest_displacement_mm"]
+    if largest is not None:
+        mm = f", {largest_mm:.3f} mm" if largest_mm is not None else ""
+        where = values["largest_displacement_at"]
+        table.add_row("largest motion", f"{largest:.2f} px, {largest / spacing:.2f} of the spacing{mm} ({where})")
+    usual, first = values["seconds_per_image"], values["seconds_first_image"]
+    speed = f"{1 / usual:.0f} a second tracked ({1e3 * usual:.2f} ms each, the first {1e3 * first:.0f} ms)"
+    table.add_row("speed", f"{speed}, {summary.images / wall:.0f} a second with reading and writing")
+    for file in files:
+        table.add_row("written", str(file))
+    output.console.print(table)

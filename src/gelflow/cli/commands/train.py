@@ -3,70 +3,86 @@
 import argparse
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
-from gelflow.cli.presets import PRESET_HELP
-from gelflow.errors import UsageError
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import add_json, add_out, add_preset, add_seed, check_at_least
+from gelflow.cli.output import Output, progress_bar
+
+if TYPE_CHECKING:
+    from gelflow.policies.learning_curve import LearningCurvePoint
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion"], help="what to learn")
+    parser.add_argument("task", choices=["insertion"], help="task to learn")
     parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: docs/guide/training.md)")
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
-    parser.add_argument("--envs", type=int, default=64, metavar="N", help="simulated robots side by side (default 64)")
-    parser.add_argument("--seed", type=int, default=0, help="decides every random number (default 0)")
-    parser.add_argument("--preset", metavar="NAME", help=PRESET_HELP)
-    parser.add_argument("--out", type=Path, default=Path("runs/insertion"), help="folder for what is made")
+    parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
+    add_seed(parser)
+    add_preset(parser)
+    add_out(parser, "folder for checkpoint and learning curve", default=Path("runs/insertion"), folder=True)
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, with a progress bar; says where the checkpoint is."""
-    if args.envs < 1 or args.seed < 0:
-        raise UsageError(f"--envs must be at least 1 and --seed at least 0, got {args.envs} and {args.seed}")
-    from gelflow.policies.environment import (
-        FlowMapNoise,  # here: torch takes seconds to import
-        make_insertion_env,
-    )
-    from gelflow.policies.learning_curve import LearningCurvePoint
+    """Train with a progress bar, then print the paths of the results."""
+    check_at_least(args, envs=1, seed=0)
+    from gelflow.policies.environment import FlowMapNoise, make_insertion_env  # deferred: torch is slow to import
     from gelflow.policies.ppo import PPOSettings, train
 
+    output = Output(args.json)
     given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
     settings = PPOSettings(seed=args.seed, **given)
-    console = Console()
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=console) as bars:
-        bar = bars.add_task("training", total=settings.attempts)
-
-        def report(point: LearningCurvePoint) -> None:
-            text = f"reward {point.reward:6.2f}  inserted {point.success:4.0%}"
-            if point.evaluation is None:
-                bars.update(bar, completed=point.attempts, description=text)
-            else:
-                evaluation = point.evaluation
-                bars.console.print(
-                    f"after {point.attempts:>9,} attempts, {point.minutes:5.1f} min:"
-                    f" inserted {evaluation.success:6.1%} in {evaluation.attempts:.1f} attempts"
-                )
-
+    with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
+        bar = _TrainingProgress(progress, settings.attempts)
         made = train(
             make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
             make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
             out=args.out,
             settings=settings,
             command=_command(args, settings.attempts),
-            report=report,
+            report=bar.report,
         )
-    console.print(f"best on validation: {made.best.success:.1%} inserted in {made.best.attempts:.1f} attempts")
-    console.print(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}", soft_wrap=True)
-    console.print(f"judge it with: gelflow eval insertion --checkpoint {shlex.quote(str(made.checkpoint))}")
-    return 0
+    best = made.best
+    output.text(f"best on validation: {best.success:.1%} inserted in {best.attempts:.1f} attempts")
+    output.text(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}")
+    output.text(f"evaluate it with: gelflow eval insertion --checkpoint {shlex.quote(str(made.checkpoint))}")
+    output.result(
+        {
+            "checkpoint": made.checkpoint,
+            "learning_curve": made.curve,
+            "picture": made.picture,
+            "validation": {"success": best.success, "attempts": best.attempts},
+        }
+    )
+    return SUCCESS
+
+
+class _TrainingProgress:
+    """Shows the newest point of the learning curve, and a line for each evaluation."""
+
+    def __init__(self, progress: Progress, attempts: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task("training", total=attempts)
+
+    def report(self, point: "LearningCurvePoint") -> None:
+        """Called by `train` for each point of the learning curve."""
+        if point.evaluation is None:
+            text = f"reward {point.reward:6.2f}  inserted {point.success:4.0%}"
+            self._progress.update(self._task, completed=point.attempts, description=text)
+            return
+        evaluation = point.evaluation
+        self._progress.console.print(
+            f"after {point.attempts:>9,} attempts, {point.minutes:5.1f} min:"
+            f" inserted {evaluation.success:6.1%} in {evaluation.attempts:.1f} attempts"
+        )
 
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
-    """The command that makes the same again, whatever the defaults become."""
+    """The command that repeats this training, with all defaults written out."""
     names = ("minutes", "envs", "seed", "preset", "out")
     values = {"attempts": attempts} | {name: getattr(args, name) for name in names}
     given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]

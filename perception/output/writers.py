@@ -1,7 +1,7 @@
-"""What `gelflow track` writes while it runs: CSV, MCAP, overlay video. No command.
+"""Writers of tracked images: CSV table, MCAP session, overlay video.
 
-Nothing waits for the end: what a killed run leaves behind can be read (an .mcap after `gelflow recover`; of the
-overlays .mkv and .avi, an .mp4 needs its end).
+Every image is written at once, so the files of a killed run are readable: .csv, .mkv and .avi directly, .mcap after
+`gelflow recover`. Only .mp4 needs its end.
 """
 
 import csv
@@ -22,36 +22,38 @@ from gelflow.protocols import CameraImage
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import SENSORS
 
-CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}  # of an overlay by its file's suffix
-PICTURES = (".png", ".jpg")
+VIDEO_CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}  # by file suffix
+PICTURE_SUFFIXES = (".png", ".jpg")
 
-_INTERVALS = 25  # between images, whose median is the overlay's: the first of a stream may come at once
-_SAFE = 50  # images after which the recording waits until all is on the disk
+_INTERVALS = 25  # between images, for the median frame interval: the first images of a stream may arrive in a burst
+_SYNC_PERIOD = 50  # number of images between waits for the disk
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Step:
-    """One image, tracked."""
+class TrackedImage:
+    """An image and its tracking result."""
 
     number: int  # from 0
     frame: SourceImage
     tracked: TrackingResult
-    position_mm: Floats | None = None  # on the gel, shape (markers, 2); None without a calibration
-    displacement_mm: Floats | None = None
+    position_mm: Floats | None = None  # on the gel [mm], shape (markers, 2); None without a calibration
+    displacement_mm: Floats | None = None  # [mm], shape (markers, 2); None without a calibration
 
 
-class Output(Protocol):
+class TrackWriter(Protocol):
     """A file that is written image by image."""
 
-    def add(self, step: Step) -> None: ...
+    def add(self, step: TrackedImage) -> None:
+        """Write one image."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Finish the file."""
 
 
-class CsvOutput:
-    """One row per image and marker. What is not known is left empty; what was guessed has inferred = 1."""
+class CsvWriter:
+    """Table with one row per image and marker. Unknown values are empty; inferred positions have inferred = 1."""
 
     def __init__(self, path: Path, *, millimetres: bool) -> None:
         columns = ["frame", "image", "stamp", "marker", "row", "col", "x_px", "y_px", "dx_px", "dy_px"]
@@ -63,7 +65,7 @@ class CsvOutput:
         self._writer = csv.writer(self._file)
         self._writer.writerow([*columns, "valid", "inferred", "quality"])
 
-    def add(self, step: Step) -> None:
+    def add(self, step: TrackedImage) -> None:
         tracked = step.tracked
         numbers = [tracked.position, tracked.displacement]
         if step.position_mm is not None and step.displacement_mm is not None:
@@ -74,16 +76,18 @@ class CsvOutput:
             zip(np.column_stack(numbers).tolist(), flags, strict=True)
         ):
             cells = ["" if value != value else f"{value:.5f}" for value in row]
-            place = divmod(marker, tracked.cols)
-            self._writer.writerow([*first, marker, *place, *cells, int(valid), int(inferred), f"{quality:.3f}"])
+            row_and_column = divmod(marker, tracked.cols)
+            self._writer.writerow(
+                [*first, marker, *row_and_column, *cells, int(valid), int(inferred), f"{quality:.3f}"]
+            )
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
 
 
-class McapOutput:
-    """A session with the images and their markers. `description` is what it says about itself."""
+class McapWriter:
+    """Session with the images and their markers. `description` becomes the description of the session."""
 
     def __init__(self, path: Path, sensor: str, description: Mapping[str, Any]) -> None:
         self._clock = _StampClock()
@@ -91,7 +95,7 @@ class McapOutput:
         self._recorder = SessionRecorder(path, self._clock).open()
         self._recorder.metadata(description)
 
-    def add(self, step: Step) -> None:
+    def add(self, step: TrackedImage) -> None:
         stamp, tracked = step.frame.stamp, step.tracked
         self._clock.stamp = stamp
         data = step.frame.data if step.frame.data is not None else _png(step.frame.image)
@@ -110,7 +114,7 @@ class McapOutput:
         if step.displacement_mm is not None:
             values["displacement_mm"] = step.displacement_mm
         self._recorder.markers(self._sensor, stamp, values)
-        if step.number % _SAFE == _SAFE - 1:
+        if step.number % _SYNC_PERIOD == _SYNC_PERIOD - 1:
             self._recorder.attempt_end()
 
     def close(self) -> None:
@@ -118,7 +122,7 @@ class McapOutput:
 
 
 class _StampClock:
-    """The time of a recording made from images: the newest one's."""
+    """Clock of a recording made from images: the stamp of the newest one."""
 
     stamp = 0.0
 
@@ -126,23 +130,23 @@ class _StampClock:
         return self.stamp
 
     def sleep(self, seconds: float) -> None:
-        """Nothing here waits."""
+        """Do not wait."""
 
     def wall(self, seconds: float) -> float:
         return seconds
 
 
-class OverlayOutput:
-    """A video of the overlays, or with the suffix of a picture the last one. It plays as fast as the images came."""
+class OverlayWriter:
+    """Video of the overlays at the rate of the images, or with the suffix of a picture the last overlay."""
 
     def __init__(self, path: Path, *, magnify: float) -> None:
         self._path, self._magnify = path, magnify
-        self._waiting: list[Step] = []  # until it is known how fast the images come
-        self._last: Step | None = None
+        self._waiting: list[TrackedImage] = []  # until the frame interval is known
+        self._last: TrackedImage | None = None
         self._video: cv2.VideoWriter | None = None
 
-    def add(self, step: Step) -> None:
-        if self._path.suffix.lower() in PICTURES:
+    def add(self, step: TrackedImage) -> None:
+        if self._path.suffix.lower() in PICTURE_SUFFIXES:
             self._last = step
         elif self._video is not None:
             self._video.write(self._draw(step))
@@ -166,18 +170,48 @@ class OverlayOutput:
         rate = min(1 / interval, 240.0) if interval > 0 else 25.0
         pictures = [self._draw(step) for step in waiting]
         size = (pictures[0].shape[1], pictures[0].shape[0])
-        code = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.lower()])
+        code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix.lower()])
         self._video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
         if not self._video.isOpened():
             raise UsageError(f"cannot write the video {self._path}; is its folder writable?")
         for picture in pictures:
             self._video.write(picture)
 
-    def _draw(self, step: Step) -> NDArray[np.uint8]:
+    def _draw(self, step: TrackedImage) -> NDArray[np.uint8]:
         return draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
-    """Without loss: tracking the recording gives the same numbers. Level 1 is fast and nearly as small as 9."""
+    """Lossless encoding, so that tracking the recording gives the same numbers. Level 1 is fast."""
     _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return data.tobytes()
+
+
+def open_writer(
+    path: Path, *, sensor: str, magnify: float, millimetres: bool, description: Mapping[str, Any]
+) -> TrackWriter:
+    """The writer for the suffix of `path`: .csv, .mcap, or a video or picture of overlays.
+
+    Parameters
+    ----------
+    sensor: channel of the session, left or right
+    magnify: length of the arrows of an overlay, relative to the displacement
+    millimetres: whether a table has columns in mm
+    description: description of the session
+
+    Raises UsageError for another suffix, or when the file cannot be created.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return CsvWriter(path, millimetres=millimetres)
+    if suffix == ".mcap":
+        return McapWriter(path, sensor, description)
+    check_suffix(path)
+    return OverlayWriter(path, magnify=magnify)
+
+
+def check_suffix(path: Path) -> None:
+    """Raise UsageError when no writer exists for the suffix of `path`."""
+    known = (".csv", ".mcap", *VIDEO_CODECS, *PICTURE_SUFFIXES)
+    if path.suffix.lower() not in known:
+        raise UsageError(f"--out {path}: the suffix must be one of {', '.join(known)}")

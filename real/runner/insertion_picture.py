@@ -1,4 +1,4 @@
-"""Pictures of an insertion that a person understands: the gels, what was felt, what the policy said. No command."""
+"""Picture of an insertion: gel images, flow maps and the corrections of the policy."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from gelflow.real.runner.insertion_runner import Attempt, Insertion
     from gelflow.task import InsertionTask
 
-_MOST = 6  # attempts in one picture
-_MAGNIFY = 5  # arrows on the gel images
+_MAX_ATTEMPTS = 6  # in one picture
+_MAGNIFICATION = 5  # of the arrows on the gel images
 _SIDES = ("left", "right")
 
 
 def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task: "InsertionTask", path: Path) -> None:
-    """One line per attempt: both gels with the tracked markers' arrows, both flow maps, and the correction in words.
+    """Draw one row per attempt: both gel images with marker displacements, both flow maps, and the correction as text.
 
-    At most 6 attempts are drawn, the last ones. Raises UsageError when the picture can't be written.
+    At most the last 6 attempts are drawn. Raises UsageError when the picture cannot be written.
     """
-    from matplotlib.figure import Figure  # here: slow to import
+    from matplotlib.figure import Figure  # deferred: slow to import
 
-    attempts = [made for made in insertion.attempts if made.reference is not None][-_MOST:]
+    attempts = [made for made in insertion.attempts if made.reference is not None][-_MAX_ATTEMPTS:]
     if not attempts:
         return
     figure = Figure(figsize=(11.5, 3.1 * len(attempts) + 0.7), layout="constrained")
@@ -37,7 +37,7 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
             _flow(line[2 + sensor], made, sensor, task)
         line[0].set_ylabel(f"attempt {made.number + 1}", fontsize=10)
         line[4].axis("off")
-        line[4].text(0.0, 0.5, _words(made), transform=line[4].transAxes, fontsize=9, va="center")
+        line[4].text(0.0, 0.5, _text(made), transform=line[4].transAxes, fontsize=9, va="center")
     try:
         figure.savefig(path, dpi=90)
     except OSError as error:
@@ -45,7 +45,7 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
 
 
 def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
-    """The deepest image, with where its markers went since the reference."""
+    """The deepest image with the marker displacements since the reference."""
     from gelflow.perception.frames import decode_image
     from gelflow.perception.tracker import MarkerTracker
 
@@ -58,18 +58,25 @@ def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
     (x, y), (right, down) = tracked.position[tracked.valid].T, tracked.displacement[tracked.valid].T
     start = x - right, y - down
     axis.quiver(
-        *start, _MAGNIFY * right, _MAGNIFY * down, color="w", angles="xy", scale_units="xy", scale=1, width=0.006
+        *start,
+        _MAGNIFICATION * right,
+        _MAGNIFICATION * down,
+        color="w",
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.006,
     )
     axis.set(xticks=[], yticks=[])
-    axis.set_title(f"{_SIDES[sensor]} camera, motion × {_MAGNIFY}", fontsize=8)
+    axis.set_title(f"{_SIDES[sensor]} camera, motion × {_MAGNIFICATION}", fontsize=8)
 
 
 def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> None:
-    """The flow map of one pad: seen from outside, the fingertip down."""
+    """The flow map of one pad, seen from outside, fingertip down."""
     axis.set(aspect="equal", xticks=[], yticks=[])
     axis.set_title(f"{_SIDES[sensor]} pad, flow map", fontsize=8)
     if made.observation is None:
-        axis.text(0.5, 0.5, "not asked", transform=axis.transAxes, ha="center", va="center", fontsize=9, color="gray")
+        axis.text(0.5, 0.5, "no decision", transform=axis.transAxes, ha="center", va="center", fontsize=9, color="gray")
         return
     positions = task.grid.positions()
     last = len(task.frame_depths) - 1
@@ -82,21 +89,21 @@ def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> Non
     axis.margins(0.15)
 
 
-def _words(made: "Attempt") -> str:
+def _text(made: "Attempt") -> str:
     x, y, yaw = made.planar_pose
     lines = [
         f"at x {1e3 * x:+.1f} mm, y {1e3 * y:+.1f} mm, yaw {np.degrees(yaw):+.1f}°",
         f"depth {1e3 * made.depth:.2f} mm, shear {made.shear:.3f} mm",
     ]
     if made.inserted:
-        lines += ["", "nothing met: in the hole"]
+        lines += ["", "no contact: in the hole"]
     elif made.action is not None and made.observation is not None:
         dx, dy, turn = made.action * (1e3, 1e3, 180 / np.pi)
         lines += [
-            "stopped by touch" if made.stopped_by_contact else "not in the hole",
+            "stopped by contact" if made.stopped_by_contact else "not in the hole",
             f"longest arrow {made.observation.divisor:.3f} {made.observation.unit}",
             "",
-            "the policy's correction:",
+            "correction of the policy:",
             f"x {dx:+.2f} mm, y {dy:+.2f} mm",
             f"yaw {turn:+.2f}°",
         ]

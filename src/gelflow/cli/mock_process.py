@@ -1,0 +1,89 @@
+"""`gelflow mock` as a separate process, and requests to its side channel with the true state of the cell."""
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+from gelflow.errors import PeerError
+
+_START_LIMIT = 60.0  # of the mock robot [s, wall]
+_STOP_LIMIT = 10.0  # [s, wall]
+
+
+@contextlib.contextmanager
+def mock_robot(*, factor: float, seed: int, preset: str | None = None) -> Iterator[tuple[Path, str]]:
+    """Run a mock robot in a separate process; yields its lab file and the URL of its true state.
+
+    Raises PeerError with the process's last line of standard error when it does not start.
+    """
+    truth_port = _free_port(socket.SOCK_STREAM)
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as errors:
+        lab = Path(folder) / "lab.toml"
+        options = {
+            "--out": lab,
+            "--factor": factor,
+            "--seed": seed,
+            "--truth-port": truth_port,
+            "--egm-port": _free_port(socket.SOCK_DGRAM),
+        }
+        if preset is not None:
+            options["--preset"] = preset
+        code = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
+        process = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                code,
+                "mock",
+                "--attached",
+                *(str(word) for pair in options.items() for word in pair),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=errors,
+        )
+        try:
+            _await_file(lab, process, errors)
+            yield lab, f"http://127.0.0.1:{truth_port}/truth"
+        finally:
+            assert process.stdin is not None
+            process.stdin.close()  # with --attached the process ends when its standard input closes
+            try:
+                process.wait(_STOP_LIMIT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def true_state(url: str) -> dict[str, Any]:
+    """The true state of the simulated cell. Raises PeerError when the mock robot does not answer."""
+    try:
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            return dict(json.load(answer))
+    except (urllib.error.URLError, OSError, ValueError) as error:
+        raise PeerError(f"the mock robot does not answer at {url}: {error}") from error
+
+
+def _await_file(path: Path, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+    end = time.monotonic() + _START_LIMIT
+    while not path.exists():
+        if process.poll() is not None or time.monotonic() > end:
+            errors.seek(0)
+            lines = errors.read().decode(errors="replace").strip().splitlines()
+            raise PeerError(f"the mock robot did not start: {lines[-1] if lines else 'no reason given'}")
+        time.sleep(0.05)
+
+
+def _free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

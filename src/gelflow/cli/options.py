@@ -1,0 +1,60 @@
+"""Command-line options that several commands share. An option has the same meaning in every command."""
+
+import argparse
+from pathlib import Path
+
+from gelflow.errors import UsageError
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """`--json`: the result as one JSON object on standard output."""
+    parser.add_argument(
+        "--json", action="store_true", help="print the result as one JSON object; all other output goes to stderr"
+    )
+
+
+def add_out(parser: argparse.ArgumentParser, text: str, *, default: Path | None = None, folder: bool = False) -> None:
+    """`--out`: the file or folder that the command writes."""
+    shown = "" if default is None else f" (default {default})"
+    parser.add_argument("--out", type=Path, default=default, metavar="DIR" if folder else "FILE", help=text + shown)
+
+
+def add_seed(parser: argparse.ArgumentParser, *, default: int = 0) -> None:
+    """`--seed`: determines every random number."""
+    parser.add_argument(
+        "--seed", type=int, default=default, metavar="N", help="determines every random number (default %(default)s)"
+    )
+
+
+def add_preset(parser: argparse.ArgumentParser) -> None:
+    """`--preset`: accuracy of the simulation."""
+    parser.add_argument(
+        "--preset",
+        metavar="NAME",
+        help="accuracy of the simulation: fast, balanced, accurate (default: the scene's own settings)",
+    )
+
+
+def add_quick(parser: argparse.ArgumentParser) -> None:
+    """`--quick`: a short run."""
+    parser.add_argument("--quick", action="store_true", help="a short run: fewer or smaller cases, fewer repeats")
+
+
+def add_repeats(parser: argparse.ArgumentParser, text: str, *, default: int | None = None) -> None:
+    """`--repeats`: number of timed runs."""
+    parser.add_argument("--repeats", type=int, default=default, metavar="N", help=text)
+
+
+def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the policy shipped with gelflow") -> None:
+    """`--checkpoint`: the policy."""
+    parser.add_argument(
+        "--checkpoint", type=Path, metavar="FILE", help=f"checkpoint of the policy (default: {default})"
+    )
+
+
+def check_at_least(args: argparse.Namespace, **limits: int) -> None:
+    """Raise UsageError for the first option that is below its limit; options that were not given are skipped."""
+    for name, limit in limits.items():
+        value = getattr(args, name)
+        if value is not None and not value >= limit:
+            raise UsageError(f"--{name.replace('_', '-')} must be at least {limit}, got {value}")

@@ -1,0 +1,47 @@
+"""Output of the commands: text on the terminal, progress bars, JSON."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+
+from gelflow.session.records import to_plain
+
+
+class Output:
+    """Standard output of a command: text, or with `--json` one JSON object.
+
+    With `--json` the text goes to standard error.
+    """
+
+    def __init__(self, as_json: bool = False, *, width: int | None = None) -> None:
+        self.json = as_json
+        self.console = Console(highlight=False, stderr=self.json, width=width)
+
+    def text(self, line: str) -> None:
+        """Print one line without markup or line breaks."""
+        self.console.print(line, markup=False, soft_wrap=True)
+
+    def result(self, values: Mapping[str, Any]) -> None:
+        """The result of the command. Printed with `--json` only; NaN and the infinities become strings."""
+        if self.json:
+            print(json.dumps(to_plain(values), indent=2, allow_nan=False))
+
+
+def progress_bar(*columns: ProgressColumn, count: bool = False, auto_refresh: bool = True) -> Progress:
+    """A progress bar on standard error that disappears at the end; invisible unless standard error is a terminal.
+
+    `count` shows the number of finished items; `columns` are added before the remaining time.
+    """
+    errors = Console(stderr=True)
+    shown = [TextColumn("{task.description}"), BarColumn(), *([MofNCompleteColumn()] if count else []), *columns]
+    return Progress(
+        *shown,
+        TimeRemainingColumn(),
+        console=errors,
+        transient=True,
+        auto_refresh=auto_refresh,
+        disable=not errors.is_terminal,
+    )
