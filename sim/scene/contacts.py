@@ -1,7 +1,7 @@
 """Contact points sampled on geometries, and contacts between point sets and shapes."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,9 +38,9 @@ class PointsDef:
     points: Array  # in the body frame [m], shape (n, 3)
     areas: Array  # components of the area along the axes of the geometry [m²], shape (n, 3); their sum is the area
     weights: Array  # factors on the contact parameters: ones, or the areas [m²]; shape (n,)
-    radius: float  # > 0: a single point, the centre of a sphere of this radius [m]
-    pose: Pose  # of the geometry in the body frame
-    per_area: bool  # weights are areas
+    radius: float = 0.0  # > 0: a single point, the centre of a sphere of this radius [m]
+    pose: Pose = field(default_factory=Pose)  # of the geometry in the body frame
+    per_area: bool = False  # weights are areas
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,12 @@ from gelflow.sim.scene.joint_limits import read_limits
 from gelflow.sim.scene.mjcf.mechanics import read_mechanics
 from gelflow.sim.scene.pads import read_pads
 from gelflow.sim.scene.presets import Presets, apply_preset, read_presets
-from gelflow.sim.scene.scene import Precision, Scene
+from gelflow.sim.scene.scene import DEFAULT_TOLERANCE, Precision, Scene
 from gelflow.sim.scene.shapes import used_shapes
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 INTEGRATORS = ("bdf1", "bdf2")
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
-DEFAULT_TOLERANCE = 1e-7  # of Newton's method
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
 _ELEMENT_TABLES = ("joints", "shapes", "points", "contacts", "pads")

@@ -45,7 +45,7 @@ class PadDef:
     against: tuple[str, ...]  # names of shapes
     law: str  # friction law: "viscous" or "elastic"
     params: Mapping[str, float]  # kn, kt, mu, kd, ks
-    collides: bool  # the markers are contact points: the tactile forces act on the body
+    collides: bool = False  # the markers are contact points: the tactile forces act on the body
     gel: Gel | None = None  # None: no displacements, tactile forces only
 
 

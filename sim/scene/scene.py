@@ -2,7 +2,7 @@
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,34 +22,37 @@ from gelflow.toml_tables import suggestion
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
 
+DEFAULT_TOLERANCE = 1e-7  # of Newton's method
+
 
 @dataclass(frozen=True)
 class Scene:
     """A scene: bodies, joints, actuators, contact geometry and tactile pads.
 
-    `load_scene` reads one from files; `dataclasses.replace` makes a changed copy. Bodies, joints and actuators are in
-    the order of the model file, contacts and pads in the order of the TOML file.
+    `load_scene` reads a scene from files; `dataclasses.replace` makes a changed copy. Bodies, joints and actuators are
+    in the order of the model file, contacts and pads in the order of the TOML file. Elements refer to bodies and joints
+    by index, to shapes and points by name.
     """
 
     name: str
-    path: Path  # of the TOML file
+    path: Path  # of the TOML file; names the scene in error messages
     step: float  # time step [s]
-    integrator: str  # "bdf1" or "bdf2"
-    tolerance: float  # of Newton's method, see docs/reference/physics.md
-    precision: Precision  # default precision of a `Simulator` of this scene
-    friction: str  # default friction law of contacts and pads: "viscous" or "elastic"
-    gravity: Array  # [m/s²], shape (3,)
-    bodies: tuple[BodyDef, ...]
+    bodies: tuple[BodyDef, ...]  # parents before children
     joints: tuple[JointDef, ...]
     limits: tuple[JointLimit, ...]  # one per joint
-    actuators: tuple[ActuatorDef, ...]
-    shapes: tuple[ShapeDef, ...]
-    points: tuple[PointsDef, ...]
-    contacts: tuple[ContactDef, ...]
-    pads: tuple[PadDef, ...]
-    q0: Array  # initial positions, shape (nq,): the keyframe "start" or "home", or the pose of the model file
-    not_modelled: tuple[str, ...]  # elements of the files that have no effect in the simulation, with the reason
-    presets: Mapping[str, Mapping[str, Any]]  # preset name -> dotted key of the TOML file -> value
+    q0: Array  # initial positions, shape (nq,)
+    integrator: str = "bdf1"  # or "bdf2"
+    tolerance: float = DEFAULT_TOLERANCE  # of Newton's method, see docs/reference/physics.md
+    precision: Precision = "double"  # default precision of a `Simulator` of this scene
+    friction: str = "viscous"  # friction law of contacts and pads that set none: "viscous" or "elastic"
+    gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -9.81]))  # [m/s²], shape (3,)
+    actuators: tuple[ActuatorDef, ...] = ()
+    shapes: tuple[ShapeDef, ...] = ()
+    points: tuple[PointsDef, ...] = ()
+    contacts: tuple[ContactDef, ...] = ()
+    pads: tuple[PadDef, ...] = ()
+    not_modelled: tuple[str, ...] = ()  # elements of the files without effect in the simulation, with the reason
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # name -> dotted key -> value
 
     @property
     def nq(self) -> int:

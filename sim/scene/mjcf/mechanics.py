@@ -20,7 +20,7 @@ from gelflow.sim.scene.mjcf.unsupported import apply_disable_flags, check_suppor
 
 Array = NDArray[np.float64]
 
-WORLD = -1
+WORLD = -1  # body index of the world
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class JointDef:
     axis: Array  # in the body frame, shape (3,)
     q_start: int  # index of the first position in q
     v_start: int  # index of the first velocity in v
-    damping: float  # [N s/m]
-    armature: float  # [kg]
-    stiffness: float  # [N/m]
-    springref: float  # position of zero spring force [m]
-    range: tuple[float, float] | None  # [m]
-    default_limit: tuple[float, float] | None  # stiffness [N/m] and damping [N s/m] beyond the range
-    ref: float  # position at the pose of the model file [m]
-    frictionloss: float  # dry friction [N]
+    damping: float = 0.0  # [N s/m]
+    armature: float = 0.0  # [kg]
+    stiffness: float = 0.0  # [N/m]
+    springref: float = 0.0  # position of zero spring force [m]
+    range: tuple[float, float] | None = None  # [m]
+    default_limit: tuple[float, float] | None = None  # stiffness [N/m] and damping [N s/m] beyond the range
+    ref: float = 0.0  # position at which the body has the pose of its definition [m]
+    frictionloss: float = 0.0  # dry friction [N]
 
     @property
     def nq(self) -> int:
