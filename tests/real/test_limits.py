@@ -1,0 +1,41 @@
+"""The table of motion limits: one source for all configurations, and the same numbers in the documentation."""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import gelflow.real
+from gelflow.real.egm.config import EgmConfig
+from gelflow.real.limits import LIMITS
+from gelflow.real.runner.lab_file import load_lab
+from gelflow.real.wsg.config import WsgConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_configurations_use_the_table() -> None:
+    lab = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
+    assert (lab.arm.max_speed, lab.arm.max_turn_speed_deg) == (LIMITS.tool_speed, LIMITS.tool_turn_speed_deg)
+    assert (lab.workspace.max_step, lab.workspace.max_turn_deg) == (LIMITS.target_distance, LIMITS.target_turn_deg)
+    assert (lab.workspace.height_min, lab.workspace.height_max) == LIMITS.workspace_height
+    assert (lab.limits.stale_pose, lab.limits.stale_frame) == (LIMITS.pose_age, LIMITS.image_age)
+    arm = EgmConfig((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    assert (arm.max_speed, arm.max_step, arm.stale) == (LIMITS.tool_speed, LIMITS.target_distance, LIMITS.pose_age)
+    assert arm.max_turn_speed == math.radians(LIMITS.tool_turn_speed_deg)
+    gripper = WsgConfig()
+    assert (gripper.limits.width, gripper.limits.speed) == (LIMITS.gripper_width, LIMITS.gripper_speed)
+    assert (gripper.limits.force, gripper.stale_after) == (LIMITS.gripper_force, LIMITS.gripper_age)
+
+
+def test_documentation_shows_the_same_numbers() -> None:
+    page = (ROOT / "docs" / "guide" / "robot.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| [^|]+ \| `(\w+)` \| ([^|]+) \|", page, flags=re.M))
+    assert set(rows) == {field.name for field in dataclasses.fields(LIMITS)}
+    for name, text in rows.items():
+        shown = [float(number.replace("−", "-")) for number in re.findall(r"[−-]?\d+(?:\.\d+)?", text)]
+        value = getattr(LIMITS, name)
+        if name == "joint_ranges_deg":
+            assert shown == [bound for low, high in value for bound in ((high,) if -low == high else (low, high))]
+        else:
+            assert shown == list(value if isinstance(value, tuple) else (value,))
