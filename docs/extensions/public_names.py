@@ -22,8 +22,8 @@ def autodoc_directive(value: object) -> str:
 def reference(package_name: str) -> str:
     """reStructuredText: a summary table of the public names, then one autodoc entry each."""
     package = import_module(package_name)
-    parent = import_module(package_name.rpartition(".")[0] or package_name)
-    documented = set(parent.__all__) if parent is not package else set()  # on the page of the parent package
+    parent_name = package_name.rpartition(".")[0]
+    documented = getattr(import_module(parent_name), "__all__", ()) if parent_name else ()  # on the page of the parent
     names = [name for name in getattr(package, "__all__", ()) if not name.startswith("__") and name not in documented]
     values = {name: getattr(package, name) for name in names}
     modules = [name for name, value in values.items() if isinstance(value, ModuleType)]
