@@ -1,4 +1,4 @@
-"""What a tracker takes for an image that is decoded already, on one thread."""
+"""Processor time of trackers per decoded image, on one thread."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -8,42 +8,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.perception.benchmark.baselines import Follower
+from gelflow.perception.benchmark.baselines import BenchmarkTracker
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Processor time, the best of several runs: others on the machine only ever make a run slower."""
+    """Processor time, the minimum of several runs, since other processes only add to it."""
 
-    start: float  # for the first image [ms]
-    frame: float  # for each other image [ms]
+    start: float  # of the first image [ms]
+    frame: float  # of each further image [ms]
 
 
 def measure_speed(
-    followers: Mapping[str, type[Follower]],
+    trackers: Mapping[str, type[BenchmarkTracker]],
     images: Sequence[NDArray[np.uint8]],
     rest: NDArray[np.float64],
-    seen: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     rows: int,
     cols: int,
     *,
     repeats: int,
 ) -> dict[str, Speed]:
-    """Times each of `followers` on `images`, in turn, `repeats` times; the others are as in `Follower.start`."""
+    """Times each tracker on `images`, interleaved, `repeats` times; see `BenchmarkTracker.start` for the rest."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in followers}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in trackers}
     try:
         for _ in range(repeats):
-            for name, kind in followers.items():
-                follower = kind()
+            for name, kind in trackers.items():
+                tracker = kind()
                 begin = time.process_time()
-                follower.start(images[0], rest, seen, rows, cols)
+                tracker.start(images[0], rest, visible, rows, cols)
                 started = time.process_time()
                 for image in images[1:]:
-                    follower.track(image)
-                each = (time.process_time() - started) / (len(images) - 1)
-                taken[name].append((1e3 * (started - begin), 1e3 * each))
+                    tracker.track(image)
+                per_image = (time.process_time() - started) / (len(images) - 1)
+                times[name].append((1e3 * (started - begin), 1e3 * per_image))
     finally:
         cv2.setNumThreads(threads)
-    return {name: Speed(*(min(times) for times in zip(*runs, strict=True))) for name, runs in taken.items()}
+    return {name: Speed(*(min(values) for values in zip(*runs, strict=True))) for name, runs in times.items()}
