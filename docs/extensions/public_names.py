@@ -1,13 +1,20 @@
-"""Sphinx directive `public-names PACKAGE`: documents exactly the names in the package's `__all__`."""
+"""Sphinx directive `public-names PACKAGE`: documents exactly the names in the package's `__all__`.
+
+Signatures show NumPy's type aliases by their names.
+"""
 
 import inspect
+import re
 from importlib import import_module
 from types import ModuleType
 
 from docutils import nodes
+from numpy.typing import ArrayLike
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
-from sphinx.util.typing import ExtensionMetadata
+from sphinx.util.typing import ExtensionMetadata, stringify_annotation
+
+NDARRAY = r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[([^\]]*)\]\]"
 
 
 def autodoc_directive(value: object) -> str:
@@ -22,9 +29,9 @@ def autodoc_directive(value: object) -> str:
 def reference(package_name: str) -> str:
     """reStructuredText: a summary table of the public names, then one autodoc entry each."""
     package = import_module(package_name)
-    parent_name = package_name.rpartition(".")[0]
-    documented = getattr(import_module(parent_name), "__all__", ()) if parent_name else ()  # on the page of the parent
-    names = [name for name in getattr(package, "__all__", ()) if not name.startswith("__") and name not in documented]
+    parent = import_module(package_name.rpartition(".")[0] or package_name)
+    documented = set(getattr(parent, "__all__", ())) if parent is not package else set()  # on the page of the parent
+    names = [name for name in package.__all__ if not name.startswith("__") and name not in documented]
     values = {name: getattr(package, name) for name in names}
     modules = [name for name, value in values.items() if isinstance(value, ModuleType)]
     lines = [f".. automodule:: {package_name}", "   :no-members:", ""]
@@ -40,6 +47,20 @@ def reference(package_name: str) -> str:
     return "\n".join(lines)
 
 
+def name_type_aliases(
+    app: Sphinx, what: str, name: str, obj: object, options: object, signature: str | None, returns: str | None
+) -> tuple[str | None, str | None]:
+    """Handler of autodoc-process-signature: `ArrayLike` and `NDArray` instead of their definitions."""
+
+    def shorten(text: str | None) -> str | None:
+        if text is None:
+            return None
+        text = text.replace(stringify_annotation(ArrayLike, "smart"), "ArrayLike")
+        return re.sub(NDARRAY, r"NDArray[\1]", text)
+
+    return shorten(signature), shorten(returns)
+
+
 class PublicNames(SphinxDirective):
     """`.. public-names:: PACKAGE`."""
 
@@ -53,4 +74,5 @@ class PublicNames(SphinxDirective):
 def setup(app: Sphinx) -> ExtensionMetadata:
     """Register the directive."""
     app.add_directive("public-names", PublicNames)
+    app.connect("autodoc-process-signature", name_type_aliases)
     return {"parallel_read_safe": True}

@@ -148,3 +148,11 @@ def test_every_page_is_part_of_the_site() -> None:
         folder = "docs/reference/api" if page.match("docs/reference/api/gelflow*") else "docs"
         name = str(page.relative_to(folder).with_suffix("")) if page.suffix == ".md" else page.name.removesuffix(".rst")
         assert page == Path("docs/index.md") or re.search(rf"^{re.escape(name)}$", index[folder], re.MULTILINE), page
+
+
+def test_new_imports_of_moved_names_resolve() -> None:
+    page = (ROOT / "docs" / "reference" / "module_moves.md").read_text()
+    rows = re.findall(r"^\| `from \S+ import [^`]+` \| `from (\S+) import ([^`]+)` \|$", page, re.MULTILINE)
+    assert len(rows) >= 20
+    for module, names in rows:
+        assert [name for name in names.split(", ") if not hasattr(importlib.import_module(module), name)] == [], module
