@@ -1,34 +1,34 @@
-"""Every error gelflow raises, under one root.
+"""Exceptions of gelflow, with one common base class.
 
-Local misuse (a wrong argument, file or setting of ours) and a peer's misbehaviour (a device, stream or
-recording that does not do what it should) are different classes, because they call for different actions:
-fix the input, or look at the machine. The command line prints any of them as one line and exits with 2.
+Wrong input (an argument, a file, a setting) and misbehaviour of a peer (a device, a stream, a recording) are different
+classes because they need different actions: correct the input, or inspect the machine. The command line prints any of
+them as one line and exits with code 2.
 """
 
 
 class GelflowError(Exception):
-    """Root of all errors that gelflow raises on purpose."""
+    """Base class of all exceptions that gelflow raises deliberately."""
 
 
 class UsageError(GelflowError, ValueError):
-    """Something that the caller gave is wrong: a key, a file, a shape, a range."""
+    """Wrong input: a key, a file, a shape, a range."""
 
 
 class PeerError(GelflowError):
-    """A device, stream or recording did not do what its protocol promises."""
+    """A device, stream or recording violates its protocol."""
 
 
 class PeerTimeout(PeerError):
-    """A peer did not answer in time."""
+    """A peer did not answer within its time limit."""
 
 
 class PeerRefused(PeerError):
-    """A peer answered, and the answer was no (the message names its status)."""
+    """A peer rejected a request; the message contains its status."""
 
 
 class SafetyError(GelflowError):
-    """A motion was refused before a byte of it was sent, or a latched stop forbids motion."""
+    """A motion was rejected before anything was sent, or a latched stop forbids motion."""
 
 
 class SimulationError(GelflowError):
-    """The simulator could not take a step; the state is the last good one."""
+    """The simulator could not compute a step; its state is that before the step."""

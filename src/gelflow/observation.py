@@ -1,9 +1,9 @@
-"""The one observation format: the tactile frame, and the normalized flow map made from frames.
+"""The observation format: tactile frames, and the normalized flow map computed from them.
 
-Whatever made a frame (the simulator's markers, tracked markers of a camera image, a recorded session), what a
-policy sees comes through `normalize` below and nothing else. Axes on every pad: z the outward normal, x from the
-finger's base to its tip (= +rows), y = z × x (= +cols). A shear vector is the force of the object on the pad, and a
-marker's displacement has its sign. Sensor 0 is the left finger, the one at the gripper's −x.
+Frames come from the simulator, from tracked markers of camera images, or from a recorded session. Policies receive
+flow maps, and every flow map is computed by `normalize`. Axes of each pad: z is the outward normal, x points from the
+finger's base to its tip (+rows), y = z × x (+cols). A shear vector is the force of the object on the pad; a marker's
+displacement has the same sign. Sensor 0 is the left finger, at the gripper's −x side.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,14 +18,14 @@ from gelflow.errors import UsageError
 
 Unit = Literal["N", "mm", "px"]
 
-# The largest vector is never divided by less than this: a frame without contact stays near zero instead of
-# becoming a picture of its noise. About three times the noise of each kind of source.
+# Lower limit of the divisor by unit, about three times the noise of the sources with that unit. It keeps the flow map
+# of a frame without contact near zero instead of amplifying the noise.
 MIN_DIVISORS: Mapping[str, float] = MappingProxyType({"N": 3e-3, "mm": 0.02, "px": 0.3})
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid of markers on a pad: rows along x (base to tip), columns along y, centred on `center`."""
+    """A regular grid of markers on a pad: rows along x (base to tip), columns along y."""
 
     rows: int
     cols: int
@@ -45,11 +45,11 @@ class Grid:
 
 @dataclass(frozen=True)
 class TactileFrame:
-    """What all tactile sensors felt at one moment."""
+    """Marker vectors of all tactile sensors at one time."""
 
     shear: NDArray[np.float32]  # in `unit`, shape (sensors, markers, 2): x, y on the pad
-    valid: NDArray[np.bool_]  # shape (sensors, markers); a marker that was not seen is False
-    positions: NDArray[np.float32]  # of the markers on the pad at rest [mm], shape (markers, 2)
+    valid: NDArray[np.bool_]  # shape (sensors, markers); False for markers that were not measured
+    positions: NDArray[np.float32]  # marker positions on the pad at rest [mm], shape (markers, 2)
     stamp: float  # [s]
     unit: Unit
     normal: NDArray[np.float32] | None = None  # in `unit`, shape (sensors, markers), ≥ 0 in compression
@@ -69,16 +69,16 @@ class TactileFrame:
 
 @dataclass(frozen=True)
 class FlowMap:
-    """The normalized flow map of one attempt: what a policy sees."""
+    """The normalized flow map of one attempt, the observation of a policy."""
 
     image: NDArray[np.float32]  # shape (frames * sensors * 2, rows, cols); largest vector has length ≤ 1
-    divisor: float  # what the shear was divided by, in `unit`: kept, so that force stays comparable
+    divisor: float  # of the normalization, in `unit`; keeps the magnitude of the forces
     unit: Unit
-    filled: NDArray[np.bool_]  # (frames * sensors, rows, cols): True where a neighbour's value stands in
+    filled: NDArray[np.bool_]  # shape (frames * sensors, rows, cols): True for values interpolated from neighbours
 
 
 def normalize(shear: Any, reference: Any, *, min_divisor: float) -> tuple[Any, Any]:
-    """The flow map itself: the single implementation, for NumPy arrays and torch tensors alike.
+    """Normalize marker vectors to a flow map, for NumPy arrays and torch tensors.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def normalize(shear: Any, reference: Any, *, min_divisor: float) -> tuple[Any, A
     frames, sensors, rows, cols = flow.shape[-5:-1]
     lead = tuple(flow.shape[:-5])
     squared = (flow * flow).sum(-1).reshape(*lead, frames * sensors * rows * cols)
-    # The square root is taken of something that is never zero: its gradient stays finite at rest.
+    # The argument of the square root is never zero, so its gradient is finite at rest.
     largest = squared.max(-1)
     largest = largest if isinstance(largest, np.ndarray | np.generic) else largest.values
     divisor = largest.clip(min_divisor * min_divisor, None) ** 0.5
@@ -107,10 +107,10 @@ def normalize(shear: Any, reference: Any, *, min_divisor: float) -> tuple[Any, A
 
 
 def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
-    """Weights that carry marker values to `grid`: linear between markers, nearest outside their hull.
+    """Weights of the interpolation of marker values to `grid`: linear between markers, nearest outside their hull.
 
-    `positions` [mm], shape (markers, 2). Returns shape (rows * cols, markers); every row sums to 1. Where a grid
-    point lies on a marker its row selects that marker exactly, so equal grids pass through unchanged.
+    `positions` [mm], shape (markers, 2). Returns shape (rows * cols, markers); every row sums to 1. The row of a
+    grid point that coincides with a marker selects that marker exactly, so equal grids are unchanged.
     """
     points = np.asarray(positions, dtype=float)
     targets = grid.positions()
@@ -120,7 +120,7 @@ def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
     exact = distance.min(axis=1) < 1e-6 * grid.pitch
     inside = np.full(len(targets), -1)
     if not exact.all() and len(points) >= 3:
-        from scipy.spatial import Delaunay  # here: only grids that differ need it
+        from scipy.spatial import Delaunay  # deferred: only different grids need it
 
         mesh = Delaunay(points)
         inside = mesh.find_simplex(targets)
@@ -135,7 +135,7 @@ def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
 
 
 def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
-    """Shear of a frame, each invalid marker replaced by the inverse-distance mean of its 6 nearest valid ones.
+    """Shear of a frame, with invalid markers replaced by the inverse-distance mean of the 6 nearest valid markers.
 
     Returns shape (sensors, markers, 2). Raises UsageError when a sensor has fewer than 6 valid markers.
     """
@@ -144,15 +144,13 @@ def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
         if valid.all():
             continue
         if valid.sum() < 6:
-            raise UsageError(
-                f"sensor {sensor} shows {valid.sum()} valid markers of {valid.size}; at least 6 are needed"
-            )
-        lost = np.flatnonzero(~valid)
-        distance = np.linalg.norm(frame.positions[lost, None] - frame.positions[None, valid], axis=-1)
+            raise UsageError(f"sensor {sensor} has {valid.sum()} valid markers of {valid.size}; at least 6 are needed")
+        invalid = np.flatnonzero(~valid)
+        distance = np.linalg.norm(frame.positions[invalid, None] - frame.positions[None, valid], axis=-1)
         near = np.argsort(distance, axis=1)[:, :6]
         weight = 1 / np.take_along_axis(distance, near, axis=1)
         values = shear[sensor, valid][near]
-        shear[sensor, lost] = (weight[..., None] * values).sum(1) / weight.sum(1)[:, None]
+        shear[sensor, invalid] = (weight[..., None] * values).sum(1) / weight.sum(1)[:, None]
     return shear
 
 
@@ -165,7 +163,7 @@ def flow_map(
 ) -> FlowMap:
     """The normalized flow map of `frames` against `reference`, on `grid`.
 
-    Raises UsageError when frames differ in unit, sensors or markers, or a sensor lost nearly all its markers.
+    Raises UsageError when frames differ in unit, sensors or markers, or a sensor has fewer than 6 valid markers.
     """
     if not frames:
         raise UsageError("a flow map needs at least one frame")
@@ -175,7 +173,7 @@ def flow_map(
         if frame.shear.shape != reference.shear.shape:
             raise UsageError(f"a frame has shape {frame.shear.shape}, the reference {reference.shear.shape}")
         if not np.allclose(frame.positions, reference.positions, atol=1e-3):
-            raise UsageError("frames and reference have their markers in different places")
+            raise UsageError("frames and reference have different marker positions")
     weights = resampling_weights(reference.positions, grid)
     sensors = reference.shear.shape[0]
 
@@ -185,7 +183,7 @@ def flow_map(
 
     stack = np.stack([on_grid(fill_invalid(frame)) for frame in frames])
     image, divisor = normalize(stack, on_grid(fill_invalid(reference)), min_divisor=min_divisors[reference.unit])
-    touched = weights > 0
-    lost = np.stack([(~(frame.valid & reference.valid))[:, None] & touched for frame in frames]).any(-1)
-    filled = lost.reshape(len(frames) * sensors, grid.rows, grid.cols)
+    used = weights > 0
+    interpolated = np.stack([(~(frame.valid & reference.valid))[:, None] & used for frame in frames]).any(-1)
+    filled = interpolated.reshape(len(frames) * sensors, grid.rows, grid.cols)
     return FlowMap(image.astype(np.float32), float(divisor), reference.unit, filled)

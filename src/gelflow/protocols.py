@@ -1,7 +1,7 @@
-"""What the runner needs of hardware and policies. A driver, or a stand-in for one, is anything that fits.
+"""Protocols of cameras, arms, grippers and policies, which drivers and mocks implement.
 
 Units are SI: metres, radians, newtons, seconds; quaternions w x y z. Times are robot time (`gelflow.clock`).
-Every method has a time-out of its own and raises `gelflow.errors.PeerError` (or a subclass) rather than hang.
+Every method has its own time limit and raises `gelflow.errors.PeerError` (or a subclass) when it is exceeded.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from gelflow.observation import FlowMap
 
 @dataclass(frozen=True)
 class CameraImage:
-    """One frame as received: the compressed bytes are what is recorded, and decoding them is repeatable."""
+    """A camera image as received. The compressed bytes are recorded; decoding them is deterministic."""
 
     data: bytes  # JPEG or PNG
     stamp: float  # robot time of reception [s]
-    sequence: int  # counts frames received from this camera
+    sequence: int  # counts the images received from this camera
     encoding: str = "jpeg"
 
 
@@ -34,7 +34,7 @@ class ArmState:
     motors_on: bool
     running: bool  # the controller follows references
     operating_mode: str = "auto"  # "auto", "manual reduced", "manual full", "unknown"
-    fault: str = ""  # empty, or what is wrong in the controller's words
+    fault: str = ""  # empty, or the controller's description of the fault
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class GripperState:
 
 @runtime_checkable
 class Camera(Protocol):
-    """A tactile camera that is already streaming."""
+    """A tactile camera whose stream is running."""
 
     name: str
 
     def latest(self) -> CameraImage:
-        """The newest frame; raises PeerTimeout when none has come within its time-out."""
+        """The newest image. Raises PeerTimeout when none has arrived within the time limit."""
         ...
 
     def next(self, after: int, timeout: float) -> CameraImage:
-        """The first frame whose `sequence` is greater than `after`; waits up to `timeout` [s, robot time]."""
+        """The first image whose `sequence` is greater than `after`; waits at most `timeout` [s, robot time]."""
         ...
 
     def close(self) -> None: ...
@@ -69,24 +69,28 @@ class Camera(Protocol):
 
 @runtime_checkable
 class Arm(Protocol):
-    """A position-controlled arm that follows a stream of references and can be stopped in mid-move.
+    """A position-controlled arm that follows a stream of references and can be stopped during a motion.
 
-    `target` may be called at any rate; the newest reference replaces the one before and expires after
-    `lifetime` seconds, whereupon the arm holds where it is. The driver bounds each cycle's change.
+    `target` may be called at any rate. The newest reference replaces the previous one and expires after `lifetime`
+    seconds; the arm then holds its position. The driver limits the change per cycle.
     """
 
-    abortable: bool  # False: a move that was sent can not be stopped (text-protocol drivers)
+    abortable: bool  # False: a motion cannot be stopped once it was sent (text-protocol drivers)
 
-    def state(self) -> ArmState: ...
+    def state(self) -> ArmState:
+        """The newest measured state."""
+        ...
 
-    def target(self, position: NDArray[np.float64], quaternion: NDArray[np.float64], *, lifetime: float) -> None: ...
+    def target(self, position: NDArray[np.float64], quaternion: NDArray[np.float64], *, lifetime: float) -> None:
+        """Set the reference of the tool: position [m], shape (3,), and quaternion w x y z, shape (4,)."""
+        ...
 
     def hold(self) -> None:
-        """Freeze the reference where it is, within one cycle."""
+        """Keep the present reference, within one cycle."""
         ...
 
     def stop(self, reason: str) -> None:
-        """Cease sending: the controller's own time-out ends motion. Latches until `reset`."""
+        """Stop sending, so that the controller's own time limit ends the motion. Latched until `reset`."""
         ...
 
     def close(self) -> None: ...
@@ -96,19 +100,29 @@ class Arm(Protocol):
 class Gripper(Protocol):
     """A parallel gripper with force-limited grasping. Widths [m], speeds [m/s], forces [N]."""
 
-    def state(self) -> GripperState: ...
-
-    def home(self) -> None: ...
-
-    def grasp(self, *, width: float, speed: float, force: float) -> None:
-        """Close on a part; returns when it is held. Raises PeerRefused when nothing is between the fingers."""
+    def state(self) -> GripperState:
+        """The newest measured state."""
         ...
 
-    def release(self, *, width: float, speed: float) -> None: ...
+    def home(self) -> None:
+        """Reference the fingers; returns when done."""
+        ...
 
-    def move(self, *, width: float, speed: float) -> None: ...
+    def grasp(self, *, width: float, speed: float, force: float) -> None:
+        """Close on a part; returns when it is held. Raises PeerRefused when there is no part between the fingers."""
+        ...
 
-    def stop(self) -> None: ...
+    def release(self, *, width: float, speed: float) -> None:
+        """Open to release a held part; returns when done."""
+        ...
+
+    def move(self, *, width: float, speed: float) -> None:
+        """Move the fingers without a part; returns when done."""
+        ...
+
+    def stop(self) -> None:
+        """Stop the motion of the fingers."""
+        ...
 
     def close(self) -> None:
         """Announce the disconnect, then close."""
@@ -116,12 +130,12 @@ class Gripper(Protocol):
 
 
 class Policy(Protocol):
-    """Turns what was felt in one attempt into a correction of the pose."""
+    """Maps the observation of an attempt to a correction of the pose."""
 
     def reset(self) -> None:
-        """Forget everything: a new part is to be inserted."""
+        """Clear the state before a new part."""
         ...
 
     def act(self, observation: FlowMap) -> NDArray[np.float64]:
-        """One correction: (dx [m], dy [m], dtheta [rad]) of the gripper, in the gripper's frame."""
+        """The correction (dx [m], dy [m], dtheta [rad]) of the gripper in its own frame, shape (3,)."""
         ...

@@ -1,4 +1,4 @@
-"""`gelflow render`: what it writes reads back as what was drawn, and it overwrites nothing."""
+"""`gelflow render`: written files contain the rendered sequence; nothing is overwritten."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from gelflow.perception.synthetic.sequence_files import read_truth
 from gelflow.perception.synthetic.sequences import GelSequence
 
 
-def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
+def test_folder_and_video_contain_the_sequence(tmp_path: Path) -> None:
     command = "--flaws hard --set contrast=0.4 --set bridges=3 --set cut_row=yes --field twist --frames 6 --peak 0.8"
     folder, video = tmp_path / "images", tmp_path / "images.mjpeg"
     for out in (folder, video):
@@ -44,7 +44,7 @@ def test_folder_and_video_hold_the_sequence(tmp_path: Path) -> None:
         (["--peak", "9"], "a peak of 0 to 2 spacings, got 64, 60 and 9.0"),
     ],
 )
-def test_wrong_input_is_told_in_one_line(
+def test_wrong_input_is_an_error_of_one_line(
     wrong: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["render", "--out", str(tmp_path / "out"), *wrong]) == 2
@@ -53,14 +53,14 @@ def test_wrong_input_is_told_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_existing_folders_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["render", "--out", str(tmp_path), "--frames", "1"]) == 2
     assert "exists and would be overwritten" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_newer_or_other_truth_is_refused(tmp_path: Path) -> None:
+def test_files_of_a_newer_or_other_format_are_rejected(tmp_path: Path) -> None:
     np.savez(tmp_path / "newer.npz", format=2)
     with pytest.raises(UsageError, match="has format 2, this gelflow reads up to 1"):
         read_truth(tmp_path / "newer.npz")

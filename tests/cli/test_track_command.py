@@ -1,4 +1,4 @@
-"""`gelflow track` and `gelflow calibrate-camera`: what they write, what a kill leaves, what they refuse in one line."""
+"""`gelflow track` and `gelflow calibrate-camera`: written files, killed runs, errors."""
 
 import csv
 import subprocess
@@ -52,7 +52,7 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("source", ["broken.jpg", "missing.mp4", "empty", "notes.txt", "zeros.mp4", "none.mcap"])
-def test_a_source_that_is_no_image_is_told_in_one_line(source: str, tmp_path: Path) -> None:
+def test_a_source_without_images_is_an_error_of_one_line(source: str, tmp_path: Path) -> None:
     (tmp_path / "broken.jpg").write_text("not an image\n" * 50)
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.txt").write_text("sechs Gramm, 5 µm\n" * 300)
@@ -64,14 +64,14 @@ def test_a_source_that_is_no_image_is_told_in_one_line(source: str, tmp_path: Pa
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_a_stream_that_nobody_serves_is_told_in_one_line() -> None:
+def test_an_unreachable_stream_is_an_error_of_one_line() -> None:
     status, error = track("http://127.0.0.1:9/?action=stream")
     assert status == 2
     assert "Connection refused" in error
     assert error.count("\n") == 1
 
 
-def test_what_is_written_is_what_was_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_written_files_contain_the_rendered_motion(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = draw(tmp_path / "images", 12)
     fit, table, video, session = (tmp_path / name for name in ("gel.json", "t.csv", "o.mkv", "s.mcap"))
     assert main(["calibrate-camera", str(folder), "--spacing-mm", "2.2", "--out", str(fit)]) == 0
@@ -101,7 +101,7 @@ def test_what_is_written_is_what_was_drawn(tmp_path: Path, capsys: pytest.Captur
     assert same == [(a["x_px"], a["dx_px"], a["quality"]) for a in rows]
 
 
-def test_a_killed_run_leaves_files_that_can_be_read(tmp_path: Path) -> None:
+def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
     folder = draw(tmp_path / "images", 12)
     files = list(folder.iterdir())
     for number in range(12, 3000):  # far more than it will get to
@@ -124,7 +124,7 @@ def test_a_killed_run_leaves_files_that_can_be_read(tmp_path: Path) -> None:
         assert reader.counts()["/left/markers"] >= images // 50 * 50  # every 50 images it waits for the disk
 
 
-def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
     table, fit = tmp_path / "t.csv", tmp_path / "gel.json"
     assert main(["track", str(tmp_path / "blank.png"), "--out", str(table)]) == 2
@@ -150,7 +150,7 @@ def test_a_refused_start_is_drawn_and_leaves_no_empty_files(tmp_path: Path, caps
         (["--images", "0"], "--images must be at least 1"),
     ],
 )
-def test_wrong_options_are_told(
+def test_wrong_options_are_errors(
     options: list[str],
     expected: str,
     tmp_path: Path,
@@ -167,7 +167,7 @@ def test_wrong_options_are_told(
     assert expected in capsys.readouterr().err and Path("notes.csv").read_text() == "mine"
 
 
-def test_jitter_is_the_noise_and_not_the_motion() -> None:
+def test_jitter_is_the_noise_without_the_motion() -> None:
     rng = np.random.default_rng(0)
     rest = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2) * 20.0
     summary, yes = TrackingSummary(), np.ones(130, dtype=bool)

@@ -1,4 +1,4 @@
-"""Robot time: scaled, and held back by whoever must keep up with it."""
+"""Robot time: scaling, and synchronization with processes that must keep up."""
 
 import itertools
 import math
@@ -15,18 +15,18 @@ from gelflow.time_sync import CONTROLLER, SIMULATED_CELL, TimeSync
 
 @pytest.fixture
 def paced(tmp_path: Path) -> tuple[ScaledClock, ScaledClock]:
-    """The clocks of two processes of one mock robot."""
+    """Clocks of two processes of one mock robot."""
     TimeSync.create(path := str(tmp_path / "time_sync"))
     return ScaledClock(100.0, path), ScaledClock(100.0, path)
 
 
-def test_nobody_who_must_keep_up_nothing_held_back(paced: tuple[ScaledClock, ScaledClock]) -> None:
+def test_without_limits_robot_time_runs_at_full_speed(paced: tuple[ScaledClock, ScaledClock]) -> None:
     clock, _ = paced
     assert clock.now() == pytest.approx(ScaledClock(100.0).now(), abs=1.0)
     assert clock.delay == 0
 
 
-def test_robot_time_stops_at_the_nearest_limit_and_does_not_jump_after_it(
+def test_robot_time_stops_at_the_earliest_limit_and_does_not_jump_after_it(
     paced: tuple[ScaledClock, ScaledClock],
 ) -> None:
     clock, other = paced
@@ -42,7 +42,7 @@ def test_robot_time_stops_at_the_nearest_limit_and_does_not_jump_after_it(
     assert start + 0.5 <= other.now() < start + 0.5 + clock.delay
 
 
-def test_sleep_lasts_until_robot_time_has_gone_that_far(paced: tuple[ScaledClock, ScaledClock]) -> None:
+def test_sleep_waits_for_robot_time(paced: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = paced
     start = clock.now()
     clock.grant(SIMULATED_CELL, start + 0.1)
@@ -56,7 +56,7 @@ def test_sleep_lasts_until_robot_time_has_gone_that_far(paced: tuple[ScaledClock
     assert not sleeper.is_alive() and clock.now() >= start + 1.0
 
 
-def test_who_says_nothing_for_long_holds_nobody_back(
+def test_a_slot_without_grants_is_ignored_after_its_timeout(
     paced: tuple[ScaledClock, ScaledClock], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, _ = paced
@@ -67,7 +67,7 @@ def test_who_says_nothing_for_long_holds_nobody_back(
     assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
 
 
-def test_time_never_runs_back_whoever_writes_meanwhile(paced: tuple[ScaledClock, ScaledClock]) -> None:
+def test_robot_time_is_monotonic_under_concurrent_grants(paced: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = paced
     ending = threading.Event()
 
@@ -86,6 +86,6 @@ def test_time_never_runs_back_whoever_writes_meanwhile(paced: tuple[ScaledClock,
     assert all(b >= a - 1e-9 for a, b in itertools.pairwise(times))
 
 
-def test_a_mock_robot_that_has_ended_is_named(tmp_path: Path) -> None:
+def test_a_missing_time_sync_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="there is no mock robot behind"):
         ScaledClock(1.0, str(tmp_path / "gone"))

@@ -30,7 +30,7 @@ def rotation(pose: Pose) -> Rotation:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_composition_inverse_and_angles(seed: int) -> None:
+def test_composition_inverse_and_angles_agree_with_scipy(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, b = random_pose(rng), random_pose(rng)
     both = a @ b
@@ -59,7 +59,7 @@ def test_plain_floats_and_arrays_agree(seed: int) -> None:
     assert angles_between(both[0], both[1]) == pytest.approx(angle_between(both[0], both[1]))
 
 
-def test_yaw_and_nearness() -> None:
+def test_yaw_and_is_near() -> None:
     pose = Pose(np.array([1.0, 2.0, 3.0]), yaw_quaternion(-0.3))
     assert pose.yaw == pytest.approx(-0.3) and pose.tilt == 0
     other = Pose(np.array([1.0, 2.0, 3.001]), yaw_quaternion(-0.31))

@@ -48,6 +48,16 @@ def test_sending_to_a_peer_that_reads_nothing_times_out() -> None:
         messages.send("anybody?")
 
 
+def test_waiting_for_a_value() -> None:
+    messages, other = pair()
+    with pytest.raises(TimeoutError, match=r"sent nothing for 0\.05 s"):
+        messages.wait(0.05)
+    other.send(b"1\n2\n")
+    assert messages.wait(5.0) == [1, 2]
+    other.close()
+    assert messages.wait(5.0) == [] and messages.closed
+
+
 def test_exit_reason_of_a_helper_that_fails() -> None:
     helper = HelperProcess.start("gelflow.there_is_no_such_module", {})
     try:

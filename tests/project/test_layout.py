@@ -1,4 +1,4 @@
-"""The house: layout, import rules, what a wheel holds, pinned versions."""
+"""Project layout: linked folders, import rules, contents of a wheel, pinned versions."""
 
 import re
 import shutil
@@ -31,7 +31,7 @@ def test_a_folder_is_linked_into_the_package(folder: str) -> None:
     assert (ROOT / folder / "__init__.py").is_file()
 
 
-def test_the_tests_run_what_is_in_the_tree() -> None:
+def test_the_tests_import_this_source_tree() -> None:
     assert Path(gelflow.__file__).resolve() == ROOT / "src" / "gelflow" / "__init__.py"
 
 
@@ -111,12 +111,12 @@ def lint_imports(skeleton: Path, edges: list[tuple[str, str]]) -> subprocess.Com
     return result
 
 
-def test_the_import_table_allows_what_the_design_allows(skeleton: Path) -> None:
+def test_permitted_imports_pass(skeleton: Path) -> None:
     result = lint_imports(skeleton, ALLOWED)
     assert result.returncode == 0, result.stdout + result.stderr
 
 
-def test_the_import_table_refuses_everything_else(skeleton: Path) -> None:
+def test_other_imports_fail(skeleton: Path) -> None:
     result = lint_imports(skeleton, REFUSED)
     assert result.returncode == 1, result.stdout + result.stderr
     for folder, target in REFUSED:
@@ -124,7 +124,7 @@ def test_the_import_table_refuses_everything_else(skeleton: Path) -> None:
         assert f"gelflow.{source}.edge -> {target} " in result.stdout
 
 
-def test_a_wheel_holds_the_data_and_no_sources_of_the_core(tmp_path: Path) -> None:
+def test_a_wheel_contains_data_and_no_c_sources(tmp_path: Path) -> None:
     tree = tmp_path / "tree"
     skip = shutil.ignore_patterns(
         ".git", ".venv", "build", "dist", "out", "sessions", "runs", "__pycache__", ".*_cache"
@@ -144,7 +144,7 @@ def test_a_wheel_holds_the_data_and_no_sources_of_the_core(tmp_path: Path) -> No
     assert [name for name in held if "csrc" in name or name.endswith((".so", ".pyc"))] == []
 
 
-def test_every_dependency_is_pinned_and_names_no_machine() -> None:
+def test_every_dependency_is_pinned_by_version_only() -> None:
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert [line for line in lines if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][A-Za-z0-9.]*", line)] == []
     pinned = {re.sub(r"[-_.]+", "-", line.split("==")[0]).lower() for line in lines}
@@ -157,7 +157,7 @@ def test_every_dependency_is_pinned_and_names_no_machine() -> None:
     assert names - pinned == set()
 
 
-def test_help_needs_no_heavy_package() -> None:
+def test_help_imports_no_heavy_package() -> None:
     code = (
         "import sys; from gelflow.cli.main import main\n"
         "try: main(['--help'])\n"

@@ -1,4 +1,4 @@
-"""What a session file holds: written, read back by us, and read by the format's own libraries."""
+"""Session files: written by the recorder, read by gelflow and by the libraries of the format."""
 
 import contextlib
 import json
@@ -88,7 +88,7 @@ def session(tmp_path: Path) -> Path:
     return path
 
 
-def test_everything_comes_back(session: Path) -> None:
+def test_all_records_are_read_back(session: Path) -> None:
     with SessionReader(session) as reader:
         records = list(reader.records())
         by_topic = {record.topic: record for record in records}
@@ -119,7 +119,7 @@ def test_everything_comes_back(session: Path) -> None:
     assert description["lab"] == {"arm": {"port": 6510}} and "numpy" in description["versions"]
 
 
-def test_the_format_s_own_reader_and_foxglove_s_schemas_agree(session: Path) -> None:
+def test_the_mcap_library_and_the_foxglove_schemas_agree(session: Path) -> None:
     with session.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         messages: dict[str, tuple[Any, Any]] = {}
@@ -163,7 +163,7 @@ def test_chunks_are_small(tmp_path: Path) -> None:
         assert max(chunk.uncompressed_size for chunk in summary.chunk_indexes) < 64 * 1024 + 21_000
 
 
-def test_when_an_attempt_has_ended_all_of_it_is_in_the_file(tmp_path: Path) -> None:
+def test_attempt_end_stores_all_records(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         for number in range(300):
             recorder.event("tick", {"number": number})
@@ -172,7 +172,7 @@ def test_when_an_attempt_has_ended_all_of_it_is_in_the_file(tmp_path: Path) -> N
     assert recover(tmp_path / "copy.mcap", tmp_path / "b.mcap").messages == 300
 
 
-def test_what_waits_is_flushed_without_an_attempt_s_end(tmp_path: Path) -> None:
+def test_records_are_flushed_periodically(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", ScaledClock(5.0)) as recorder:
         recorder.event("tick")
         given_up = time.monotonic() + 20
@@ -185,7 +185,7 @@ def test_what_waits_is_flushed_without_an_attempt_s_end(tmp_path: Path) -> None:
     assert found == 1
 
 
-def test_many_threads_record_at_once(tmp_path: Path) -> None:
+def test_many_threads_record_concurrently(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
 
         def work(sensor: int) -> None:
@@ -214,7 +214,7 @@ class StuckClock(ScaledClock):
         return super().now()
 
 
-def test_a_full_queue_raises_and_stays_so(tmp_path: Path) -> None:
+def test_a_full_queue_raises_in_every_later_call(tmp_path: Path) -> None:
     recorder = SessionRecorder(tmp_path / "a.mcap", StuckClock(), queue_size=10).open()
     with pytest.raises(PeerError, match="10 records wait") as caught:
         for _ in range(11):
@@ -246,7 +246,7 @@ except PeerError as error:
 """
 
 
-def test_a_disk_that_takes_no_more_is_told_at_once(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_at_once(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, str(tmp_path / "a.mcap")], capture_output=True, text=True, timeout=60
     )
@@ -254,7 +254,7 @@ def test_a_disk_that_takes_no_more_is_told_at_once(tmp_path: Path) -> None:
     assert 10 < int(number) < 25 and "File too large" in message and done.stderr == ""
 
 
-def test_an_exception_closes_the_file_and_is_not_hidden(tmp_path: Path) -> None:
+def test_an_exception_closes_the_file_and_is_reraised(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         recorder.event("tick")
         raise KeyboardInterrupt
@@ -262,7 +262,7 @@ def test_an_exception_closes_the_file_and_is_not_hidden(tmp_path: Path) -> None:
         assert reader.counts() == {"/event": 1}
 
 
-def test_misuse_of_the_recorder(tmp_path: Path) -> None:
+def test_misuse_of_the_recorder_raises_usage_errors(tmp_path: Path) -> None:
     recorder = SessionRecorder(tmp_path / "a.mcap", CLOCK)
     assert not recorder.path.exists()
     with pytest.raises(UsageError, match="not open"):
@@ -289,7 +289,7 @@ def test_misuse_of_the_recorder(tmp_path: Path) -> None:
         SessionRecorder(tmp_path / "file" / "a.mcap", CLOCK).open()
 
 
-def test_a_decision_that_could_not_be_repeated_is_refused() -> None:
+def test_a_decision_that_cannot_be_recomputed_is_rejected() -> None:
     good = a_decision().to_json()
     changes: list[tuple[dict[str, Any], str]] = [
         ({"reference": [9, 2]}, "image 9 of sensor 0 in reference was never tracked"),
@@ -315,7 +315,7 @@ def write_foreign(path: Path, metadata: dict[str, str] | None) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def test_wrong_files_are_refused_in_one_line(tmp_path: Path) -> None:
+def test_wrong_files_are_rejected_with_one_line(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello, this is a text file")
     (tmp_path / "empty.mcap").touch()
     write_foreign(tmp_path / "foreign.mcap", None)
@@ -354,17 +354,17 @@ NUMBERS = st.floats(width=64) | st.integers(-(2**60), 2**60)
 
 @settings(max_examples=50)
 @given(st.recursive(NUMBERS | st.text() | st.booleans() | st.none(), lambda inner: st.lists(inner, max_size=4)))
-def test_plain_data_comes_back_bit_for_bit(value: Any) -> None:
+def test_plain_data_is_restored_bit_for_bit(value: Any) -> None:
     assert repr(json.loads(to_json(value))) == repr(to_plain(value))
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
-def test_single_precision_survives(value: float) -> None:
+def test_single_precision_is_restored_exactly(value: float) -> None:
     (back,) = json.loads(to_json(np.array([value], dtype=np.float32)))
     assert np.float32(back).tobytes() == np.float32(value).tobytes()
 
 
-def test_dataclasses_come_back() -> None:
+def test_dataclasses_are_restored() -> None:
     from gelflow.observation import Grid
 
     grid = Grid(3, 4, 1.5, (1.0, 2.0))

@@ -1,4 +1,4 @@
-"""What is left of a session whose recorder was killed, or whose disk has lied."""
+"""Recovery of sessions whose recorder was killed or whose file is damaged."""
 
 import signal
 import subprocess
@@ -58,7 +58,7 @@ def make(path: Path, messages: int = 40) -> Path:
     return path
 
 
-def test_any_cut_leaves_a_readable_beginning(tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_is_recovered_up_to_the_cut(tmp_path: Path) -> None:
     whole = make(tmp_path / "whole.mcap").read_bytes()
     cut, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
     found = []
@@ -81,7 +81,7 @@ def test_any_cut_leaves_a_readable_beginning(tmp_path: Path) -> None:
     assert list(tmp_path.glob("*.part")) == []
 
 
-def test_damage_within_a_finished_file_is_told_and_the_rest_is_salvaged(tmp_path: Path) -> None:
+def test_damage_in_a_finished_file_is_reported_and_the_rest_recovered(tmp_path: Path) -> None:
     path = make(tmp_path / "session.mcap")
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -96,7 +96,7 @@ def test_damage_within_a_finished_file_is_told_and_the_rest_is_salvaged(tmp_path
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, seed: int) -> None:
+def test_random_damage_raises_gelflow_errors_only(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     path = make(tmp_path / "session.mcap", messages=12)
     data = bytearray(path.read_bytes())
@@ -116,7 +116,7 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path: Path, seed: int) -> N
         list(reader.records())
 
 
-def test_recover_refuses_what_needs_no_help(tmp_path: Path) -> None:
+def test_undamaged_files_and_wrong_paths_are_rejected(tmp_path: Path) -> None:
     path = make(tmp_path / "session.mcap", messages=3)
     with pytest.raises(UsageError, match="nothing to recover"):
         recover(path, tmp_path / "saved.mcap")
@@ -133,7 +133,7 @@ def test_recover_refuses_what_needs_no_help(tmp_path: Path) -> None:
         recover(path, tmp_path / "text" / "new.mcap")
 
 
-def test_a_session_in_progress_is_left_alone(tmp_path: Path) -> None:
+def test_a_session_in_progress_is_rejected(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         recorder.attempt_end({"insertion": 0})
         with pytest.raises(PeerError, match="still being recorded"):
@@ -142,7 +142,7 @@ def test_a_session_in_progress_is_left_alone(tmp_path: Path) -> None:
             recover(tmp_path / "a.mcap", tmp_path / "b.mcap")
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_recover_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = make(tmp_path / "session.mcap", messages=20)
     assert main(["recover", str(path)]) == 2
     assert "nothing to recover" in capsys.readouterr().err

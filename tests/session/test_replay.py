@@ -1,4 +1,4 @@
-"""Replay: the same images in the same order give the same decisions, and any difference is found."""
+"""Replay: the same images in the same order give the same decisions; every difference is detected."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -125,7 +125,7 @@ def test_a_replay_is_identical(tmp_path: Path) -> None:
     assert len({made.action.tobytes() for made in comparisons}) == 6
 
 
-def test_the_smallest_change_of_an_action_is_found(tmp_path: Path) -> None:
+def test_a_change_of_an_action_by_one_bit_is_detected(tmp_path: Path) -> None:
     def nudge(decision: Decision) -> Decision:
         if (decision.insertion, decision.attempt) != (1, 1):
             return decision
@@ -146,7 +146,7 @@ def test_the_smallest_change_of_an_action_is_found(tmp_path: Path) -> None:
         lambda d: dataclasses.replace(d, tracked=(d.tracked[0][:1] + d.tracked[0][2:], d.tracked[1])),
     ],
 )
-def test_any_other_change_is_found(tmp_path: Path, change: Change) -> None:
+def test_every_other_change_is_detected(tmp_path: Path, change: Change) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         run_live(recorder, change=change)
     assert not any(made.identical for made in replayed(tmp_path / "a.mcap"))
@@ -161,7 +161,7 @@ def test_another_policy_and_another_tracker_differ(tmp_path: Path) -> None:
     assert all(made.flow_difference > 0 for made in replayed(tmp_path / "a.mcap", perception=swapped))
 
 
-def test_a_missing_image_is_named(tmp_path: Path) -> None:
+def test_a_missing_image_is_an_error(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         run_live(recorder, lose=23)
     with pytest.raises(PeerError, match="image 23 of sensor"):
@@ -179,7 +179,7 @@ class FussyTracker(SumTracker):
         return super().track(data)
 
 
-def test_an_image_that_the_tracker_refuses_matters_only_where_it_was_needed(tmp_path: Path) -> None:
+def test_an_image_that_the_tracker_rejects_is_an_error_only_if_required(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         run_live(recorder)
     with SessionReader(tmp_path / "a.mcap") as session:
@@ -193,7 +193,7 @@ def test_an_image_that_the_tracker_refuses_matters_only_where_it_was_needed(tmp_
         replayed(tmp_path / "a.mcap", perception=fussy)
 
 
-def test_differences() -> None:
+def test_difference_of_arrays() -> None:
     assert difference(np.array([1.0, 2.0]), np.array([1.0, 2.5])) == 0.5
     assert difference(np.array([np.nan]), np.array([np.nan])) == np.inf
     assert difference(np.zeros(2), np.zeros(3)) == np.inf
@@ -263,7 +263,9 @@ def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "session.mcap"
 
 
-def test_the_command_says_identical(real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_command_reports_identical_decisions(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     picture = tmp_path / "maps.png"
     assert main(["replay", str(real_session), "--out", str(picture)]) == 0
     out = capsys.readouterr().out
@@ -275,7 +277,7 @@ def test_the_command_says_identical(real_session: Path, capsys: pytest.CaptureFi
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
 
 
-def test_the_command_finds_another_policy(
+def test_the_command_detects_another_policy(
     real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     other = untrained(tmp_path / "other.safetensors", 2)
@@ -284,7 +286,9 @@ def test_the_command_finds_another_policy(
     assert "3 of 3 decisions differ" in out and "is not the policy that the session ran" in out
 
 
-def test_the_command_s_wrong_input(real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_command_rejects_wrong_input_with_one_line(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(real_session.read_bytes()[:-100])
     (tmp_path / "text.mcap").write_text("no session")

@@ -67,7 +67,7 @@ def _measured(scene: "Scene", repeats: int) -> "StepTimes":
 
 
 def tree(d: "Description") -> Tree:
-    """The scene's parts as a tree."""
+    """Tree of the parts of a scene."""
     gravity = " ".join(f"{g:g}" for g in d.gravity)
     root = Tree(
         f"[bold]{escape(d.scene)}[/bold]: steps of {d.step * 1e3:g} ms, {d.friction} law, gravity {gravity} m/s²"
@@ -172,7 +172,7 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
 
 
 def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_by_depth: bool) -> str:
-    """A force law in words; units as in docs/reference/conventions.md, plain damping has that of k_t."""
+    """Text of a force law; units as in docs/reference/conventions.md, plain damping has that of k_t."""
     stiffness, friction, by_depth = ("N/m³", "N s/m³", "N s/m⁴") if unit == "per area" else ("N/m", "N s/m", "N s/m²")
     words = [f"k_n {numbers['kn']:g} {stiffness}"]
     if law == "elastic":
@@ -197,13 +197,13 @@ def _size(size: "Size") -> Table:
     table.add_column("number", justify="right", no_wrap=True)
 
     def count(what: str, number: int | None) -> None:
-        table.add_row(what, "not known here" if number is None else f"{number:,}".replace(",", " "))
+        table.add_row(what, "unknown" if number is None else f"{number:,}".replace(",", " "))
 
     count("positions (nq)", size.nq)
     count("velocities, the unknowns of a step (nv)", size.nv)
     count("controls (nu)", size.nu)
     count("contact pairs: points against one geometry", size.contact_pairs)
-    count("candidate points, over all pairs", size.candidate_points)
+    count("candidate points of all pairs", size.candidate_points)
     count("anchors: memory of the elastic law", size.anchors)
     count("markers", size.markers)
     count("parameters", size.parameters)
@@ -223,7 +223,7 @@ def _times(times: "StepTimes") -> Group:
     table.add_column("share", justify="right", no_wrap=True)
 
     def row(name: str, microseconds: float) -> None:
-        # Rounded first: no −0.0 where a difference is noise.
+        # Adding 0 to the rounded value turns −0.0 into 0.0.
         table.add_row(
             escape(name), f"{round(microseconds, 1) + 0:.1f}", f"{round(100 * microseconds / times.whole) + 0:.0f} %"
         )
@@ -234,16 +234,16 @@ def _times(times: "StepTimes") -> Group:
     row("whole step", times.whole)
     if times.reading is not None:
         table.add_section()
-        row("one reading of all markers, apart from the step", times.reading)
+        row("one reading of all markers, not part of the step", times.reading)
     low, high = times.quartiles
     halved = f", {times.halved_steps} of the steps were halved" if times.halved_steps else ""
     text = (
         f"One environment, one thread of {times.machine}. Steps from {times.timed_steps} states of a run: "
-        f"{times.run_steps} steps from the scene's start, servos held there, all other controls 0. A contact or pad is "
-        "what a step takes longer when the scene has it twice, the second one without force; bodies and solver are the "
-        "rest of the whole step. So these are differences of whole steps: a few tenths of a µs are noise. Medians of "
-        f"{times.repeats} repeats in turn; half of the repeats' whole steps took {low:.1f} to {high:.1f} µs, the very "
-        f"first step {times.at_start:.1f} µs. Newton's method needed {times.newton_iterations:.2f} iterations per step"
+        f"{times.run_steps} steps from the scene's start, servos at their start positions, other controls 0. The time "
+        "of a contact or pad is the increase of the step time when the scene has it twice, once without force; "
+        "bodies and solver are the remainder. These are differences of whole steps with a noise of tenths of a µs. "
+        f"Medians of {times.repeats} interleaved repeats; half of the whole steps took {low:.1f} to {high:.1f} µs, the "
+        f"first step {times.at_start:.1f} µs. Newton's method took {times.newton_iterations:.2f} iterations per step"
         f"{halved}."
     )
     return Group(table, Padding(escape(text), (0, 0)))
