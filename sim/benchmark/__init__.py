@@ -1,10 +1,10 @@
-"""Measurements of the simulator's speed, for `gelflow bench`."""
+"""Measurements of scenes: description, speed, accuracy against speed, and instruction profile."""
 
 from gelflow.measurement import machine
 
 
 def versions() -> dict[str, str]:
-    """The versions that every measurement stores, and the build of the C++ core."""
-    from gelflow.sim._core import LEVEL  # imported here: the package can be imported before the core is built
+    """Versions stored with every measurement, and the build of the C++ core."""
+    from gelflow.sim._core import LEVEL  # deferred: the package can be imported before the core is built
 
     return {**machine.versions(), "core": LEVEL}

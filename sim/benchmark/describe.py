@@ -1,4 +1,4 @@
-"""What a scene amounts to: its parts, what was left out and why, and how large it is; `gelflow describe` prints it."""
+"""Description of a loaded scene: its parts, elements that are not modelled, and its size (`gelflow describe`)."""
 
 import ctypes
 import gc
@@ -20,22 +20,26 @@ from gelflow.toml_tables import read_toml
 
 @dataclass(frozen=True)
 class ActuatorPart:
+    """An actuator of a joint."""
+
     name: str
     kind: str  # "motor", "position", "velocity" or "general"
     gear: float
     kp: float
     kd: float
-    gain: float  # of the control; 1 but for a "general" one
+    gain: float  # factor of the control; 1 except for kind "general"
     bias: float
     force: tuple[float | None, float | None]  # [N] or [N m]; None where unlimited
-    control: tuple[float | None, float | None]  # what the control is clipped to
+    control: tuple[float | None, float | None]  # range of the control; None where unlimited
 
 
 @dataclass(frozen=True)
 class JointPart:
+    """A joint of a body."""
+
     name: str
     type: str
-    axis: tuple[float, ...] | None  # in the body's frame; None where a joint turns about all
+    axis: tuple[float, ...] | None  # in the body's frame; None for ball and free joints
     range: tuple[float, float] | None  # [m] or [rad]
     limit_stiffness: float
     damping: float
@@ -47,19 +51,19 @@ class JointPart:
 
 @dataclass(frozen=True)
 class BodyPart:
-    """A moving body, or the world, with all that is rigidly attached to it."""
+    """A moving body, or the world, with its rigidly attached bodies."""
 
     name: str
-    parent: str | None  # None: this is the world
+    parent: str | None  # None for the world
     mass: float  # [kg], of the attached bodies too; 0 for the world
-    merged: tuple[str, ...]  # bodies of the model file that became part of it
+    merged: tuple[str, ...]  # bodies of the model file that are merged into it
     geometry: tuple[str, ...]  # kind and name
     joints: tuple[JointPart, ...]
 
 
 @dataclass(frozen=True)
 class ShapePart:
-    """A geometry that is touched otherwise than as the model file has it."""
+    """A contact geometry that differs from the model file."""
 
     name: str
     kind: str  # "box", "cylinder" or "mesh"
@@ -71,6 +75,8 @@ class ShapePart:
 
 @dataclass(frozen=True)
 class ContactPart:
+    """A contact of sampled points with one or more shapes."""
+
     name: str
     points: str  # kind and name of the sampled geometry
     candidates: int  # points
@@ -83,49 +89,53 @@ class ContactPart:
 
 @dataclass(frozen=True)
 class PadPart:
+    """A tactile pad."""
+
     name: str
     body: str
     shape: str  # "rectangle", "disc", "hemisphere" or "points"
     markers: int
-    rows: int | None  # None where the markers have no rows and columns
+    rows: int | None  # None without a grid
     cols: int | None
     pitch: float | None  # [mm]
     against: tuple[str, ...]
     law: str
     unit: str
     numbers: dict[str, float]
-    collides: bool  # its markers are contact points
-    gel: str | None  # None: its markers have forces only
+    collides: bool  # the markers are contact points
+    gel: str | None  # None without a gel model
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large the scene is. Bytes are those of double precision."""
+    """Size of a scene; bytes for double precision."""
 
     nq: int
     nv: int
     nu: int
-    contact_pairs: int  # point sets against one geometry each
-    candidate_points: int  # point-geometry tests that one evaluation of the contacts may need
-    anchors: int  # memory of the elastic law: points and markers, for each geometry
+    contact_pairs: int  # pairs of a point set and a geometry
+    candidate_points: int  # largest number of point-geometry tests in an evaluation of the contacts
+    anchors: int  # friction anchors: points and markers, for each geometry
     markers: int
     parameters: int
     state_bytes: int  # per environment
     parameter_bytes: int  # per environment
     reading_bytes: int  # per environment
-    workspace_bytes: int | None  # per thread, as allocated; None where the C library cannot tell
+    workspace_bytes: int | None  # per thread, as allocated; None if the C library does not report it
     model_bytes: int | None  # shared by all environments
 
 
 @dataclass(frozen=True)
 class Description:
+    """All parts of a scene, elements that are not modelled, and its size."""
+
     scene: str
     path: str
     step: float  # [s]
     friction: str
     gravity: tuple[float, ...]  # [m/s²]
     bodies: tuple[BodyPart, ...]  # the world first
-    shapes: tuple[ShapePart, ...]  # meshes and rounded ones
+    shapes: tuple[ShapePart, ...]  # meshes and rounded shapes
     contacts: tuple[ContactPart, ...]
     pads: tuple[PadPart, ...]
     not_modelled: tuple[str, ...]
@@ -133,14 +143,14 @@ class Description:
 
 
 def describe(scene: Scene) -> Description:
-    """What is modelled of a scene, what is not and why, and how large it is.
+    """Describe a scene.
 
-    Raises UsageError when the scene's files no longer hold what it was loaded from.
+    Raises UsageError when the scene's files changed after it was loaded.
     """
     path = scene.path.parent / str(read_toml(scene.path).get("model"))
     mechanics = read_mechanics(path)
     if [b.name for b in mechanics.bodies] != [b.name for b in scene.bodies]:
-        raise UsageError(f"{path} has other bodies than the scene; load the scene again")
+        raise UsageError(f"{path} has other bodies than the loaded scene; load the scene again")
     model, _ = compile_model(path)
     bodies = _bodies(scene, mechanics, model)
     kinds = {geom.name: geom.kind for geom in mechanics.geoms}
@@ -149,7 +159,7 @@ def describe(scene: Scene) -> Description:
         path=str(scene.path),
         step=scene.step,
         friction=scene.friction,
-        gravity=_plain(scene.gravity),
+        gravity=_floats(scene.gravity),
         bodies=bodies,
         shapes=_shapes(scene),
         contacts=_contacts(scene, kinds),
@@ -176,7 +186,7 @@ def describe(scene: Scene) -> Description:
     )
 
 
-def _plain(values: Any) -> tuple[float, ...]:
+def _floats(values: Any) -> tuple[float, ...]:
     return tuple(float(x) for x in values)
 
 
@@ -185,7 +195,7 @@ def _body_name(scene: Scene, body: int) -> str:
 
 
 def _bodies(scene: Scene, mechanics: Mechanics, model: Any) -> tuple[BodyPart, ...]:
-    roots = [0, *np.flatnonzero(model.body_jntnum > 0)]  # of the file's bodies: the world, and those that move
+    roots = [0, *np.flatnonzero(model.body_jntnum > 0)]  # bodies of the file: the world, and those with joints
     file_names = element_names(model, "body", model.nbody)
     parts = []
     for index, root in zip(range(WORLD, len(scene.bodies)), roots, strict=True):
@@ -201,7 +211,7 @@ def _bodies(scene: Scene, mechanics: Mechanics, model: Any) -> tuple[BodyPart, .
                     JointPart(
                         name=joint.name,
                         type=joint.type,
-                        axis=_plain(joint.axis) if joint.type in ("slide", "hinge") else None,
+                        axis=_floats(joint.axis) if joint.type in ("slide", "hinge") else None,
                         range=joint.range,
                         limit_stiffness=limit.stiffness,
                         damping=joint.damping,
@@ -269,34 +279,34 @@ def _contacts(scene: Scene, kinds: dict[str, str]) -> tuple[ContactPart, ...]:
 
 
 def _not_modelled(scene: Scene, mechanics: Mechanics, model: Any, bodies: tuple[BodyPart, ...]) -> Iterator[str]:
-    """What the scene itself does not say of what is left out."""
+    """Elements without effect that `Scene.not_modelled` does not list, with the reason."""
     for body in bodies:
         for name in body.merged:
             merged = "" if body.parent is None else ", merged into it with its mass"
-            yield f"body {name}: rigidly attached to {body.name}{merged}; costs nothing"
+            yield f"body {name}: rigidly attached to {body.name}{merged}; no cost"
     for pad in scene.pads:
         if pad.law == "viscous":
-            yield f"pad {pad.name}: viscous markers have no memory; they cost nothing until they are read"
+            yield f"pad {pad.name}: viscous markers have no history; no cost until their forces are evaluated"
     shapes = {shape.name: shape.body for shape in scene.shapes}
     points = {p.name: p.body for p in scene.points}
-    touching = {frozenset((points[c.points], shapes[c.shape])) for c in scene.contacts}
+    contacts = {frozenset((points[c.points], shapes[c.shape])) for c in scene.contacts}
     solid = sorted({geom.body for geom in mechanics.geoms})
     apart = [
         f"{_body_name(scene, b)} and {_body_name(scene, a)}"
         for a, b in itertools.combinations(solid, 2)
-        if frozenset((a, b)) not in touching and (a == WORLD or scene.bodies[b].parent != a)
+        if frozenset((a, b)) not in contacts and (a == WORLD or scene.bodies[b].parent != a)
     ]
     if apart:
         more = f" and {len(apart) - 6} more pairs" if len(apart) > 6 else ""
-        yield f"contact between {', '.join(apart[:6])}{more}: the scene file has none; they pass through each other"
+        yield f"contact between {', '.join(apart[:6])}{more}: not in the scene file; no collision"
     drawn = {"cameras": model.ncam, "lights": model.nlight, "materials": model.nmat, "textures": model.ntex}
     if any(drawn.values()):
         yield f"{', '.join(f'{n} {what}' for what, n in drawn.items() if n)}: for drawing only"
-    yield "MuJoCo's contact and solver settings: the scene file says what touches what, and how"
+    yield "MuJoCo's contact and solver settings: replaced by those of the scene file"
 
 
 def _size(scene: Scene) -> Size:
-    Simulator(scene, threads=1).tactile()  # what is allocated once and for all is not counted below
+    Simulator(scene, threads=1).tactile()  # one-time allocations are not counted below
     gc.collect()
     before = _allocated()
     model = scene.build()
@@ -311,14 +321,14 @@ def _size(scene: Scene) -> Size:
     reading_bytes = int(model.markers) * 3 * sim.q.itemsize
     known = state_bytes + sim.params.nbytes + reading_bytes
     sizes = {p.name: len(p.points) for p in scene.points}
-    pushing = [pad for pad in scene.pads if pad.collides]
+    colliding = [pad for pad in scene.pads if pad.collides]
     return Size(
         nq=model.nq,
         nv=model.nv,
         nu=model.nu,
-        contact_pairs=len(scene.contacts) + sum(len(pad.against) for pad in pushing),
+        contact_pairs=len(scene.contacts) + sum(len(pad.against) for pad in colliding),
         candidate_points=sum(sizes[c.points] for c in scene.contacts)
-        + sum(len(pad.positions) * len(pad.against) for pad in pushing),
+        + sum(len(pad.positions) * len(pad.against) for pad in colliding),
         anchors=model.na,
         markers=model.markers,
         parameters=len(model.param_names),
@@ -331,7 +341,7 @@ def _size(scene: Scene) -> Size:
 
 
 class _Mallinfo2(ctypes.Structure):
-    """glibc's account of what the heap holds, in bytes."""
+    """Heap statistics of glibc [bytes]."""
 
     _fields_ = [
         (name, ctypes.c_size_t)
@@ -343,11 +353,11 @@ class _Mallinfo2(ctypes.Structure):
 
 
 def _allocated() -> int | None:
-    """Bytes that this process has from malloc; None without glibc 2.33 or newer."""
+    """Bytes allocated with malloc by this process; None without glibc 2.33 or newer."""
     try:
-        tell = ctypes.CDLL(None).mallinfo2
+        mallinfo2 = ctypes.CDLL(None).mallinfo2
     except (OSError, AttributeError, TypeError):
         return None
-    tell.restype = _Mallinfo2
-    info = tell()
+    mallinfo2.restype = _Mallinfo2
+    info = mallinfo2()
     return int(info.uordblks + info.hblkhd)

@@ -1,8 +1,8 @@
-"""Where the time of a step goes, on this machine; `gelflow describe` prints it.
+"""Time of a step by part of the scene, on this machine (`gelflow describe`).
 
-A part cannot be timed by leaving it out: without a contact the scene moves otherwise and Newton's method takes other
-iterations. So the scene is timed with the part *twice*. The second one has stiffness and damping 0: it is computed just
-like the first, at the same points, and changes nothing. What the step takes longer is what the part costs.
+Removing a contact changes the motion and the number of Newton iterations. Therefore the scene is timed with the part
+duplicated: the duplicate has stiffness and damping 0, is computed at the same points, and changes no result. The
+additional time of the step is the cost of the part.
 """
 
 import statistics
@@ -23,12 +23,12 @@ from gelflow.sim.simulator import Simulator
 Array = NDArray[np.float64]
 State = tuple[NDArray[Any], ...]
 
-# The run whose steps are timed: so many steps from the scene's start, of which every fifth.
+# Length of the run from the scene's start, and interval between its timed steps.
 RUN_STEPS = 100
 EVERY = 5
 
-_AGAIN = " again"  # what the second one of a part is called
-_FORCES = ("kn", "kt", "kd", "ks")  # the numbers that are 0 in it
+_DUPLICATE = " again"  # suffix of the names of duplicates
+_FORCE_PARAMS = ("kn", "kt", "kd", "ks")  # 0 in the duplicate
 
 
 @dataclass(frozen=True)
@@ -42,76 +42,76 @@ class Part:
 
 @dataclass(frozen=True)
 class StepTimes:
-    """Where the time of a step goes. Times in µs, one environment, one thread."""
+    """Times of a step and its parts [µs], one environment, one thread."""
 
     machine: str
     run_steps: int  # length of the run, from the scene's start
     timed_steps: int  # of the run
     repeats: int
-    whole: float  # a step as a user calls it, the mean over the timed steps
-    quartiles: tuple[float, float]  # of the repeats' whole steps
-    at_start: float  # the run's first step alone
+    whole: float  # one call of `Simulator.step`, mean over the timed steps
+    quartiles: tuple[float, float]  # of the whole step, over the repeats
+    at_start: float  # first step of the run
     newton_iterations: float  # per timed step
-    halved_steps: int  # of the timed ones: were taken as substeps
-    parts: tuple[Part, ...]  # add up to the whole
-    reading: float | None  # one reading of all markers, which is no part of a step; None without pads
+    halved_steps: int  # timed steps that were split into substeps
+    parts: tuple[Part, ...]  # their sum is the whole step
+    reading: float | None  # one evaluation of all tactile forces, not part of a step; None without pads
 
 
 def holding_controls(scene: Scene) -> Array:
-    """Controls that ask for nothing: servos hold where the scene starts, all else is 0. Shape (nu,)."""
+    """Controls that hold position servos at the start of the scene; others are 0. Shape (nu,)."""
     lengths = [a.gear * scene.q0[scene.joints[a.joint].q_start] for a in scene.actuators]
     servo = [a.kind == "position" for a in scene.actuators]
     return np.where(servo, lengths, 0.0)
 
 
 def with_duplicates(scene: Scene) -> list[tuple[str, Simulator]]:
-    """For each contact and each pad, its name and a simulator of the scene that has it twice, the second without force.
+    """Name of each contact and pad, and a simulator of the scene with a duplicate of it that has no force.
 
-    All of them move exactly like the scene.
+    All simulators have the motion of the scene.
     """
-    found = []
+    result = []
     for group in dict.fromkeys(c.group for c in scene.contacts):
-        twins = tuple(
-            replace(c, name=c.name + _AGAIN, group=group + _AGAIN, points=c.points + _AGAIN)
+        duplicates = tuple(
+            replace(c, name=c.name + _DUPLICATE, group=group + _DUPLICATE, points=c.points + _DUPLICATE)
             for c in scene.contacts
             if c.group == group
         )
-        # Own points too: shared ones would be in the processor's cache when the second contact comes to them.
-        names = {c.points for c in twins}
-        points = tuple(replace(p, name=p.name + _AGAIN) for p in scene.points if p.name + _AGAIN in names)
-        both = replace(scene, contacts=(*scene.contacts, *twins), points=(*scene.points, *points))
+        # Separate points: shared ones would be in the processor cache when the duplicate is evaluated.
+        names = {c.points for c in duplicates}
+        points = tuple(replace(p, name=p.name + _DUPLICATE) for p in scene.points if p.name + _DUPLICATE in names)
+        both = replace(scene, contacts=(*scene.contacts, *duplicates), points=(*scene.points, *points))
         sim = Simulator(both, threads=1)
-        for contact in twins:
-            for number in _FORCES:
+        for contact in duplicates:
+            for number in _FORCE_PARAMS:
                 sim.param(f"{contact.name}.{number}")[:] = 0
-        found.append((f"contact {group}", sim))
+        result.append((f"contact {group}", sim))
     for pad in scene.pads:
-        what = "memory of its markers" if pad.law == "elastic" else "viscous, not read"
-        both = replace(scene, pads=(*scene.pads, replace(pad, name=pad.name + _AGAIN)))
-        found.append((f"pad {pad.name}: {what}", Simulator(both, threads=1)))
-    return found
+        what = "friction anchors of its markers" if pad.law == "elastic" else "viscous, not evaluated"
+        both = replace(scene, pads=(*scene.pads, replace(pad, name=pad.name + _DUPLICATE)))
+        result.append((f"pad {pad.name}: {what}", Simulator(both, threads=1)))
+    return result
 
 
 def measure(scene: Scene, *, repeats: int = 60, done: Callable[[], None] = lambda: None) -> StepTimes:
     """Time a step and its parts.
 
-    The scene runs for `RUN_STEPS` steps from its start under `holding_controls`. Then single steps are taken from every
-    `EVERY`th of the states it went through, by the scene and by those of `with_duplicates`, in turn, again and again. A
-    step's time and the differences from it are medians over the repeats for each state, then means over the states.
+    The scene runs for `RUN_STEPS` steps from its start under `holding_controls`. Single steps from every
+    `EVERY`th state of the run are timed, in turn with the scene and with each of `with_duplicates`. Times and their
+    differences are medians over the repeats for each state, and means over the states.
 
     Parameters
     ----------
-    repeats: how often each state is stepped from
-    done: called after each of the repeats
+    repeats: timed steps from each state
+    done: called after each repeat
 
-    Raises UsageError when `repeats` is below 1, SimulationError when a step cannot be taken.
+    Raises UsageError when `repeats` is below 1, SimulationError when a step fails.
     """
     if repeats < 1:
         raise UsageError(f"repeats must be at least 1, got {repeats}")
     u = holding_controls(scene)
     twice = with_duplicates(scene)
     sims = [Simulator(scene, threads=1), *(sim for _, sim in twice)]
-    runs = [_recorded(sim, scene.q0, u) for sim in sims]
+    runs = [_record(sim, scene.q0, u) for sim in sims]
     free = Simulator(replace(scene, contacts=(), pads=()), threads=1)
     steps = np.zeros((repeats, len(sims), len(runs[0])))
     readings = np.zeros((repeats, len(runs[0])))
@@ -119,12 +119,12 @@ def measure(scene: Scene, *, repeats: int = 60, done: Callable[[], None] = lambd
     for repeat in range(repeats):
         for i, (sim, states) in enumerate(zip(sims, runs, strict=True)):
             for k, state in enumerate(states):
-                _place(sim, state)
+                _set_state(sim, state)
                 steps[repeat, i, k] = _seconds(partial(sim.step, u))
         for k, state in enumerate(runs[0]):
-            _place(sims[0], state)
+            _set_state(sims[0], state)
             readings[repeat, k] = _seconds(sims[0].tactile)
-        calls.append(_call(free, scene.q0, u))
+        calls.append(_call_overhead(free, scene.q0, u))
         done()
     typical = np.median(steps[:, 0], axis=0) * 1e6
     whole = float(typical.mean())
@@ -154,25 +154,25 @@ def _seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - clock
 
 
-def _recorded(sim: Simulator, q0: Array, u: Array) -> list[State]:
-    """States of the run at every `EVERY`th step: q, v, anchors, anchored. Raises SimulationError when it fails."""
+def _record(sim: Simulator, q0: Array, u: Array) -> list[State]:
+    """States (q, v, anchors, anchored) at every `EVERY`th step of the run. Raises SimulationError when a step fails."""
     sim.q[:] = q0
     states: list[State] = []
     for _ in range(0, RUN_STEPS, EVERY):
         states.append((sim.q.copy(), sim.v.copy(), sim.anchors.copy(), sim.anchored.copy()))
         sim.step(u, EVERY)
     sim.check()
-    sim.reset()  # iterations count from here
+    sim.reset()  # resets the iteration counts
     return states
 
 
-def _place(sim: Simulator, state: State) -> None:
+def _set_state(sim: Simulator, state: State) -> None:
     for own, recorded in zip((sim.q, sim.v, sim.anchors, sim.anchored), state, strict=True):
         own[:] = recorded
 
 
-def _call(sim: Simulator, q0: Array, u: Array) -> float:
-    """What one call costs besides the step in it [s]: many calls of a step against one call of many."""
+def _call_overhead(sim: Simulator, q0: Array, u: Array) -> float:
+    """Overhead of a call [s]: many calls of one step, minus one call of many steps."""
 
     def run(calls: int, steps: int) -> float:
         sim.reset()

@@ -1,1 +1,1 @@
-"""Checks of the simulator: gradients, energy, stress, reference motions."""
+"""Verification of the simulator: gradients, energy, stress tests, reference motions, and studies of its accuracy."""

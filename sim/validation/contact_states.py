@@ -1,7 +1,6 @@
-"""States in contact from which gradients are checked: in the middle of each scene, and on each kind of shape.
+"""Random states in contact for gradient checks: of each scene, and on each kind of shape.
 
-Newton's method goes on after it has converged, down to rounding errors: a difference of two runs must see the step, not
-the solver.
+Newton's method continues to rounding errors after convergence, so that finite differences do not contain solver errors.
 """
 
 from functools import cache
@@ -37,12 +36,12 @@ _TOPS = {
     "mesh": 0.01,
 }
 FREE = "free body"  # on a plane
-POLISH = 2  # iterations after convergence, as the runs with dual numbers have them
-STEPS = 3  # that are checked
+POLISH = 2  # Newton iterations after convergence, as in runs with dual numbers
+STEPS = 3  # length of the checked rollouts
 
 
 def converged_simulator(name: str, law: str, integrator: str) -> Simulator:
-    """A scene solved down to rounding errors; the rolling pad with 24 × 24 markers."""
+    """Simulator of a scene, solved to rounding errors; the rolling pad has 24 × 24 markers."""
     overrides = {"pads.pad.rows": 24, "pads.pad.cols": 24} if name == "rolling" else {}
     scene = load_scene(name, friction=law, overrides={**overrides, "integrator": integrator})
     spec = scene.describe_to(_core.ModelSpec())
@@ -53,9 +52,9 @@ def converged_simulator(name: str, law: str, integrator: str) -> Simulator:
 
 
 def scene_in_contact(name: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
-    """A simulator in the middle of a scene's contact, and controls (steps, nu) to go on with, drawn at random."""
+    """A simulator of a scene in contact, and random controls (steps, nu) for the rollout."""
     sim = converged_simulator(name, law, integrator)
-    hold, spread = _BEGIN[name](sim, sim.scene, rng)
+    hold, spread = _PREPARE[name](sim, sim.scene, rng)
     sim.check()
     return sim, hold + rng.normal(size=(STEPS, sim.model.nu)) * spread
 
@@ -68,9 +67,9 @@ def _rolling(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Ar
 
 
 def _insertion(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The part's edge on the rim."""
-    place = {"arm_x": 0.004, "arm_y": 0.003, "arm_z": 0.0555, "finger_left": -0.0175, "finger_right": -0.0175}
-    for joint, value in place.items():
+    """An edge of the part on the rim of the hole."""
+    positions = {"arm_x": 0.004, "arm_y": 0.003, "arm_z": 0.0555, "finger_left": -0.0175, "finger_right": -0.0175}
+    for joint, value in positions.items():
         sim.q[:, scene.q(joint)] = value
     sim.q[0, scene.q("part")][:3] = [0.004, 0.003, 0.0555]
     hold = np.zeros(scene.nu)
@@ -88,7 +87,7 @@ def _insertion(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[
 
 
 def _pushing(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The finger pushes the box off its middle."""
+    """The finger pushes the box away from its centre line."""
     sim.q[:] = scene.q0
     hold = np.zeros(scene.nu)
     hold[scene.u("gripper_x")] = 0.8
@@ -98,7 +97,7 @@ def _pushing(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Ar
 
 
 def _grasp(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The bar held off its centre of mass: still on the tables, or in the air."""
+    """The bar is grasped away from its centre of mass, still on the tables or lifted."""
     sim.param("bar.com.y")[:] = 0.02
     sim.q[:] = scene.q0
     hold = np.zeros(scene.nu)
@@ -112,7 +111,7 @@ def _grasp(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Arra
 
 
 def _dclaw(sim: Simulator, scene: Scene, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Three fingers that turn the cap."""
+    """Three fingers rotate the cap."""
     sim.q[:] = scene.q0
     bend, swing = (np.array([a.name.startswith(kind) for a in scene.actuators]) for kind in ("bend", "swing"))
     hold = scene.q0[: scene.nu].copy()
@@ -131,7 +130,7 @@ def _both(scene: Scene, what: str) -> list[int]:
 
 @cache
 def bracket_grid() -> DistanceGrid:
-    """Distances to a bracket with rounded edges, 40 mm long in 20 cells; the elbow's inner edge stays sharp."""
+    """Distance grid of a bracket with rounded edges, 40 mm in 20 cells; the inner edge of the elbow is sharp."""
     arm, thick, depth, rounding, spacing = 0.04, 0.016, 0.02, 0.004, 0.002
     low = np.array([0.0, 0.0, -depth / 2]) - 3 * spacing
     lines = [spacing * np.arange(round(length / spacing) + 7) for length in (arm, arm, depth)]
@@ -141,19 +140,16 @@ def bracket_grid() -> DistanceGrid:
     return spline_grid(distances.reshape(nodes.shape[:3]), low - [thick / 2, thick / 2, 0], spacing)
 
 
-_BEGIN = {"rolling": _rolling, "insertion": _insertion, "pushing": _pushing, "grasp": _grasp, "dclaw": _dclaw}
+_PREPARE = {"rolling": _rolling, "insertion": _insertion, "pushing": _pushing, "grasp": _grasp, "dclaw": _dclaw}
 
 
 def cloud_on_shape(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
-    """Points pressed onto one of SHAPES, or those of a FREE body; and controls to go on with, drawn at random."""
+    """A cloud of points pressed onto one of SHAPES, or of a FREE body, and random controls for the rollout."""
     return free_cloud(law, integrator, rng) if kind == FREE else pressed_cloud(kind, law, integrator, rng)
 
 
 def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
-    """A cloud of points, carried by a ball joint on a slide, pressed onto a shape that turns on a hinge.
-
-    And controls (steps, 3) to go on with, drawn at random.
-    """
+    """A cloud of points on a ball joint and slides, pressed onto a shape on a hinge, and random controls (steps, 3)."""
     spec = _core.ModelSpec()
     spec.polish = POLISH
     spec.integrator = integrator
@@ -166,12 +162,12 @@ def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator
     ]
     hand = spec.add_body("hand", carriage, (0, 0, 0.005), (1, 0, 0, 0), 0.02, (0, 0, 1e-3), (1e-5, 2e-5, 1e-5, 0, 0, 0))
     spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
-    told: dict[str, Any] = {}
+    grid_arguments: dict[str, Any] = {}
     if kind == "mesh":
         grid = bracket_grid()
-        told = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
+        grid_arguments = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
     in_core = "grid" if kind == "mesh" else kind
-    shape = spec.add_shape("shape", turret, in_core, (1e-3, 0, 0), (1, 0, 0, 0), SHAPES[kind], **told)
+    shape = spec.add_shape("shape", turret, in_core, (1e-3, 0, 0), (1, 0, 0, 0), SHAPES[kind], **grid_arguments)
     _add_cloud(spec, hand, {"press": shape}, law, rng)
     spec.add_actuator("turn", hinge, "velocity", kd=2e-3)
     spec.add_actuator("x", slides[0], "general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1)
@@ -186,12 +182,9 @@ def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator
 
 
 def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Simulator, Array]:
-    """A free cloud of points, its centre of mass off its frame, that spins on the ground and against a pusher.
-
-    And controls (steps, 1) to go on with, drawn at random.
-    """
+    """A spinning free body, centre of mass offset, on the ground and at a pusher; and random controls (steps, 1)."""
     spec = _core.ModelSpec()
-    spec.polish, spec.integrator, spec.gravity = POLISH, integrator, (0.0, 0.0, -60.0)  # or it would bounce off
+    spec.polish, spec.integrator, spec.gravity = POLISH, integrator, (0.0, 0.0, -60.0)  # strong enough to keep contact
     upright = (1.0, 0.0, 0.0, 0.0)
     body = spec.add_body(
         "body", -1, (0, 0, 0), upright, 0.05, (2e-3, -1e-3, 3e-3), (3e-6, 4e-6, 5e-6, 2e-7, -3e-7, 4e-7)
@@ -205,14 +198,14 @@ def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Sim
     spec.add_actuator("push", slide, "motor")
     sim = Simulator(_core.Model(spec))
     sim.q[0, :3] = 0, 0, 0.011
-    sim.v[0, 3:6] = rng.normal(size=3) * 60  # some 0.3 rad in a step
+    sim.v[0, 3:6] = rng.normal(size=3) * 60  # about 0.3 rad per step
     sim.step([0.3], 4)
     sim.check()
     return sim, 0.3 + rng.normal(size=(STEPS, 1)) * 0.1
 
 
 def _add_cloud(spec: Any, body: int, contacts: dict[str, int], law: str, rng: np.random.Generator) -> None:
-    """Points all around a body, in contact with shapes (by the contact's name), and markers just outside of them."""
+    """Add points around a body, their contacts with shapes (contact name → shape), and markers just outside of them."""
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
     points = spec.add_points("cloud", body, cloud, np.ones(60))

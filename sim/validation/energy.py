@@ -1,8 +1,8 @@
-"""Mechanical energy of a simulator's state, part by part: what a step may take, and must not give.
+"""Mechanical energy of a simulator's state, by kind of storage.
 
-Penalty contact stores energy, per point that is inside by d: ½ k_n d², and where the friction is elastic ½ k_s |s|²
-with s the strain from the point's anchor. The core sums forces and keeps no single point; here the same points, shapes
-and anchors are given to a second model as markers of stiffness 1, whose readings are −d n and −s.
+A penalty contact point with depth d stores ½ k_n d², and with elastic friction also ½ k_s |s|², where s is the strain
+from its anchor. The core sums forces and does not store values of single points. Therefore a second model, the probe,
+has the same points, shapes and anchors as markers of stiffness 1, whose forces are −d n and −s.
 """
 
 from dataclasses import dataclass
@@ -19,81 +19,82 @@ from gelflow.sim.validation.gradient_check import quaternion_joints
 
 Array = NDArray[np.float64]
 
-_UNBOUNDED = 1e18  # a friction coefficient that no strain reaches
+_UNBOUNDED = 1e18  # friction coefficient without slip
 
 
 class Describes(Protocol):
-    """Anything that tells a model builder its parts: a `gelflow.sim.scene.Scene`."""
+    """An object that adds its parts to a ModelSpec, such as `gelflow.sim.Scene`."""
 
     def describe_to(self, spec: Any) -> Any: ...
 
 
 @dataclass(frozen=True)
 class Energy:
-    """Parts of the mechanical energy [J], each of shape (N,). What servos and motors store or give is no part of it."""
+    """Mechanical energy [J] by kind, each of shape (N,), without the energy of servos and motors."""
 
     kinetic: Array
-    gravity: Array  # zero at height zero
-    contact: Array  # ½ k_n d² of all contact points; markers do not act on bodies and store nothing
+    gravity: Array  # zero at the origin of the world
+    contact: Array  # ½ k_n d² of all contact points; markers that do not collide store none
     friction: Array  # ½ k_s |s|² of all contact points
-    springs: Array  # of joints
-    limits: Array  # of joints beyond their range
+    springs: Array  # of joint springs
+    limits: Array  # of joint limits
 
     @property
     def total(self) -> Array:
+        """Sum of all kinds."""
         return self.kinetic + self.gravity + self.contact + self.friction + self.springs + self.limits
 
 
 class EnergyGauge:
-    """Reads the energy of simulators of one scene.
+    """Computes the energy of simulators of one scene.
 
     Parameters
     ----------
-    scene: the `Scene`, or whatever described the simulator's model
-    num_envs: of the simulators that are read
+    scene: the `Scene`, or another object that described the simulator's model
+    num_envs: number of environments of the simulators
     """
 
     def __init__(self, scene: Describes, *, num_envs: int = 1) -> None:
         self._parts = _Parts()
         scene.describe_to(self._parts)
-        self._twin = Simulator(_core.Model(self._parts.spec), num_envs=num_envs)
+        self._probe = Simulator(_core.Model(self._parts.spec), num_envs=num_envs)
 
     def read(self, sim: Simulator) -> Energy:
-        """Energy of the present state."""
+        """Energy of the present state of a simulator."""
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
         contact, friction = self._stored(sim, *self.points(sim))
         springs, limits = _joints(sim)
         return Energy(kinetic, _gravity(sim), contact, friction, springs, limits)
 
     def points(self, sim: Simulator) -> tuple[Array, Array]:
-        """Depth [m], (N, points), of all contact points, 0 outside, and strain [m], (N, points, 3), in its body's axes.
+        """Depth (N, points), 0 outside, and strain (N, points, 3) in the body's axes, of all contact points [m].
 
-        Points stand contact by contact, in the order in which they were given.
+        Points are ordered by contact, as in the scene.
         """
-        twin, numbers = self._twin, set(CONTACT_PARAMS)
-        theirs = {name: i for i, name in enumerate(sim.model.param_names)}
-        for i, name in enumerate(twin.model.param_names):
-            if name in theirs and name.rsplit(".", 1)[-1] not in numbers:
-                twin.params[:, i] = sim.params[:, theirs[name]]
-        twin.q[:], twin.v[:] = sim.q, 0
-        twin.anchored[:] = 0
+        probe, numbers = self._probe, set(CONTACT_PARAMS)
+        columns = {name: i for i, name in enumerate(sim.model.param_names)}
+        for i, name in enumerate(probe.model.param_names):
+            if name in columns and name.rsplit(".", 1)[-1] not in numbers:
+                probe.params[:, i] = sim.params[:, columns[name]]
+        probe.q[:], probe.v[:] = sim.q, 0
+        probe.anchored[:] = 0
         first = 0
         for block, count in zip(self._parts.anchors, self._parts.counts, strict=True):
             if block is not None:
-                twin.anchors[:, first : first + count] = sim.anchors[:, block : block + count]
-                twin.anchored[:, first : first + count] = sim.anchored[:, block : block + count]
+                probe.anchors[:, first : first + count] = sim.anchors[:, block : block + count]
+                probe.anchored[:, first : first + count] = sim.anchored[:, block : block + count]
             first += count
         forces = []
         for mu in (0.0, _UNBOUNDED):
-            for name in twin.model.pad_names:
-                twin.param(f"{name}.mu")[:] = mu
-            forces.append(twin.tactile() * [1.0, 1.0, -1.0])
+            for name in probe.model.pad_names:
+                probe.param(f"{name}.mu")[:] = mu
+            forces.append(probe.tactile() * [1.0, 1.0, -1.0])
         return np.linalg.norm(forces[0], axis=2), forces[0] - forces[1]
 
     def _stored(self, sim: Simulator, depth: Array, strain: Array) -> tuple[Array, Array]:
         contact, friction = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
-        for n, name in enumerate(self._twin.model.pad_names):
-            own, weights = self._twin.pad(name), self._parts.weights[n]
+        for n, name in enumerate(self._probe.model.pad_names):
+            own, weights = self._probe.pad(name), self._parts.weights[n]
             contact += 0.5 * _number(sim, name, "kn") * (depth[:, own] ** 2 @ weights)
             if self._parts.anchors[n] is not None:
                 friction += 0.5 * _number(sim, name, "ks") * ((strain[:, own] ** 2).sum(2) @ weights)
@@ -101,9 +102,9 @@ class EnergyGauge:
 
 
 def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
-    """What each actuator pulls its joint with now, under controls u (nu,), shape (N, nu) [N, N m].
+    """Joint forces of the actuators at the present state with controls u (nu,), shape (N, nu) [N, N m].
 
-    Times the way of a step it is the motor's work in it, since a step's forces are those at its end.
+    Times the displacement of a step it is the work of the actuator, since the forces of a step are those at its end.
     """
     controls, forces = np.asarray(u, float), np.zeros((sim.num_envs, scene.nu))
     for i, a in enumerate(scene.actuators):
@@ -121,26 +122,26 @@ def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
 
 
 def _number(sim: Simulator, contact: str, number: str) -> Array:
-    """Of a contact; those of a pad that pushes several shapes have the pad's."""
+    """Parameter of a contact, (N,); contacts of a pad with several shapes have those of the pad."""
     own = f"{contact}.{number}"
     return sim.param(own if own in sim.model.param_names else f"{contact.split('/')[0]}.{number}")
 
 
 def _gravity(sim: Simulator) -> Array:
-    pull = np.stack([sim.param(f"gravity.{axis}") for axis in "xyz"], axis=1)
+    gravity = np.stack([sim.param(f"gravity.{axis}") for axis in "xyz"], axis=1)
     result, poses = np.zeros(sim.num_envs), sim.poses()
     for n, name in enumerate(sim.model.body_names):
         com = np.stack([sim.param(f"{name}.com.{axis}") for axis in "xyz"], axis=1)
-        place = poses[:, n, :3] + [rotate(turn, c) for turn, c in zip(poses[:, n, 3:], com, strict=True)]
-        result -= sim.param(f"{name}.mass") * (place * pull).sum(1)
+        position = poses[:, n, :3] + [rotate(turn, c) for turn, c in zip(poses[:, n, 3:], com, strict=True)]
+        result -= sim.param(f"{name}.mass") * (position * gravity).sum(1)
     return result
 
 
 def _joints(sim: Simulator) -> tuple[Array, Array]:
     springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
-    turning = {v for _, v in quaternion_joints(sim.model)}
+    quaternions = {v for _, v in quaternion_joints(sim.model)}
     for name, q, v in zip(sim.model.joint_names, sim.model.joint_q, sim.model.joint_v, strict=True):
-        if v in turning or v + 3 in turning:  # a ball; a free joint, whose turning part comes after three numbers
+        if v in quaternions or v + 3 in quaternions:  # ball or free joint
             continue
         value = sim.q[:, q]
         springs += 0.5 * sim.param(f"{name}.stiffness") * (value - sim.param(f"{name}.springref")) ** 2
@@ -150,7 +151,7 @@ def _joints(sim: Simulator) -> tuple[Array, Array]:
 
 
 class _Parts:
-    """Takes what a scene tells a model builder, and builds the model of markers in place of contacts."""
+    """Stands in for ModelSpec: builds the probe, with markers in place of contact points."""
 
     gravity: Any
     step: float
@@ -159,8 +160,8 @@ class _Parts:
 
     def __init__(self) -> None:
         self.spec = _core.ModelSpec()
-        self.anchors: list[int | None] = []  # of each contact: its first anchor; None where it has none
-        self.counts: list[int] = []  # points
+        self.anchors: list[int | None] = []  # first anchor of each contact; None without anchors
+        self.counts: list[int] = []  # points of each contact
         self.weights: list[Array] = []
         self._anchors = 0
         self._points: list[tuple[int, Array, Array, float, dict[str, Array]]] = []
@@ -197,7 +198,7 @@ class _Parts:
 
     def add_contact(self, name: str, points: int, shape: int, *, law: str = "viscous", **numbers: Any) -> None:
         body, places, weights, radius, place = self._points[points]
-        if radius > 0:  # the sphere's lowest point against the plane: its centre against one that is higher
+        if radius > 0:  # lowest point of a sphere: its centre against a plane shifted by the radius
             owner, on, kind, pos, quat, size = self._shapes[shape]
             w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
             normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

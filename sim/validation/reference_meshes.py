@@ -1,4 +1,4 @@
-"""Closed meshes of solids whose exact distances are known: what grids are tested and measured on."""
+"""Closed meshes of solids with known exact distances, for tests and studies of distance grids."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,23 +10,23 @@ Array = NDArray[np.float64]
 
 
 def hull(points: Array) -> TriangleMesh:
-    """The convex hull of points, its triangles turned outwards."""
-    found = ConvexHull(points)
-    faces = found.simplices.astype(np.int64)
+    """Convex hull of points, with outward triangles."""
+    convex = ConvexHull(points)
+    faces = convex.simplices.astype(np.int64)
     a, b, c = (points[faces[:, i]] for i in range(3))
-    inwards = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(1) < 0
+    inwards = (np.cross(b - a, c - a) * convex.equations[:, :3]).sum(1) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     return TriangleMesh(points, faces)
 
 
 def box(half: tuple[float, float, float]) -> TriangleMesh:
-    """A box about the origin."""
+    """Box centred at the origin, with half lengths `half` [m]."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
     return hull(signs * half)
 
 
 def sphere(radius: float, count: int = 4000) -> TriangleMesh:
-    """A polyhedron with its corners on a sphere."""
+    """Polyhedron with `count` vertices on a sphere."""
     height = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     around = np.sqrt(1 - height**2)
@@ -34,12 +34,12 @@ def sphere(radius: float, count: int = 4000) -> TriangleMesh:
 
 
 def cylinder(radius: float, half_length: float, around: int = 720) -> TriangleMesh:
-    """A prism about z with its corners on a cylinder, in triangles that are not much longer than wide."""
+    """Prism about z with vertices on a cylinder, from triangles of similar edge lengths."""
     step = 2 * np.pi * radius / around
     rings, rows = round(radius / step / 4), round(2 * half_length / step / 4) + 1
     inwards = radius * np.arange(1, rings + 1) / rings
     heights = np.linspace(-half_length, half_length, rows)
-    profile = np.concatenate(  # (distance from the axis, height), from the middle of one end to that of the other
+    profile = np.concatenate(  # (distance from the axis, height), from the centre of one end to that of the other
         [
             np.column_stack([inwards[:-1], np.full(rings - 1, -half_length)]),
             np.column_stack([np.full(rows, radius), heights]),
@@ -65,7 +65,7 @@ def cylinder(radius: float, half_length: float, around: int = 720) -> TriangleMe
 
 
 def bracket(arm: float, thick: float, depth: float) -> TriangleMesh:
-    """An L: two arms from the origin along x and y, its outline extruded from −depth/2 to depth/2 along z."""
+    """L-bracket: arms from the origin along x and y, extruded from −depth/2 to depth/2 along z."""
     outline = np.array([[0, 0], [arm, 0], [arm, thick], [thick, thick], [thick, arm], [0, arm]], dtype=float)
     n = len(outline)
     ends = [np.column_stack([outline, np.full(n, z)]) for z in (-depth / 2, depth / 2)]
@@ -75,7 +75,7 @@ def bracket(arm: float, thick: float, depth: float) -> TriangleMesh:
 
 
 def bracket_distance(points: Array, arm: float, thick: float, depth: float) -> Array:
-    """Exact signed distance to `bracket`."""
+    """Exact signed distance of points (n, 3) to `bracket` [m], shape (n,)."""
     outline = np.array([[0, 0], [arm, 0], [arm, thick], [thick, thick], [thick, arm], [0, arm]], dtype=float)
     flat = points[:, :2]
     a, b = outline, np.roll(outline, -1, axis=0)
@@ -89,6 +89,6 @@ def bracket_distance(points: Array, arm: float, thick: float, depth: float) -> A
 
 
 def obj(mesh: TriangleMesh) -> str:
-    """The text of a Wavefront file."""
+    """Mesh in Wavefront OBJ format."""
     corners = "".join("v {:.17g} {:.17g} {:.17g}\n".format(*v) for v in mesh.vertices)
     return corners + "".join("f {} {} {}\n".format(*(f + 1)) for f in mesh.faces)

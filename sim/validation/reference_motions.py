@@ -1,7 +1,7 @@
-"""One motion of each scene that comes along, for measurements: touch is made, slides and sticks, breaks, is made again.
+"""Reference motions of the included scenes: contact is made, slides, sticks, breaks, and is made again.
 
-Controls are smooth functions of time, so that a motion is the same whatever the step: the controls of a step are those
-of its end.
+Controls are smooth functions of time, so that the motion does not depend on the time step. The controls of a step are
+those at its end.
 """
 
 from collections.abc import Callable
@@ -28,45 +28,45 @@ PUBLISHED_ROLLING_FORCES = (
 
 @dataclass(frozen=True)
 class ReferenceMotion:
-    """Where a scene starts, at rest, and what its actuators are told."""
+    """Start configuration, at rest, and controls over time."""
 
     q0: Array  # (nq,)
     duration: float  # [s]
-    evaluation_time: float  # when what is felt is worth a look: touch is made and held [s]
+    evaluation_time: float  # time of evaluation, while contact is held [s]
     controls: Callable[[ArrayLike], Array]  # times (K,) [s] → u (K, nu)
 
     def step_controls(self, step: float) -> Array:
-        """Controls of all steps of this length [s], (steps, nu). Raises UsageError where none fits in."""
+        """Controls of all steps of length `step` [s], (steps, nu). Raises UsageError if none fits in the duration."""
         count = round(self.duration / step)
         if count < 1:
             raise UsageError(f"a step of {step} s is longer than the motion, {self.duration} s")
         return self.controls(step * np.arange(1, count + 1))
 
-    def varied(self, size: float, pace: float) -> "ReferenceMotion":
-        """The same motion, its controls' changes `size` times as large and `pace` times as fast, for as long."""
+    def varied(self, amplitude: float, speed: float) -> "ReferenceMotion":
+        """The motion with control changes scaled by `amplitude`, `speed` times as fast, for the same duration."""
         rest = self.controls(0.0)
 
         def controls(times: ArrayLike) -> Array:
-            return rest + size * (self.controls(pace * np.asarray(times, float)) - rest)
+            return rest + amplitude * (self.controls(speed * np.asarray(times, float)) - rest)
 
-        return ReferenceMotion(self.q0, self.duration, min(self.evaluation_time / pace, self.duration), controls)
+        return ReferenceMotion(self.q0, self.duration, min(self.evaluation_time / speed, self.duration), controls)
 
 
 def reference_motion(scene: Scene) -> ReferenceMotion:
-    """The motion of a scene that comes along. Raises UsageError for another scene."""
+    """Reference motion of an included scene. Raises UsageError for another scene."""
     if scene.name not in _MOTIONS:
-        raise UsageError(f"no motion for scene {scene.name!r}; there are {', '.join(_MOTIONS)}")
+        raise UsageError(f"scene {scene.name!r} has no reference motion; there are {', '.join(_MOTIONS)}")
     return _MOTIONS[scene.name](scene)
 
 
 def _ramp(times: ArrayLike, start: float, end: float) -> Array:
-    """From 0 to 1 between two times, with a continuous slope."""
+    """Smooth ramp from 0 to 1 between two times."""
     x = np.clip((np.asarray(times, float) - start) / (end - start), 0, 1)
     return np.asarray(x * x * (3 - 2 * x))
 
 
 def _follow(scene: Scene, tracks: dict[str, list[tuple[float, float]]]) -> Callable[[ArrayLike], Array]:
-    """Controls that pass through (time, value) points, smooth ramps in between; others are 0."""
+    """Controls with smooth ramps between (time, value) points; actuators without a track have control 0."""
 
     def controls(times: ArrayLike) -> Array:
         t = np.atleast_1d(np.asarray(times, float))
@@ -82,12 +82,14 @@ def _follow(scene: Scene, tracks: dict[str, list[tuple[float, float]]]) -> Calla
 
 
 def _rolling(scene: Scene) -> ReferenceMotion:
-    """The pad comes down on the ball, rolls it, lifts off while the ball rolls on, and catches it."""
+    """The pad descends on the ball, rolls it, lifts off while the ball rolls on, and makes contact again."""
     q0 = scene.q0.copy()
-    q0[scene.q("pad_z")] = -0.0145  # half a millimetre above the ball
+    q0[scene.q("pad_z")] = -0.0145  # 0.5 mm above the ball
     ball = next(b for b in scene.bodies if b.name == "ball")
     ground = next(c for c in scene.contacts if c.name == "ball_ground")
-    q0[scene.q("ball").start + 2] += scene.gravity[2] * ball.mass / ground.params["kn"]  # it would bounce otherwise
+    q0[scene.q("ball").start + 2] += (
+        scene.gravity[2] * ball.mass / ground.params["kn"]
+    )  # static equilibrium: no bounce at the start
     tracks = {  # the pad weighs 0.245 N
         "pad_z": [(0.0, 0.18), (0.1, 0.16), (0.3, 0.16), (0.34, 0.30), (0.38, 0.30), (0.42, 0.17)],
         "pad_x": [(0.1, 0.0), (0.18, 0.1), (0.26, 0.1), (0.34, 0.04), (0.45, 0.04), (0.55, -0.05)],
@@ -97,7 +99,7 @@ def _rolling(scene: Scene) -> ReferenceMotion:
 
 
 def _pushing(scene: Scene) -> ReferenceMotion:
-    """The finger runs into the box, pushes it away and round over the ground, draws back, and pushes again."""
+    """The finger pushes and rotates the box on the ground, retracts, and pushes again."""
     tracks = {
         "gripper_x": [(0.0, 0.3), (0.1, 1.0), (0.3, 0.9), (0.34, -0.6), (0.4, -0.6), (0.44, 0.9)],
         "gripper_y": [(0.1, 0.0), (0.2, 0.3), (0.3, 0.0)],
@@ -107,7 +109,7 @@ def _pushing(scene: Scene) -> ReferenceMotion:
 
 
 def _insertion(scene: Scene) -> ReferenceMotion:
-    """A held part comes down on the rim beside its hole, slides over it, is lifted off, goes in and leans on a wall."""
+    """A grasped part descends on the rim beside its hole, slides, is lifted, inserted, and pressed on a wall."""
     q0, force, lift, shift = scene.q0.copy(), 5.0, 0.5e-3, 4.5e-3
     q0[scene.q("arm_z")] += lift
     q0[scene.q("part").start + 2] += lift
@@ -159,7 +161,7 @@ def _grasp(scene: Scene) -> ReferenceMotion:
 
 
 def _sag(scene: Scene) -> float:
-    """How far the bar sinks into its two tables [m]. If it fell there it would rattle for as long as the motion."""
+    """Static penetration of the bar into its tables [m]; without it the bar vibrates during the whole motion."""
     cloud = next(p for p in scene.points if p.name == "bar")
     kn = next(c.params["kn"] for c in scene.contacts if c.points == "bar")
     places, weights = cloud.points + scene.q0[scene.q("bar")][:3], cloud.weights * (cloud.points[:, 2] < 0)
@@ -169,7 +171,7 @@ def _sag(scene: Scene) -> float:
 
 
 def _dclaw(scene: Scene) -> ReferenceMotion:
-    """Three fingers close on the cap, turn it, open and swing back, and close again."""
+    """Three fingers close on the cap, rotate it, open, swing back, and close again."""
     q0 = scene.q0.copy()
     start = dict(zip((a.name for a in scene.actuators), q0, strict=False))
     tracks: dict[str, list[tuple[float, float]]] = {}

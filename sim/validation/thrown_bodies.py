@@ -1,4 +1,4 @@
-"""Free bodies thrown on planes, and what each step does to their energy, for measurements."""
+"""Free bodies thrown on planes, and the change of their energy in each step."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _HALF_LENGTH = 1.2 * SIZE
 
 
 def _body(kind: Kind) -> tuple[Array, Array, float]:
-    """Contact points, principal moments of inertia per kilogram [m²], radius of a moving point or 0."""
+    """Contact points, principal moments of inertia per mass [m²], and radius of a sphere's contact point or 0."""
     if kind == "sphere":
         return np.zeros((1, 3)), np.full(3, 0.4 * SIZE**2), SIZE
     if kind == "box":
@@ -37,7 +37,7 @@ def _body(kind: Kind) -> tuple[Array, Array, float]:
 
 @dataclass(frozen=True)
 class ThrownBody:
-    """A free body over a ground, and a plane that leans at 45° beside it."""
+    """A free body above a ground plane and a plane inclined by 45°."""
 
     kind: Kind
     law: str  # of friction
@@ -45,18 +45,18 @@ class ThrownBody:
     step: float  # [s]
     numbers: Mapping[str, float]  # kn, kt, mu, kd, ks per point
     integrator: str = "bdf1"
-    has_rotation: bool = True  # else it is carried by three slides
+    has_rotation: bool = True  # False: three slides instead of a free joint
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of mass, in the body's frame [m]
     tolerance: float = 1e-9  # of Newton's method
 
     @property
     def reach(self) -> float:
-        """The farthest point from the body's centre [m]."""
+        """Largest distance of a point from the body's origin [m]."""
         points, _, radius = _body(self.kind)
         return float(np.linalg.norm(points, axis=1).max()) + radius
 
     def describe_to(self, spec: Any) -> Any:
-        """Tell a model builder every part; returns it."""
+        """Add all parts to a ModelSpec; returns it."""
         points, moments, radius = _body(self.kind)
         spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), self.step, self.tolerance
         spec.integrator = self.integrator
@@ -68,7 +68,7 @@ class ThrownBody:
             for name, axis in zip("xyz", np.eye(3), strict=True):
                 spec.add_joint(name, body, "slide", still, axis)
         sampled = spec.add_points("points", body, points, np.ones(len(points)), radius=radius)
-        lean = (np.cos(np.pi / 8), 0.0, -np.sin(np.pi / 8), 0.0)  # its normal is (−1, 0, 1) / √2
+        lean = (np.cos(np.pi / 8), 0.0, -np.sin(np.pi / 8), 0.0)  # normal (−1, 0, 1) / √2
         planes = {"ground": (still, upright), "slope": ((3 * SIZE, 0.0, 0.0), lean)}
         for name, (pos, quat) in planes.items():
             plane = spec.add_shape(name, -1, "plane", pos, quat, (1.0, 1.0, 1.0))
@@ -78,29 +78,29 @@ class ThrownBody:
 
 @dataclass(frozen=True)
 class EnergyChange:
-    """What each step did; arrays (steps, N) [J] but for `halved`, of all steps but those that failed."""
+    """Energy changes of all steps, (steps, N) [J]."""
 
-    change: Array  # of the energy
-    scale: Array  # energy at work before the step: kinetic, stored, and the body's weight lifted by its reach
-    halved: NDArray[np.bool_]
-    total: Array  # (steps + 1, N): the energy itself
+    change: Array  # energy after the step minus energy before it
+    scale: Array  # energy scale before the step: kinetic, stored, and weight times reach
+    halved: NDArray[np.bool_]  # steps that were split into substeps
+    total: Array  # (steps + 1, N): energy
 
 
-def throw_bodies(throw: ThrownBody, rng: np.random.Generator, *, bodies: int, steps: int) -> EnergyChange:
+def throw_bodies(body: ThrownBody, rng: np.random.Generator, *, bodies: int, steps: int) -> EnergyChange:
     """ThrownBody bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
-    sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
-    gauge = EnergyGauge(throw, num_envs=bodies)
+    sim = Simulator(_core.Model(body.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
+    gauge = EnergyGauge(body, num_envs=bodies)
     speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)
     sim.v[:, :3] = speed * rng.normal(size=(bodies, 3))
-    if throw.has_rotation:
+    if body.has_rotation:
         turn = rng.normal(size=(bodies, 4))
         turn[: bodies // 3] = 1, 0, 0, 0
         sim.q[:, 3:] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
         sim.v[:, 3:] = speed / SIZE * rng.normal(size=(bodies, 3)) * (rng.random((bodies, 1)) < 0.8)
-    sim.q[:, 2] = throw.reach
-    for _ in range(3):  # out of the planes, or a little into them
+    sim.q[:, 2] = body.reach
+    for _ in range(3):  # to the surface of the planes
         sim.q[:, 2] += gauge.points(sim)[0].max(1)
-    sim.q[:, 2] += rng.choice([-1e-4, 0.0, 0.3 * throw.reach], bodies)
+    sim.q[:, 2] += rng.choice([-1e-4, 0.0, 0.3 * body.reach], bodies)
     rows: list[tuple[NDArray[Any], ...]] = []
     before = gauge.read(sim)
     total = [before.total]
@@ -108,8 +108,8 @@ def throw_bodies(throw: ThrownBody, rng: np.random.Generator, *, bodies: int, st
         halvings = sim.halved.copy()
         sim.step(np.zeros(0))
         after = gauge.read(sim)
-        at_work = before.kinetic + before.contact + before.friction + MASS * GRAVITY * throw.reach
-        rows.append((after.total - before.total, at_work, sim.halved > halvings))
+        scale = before.kinetic + before.contact + before.friction + MASS * GRAVITY * body.reach
+        rows.append((after.total - before.total, scale, sim.halved > halvings))
         total.append(after.total)
         before = after
     sim.check()

@@ -1,1 +1,1 @@
-"""Accuracy against computing time: `gelflow tradeoff`."""
+"""Accuracy against computing time of a scene's settings (`gelflow tradeoff`)."""

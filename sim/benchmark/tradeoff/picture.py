@@ -1,4 +1,4 @@
-"""The picture of `gelflow tradeoff`: four errors over the time that they cost, with the fronts and the presets."""
+"""Picture of the trade-off: four errors over computing time, with Pareto fronts and presets."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,34 +10,34 @@ if TYPE_CHECKING:
     from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff
 
 _PANELS = {
-    "position": "largest error of a position [m]",
-    "markers": "error of the marker field, relative",
-    "flow": "error of the flow map's vectors",
-    "gradient": "error of the gradient, relative",
+    "position": "largest position error [m]",
+    "markers": "relative error of the marker forces",
+    "flow": "mean error of flow vectors (longest = 1)",
+    "gradient": "relative error of the gradient",
 }
-_GROUPS = {  # group: what the legend says, colour, marker
-    "default": ("the scene's own numbers", "black", "D"),
+_GROUPS = {  # group → label, colour, marker
+    "default": ("scene default", "black", "D"),
     "step": ("step and integrator", "tab:blue", "o"),
     "tolerance": ("Newton's tolerance", "tab:purple", "v"),
-    "combined": ("the same, tolerance 1e-3", "tab:cyan", "s"),
-    "single": ("the same in single precision", "tab:gray", "x"),
+    "combined": ("step and integrator, tolerance 1e-3", "tab:cyan", "s"),
+    "single": ("single precision, tolerance 1e-3", "tab:gray", "x"),
     "preset": ("preset", "tab:red", "*"),
-    "reads": ("read less often", "tab:orange", "<"),
+    "reads": ("lower reading rate", "tab:orange", "<"),
     "markers": ("other markers", "tab:green", "^"),
     "contacts": ("other contact points", "tab:brown", "P"),
 }
-_LEAST = 1e-7  # what is drawn for an error of 0
+_LEAST = 1e-7  # drawn for an error of 0
 
 
 def draw(found: "Tradeoff", path: Path) -> None:
-    """Draw the picture. Raises UsageError when it can't be written."""
-    from matplotlib.figure import Figure  # here: slow to import
+    """Draw the picture to a file. Raises UsageError when it cannot be written."""
+    from matplotlib.figure import Figure  # deferred: slow to import
 
     figure = Figure(figsize=(11, 8.5), layout="constrained")
-    figure.suptitle(f"{found.scene}: error over computing time per simulated second")
+    figure.suptitle(f"{found.scene}: error over computing time")
     for axis, (name, label) in zip(figure.subplots(2, 2).flat, _PANELS.items(), strict=True):
         _panel(axis, found, name)
-        axis.set(xscale="log", yscale="log", xlabel="computing per simulated second [s]", ylabel=label)
+        axis.set(xscale="log", yscale="log", xlabel="computing time per simulated second [s]", ylabel=label)
         axis.grid(alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
@@ -58,8 +58,8 @@ def _panel(axis: Any, found: "Tradeoff", name: str) -> None:
         if chosen:
             x, y = zip(*chosen, strict=True)
             axis.plot(x, y, marker, color=color, ms=5, alpha=0.75, label=label, ls="")
-    same_world = [p for p, of in zip(points, groups, strict=True) if of not in ("single", "markers", "contacts")]
-    axis.plot(*zip(*front(same_world), strict=True), "k-", lw=0.8, alpha=0.6, label="front")
+    comparable = [p for p, of in zip(points, groups, strict=True) if of not in ("single", "markers", "contacts")]
+    axis.plot(*zip(*front(comparable), strict=True), "k-", lw=0.8, alpha=0.6, label="front")
     axis.margins(0.1)
     named = [
         (n, point) for measurement, point in zip(found.measurements, points, strict=True) for n in measurement.presets
@@ -70,7 +70,7 @@ def _panel(axis: Any, found: "Tradeoff", name: str) -> None:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points that no other one is left of and below, from left to right."""
+    """Pareto front of points (time, error): those without another point of less time and error, by time."""
     found: list[tuple[float, float]] = []
     for point in sorted(points):
         if not found or point[1] < found[-1][1]:

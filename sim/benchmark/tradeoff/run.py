@@ -1,8 +1,8 @@
-"""One scene's motion as a user steps and reads it: what came of it, how far off that is, and what it took.
+"""A scene's reference motion with given settings: results, errors relative to a reference, and computing time.
 
-Whatever the time step, controls are those of the motion every 10 ms, and markers are read then, or at every second,
-fourth, … of these times; in between a user has the last reading in hand. So all settings solve one and the same
-problem, and one call of the core steps from one reading to the next.
+For every time step, controls change every 10 ms (a frame), and marker forces are evaluated every one, two, four, …
+frames; in between the last forces are held. All settings therefore solve the same problem, with one call of the core
+per frame.
 """
 
 import time
@@ -23,49 +23,51 @@ from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
 
-FRAME = 10e-3  # between two controls, and at least between two readings [s]
-DRAWN = 1.5  # stiffness, friction and masses are drawn up to this many times larger or smaller
-WINDOW = 8  # frames before the look: over which the loss is, and by whose controls it is differentiated
-_FLOOR = 0.1  # of a run's largest shear, see `_flow`
+FRAME = 10e-3  # interval of controls, and shortest interval of tactile forces [s]
+SPREAD = 1.5  # largest factor of sampled stiffness, friction and masses
+WINDOW = 8  # frames before the evaluation: those of the loss, and of the differentiated controls
+_FLOOR = 0.1  # minimum divisor relative to the largest shear, see `_flow`
 _STATE = ("q", "v", "anchors", "anchored", "history")
 
 
 @dataclass(frozen=True)
-class Run:
-    """What one run came to, at the start and after each frame."""
+class MotionResult:
+    """Results of one motion, at the start and after each frame."""
 
     poses: Array  # of all bodies (frames + 1, bodies, 7)
-    field: Array  # what the markers felt when last read, over their weights (frames + 1, markers, 3)
-    gradient: Array | None  # of the tactile loss by the controls, times their spread (WINDOW, controls that change)
-    look: int  # frame of the motion's look
-    iterations: int  # of Newton's method
-    halved: int  # steps that had to be halved
+    field: Array  # last evaluated marker forces over their weights (frames + 1, markers, 3)
+    gradient: (
+        Array | None
+    )  # of the tactile loss with respect to controls, times their standard deviation (WINDOW, changing controls)
+    look: int  # frame of the motion's evaluation time
+    iterations: int  # Newton iterations
+    halved: int  # steps that were split into substeps
 
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a run is off, at most over all frames where nothing else is said."""
+    """Errors relative to a reference; maxima over all frames unless stated otherwise."""
 
-    position: float  # of any body [m]
-    rotation: float  # of any body [rad]
-    markers: float  # of the marker field, over all frames: ‖T − T*‖ / ‖T*‖
-    flow: float  # endpoint error of the flow map at the look: mean length of what its vectors are off; the longest is 1
-    cosine: float  # between the gradients of the tactile loss by all controls
+    position: float  # largest of any body [m]
+    rotation: float  # largest of any body [rad]
+    markers: float  # marker forces over all frames: ‖T − T*‖ / ‖T*‖
+    flow: float  # mean endpoint error of the flow map at the evaluation time; the longest vector is 1
+    cosine: float  # between the gradients of the tactile loss with respect to all controls
     gradient: float  # of that gradient: ‖g − g*‖ / ‖g*‖
 
     def worst(self, other: "Errors") -> "Errors":
-        """Of both, the worse in each figure."""
+        """The larger error in each quantity."""
         pairs = {name: (mine, vars(other)[name]) for name, mine in vars(self).items()}
         return Errors(**{name: min(pair) if name == "cosine" else max(pair) for name, pair in pairs.items()})
 
 
-class Task:
-    """A scene's motion, ready to be run again and again.
+class MotionBenchmark:
+    """The reference motion of a scene, for repeated runs.
 
     Parameters
     ----------
-    scene: one with a motion; its step must divide 10 ms
-    every: markers are read after every so many frames
+    scene: scene with a reference motion; its step must divide 10 ms
+    every: frames between evaluations of marker forces
 
     Raises UsageError when the step does not divide a frame.
     """
@@ -83,9 +85,9 @@ class Task:
         self._weights = weights[:, None]
 
     def seconds(self) -> float:
-        """Run once, for the processor's time that stepping and reading take [s]: what else runs here counts less so.
+        """Processor time of one run [s]; less sensitive to other processes than wall-clock time.
 
-        Raises SimulationError where a step can't be taken.
+        Raises SimulationError when a step fails.
         """
         sim = self._at_start()
         begun = time.thread_time()
@@ -97,10 +99,10 @@ class Task:
         sim.check()
         return spent
 
-    def run(self, *, onto: Scene | None = None, gradient: bool = True) -> Run:
-        """Run once, for what comes of it; the marker field on the markers of `onto`.
+    def run(self, *, onto: Scene | None = None, gradient: bool = True) -> MotionResult:
+        """Results of one run; with `onto`, marker forces are interpolated to the markers of that scene.
 
-        Raises SimulationError where a step can't be taken.
+        Raises SimulationError when a step fails.
         """
         sim = self._at_start()
         iterations, halved = int(sim.iterations[0]), int(sim.halved[0])
@@ -112,7 +114,7 @@ class Task:
             poses.append(sim.poses()[0].copy())
             fields.append(self._read() if frame % self.every == 0 else fields[-1])
         sim.check()
-        return Run(
+        return MotionResult(
             poses=np.array(poses, float),
             field=np.array(fields if onto is None else _resampled(fields, self.scene.pads, onto.pads)),
             gradient=self._gradient(starts, fields) if gradient else None,
@@ -130,10 +132,10 @@ class Task:
         return np.asarray(self.sim.tactile()[0] / self._weights, float)
 
     def _gradient(self, starts: Mapping[int, Mapping[str, NDArray[Any]]], fields: Sequence[Array]) -> Array:
-        """Of the mean square of the field over the frames before the look, by the controls of the same frames.
+        """Gradient of the mean square of the marker forces over the window, with respect to the controls in the window.
 
-        Frames are gone back over one by one, from the states at their starts: the whole trajectory of short steps would
-        not fit into memory.
+        The reverse pass goes frame by frame, from stored initial states, because the whole trajectory of short steps
+        does not fit into memory.
         """
         sim = self.sim
         scale = 2 / (WINDOW * len(self._weights))
@@ -145,7 +147,7 @@ class Task:
             start: dict[str, Any] = {**starts[frame]}
             trajectory = sim.rollout(u, **start, read_after=(self.steps,) if reads else ())
             held = min(self.every, self.look - frame + 1)
-            felt = scale * held * fields[frame] / self._weights if reads else None
+            by_tactile = scale * held * fields[frame] / self._weights if reads else None
             at_end = {name: np.zeros(getattr(trajectory, name).shape) for name in ("q", "v")}
             for name, values in at_end.items():
                 values[-1] = later.get(name, 0)
@@ -153,7 +155,7 @@ class Task:
                 trajectory,
                 q=at_end["q"],
                 v=at_end["v"],
-                tactile=felt,
+                tactile=by_tactile,
                 anchors_end=later.get("anchors"),
                 history_end=later.get("history"),
             )
@@ -163,14 +165,15 @@ class Task:
         return np.asarray(np.array(rows)[:, spread > 0] * spread[spread > 0], float)
 
 
-def drawn(scene: Scene, rng: np.random.Generator) -> Scene:
-    """The scene with another physics: stiffness (damping along with it) and friction of each contact and pad, and the
-    mass of each body, times factors between 1/1.5 and 1.5. One state of `rng` gives one physics, whatever the step.
+def randomized(scene: Scene, rng: np.random.Generator) -> Scene:
+    """The scene with sampled physics: stiffness and damping, friction, and masses times factors between 1/1.5 and 1.5.
 
-    Bodies with pads keep their mass: motions push them with forces that are meant for it."""
+    The sample depends on the state of `rng` only, not on the scene's settings. Bodies with pads keep their mass, for
+    which the forces of the reference motions are chosen.
+    """
 
     def factor() -> float:
-        return float(np.exp(rng.uniform(-1, 1) * np.log(DRAWN)))
+        return float(np.exp(rng.uniform(-1, 1) * np.log(SPREAD)))
 
     def numbers(old: Mapping[str, float], stiffness: float, friction: float) -> dict[str, float]:
         return {name: value * (friction if name == "mu" else stiffness) for name, value in old.items()}
@@ -189,19 +192,19 @@ def drawn(scene: Scene, rng: np.random.Generator) -> Scene:
     )
 
 
-def compare(run: Run, truth: Run) -> Errors:
-    """How far a run is off the truth, both on the same markers. Gradients that were not asked for count as right."""
-    shift = np.linalg.norm(run.poses[..., :3] - truth.poses[..., :3], axis=-1)
-    flow = _flow(run, truth) - _flow(truth, truth)
+def compare(run: MotionResult, reference: MotionResult) -> Errors:
+    """Errors of a run relative to a reference on the same markers; a missing gradient has no error."""
+    shift = np.linalg.norm(run.poses[..., :3] - reference.poses[..., :3], axis=-1)
+    flow = _flow(run, reference) - _flow(reference, reference)
     cosine, gradient = 1.0, 0.0
-    if run.gradient is not None and truth.gradient is not None:
-        sizes = float(np.linalg.norm(run.gradient) * np.linalg.norm(truth.gradient))
-        cosine = float((run.gradient * truth.gradient).sum()) / sizes if sizes > 0 else 0.0
-        gradient = _relative(run.gradient, truth.gradient)
+    if run.gradient is not None and reference.gradient is not None:
+        sizes = float(np.linalg.norm(run.gradient) * np.linalg.norm(reference.gradient))
+        cosine = float((run.gradient * reference.gradient).sum()) / sizes if sizes > 0 else 0.0
+        gradient = _relative(run.gradient, reference.gradient)
     return Errors(
         position=float(shift.max()),
-        rotation=float(angles_between(run.poses[..., 3:], truth.poses[..., 3:]).max()),
-        markers=_relative(run.field[1:], truth.field[1:]),
+        rotation=float(angles_between(run.poses[..., 3:], reference.poses[..., 3:]).max()),
+        markers=_relative(run.field[1:], reference.field[1:]),
         flow=float(np.linalg.norm(flow, axis=-1).mean()),
         cosine=cosine,
         gradient=gradient,
@@ -213,22 +216,22 @@ def _relative(found: Array, true: Array) -> float:
     return off / size if size > 0 else (0.0 if off == 0 else np.inf)
 
 
-def _flow(run: Run, truth: Run) -> Array:
+def _flow(run: MotionResult, reference: MotionResult) -> Array:
     """The vectors of the flow map at the look, against the start, (markers, 2).
 
     Where all forces of a scene are small, a tenth of the largest is the floor, instead of the noise of a real sensor.
     """
-    shear = np.linalg.norm(truth.field[..., :2] - truth.field[0, :, :2], axis=-1)
+    shear = np.linalg.norm(reference.field[..., :2] - reference.field[0, :, :2], axis=-1)
     floor = min(MIN_DIVISORS["N"], _FLOOR * float(shear.max()))
     one = (1, -1, 1, 2)  # sensors, rows, columns: how markers are arranged makes no difference to the vectors
     image, _ = normalize(
-        run.field[truth.look, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), min_divisor=floor
+        run.field[reference.look, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), min_divisor=floor
     )
     return np.asarray(image).reshape(2, -1).T
 
 
 def _resampled(fields: Sequence[Array], pads: Sequence[PadDef], onto: Sequence[PadDef]) -> Array:
-    """Fields on the markers of other pads: linear between four markers, nearest beyond the outermost."""
+    """Marker forces interpolated to other pads: bilinear, constant outside of the grid."""
     parts, first = [], 0
     for pad, other in zip(pads, onto, strict=True):
         values = np.array([field[first : first + len(pad.positions)] for field in fields])
@@ -238,8 +241,8 @@ def _resampled(fields: Sequence[Array], pads: Sequence[PadDef], onto: Sequence[P
                 (np.arange(n) - (n - 1) / 2) * pad.grid.pitch + middle
                 for n, middle in zip((pad.grid.rows, pad.grid.cols), pad.grid.center, strict=True)
             ]
-            by_place = values.reshape(len(fields), pad.grid.rows, pad.grid.cols, 3).transpose(1, 2, 0, 3)
-            places = np.clip(other.grid.positions(), [a[0] for a in along], [a[-1] for a in along])
-            values = RegularGridInterpolator(along, by_place)(places).transpose(1, 0, 2)
+            by_row = values.reshape(len(fields), pad.grid.rows, pad.grid.cols, 3).transpose(1, 2, 0, 3)
+            positions = np.clip(other.grid.positions(), [a[0] for a in along], [a[-1] for a in along])
+            values = RegularGridInterpolator(along, by_row)(positions).transpose(1, 0, 2)
         parts.append(values)
     return np.concatenate(parts, axis=1)

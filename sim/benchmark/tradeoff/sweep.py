@@ -1,7 +1,7 @@
-"""What accuracy costs: a scene's motion under many settings, each with its time and its errors.
+"""Computing time and errors of a scene's reference motion for many settings.
 
-A setting is what `load_scene` takes as overrides, and how often markers are read. Errors are differences to a
-reference, BDF2 with a step so short that one more halving changes next to nothing; by how much is measured and kept.
+A setting consists of overrides of `load_scene` and the interval between evaluations of marker forces. Errors are
+relative to a reference with BDF2 and a very short step; the change by the last halving of its step is measured, too.
 """
 
 import math
@@ -14,22 +14,23 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import SimulationError
-from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, Run, Task, compare, drawn
+from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, MotionBenchmark, MotionResult, compare, randomized
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.validation.reference_motions import reference_motion
 from gelflow.toml_tables import read_toml
 
-STEPS = (1, 2, 4, 8, 16, 32)  # that a frame of 10 ms is cut into: 10 to 0.3125 ms
+STEPS = (1, 2, 4, 8, 16, 32)  # steps per frame of 10 ms: steps of 10 to 0.3125 ms
 TOLERANCES = (1e-2, 1e-3, 1e-5, 1e-9)
 LOOSE = 1e-3  # Newton's tolerance where settings are combined
-EVERY = (2, 4, 8)  # frames between readings
-CONTACTS = (0.5, 1, 2)  # contact points along a length, against the scene's own
-FINE, COARSE = (9, 6), (7, 4)  # halvings of a frame for the references: of the scene, and with dense points; quick ones
-DENSE = 4  # contact points along a length in the reference of those settings
+EVERY = (2, 4, 8)  # frames between evaluations of marker forces
+CONTACTS = (0.5, 1, 2)  # density of contact points along a length, relative to the scene
+FINE, COARSE = (9, 6), (7, 4)  # halvings of a frame in the references: of the scene, and with dense contact points
+DENSE = 4  # density of contact points in the reference of settings with other contact points
 EXACT = {"integrator": "bdf2", "tolerance": 1e-10, "precision": "double"}
-_CORNERS = 8  # points that are the corners of a box stay: they are no sample of a surface
-_APART = ("single", "markers", "contacts")  # other arrays, readings or physics: they make no other setting needless
-_EQUAL, _BETTER = 1.02, 0.9  # figures within 2 % are the same; one by 10 % lower is better
+_CORNERS = 8  # the corners of a box are no samples of a surface, and are kept
+# Groups with other arrays, outputs or physics, which do not dominate settings of other groups.
+_SEPARATE = ("single", "markers", "contacts")
+_EQUAL, _BETTER = 1.02, 0.9  # figures within 2 % count as equal, and 10 % lower as better
 
 GROUPS = ("default", "step", "tolerance", "combined", "single", "reads", "markers", "contacts", "preset")
 
@@ -38,50 +39,53 @@ Overrides = dict[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to simulate a scene."""
+    """Settings of a simulation."""
 
     name: str
-    group: str  # what is varied, one of GROUPS
+    group: str  # varied quantity, one of GROUPS
     overrides: Mapping[str, Any]
-    every: int = 1  # frames of 10 ms between two readings
+    every: int = 1  # frames between evaluations of marker forces
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A setting, what it costs and how far it is off."""
+    """Computing time and errors of one setting."""
 
     setting: Setting
-    presets: tuple[str, ...]  # of the scene that are this setting
-    seconds: float  # of the processor's time per simulated second, one environment and one thread; median
+    presets: tuple[str, ...]  # presets of the scene that equal this setting
+    seconds: float  # median processor time per simulated second, one environment, one thread
     errors: Errors
-    iterations: float  # of Newton's method, per step
-    dominated_by: str | None  # a setting that is no worse in anything, and better in something
+    iterations: float  # Newton iterations per step
+    dominated_by: str | None  # a setting that is not worse in any figure, and better in one
 
     @property
     def speed(self) -> float:
-        """Times faster than real time."""
+        """Simulated seconds per second."""
         return 1 / self.seconds
 
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """All settings of a scene, in the order in which they were varied."""
+    """Measurements of all settings of a scene."""
 
     scene: str
     measurements: tuple[Measurement, ...]
-    failed: Mapping[str, str]  # setting → why it could not be run
+    failed: Mapping[str, str]  # setting → reason of failure
     reference_step: float  # [s]
-    changes: Mapping[str, Errors]  # reference → what it changed by when its step was halved for the last time
+    changes: Mapping[str, Errors]  # reference → change by the last halving of its step
     repeats: int
 
 
 def settings(scene: str | Path, *, quick: bool = False) -> list[Setting]:
-    """What is tried on a scene: one factor at a time, and step, integrator, tolerance and precision together."""
+    """Settings to measure: one factor at a time, and combinations of step, integrator, tolerance and precision."""
     own = load_scene(scene)
     cuts = STEPS[::2] if quick else STEPS
     timed = [_timed(integrator, cut, {}) for integrator in ("bdf1", "bdf2") for cut in cuts]
-    mine = {"step": own.step, "integrator": own.integrator}
-    found = [Setting(f"{_words(mine)} (default)", "default", {}), *(s for s in timed if s.overrides != mine)]
+    scene_values = {"step": own.step, "integrator": own.integrator}
+    found = [
+        Setting(f"{_words(scene_values)} (default)", "default", {}),
+        *(s for s in timed if s.overrides != scene_values),
+    ]
     for tolerance in TOLERANCES:
         found.append(Setting(f"tolerance {_power(tolerance)}", "tolerance", {"tolerance": tolerance}))
     for precision in ("double", "single"):
@@ -117,7 +121,7 @@ def _power(number: float) -> str:
 
 
 def _markers(scene: Scene) -> dict[str, Overrides]:
-    """Coarser and finer grids on the same place: of the same area, or with the same outermost markers."""
+    """Overrides for coarser and finer marker grids of the same area, or with the same outermost markers."""
     grid = scene.pads[0].grid
     if grid is None or any(pad.grid is None for pad in scene.pads):
         return {}
@@ -140,10 +144,9 @@ def _markers(scene: Scene) -> dict[str, Overrides]:
 
 
 def contact_density(scene: Scene, density: float) -> Overrides:
-    """Overrides that sample all contact points `density` times as densely along a length, their stiffness per area.
+    """Overrides with `density` times the contact points along a length, and stiffness per area.
 
-    Where it is per point, the contacts' numbers are divided by the area that one of the scene's own points stands for,
-    so that all points together are as stiff as before.
+    Parameters per point are divided by the area of a point of the scene, so that the total stiffness is unchanged.
     """
     data = read_toml(scene.path)
     found: Overrides = {}
@@ -173,56 +176,56 @@ def contact_density(scene: Scene, density: float) -> Overrides:
 
 def reference(
     scene: str | Path, halvings: int, more: Mapping[str, Any] | None = None, *, seed: int | None = None
-) -> Run:
-    """The scene's motion by BDF2 with a frame of 10 ms halved so many times, the physics as in the file or drawn."""
+) -> MotionResult:
+    """Reference result: BDF2 with steps of 10 ms / 2^halvings; physics of the file, or sampled with `seed`."""
     return simulated(scene, {**(more or {}), **EXACT, "step": FRAME / 2**halvings}, seed=seed)
 
 
-def simulated(scene: str | Path, overrides: Mapping[str, Any], *, seed: int | None = None) -> Run:
-    """The scene's motion under overrides, the physics as in the file or drawn with this seed."""
+def simulated(scene: str | Path, overrides: Mapping[str, Any], *, seed: int | None = None) -> MotionResult:
+    """Result with overrides; physics of the file, or sampled with `seed`."""
     loaded = load_scene(scene, overrides=overrides)
-    return Task(loaded if seed is None else drawn(loaded, np.random.default_rng(seed))).run()
+    return MotionBenchmark(loaded if seed is None else randomized(loaded, np.random.default_rng(seed))).run()
 
 
 def measure(
     scene: str | Path, *, quick: bool = False, repeats: int = 9, done: Callable[[str, float], None] = lambda *_: None
 ) -> Tradeoff:
-    """Try all settings of a scene and its presets.
+    """Measure all settings of a scene and its presets.
 
     Parameters
     ----------
-    scene: name of a scene that comes along
+    scene: name of an included scene
     quick: fewer settings, a coarser reference
-    repeats: timed runs of each setting, all settings in turn, of which the median counts
-    done: told what is being done, and which share of all
+    repeats: timed runs of each setting, interleaved; the median is reported
+    done: called with the present task and the completed share
 
-    Raises UsageError for a scene without a motion.
+    Raises UsageError for a scene without a reference motion.
     """
     own = load_scene(scene)
-    reference_motion(own)  # raises where there is none
+    reference_motion(own)  # raises for a scene without one
     halvings = COARSE if quick else FINE
-    truths, changes = _references(own, scene, halvings, lambda share: done("reference", 0.3 * share))
-    tried, presets = _with_presets(own, settings(scene, quick=quick))
-    tasks: dict[str, Task] = {}
+    references, changes = _references(own, scene, halvings, lambda share: done("reference", 0.3 * share))
+    all_settings, presets = _with_presets(own, settings(scene, quick=quick))
+    tasks: dict[str, MotionBenchmark] = {}
     errors: dict[str, Errors] = {}
     iterations, failed = {}, {}
-    for at, setting in enumerate(tried):
-        task = Task(load_scene(scene, overrides=setting.overrides), every=setting.every)
+    for at, setting in enumerate(all_settings):
+        task = MotionBenchmark(load_scene(scene, overrides=setting.overrides), every=setting.every)
         try:
             run = task.run(onto=own)
         except SimulationError as error:
             failed[setting.name] = str(error)
         else:
-            truth = truths["points" if setting.group == "contacts" else "scene"]
-            tasks[setting.name], errors[setting.name] = task, compare(run, truth)
+            exact = references["points" if setting.group == "contacts" else "scene"]
+            tasks[setting.name], errors[setting.name] = task, compare(run, exact)
             iterations[setting.name] = run.iterations / (task.steps * len(task.controls))
-        done("errors", 0.3 + 0.3 * (at + 1) / len(tried))
+        done("errors", 0.3 + 0.3 * (at + 1) / len(all_settings))
     seconds = _seconds(tasks, repeats, lambda share: done("timing", 0.6 + 0.4 * share))
-    groups = {s.name: s.group for s in tried}
-    beaten = dominated({name: (seconds[name], *_figures(errors[name])) for name in tasks}, groups)
+    groups = {s.name: s.group for s in all_settings}
+    dominators = dominated({name: (seconds[name], *_figures(errors[name])) for name in tasks}, groups)
     measurements = tuple(
-        Measurement(s, presets[s.name], seconds[s.name], errors[s.name], iterations[s.name], beaten[s.name])
-        for s in tried
+        Measurement(s, presets[s.name], seconds[s.name], errors[s.name], iterations[s.name], dominators[s.name])
+        for s in all_settings
         if s.name in tasks
     )
     return Tradeoff(own.name, measurements, failed, FRAME / 2 ** halvings[0], changes, repeats)
@@ -230,23 +233,23 @@ def measure(
 
 def _references(
     own: Scene, scene: str | Path, halvings: tuple[int, int], done: Callable[[float], None]
-) -> tuple[dict[str, Run], dict[str, Errors]]:
-    """What settings are compared with, of the scene and with dense points, and what their last halving changed."""
+) -> tuple[dict[str, MotionResult], dict[str, Errors]]:
+    """References of the scene and of dense contact points, and their changes by the last halving of the step."""
     plain, dense = halvings
-    families: dict[str, tuple[int, Overrides, Overrides]] = {"scene": (plain, {}, {})}
+    kinds: dict[str, tuple[int, Overrides, Overrides]] = {"scene": (plain, {}, {})}
     if contact_density(own, 1):
-        families["points"] = dense, contact_density(own, DENSE), contact_density(own, DENSE / 2)
-    truths, changes = {}, {}
+        kinds["points"] = dense, contact_density(own, DENSE), contact_density(own, DENSE / 2)
+    references, changes = {}, {}
     done(0.0)
-    for at, (family, (count, more, before)) in enumerate(families.items()):
-        truths[family] = reference(scene, count, more)
-        changes[family] = compare(reference(scene, count - 1, before), truths[family])
-        done((at + 1) / len(families))
-    return truths, changes
+    for at, (kind, (count, more, before)) in enumerate(kinds.items()):
+        references[kind] = reference(scene, count, more)
+        changes[kind] = compare(reference(scene, count - 1, before), references[kind])
+        done((at + 1) / len(kinds))
+    return references, changes
 
 
-def _seconds(tasks: Mapping[str, Task], repeats: int, done: Callable[[float], None]) -> dict[str, float]:
-    """Per simulated second; all in turn, so that a disturbance of the machine hits all alike."""
+def _seconds(tasks: Mapping[str, MotionBenchmark], repeats: int, done: Callable[[float], None]) -> dict[str, float]:
+    """Median processor time per simulated second; runs are interleaved, so that disturbances affect all settings."""
     times: dict[str, list[float]] = {name: [] for name in tasks}
     for at in range(repeats):
         for name, task in tasks.items():
@@ -259,11 +262,11 @@ def _figures(errors: Errors) -> tuple[float, ...]:
     return errors.position, errors.rotation, errors.markers, errors.flow, errors.gradient
 
 
-def _with_presets(scene: Scene, tried: Sequence[Setting]) -> tuple[list[Setting], dict[str, tuple[str, ...]]]:
-    """Settings with those presets that are none of them, and which presets each setting is."""
+def _with_presets(scene: Scene, all_settings: Sequence[Setting]) -> tuple[list[Setting], dict[str, tuple[str, ...]]]:
+    """Settings extended by the remaining presets, and the presets that each setting equals."""
     own = {"step": scene.step, "integrator": scene.integrator, "tolerance": scene.tolerance}
     own |= {"precision": scene.precision}
-    every = list(tried)
+    every = list(all_settings)
     presets: dict[str, tuple[str, ...]] = {s.name: () for s in every}
     for name, values in scene.presets.items():
         same = [s for s in every if {**own, **s.overrides} == {**own, **values} and s.every == 1]
@@ -276,17 +279,17 @@ def _with_presets(scene: Scene, tried: Sequence[Setting]) -> tuple[list[Setting]
 
 
 def dominated(figures: Mapping[str, Sequence[float]], groups: Mapping[str, str]) -> dict[str, str | None]:
-    """For each setting the one, if any, that is no worse in any figure (2 % apart) and better in some (10 %).
+    """For each setting, the fastest one that dominates it: not worse in any figure (by 2 %), better in one (by 10 %).
 
-    Figures are such that less is better, time first; of several settings the one with the least time is named. Settings
-    in single precision, with other markers or other points are better only than their like.
+    Figures are minimized; the first one is the time. Settings of the groups `_SEPARATE` dominate only settings of
+    their own group. None for settings that are not dominated.
     """
     found: dict[str, str | None] = {}
     for name, mine in figures.items():
         better = [
             (theirs[0], other)
             for other, theirs in figures.items()
-            if (groups[other] not in _APART or groups[other] == groups[name])
+            if (groups[other] not in _SEPARATE or groups[other] == groups[name])
             and all(t <= _EQUAL * m for t, m in zip(theirs, mine, strict=True))
             and any(t < _BETTER * m for t, m in zip(theirs, mine, strict=True))
         ]

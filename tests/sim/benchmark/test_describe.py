@@ -1,4 +1,4 @@
-"""`gelflow describe`: its tree and numbers against the scenes, what it says was left out. No test looks at speed."""
+"""`gelflow describe`: its tree and numbers compared with the scenes, and elements that are not modelled."""
 
 import json
 import shutil
@@ -54,7 +54,7 @@ pads.pad = { site = "face", rows = 4, cols = 3, pitch = 1e-3, against = "ground"
 
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
-    """A small scene with something of everything that is left out."""
+    """A small scene with one element of each kind that is not modelled."""
     (tmp_path / "own.xml").write_text(MODEL, encoding="utf-8")
     (tmp_path / "own.toml").write_text(SCENE, encoding="utf-8")
     return tmp_path / "own.toml"
@@ -66,13 +66,13 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def words(text: str) -> str:
-    """The text without the tree's lines and line breaks."""
+    """The text without tree lines and line breaks."""
     return " ".join(text.translate(str.maketrans("│├└─┌┐┬┴┼┤", " " * 10)).split())
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
-def test_the_tree_holds_every_part(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tree_contains_every_part(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
     scene = load_scene(name, friction=law)
     lines = printed(capsys, name, "--friction", law, "--no-timing").splitlines()
     assert max(map(len, lines)) <= 80
@@ -98,7 +98,7 @@ def test_the_tree_holds_every_part(name: str, law: str, capsys: pytest.CaptureFi
         assert f"{pad.name}: {count}" in text
 
 
-def test_numbers_of_a_contact_and_a_joint(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tree_shows_parameters_of_contacts_and_joints(capsys: pytest.CaptureFixture[str]) -> None:
     text = words(printed(capsys, "insertion", "--no-timing"))
     assert "range -0.055 to 0 m (stop 500 N/m), damping 20 N s/m" in text
     assert "actuator arm_yaw: position, k_p 10, k_d 0.1, force -100 to 100 N m" in text
@@ -108,7 +108,7 @@ def test_numbers_of_a_contact_and_a_joint(capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
-def test_json_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_output_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(printed(capsys, name, "--friction", law, "--no-timing", "--json"))
     scene = load_scene(name, friction=law)
     sim = Simulator(scene)
@@ -132,8 +132,8 @@ def test_json_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureF
     assert told["times"] is None
 
 
-def test_memory_grows_with_what_is_kept() -> None:
-    """The state keeps every anchor, the model, where its size is known, every marker; the workspace neither."""
+def test_memory_sizes_grow_with_anchors_and_markers() -> None:
+    """The state stores every anchor and the model every marker; the workspace neither."""
     small, large = (
         describe(load_scene("pushing", friction="elastic", overrides={"pads.pad.rows": rows})).size
         for rows in (10, 1000)
@@ -145,7 +145,7 @@ def test_memory_grows_with_what_is_kept() -> None:
         assert large.model_bytes - small.model_bytes >= more * 24
 
 
-def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_elements_that_are_not_modelled_are_listed(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     told = describe(load_scene(own))
     world, block, other = told.bodies
     assert (world.merged, block.merged, other.merged) == (("table",), ("sticker",), ())
@@ -154,12 +154,12 @@ def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None
         "box top: in no contact and under no pad",
         "box sticker: in no contact and under no pad",
         "sphere other: in no contact and under no pad",
-        "body table: rigidly attached to world; costs nothing",
-        "body sticker: rigidly attached to block, merged into it with its mass; costs nothing",
-        "pad pad: viscous markers have no memory; they cost nothing until they are read",
-        "contact between other and world, other and block: the scene file has none; they pass through each other",
+        "body table: rigidly attached to world; no cost",
+        "body sticker: rigidly attached to block, merged into it with its mass; no cost",
+        "pad pad: viscous markers have no history; no cost until their forces are evaluated",
+        "contact between other and world, other and block: not in the scene file; no collision",
         "1 cameras: for drawing only",
-        "MuJoCo's contact and solver settings: the scene file says what touches what, and how",
+        "MuJoCo's contact and solver settings: replaced by those of the scene file",
     )
     text = words(printed(capsys, str(own), "--no-timing"))
     for line in told.not_modelled:
@@ -172,24 +172,24 @@ def test_what_is_left_out(own: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "viscous per area: k_n 1000 N/m³, k_t 1 N s/m³, k_d 10 N s/m⁴, µ 0.8" in text
 
 
-def test_an_elastic_pad_is_not_left_out(own: Path) -> None:
+def test_elastic_pad_is_not_listed_as_free_of_cost(own: Path) -> None:
     scene = load_scene(own, overrides={"pads.pad.law": "elastic", "pads.pad.ks": 1.0})
     told = describe(scene)
     assert not any(line.startswith("pad pad") for line in told.not_modelled)
     assert told.size.anchors == 12
-    assert [name for name, _ in with_duplicates(scene)] == ["contact stand", "pad pad: memory of its markers"]
+    assert [name for name, _ in with_duplicates(scene)] == ["contact stand", "pad pad: friction anchors of its markers"]
 
 
-def test_viscous_markers_are_free_until_they_are_read() -> None:
-    """No state, no unknowns, and the same motion with a hundred times as many."""
+def test_viscous_markers_have_no_cost_until_evaluated() -> None:
+    """No state, no unknowns, and the same motion with a hundred times as many markers."""
     few, many = (load_scene("rolling", overrides={"pads.pad.rows": n, "pads.pad.cols": n}) for n in (10, 100))
     assert describe(few).size.state_bytes == describe(many).size.state_bytes
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
-def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
-    """What is timed with a part twice takes the very steps and Newton iterations that the scene takes."""
+def test_duplicated_part_does_not_change_the_motion(name: str, law: str) -> None:
+    """A scene with a duplicate takes the same steps and Newton iterations."""
     scene = load_scene(name, friction=law, overrides={"pads.*.rows": 8, "pads.*.cols": 8} if name == "rolling" else {})
     u = holding_controls(scene)
 
@@ -212,7 +212,7 @@ def test_a_part_twice_changes_no_motion(name: str, law: str) -> None:
         assert sim.anchored.sum() >= alone.anchored.sum()
 
 
-def test_start_controls_hold_the_scene_where_it_starts() -> None:
+def test_holding_controls_keep_the_scene_at_its_start() -> None:
     scene = load_scene("insertion")
     u = holding_controls(scene)
     assert u[scene.u("arm_z")] == scene.q0[2] == 0.0555
@@ -224,19 +224,19 @@ def test_start_controls_hold_the_scene_where_it_starts() -> None:
     np.testing.assert_allclose(sim.q[0, :6], scene.q0[:6], atol=5e-3)
 
 
-def test_measured_parts_add_up(capsys: pytest.CaptureFixture[str]) -> None:
+def test_times_of_parts_add_up_to_the_step(capsys: pytest.CaptureFixture[str]) -> None:
     told = json.loads(printed(capsys, "insertion", "--json", "--repeats", "2"))["times"]
     names = [part["name"] for part in told["parts"]]
     assert names[:2] == ["call from Python", "bodies, joints, actuators, solver"]
     assert names[2:6] == [f"contact {name}" for name in ("pad_left", "pad_right", "part_hole", "part_floor")]
-    assert names[6:] == [f"pad {side}: memory of its markers" for side in ("left", "right")]
+    assert names[6:] == [f"pad {side}: friction anchors of its markers" for side in ("left", "right")]
     assert sum(part["microseconds"] for part in told["parts"]) == pytest.approx(told["whole"])
     assert sum(part["share"] for part in told["parts"]) == pytest.approx(1)
     assert told["whole"] > 0 and told["at_start"] > 0 and told["reading"] > 0
     assert told["repeats"] == 2 and told["timed_steps"] == 20 and told["run_steps"] == 100
 
 
-def test_a_scene_without_contacts_and_pads_is_measured(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_without_contacts_and_pads_is_timed(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bare = SCENE.splitlines()[:5]
     own.write_text("\n".join(bare), encoding="utf-8")
     times = measure(load_scene(own), repeats=1)
@@ -246,7 +246,7 @@ def test_a_scene_without_contacts_and_pads_is_measured(own: Path, capsys: pytest
     assert "contacts: none" in text and "pads: none" in text and "one reading of all markers" not in text
 
 
-def test_the_printed_times_fit(capsys: pytest.CaptureFixture[str]) -> None:
+def test_printed_times_fit_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     out = printed(capsys, "pushing", "--repeats", "1")
     assert max(map(len, out.splitlines())) <= 80
     assert "whole step" in out and "one reading of all markers" in out and "differences of whole steps" in words(out)
@@ -260,14 +260,14 @@ def test_the_printed_times_fit(capsys: pytest.CaptureFixture[str]) -> None:
         (["rolling", "--repeats", "0"], "--repeats must be at least 1, got 0"),
     ],
 )
-def test_wrong_input_is_refused_in_one_line(
+def test_invalid_arguments_give_one_line_errors(
     arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["describe", *arguments]) == 2
     assert capsys.readouterr().err == f"gelflow describe: {message}\n"
 
 
-def test_a_model_file_that_changed_meanwhile_is_noticed(own: Path) -> None:
+def test_changed_model_file_raises(own: Path) -> None:
     scene = load_scene(own)
     shutil.copy(load_scene("rolling").path.with_suffix(".xml"), own.with_suffix(".xml"))
     with pytest.raises(UsageError, match="has other bodies than the scene"):

@@ -1,4 +1,4 @@
-"""`gelflow tradeoff`: runs that can be compared, errors that mean something, settings that are what they say."""
+"""`gelflow tradeoff`: comparable runs, meaningful errors, and settings."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,7 @@ from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.tradeoff.picture import front
 from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds
-from gelflow.sim.benchmark.tradeoff.run import FRAME, WINDOW, Errors, Task, compare, drawn
+from gelflow.sim.benchmark.tradeoff.run import FRAME, WINDOW, Errors, MotionBenchmark, compare, randomized
 from gelflow.sim.benchmark.tradeoff.sweep import (
     GROUPS,
     Measurement,
@@ -28,7 +28,7 @@ from gelflow.sim.benchmark.tradeoff.sweep import (
 from gelflow.sim.scene import PRESET_NAMES, load_scene, scene_names
 
 
-def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_quick_measurement_prints_its_results(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     picture = tmp_path / "new" / "pushing.png"
     assert main(["tradeoff", "pushing", "--quick", "--repeats", "1", "--json", "--out", str(picture)]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -56,25 +56,25 @@ def test_a_quick_run_prints_what_it_measured(capsys: pytest.CaptureFixture[str],
     assert "The reference changed by" in out
 
 
-def test_a_scene_without_a_motion_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scene_without_reference_motion_raises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "ball.xml").write_text(
         "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
     )
     path = tmp_path / "ball.toml"
     path.write_text('format = 1\nmodel = "ball.xml"\nstep = 1e-3\n')
     assert main(["tradeoff", str(path)]) == 2
-    assert "no motion for scene 'ball'" in capsys.readouterr().err
+    assert "scene 'ball' has no reference motion" in capsys.readouterr().err
 
 
-def test_a_step_must_fit_into_a_frame() -> None:
+def test_step_must_divide_a_frame() -> None:
     with pytest.raises(UsageError, match=r"must divide 0\.01 s"):
-        Task(load_scene("pushing", overrides={"step": 3e-3}))
+        MotionBenchmark(load_scene("pushing", overrides={"step": 3e-3}))
     with pytest.raises(UsageError, match=r"must divide 0\.01 s"):
-        Task(load_scene("pushing", overrides={"step": 30e-3}))
+        MotionBenchmark(load_scene("pushing", overrides={"step": 30e-3}))
 
 
 @pytest.mark.parametrize("name", scene_names())
-def test_settings_are_of_the_scene_and_differ(name: str) -> None:
+def test_settings_load_and_differ(name: str) -> None:
     found = settings(name)
     assert len({s.name for s in found}) == len(found) > 40
     assert {s.group for s in found} <= set(GROUPS)
@@ -89,7 +89,7 @@ def test_settings_are_of_the_scene_and_differ(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", scene_names())
-def test_other_densities_of_points_are_as_stiff_in_all(name: str) -> None:
+def test_contact_densities_keep_the_total_stiffness(name: str) -> None:
     own = load_scene(name)
     total = {p.name: p.weights.sum() for p in own.points}
     for density in (1, 2):
@@ -106,7 +106,7 @@ def test_other_densities_of_points_are_as_stiff_in_all(name: str) -> None:
             assert contact.params["mu"] == before.params["mu"]
 
 
-def test_coarser_markers_stay_in_place() -> None:
+def test_coarser_marker_grids_keep_their_extent() -> None:
     for name in ("pushing", "rolling"):
         own = load_scene(name).grids[0]
         for setting in settings(name):
@@ -119,9 +119,9 @@ def test_coarser_markers_stay_in_place() -> None:
                     assert grid.rows * grid.pitch == pytest.approx(own.rows * own.pitch)
 
 
-def test_a_run_is_a_plain_loop_of_steps_and_readings() -> None:
+def test_run_equals_a_loop_of_steps() -> None:
     scene = load_scene("pushing", preset="balanced")
-    run, task = Task(scene).run(gradient=False), Task(scene, every=4)
+    run, task = MotionBenchmark(scene).run(gradient=False), MotionBenchmark(scene, every=4)
     rare = task.run(gradient=False)
     sim = task.sim
     sim.reset()
@@ -136,9 +136,9 @@ def test_a_run_is_a_plain_loop_of_steps_and_readings() -> None:
 
 
 @pytest.mark.parametrize(("name", "every"), [("pushing", 1), ("insertion", 1), ("dclaw", 1), ("pushing", 4)])
-def test_the_gradient_is_that_of_the_loss(name: str, every: int) -> None:
-    """Against central differences of runs; in the middle of the motion's touch, so that no point begins to touch."""
-    task = Task(load_scene(name, overrides={"tolerance": 1e-12}), every=every)
+def test_gradient_equals_finite_differences_of_the_loss(name: str, every: int) -> None:
+    """Central differences of runs, in the middle of contact, so that no point makes contact within a stencil."""
+    task = MotionBenchmark(load_scene(name, overrides={"tolerance": 1e-12}), every=every)
     gradient = task.run().gradient
     assert gradient is not None and gradient.shape[0] == WINDOW
     spread = task.motion.step_controls(FRAME).std(0)
@@ -162,7 +162,7 @@ def test_the_gradient_is_that_of_the_loss(name: str, every: int) -> None:
         assert gradient[frame, column] == pytest.approx(slope, rel=1e-3, abs=1e-5 * np.abs(gradient).max())
 
 
-def test_errors_of_a_run_that_is_off_by_known_amounts() -> None:
+def test_errors_of_known_deviations() -> None:
     truth = simulated("insertion", {})
     assert truth.gradient is not None
     assert replace(compare(truth, truth), cosine=1) == Errors(0, 0, 0, 0, 1, 0)
@@ -179,17 +179,17 @@ def test_errors_of_a_run_that_is_off_by_known_amounts() -> None:
     assert errors.cosine == pytest.approx(1) and errors.gradient == pytest.approx(1)
 
 
-def test_readings_are_compared_on_the_scene_s_own_markers() -> None:
+def test_marker_forces_are_compared_on_the_markers_of_the_scene() -> None:
     own = load_scene("pushing")
     finer = load_scene("pushing", overrides={"pads.pad.rows": 25, "pads.pad.cols": 19, "pads.pad.pitch": 0.75e-3})
-    plain, fine = Task(own).run(gradient=False), Task(finer).run(onto=own, gradient=False)
+    plain, fine = MotionBenchmark(own).run(gradient=False), MotionBenchmark(finer).run(onto=own, gradient=False)
     np.testing.assert_allclose(fine.field, plain.field, rtol=1e-9, atol=1e-12)  # every second marker is the same one
     np.testing.assert_array_equal(fine.poses, plain.poses)
 
 
-def test_a_draw_is_the_same_for_every_step_and_changes_the_physics() -> None:
-    first, again, other = (drawn(load_scene("grasp"), np.random.default_rng(seed)) for seed in (1, 1, 2))
-    fine = drawn(load_scene("grasp", preset="accurate"), np.random.default_rng(1))
+def test_sampled_physics_is_independent_of_the_step() -> None:
+    first, again, other = (randomized(load_scene("grasp"), np.random.default_rng(seed)) for seed in (1, 1, 2))
+    fine = randomized(load_scene("grasp", preset="accurate"), np.random.default_rng(1))
     own = load_scene("grasp")
     for scene in (again, fine):
         assert [c.params for c in scene.contacts] == [c.params for c in first.contacts]
@@ -204,11 +204,11 @@ def test_a_draw_is_the_same_for_every_step_and_changes_the_physics() -> None:
         assert contact.params["ks"] == pytest.approx(ratio * before_contact.params["ks"])
 
 
-def test_the_bar_of_grasp_starts_at_rest() -> None:
-    """If it fell onto its tables it would rattle, and no halving of the step would settle when it is touched."""
+def test_bar_of_the_grasp_motion_starts_at_rest() -> None:
+    """Without static penetration the bar vibrates, and the time of contact does not converge with the step."""
     own = load_scene("grasp")
     for overrides in ({}, contact_density(own, 2)):
-        task = Task(load_scene("grasp", overrides=overrides))
+        task = MotionBenchmark(load_scene("grasp", overrides=overrides))
         bar, sim = own.q("bar"), task.sim
         sim.q[0] = task.motion.q0
         u = task.controls[0].copy()
@@ -219,7 +219,7 @@ def test_the_bar_of_grasp_starts_at_rest() -> None:
     assert errors.markers < 0.02 and errors.gradient < 0.02
 
 
-def test_what_is_dominated() -> None:
+def test_dominated_settings() -> None:
     figures = {"a": (1.0, 1.0), "b": (1.01, 2.0), "c": (0.5, 3.0), "d": (1.01, 0.99), "e": (0.4, 0.4), "f": (0.6, 3.5)}
     groups = dict.fromkeys(figures, "step") | {"e": "single"}
     found = dominated(figures, groups)
@@ -227,7 +227,7 @@ def test_what_is_dominated() -> None:
     assert front([(1, 1), (2, 0.5), (1.5, 2), (3, 0.5)]) == [(1, 1), (2, 0.5)]
 
 
-def test_bounds_are_above_and_rounded_up() -> None:
+def test_bounds_are_rounded_up() -> None:
     worst = {"fast": Errors(1.01e-4, 0.0, 0.2, 3e-3, 0.9, 0.41)}
     found = bounds(worst, 4)["fast"]
     assert found.bound == Errors(1.6e-4, 0.0, 0.3, 4.5e-3, 0.85, 0.62)

@@ -1,4 +1,4 @@
-"""The error bounds in docs/guide/tradeoff.md hold for physics that did not choose them."""
+"""The error bounds in docs/guide/tradeoff.md hold for other samples of the physics."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ HALVINGS = 8
 
 
 def promised() -> dict[tuple[str, str], tuple[str, Errors]]:
-    """(scene, preset) → how it is simulated, in words, and the bounds."""
+    """(scene, preset) → settings as text, and the bounds."""
     found = {}
     for line in PAGE.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
@@ -25,7 +25,7 @@ def promised() -> dict[tuple[str, str], tuple[str, Errors]]:
     return found
 
 
-def test_the_page_has_every_preset_as_it_is() -> None:
+def test_page_lists_every_preset_with_its_settings() -> None:
     found = promised()
     assert set(found) == {(scene, name) for scene in scene_names() for name in (*PRESET_NAMES, SCENE_DEFAULT)}
     for (scene, name), (how, _) in found.items():

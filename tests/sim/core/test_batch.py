@@ -1,4 +1,4 @@
-"""Batches: the same bits whatever the company, clear errors for what is not finite, and failures that stay at home."""
+"""Batches: results independent of the batch, errors for values that are not finite, and isolated failures."""
 
 import os
 import re
@@ -28,7 +28,7 @@ def insertion(request: pytest.FixtureRequest) -> Scene:
 
 
 def controls(scene: Scene) -> Array:
-    """Hold the part and lower it onto the rim, each environment a little differently; shape (steps, envs, nu)."""
+    """Controls that hold the part and lower it onto the rim, slightly different per environment; (steps, envs, nu)."""
     rng = np.random.default_rng(3)
     u = np.zeros((STEPS, ENVS, scene.nu))
     u[..., [scene.u("finger_left"), scene.u("finger_right")]] = 5.0 + rng.normal(size=(ENVS, 2))
@@ -39,7 +39,7 @@ def controls(scene: Scene) -> Array:
 
 
 def started(scene: Any, envs: list[int], *, threads: int = 1, precision: Any = "double") -> Simulator:
-    """A batch of the named environments, each with its own start and its own friction."""
+    """A batch of the given environments, with individual starts and friction."""
     sim = Simulator(scene, num_envs=len(envs), threads=threads, precision=precision)
     sim.q[:] = scene.q0
     sim.q[:, scene.q("arm_x")] += 1e-4 * np.array(envs)[:, None]
@@ -48,7 +48,7 @@ def started(scene: Any, envs: list[int], *, threads: int = 1, precision: Any = "
 
 
 def trace(sim: Simulator, u: Array) -> list[Array]:
-    """State, memory of contact and readings after every step, one environment after the other along the first axis."""
+    """State, anchors and marker forces after every step, environments along the first axis."""
     rows = []
     for now in u:
         sim.step(now)
@@ -58,7 +58,7 @@ def trace(sim: Simulator, u: Array) -> list[Array]:
     return [np.concatenate([part for row in rows for part in row], axis=1)[e] for e in range(sim.num_envs)]
 
 
-def test_the_same_bits_for_any_number_of_threads_and_any_batch(insertion: Scene) -> None:
+def test_results_are_bitwise_independent_of_threads_and_batch(insertion: Scene) -> None:
     u = controls(insertion)
     reference = trace(started(insertion, list(range(ENVS))), u)
     assert len({row.tobytes() for row in reference}) == ENVS  # the environments do differ
@@ -74,9 +74,9 @@ def test_the_same_bits_for_any_number_of_threads_and_any_batch(insertion: Scene)
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_neighbour_with_other_parameters_leaves_no_trace(name: str) -> None:
-    """Both run on one thread, in its memory: what the first one needs of that and the second does not, such as a centre
-    of mass that is off the frame's origin."""
+def test_other_environments_of_a_thread_do_not_affect_results(name: str) -> None:
+    """Both run on one thread and share its workspace, in which only the first needs some values, such as the offset of
+    the centre of mass."""
     scene = load_scene(name)
     moves = reference_motion(scene)
     u = moves.step_controls(scene.step)[:3, None]
@@ -95,7 +95,7 @@ def test_a_neighbour_with_other_parameters_leaves_no_trace(name: str) -> None:
         np.testing.assert_array_equal(alone.take(-1, axis), beside.take(-1, axis))
 
 
-def test_a_rollout_is_the_same_steps(insertion: Scene) -> None:
+def test_rollout_equals_steps(insertion: Scene) -> None:
     u = controls(insertion)
     sim = started(insertion, list(range(ENVS)), threads=2)
     run = sim.rollout(u, read_after=[0, STEPS])
@@ -108,7 +108,7 @@ def test_a_rollout_is_the_same_steps(insertion: Scene) -> None:
     np.testing.assert_array_equal(sim.tactile(), run.tactile[1])
 
 
-def test_several_steps_at_once_are_those_steps(insertion: Scene) -> None:
+def test_several_steps_in_one_call_equal_single_steps(insertion: Scene) -> None:
     u = controls(insertion)[0]
     at_once, one_by_one = (started(insertion, list(range(ENVS))) for _ in range(2))
     at_once.step(u, steps=7)
@@ -119,7 +119,7 @@ def test_several_steps_at_once_are_those_steps(insertion: Scene) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_refused_by_name(insertion: Scene, bad: float) -> None:
+def test_values_that_are_not_finite_raise_with_their_name(insertion: Scene, bad: float) -> None:
     u = controls(insertion)
     sim = started(insertion, list(range(ENVS)))
     before = sim.q.copy()
@@ -146,7 +146,7 @@ def test_what_is_not_finite_is_refused_by_name(insertion: Scene, bad: float) -> 
     sim.check()
 
 
-def test_wrong_shapes_and_numbers_are_refused(insertion: Scene) -> None:
+def test_wrong_shapes_and_types_raise(insertion: Scene) -> None:
     sim = started(insertion, [0, 1])
     nu = insertion.nu
     with pytest.raises(UsageError, match=rf"u must have shape \(2, {nu}\) or \({nu},\), got \(3, {nu}\)"):
@@ -165,7 +165,7 @@ def test_wrong_shapes_and_numbers_are_refused(insertion: Scene) -> None:
         sim.pad("middle")
 
 
-def test_no_number_of_steps_and_a_negative_one(insertion: Scene) -> None:
+def test_zero_steps_do_nothing_and_negative_steps_raise(insertion: Scene) -> None:
     sim = started(insertion, [0])
     before = sim.q.copy()
     sim.step(controls(insertion)[0, :1], steps=0)
@@ -177,7 +177,7 @@ ABSURD = {"stiffness without measure": ("pad_left.kn", 1e305), "a mass that is n
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("absurd", ABSURD)
-def test_a_failed_environment_keeps_its_last_good_state_and_its_neighbours_do_not_notice(
+def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
     insertion: Scene, absurd: str, threads: int
 ) -> None:
     u = controls(insertion)
@@ -210,7 +210,7 @@ def test_a_failed_environment_keeps_its_last_good_state_and_its_neighbours_do_no
     sim.check()
 
 
-def test_newton_that_may_not_iterate_says_so(insertion: Scene) -> None:
+def test_iteration_limit_of_zero_gives_a_failure_status(insertion: Scene) -> None:
     spec = insertion.describe_to(_core.ModelSpec())
     spec.max_step_iterations = 1
     sim = Simulator(_core.Model(spec))
@@ -222,7 +222,7 @@ def test_newton_that_may_not_iterate_says_so(insertion: Scene) -> None:
         sim.check()
 
 
-def test_a_failed_environment_of_a_rollout_has_gradient_zero(insertion: Scene) -> None:
+def test_failed_environment_has_gradient_zero(insertion: Scene) -> None:
     u = controls(insertion)
     sim = started(insertion, list(range(ENVS)))
     sim.param("part.mass")[1] = np.nan
@@ -246,7 +246,7 @@ PUSHES = {
 
 @pytest.mark.parametrize("friction", ["viscous", "elastic"])
 @pytest.mark.parametrize("name", PUSHES)
-def test_single_precision_follows_double(name: str, friction: str) -> None:
+def test_single_precision_agrees_with_double(name: str, friction: str) -> None:
     scene = load_scene(name, friction=friction, overrides={"pads.pad.rows": 13, "pads.pad.cols": 13})
     double, single = (Simulator(scene, precision=p) for p in ("double", "single"))
     assert single.q.dtype == single.tactile().dtype == np.float32
@@ -262,7 +262,7 @@ def test_single_precision_follows_double(name: str, friction: str) -> None:
     assert reading.any()
 
 
-def test_single_precision_follows_double_in_a_grasp(insertion: Scene) -> None:
+def test_single_precision_agrees_with_double_in_a_grasp(insertion: Scene) -> None:
     double, single = (started(insertion, list(range(ENVS)), precision=p) for p in ("double", "single"))
     for u in controls(insertion):
         for sim in (double, single):
@@ -274,8 +274,8 @@ def test_single_precision_follows_double_in_a_grasp(insertion: Scene) -> None:
     np.testing.assert_allclose(single.tactile(), reading, atol=5e-3 * np.abs(reading).max())
 
 
-def test_small_steps_add_up_in_single_precision() -> None:
-    """A step moves the body by 1e-9 m, a sixtieth of what single precision resolves at half a metre."""
+def test_small_increments_accumulate_in_single_precision() -> None:
+    """A step moves the body by 1e-9 m, 1/60 of the resolution of single precision at 0.5 m."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step = (0.0, 0.0, 0.0), 1e-6
     body = spec.add_body("body", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
@@ -297,7 +297,7 @@ def test_small_steps_add_up_in_single_precision() -> None:
 
 @pytest.mark.parametrize("friction", ["viscous", "elastic"])
 @pytest.mark.parametrize("name", SCENES)
-def test_gradients_of_single_precision_are_those_of_double(name: str, friction: str) -> None:
+def test_gradients_of_single_precision_agree_with_double(name: str, friction: str) -> None:
     scene = load_scene(name, friction=friction)
     moves = reference_motion(scene)
     u = moves.step_controls(scene.step)[:40, None]
@@ -331,7 +331,7 @@ np.savez(sys.argv[3], q=sim.q, tactile=sim.tactile())
 """
 
 
-def test_the_build_for_any_processor_computes_the_same(insertion: Scene, tmp_path: Path) -> None:
+def test_portable_build_agrees_with_the_native_build(insertion: Scene, tmp_path: Path) -> None:
     u = controls(insertion)[:, 0]
     np.save(tmp_path / "u.npy", u)
     command = [sys.executable, "-c", BUILDS, insertion.friction, str(tmp_path / "u.npy"), str(tmp_path / "end.npz")]
@@ -346,15 +346,15 @@ def test_the_build_for_any_processor_computes_the_same(insertion: Scene, tmp_pat
 
 
 @pytest.mark.parametrize(("wanted", "says"), [("fast", "must be base or v3"), ("", "")])
-def test_a_build_that_is_not_there_is_told(wanted: str, says: str) -> None:
+def test_unavailable_build_raises(wanted: str, says: str) -> None:
     command = [sys.executable, "-c", "import gelflow.sim._core"]
     run = subprocess.run(command, env={**os.environ, "GELFLOW_CORE": wanted}, capture_output=True, text=True)
     assert (run.returncode == 0) == (not says)
     assert says in run.stderr
 
 
-def test_results_land_in_given_arrays(insertion: Scene) -> None:
-    """A second rollout into the first one's arrays, poses and wrenches into one's own: the same numbers, no copies."""
+def test_results_are_written_to_given_arrays(insertion: Scene) -> None:
+    """Rollouts, poses and wrenches into existing arrays give the same values without copies."""
     u, sim = controls(insertion), started(insertion, list(range(ENVS)))
     reads = (0, 5, STEPS)
     right = sim.rollout(u, read_after=reads)
@@ -375,7 +375,7 @@ def test_results_land_in_given_arrays(insertion: Scene) -> None:
         sim.rollout(u, read_after=(3,), out=other)
 
 
-def test_controls_of_any_layout(insertion: Scene) -> None:
+def test_controls_of_any_memory_layout(insertion: Scene) -> None:
     u = controls(insertion)[0]
     one, two, three = (started(insertion, list(range(ENVS))) for _ in range(3))
     one.step(u, 3)

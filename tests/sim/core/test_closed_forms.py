@@ -1,4 +1,4 @@
-"""Closed forms of touch: a sphere in a flat pad of stiffness per area, and a part held in a grasp for ten seconds."""
+"""Closed forms of contact: a sphere on a pad with stiffness per area, and a part in a grasp for ten seconds."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RADIUS, DEPTH, STIFFNESS = 0.020, 1e-3, 1e8  # [m], [m], [N/m³]
 
 
 def pressed(side: int) -> float:
-    """Sum of the normal readings of side × side markers on 16 × 16 mm, pressed by DEPTH onto a fixed sphere [N]."""
+    """Sum of the normal forces of side × side markers on 16 × 16 mm, pressed by DEPTH onto a fixed sphere [N]."""
     spec = _core.ModelSpec()
     body = spec.add_body("pad", -1, (0, 0, RADIUS - DEPTH), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
     spec.add_joint("height", body, "slide", (0, 0, 0), (0, 0, 1))
@@ -27,8 +27,8 @@ def pressed(side: int) -> float:
     return float(Simulator(_core.Model(spec)).tactile()[0, :, 2].sum())
 
 
-def test_a_sphere_pressed_into_a_pad_of_stiffness_per_area() -> None:
-    """F = π K (R − δ) δ²; the sum over cells converges to it."""
+def test_force_of_a_sphere_on_a_pad_with_stiffness_per_area() -> None:
+    """The sum over markers converges to F = π K (R − δ) δ²."""
     exact = np.pi * STIFFNESS * (RADIUS - DEPTH) * DEPTH**2
     errors = [abs(pressed(side) / exact - 1) for side in (25, 50, 100, 200, 400)]
     print([f"{error:.1e}" for error in errors])
@@ -37,7 +37,7 @@ def test_a_sphere_pressed_into_a_pad_of_stiffness_per_area() -> None:
 
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
-def test_a_held_part_does_not_creep_under_the_elastic_law_and_shows_its_load(integrator: str) -> None:
+def test_grasped_part_does_not_creep_and_markers_show_its_load_under_the_elastic_law(integrator: str) -> None:
     attempts = InsertionAttempts(1, scene=insertion_scene(friction="elastic"), randomization=NOMINAL)
     attempts.draw(np.random.default_rng(0))
     spec = attempts.scene.describe_to(_core.ModelSpec())

@@ -1,4 +1,4 @@
-"""Contact and friction in the core against statics, textbook motions, and Newton's third law.
+"""Contact and friction compared with statics, closed-form motions and Newton's third law.
 
 A block is a free cube with its corners as contact points: 8 of them, 4 of which touch. Stiffness is per point.
 """
@@ -25,7 +25,7 @@ CORNERS = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in 
 
 
 def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:
-    """A free cube; returns its body."""
+    """Add a free cube; returns its body."""
     inertia = mass * (2 * HALF) ** 2 / 6
     body = int(spec.add_body(name, -1, pos, UPRIGHT, mass, ORIGIN, (inertia, inertia, inertia, 0, 0, 0)))
     spec.add_joint(f"{name}_free", body, "free", ORIGIN, (0, 0, 1))
@@ -33,7 +33,7 @@ def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:
 
 
 def block_on_plane(law: str, *, slope: float = 0.0, damping: str = "depth", **numbers: float) -> Simulator:
-    """A block on a plane with markers at its corners that follow the same law; gravity is turned by `slope` [rad]."""
+    """A block on a plane, with markers of the same law at its corners; gravity is inclined by `slope` [rad]."""
     spec = _core.ModelSpec()
     spec.step, spec.tolerance = 2e-3, 1e-12
     spec.gravity = (G * np.sin(slope), 0.0, -G * np.cos(slope))
@@ -54,7 +54,7 @@ def settle(sim: Simulator, seconds: float) -> None:
 
 @pytest.mark.parametrize("damping", ["depth", "plain"])
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_a_block_at_rest_carries_its_weight(law: str, damping: str) -> None:
+def test_contact_forces_of_a_resting_block_carry_its_weight(law: str, damping: str) -> None:
     sim = block_on_plane(law, damping=damping, kd=20.0 if damping == "plain" else 2e4)
     settle(sim, 2.0)
     wrench = sim.wrenches()[0, 0]
@@ -63,8 +63,8 @@ def test_a_block_at_rest_carries_its_weight(law: str, damping: str) -> None:
     assert HALF - sim.q[0, 2] == pytest.approx(MASS * G / (4 * 2e3), rel=1e-8)
 
 
-def test_a_block_that_the_viscous_law_holds_creeps() -> None:
-    """N points in contact let a load F creep at F / (N k_t)."""
+def test_sticking_block_creeps_under_the_viscous_law() -> None:
+    """The rate with N points in contact and load F is F / (N k_t)."""
     sim = block_on_plane("viscous", slope=0.3)
     settle(sim, 2.0)
     speed = MASS * G * np.sin(0.3) / (4 * 20.0)
@@ -74,8 +74,8 @@ def test_a_block_that_the_viscous_law_holds_creeps() -> None:
     assert sim.q[0, 0] - before == pytest.approx(speed, rel=1e-6)
 
 
-def test_a_block_that_the_elastic_law_holds_stays() -> None:
-    """It gives way by F / (N k_s) and stays there; when the load is gone, it comes back."""
+def test_sticking_block_does_not_creep_under_the_elastic_law() -> None:
+    """Its displacement is F / (N k_s), constant, and zero again without load."""
     sim = block_on_plane("elastic", mu=2.0)  # so that no corner slips while the block sways
     settle(sim, 1.0)
     rest = sim.q[0, 0]
@@ -92,7 +92,7 @@ def test_a_block_that_the_elastic_law_holds_stays() -> None:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_a_block_that_slips_is_braked_by_mu_n(law: str) -> None:
+def test_slipping_block_is_decelerated_by_mu_n(law: str) -> None:
     slope, mu = 0.3, 0.1
     sim = block_on_plane(law, slope=slope, mu=mu)
     settle(sim, 0.5)
@@ -106,8 +106,8 @@ def test_a_block_that_slips_is_braked_by_mu_n(law: str) -> None:
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("slope", [0.3, 0.9])
-def test_markers_at_the_contact_points_add_up_to_what_the_solver_applied(law: str, slope: float) -> None:
-    """With the law of the contact: holding and slipping, forces on the body by both ways."""
+def test_marker_forces_at_contact_points_add_up_to_the_contact_force(law: str, slope: float) -> None:
+    """With the contact's parameters, sticking and slipping."""
     sim = block_on_plane(law, slope=slope)
     sim.v[0, 3:] = 0.1, 0.2, 0.5
     sim.step(np.zeros(0), 60)
@@ -130,7 +130,7 @@ def matrix(quat: Array) -> Array:
 
 
 def two_blocks(law: str) -> Simulator:
-    """A block against another, both afloat: the corners of the first against the faces of the second."""
+    """Two free blocks: the corners of the first in contact with the faces of the second."""
     spec = _core.ModelSpec()
     spec.step, spec.tolerance, spec.gravity = 1e-3, 1e-13, ORIGIN
     first = block(spec, "first")
@@ -144,8 +144,8 @@ def two_blocks(law: str) -> Simulator:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_forces_of_a_pair_are_equal_and_opposite(law: str) -> None:
-    """What each body's momentum gains in a step is the contact's impulse, and its reverse on the other body."""
+def test_contact_forces_on_two_bodies_are_equal_and_opposite(law: str) -> None:
+    """The change of momentum in a step is the contact impulse, with opposite signs for the two bodies."""
     sim = two_blocks(law)
     # The force of the implicit step is the one at its end, with the anchors of its start: those are put back to read.
     gained = 0.0
@@ -172,7 +172,7 @@ def test_forces_of_a_pair_are_equal_and_opposite(law: str) -> None:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_contact_takes_energy_and_never_gives_any(law: str) -> None:
+def test_contact_does_not_add_energy(law: str) -> None:
     sim = two_blocks(law)
     masses = np.repeat([MASS, 0.1], 6) * np.tile([1, 1, 1, *[(2 * HALF) ** 2 / 6] * 3], 2)
     start = 0.5 * float(masses @ sim.v[0] ** 2)
@@ -195,15 +195,15 @@ def ball_on_plane(step: float = 1e-3) -> Simulator:
     return Simulator(_core.Model(spec))
 
 
-def test_a_sphere_on_a_plane_sinks_by_its_weight() -> None:
+def test_penetration_of_a_sphere_balances_its_weight() -> None:
     sim = ball_on_plane()
     settle(sim, 1.0)
     assert 0.03 - sim.q[0, 2] == pytest.approx(0.2 * G / 5e4, rel=1e-9)
     np.testing.assert_allclose(sim.wrenches()[0, 0], [0, 0, 0, 0, 0, 0.2 * G], atol=1e-10)
 
 
-def test_a_sliding_ball_ends_rolling_at_five_sevenths() -> None:
-    """Whatever the friction: angular momentum about the ground is kept, so v = 5/7 v₀, and it rolls without slip."""
+def test_sliding_ball_ends_rolling_at_five_sevenths_of_its_speed() -> None:
+    """For any friction: conserved angular momentum about the contact gives v = 5/7 v₀, rolling without slip."""
     sim = ball_on_plane()
     settle(sim, 0.5)
     sim.v[0, 0] = 1.0
@@ -221,7 +221,7 @@ def test_a_sliding_ball_ends_rolling_at_five_sevenths() -> None:
     assert sim.v[0, 0] == pytest.approx(before, rel=1e-6)
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_contacts_raise() -> None:
     with pytest.raises(ValueError, match="ks > 0"):
         block_on_plane("elastic", ks=0.0)
     with pytest.raises(ValueError, match="mu must be finite and not negative"):

@@ -1,4 +1,4 @@
-"""The same bits for any number of threads and in any batch, for all that a simulator computes, in every scene."""
+"""All results of a simulator are bitwise independent of threads and batch, in every scene."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -80,7 +80,7 @@ COMPUTED: dict[str, Compute] = {
     scope="module", params=[(name, law) for name in scene_names() for law in ("viscous", "elastic")], ids=str
 )
 def case(request: pytest.FixtureRequest) -> tuple[Scene, Array, dict[str, Array]]:
-    """A scene, controls (STEPS, nu) in the middle of its motion, and the state there; by BDF2, for its history."""
+    """A scene with BDF2, controls (STEPS, nu) in the middle of its motion, and the state there."""
     name, law = request.param
     scene = load_scene(name, friction=law, overrides={**OVERRIDES.get(name, {}), "integrator": "bdf2"})
     moves = reference_motion(scene)
@@ -96,7 +96,7 @@ def case(request: pytest.FixtureRequest) -> tuple[Scene, Array, dict[str, Array]
 
 
 def batch(case: tuple[Scene, Array, dict[str, Array]], envs: Sequence[int], threads: int) -> tuple[Simulator, Array]:
-    """The named environments, each with its own speed, masses and controls."""
+    """The given environments, with individual velocities, masses and controls."""
     scene, u, state = case
     sim = Simulator(scene, num_envs=len(envs), threads=threads)
     for part, value in state.items():
@@ -109,13 +109,15 @@ def batch(case: tuple[Scene, Array, dict[str, Array]], envs: Sequence[int], thre
 
 
 def bits(compute: Compute, sim: Simulator, u: Array) -> list[bytes]:
-    """All that was computed, environment by environment."""
+    """All results, by environment."""
     parts = compute(sim, u)
     return [b"".join(np.ascontiguousarray(part[env]).tobytes() for part in parts) for env in range(sim.num_envs)]
 
 
 @pytest.mark.parametrize("what", COMPUTED)
-def test_threads_and_company_change_no_bit(case: tuple[Scene, Array, dict[str, Array]], what: str) -> None:
+def test_results_are_bitwise_independent_of_threads_and_batch(
+    case: tuple[Scene, Array, dict[str, Array]], what: str
+) -> None:
     everyone = list(range(ENVS))
     reference = bits(COMPUTED[what], *batch(case, everyone, 1))
     assert len(set(reference)) == ENVS  # the environments do differ

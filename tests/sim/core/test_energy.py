@@ -1,4 +1,4 @@
-"""Energy: BDF1 never adds any to free bodies on planes; of scenes it is told how much a step may gain.
+"""Energy: BDF1 never adds energy to free bodies on planes; in scenes the gain of a step is bounded.
 
 Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction, step and centre of mass. The
 tolerance is ten times Newton's, relative to the energy at work.
@@ -24,7 +24,7 @@ def logarithmic(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 def throws(kind: Kind, law: str) -> st.SearchStrategy[ThrownBody]:
-    """Every material, with and without damping, at steps of 0.1 to 20 ms, of bodies that turn and that do not."""
+    """All materials, with and without damping, steps of 0.1 to 20 ms, with and without rotation."""
     damped = st.one_of(st.just(0.0), logarithmic(0.03, 30))
     numbers = st.fixed_dictionaries(
         {
@@ -54,8 +54,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 @pytest.mark.parametrize(
     ("kind", "law"), [(kind, law) for kind in KINDS for law in FRICTION_LAWS if (kind, law) != ("sphere", "elastic")]
 )
-def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
-    """Not in one step, halved or not; a sphere's moving point keeps no anchor, so that its friction is viscous."""
+def test_free_bodies_on_planes_never_gain_energy(kind: Kind, law: str) -> None:
+    """In no step, with or without substeps. The contact point of a sphere has no anchor, so its friction is viscous."""
 
     @settings(max_examples=40)
     @given(throw=throws(kind, law), seed=SEEDS)
@@ -66,8 +66,8 @@ def test_free_bodies_on_planes_never_gain(kind: Kind, law: str) -> None:
     check()
 
 
-def test_what_spins_fast_over_long_steps_never_gains() -> None:
-    """Where a step's points take the longest arcs, and springs hold back nothing; the body's frame off its centre."""
+def test_fast_spinning_bodies_with_long_steps_never_gain_energy() -> None:
+    """Points move along long arcs within a step, without friction springs; the body frame is off the centre of mass."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
     for kind in ("box", "cylinder"):
         throw = ThrownBody(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
@@ -76,10 +76,10 @@ def test_what_spins_fast_over_long_steps_never_gains() -> None:
 
 
 @pytest.mark.parametrize(("integrator", "step", "within"), [("bdf1", 1e-3, 1e-6), ("bdf2", 1e-5, 2e-3)])
-def test_what_the_elastic_law_stores_in_a_slip(integrator: str, step: float, within: float) -> None:
-    """A block that slides strains its springs by µ N / k_s and no more, however fast, and is braked by µ m g.
+def test_friction_energy_of_a_slipping_block(integrator: str, step: float, within: float) -> None:
+    """The springs of a sliding block have strain µ N / k_s at any speed, and the deceleration is µ g.
 
-    BDF2 knows the way of a step to first order."""
+    BDF2 computes the slip of a step to first order."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
     throw = ThrownBody("box", "elastic", "depth", step, numbers, integrator=integrator, has_rotation=False)
     sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
@@ -92,8 +92,8 @@ def test_what_the_elastic_law_stores_in_a_slip(integrator: str, step: float, wit
     assert gauge.read(sim).friction[0] == pytest.approx(points * 0.5 * numbers["ks"] * strain**2, rel=within)
 
 
-def test_the_parts_of_the_energy() -> None:
-    """A block that stands, and a scene's spring-like parts, against their formulas."""
+def test_energy_terms_equal_their_formulas() -> None:
+    """A resting block, and the springs of a scene."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
     throw = ThrownBody("box", "elastic", "depth", 1e-3, numbers)
     sim, gauge = (
@@ -123,7 +123,7 @@ MOST = {
 
 @pytest.mark.parametrize(("law", "integrator"), MOST)
 @pytest.mark.parametrize("name", scene_names())
-def test_what_scenes_gain_is_bounded(name: str, law: str, integrator: str) -> None:
+def test_energy_gain_of_scenes_is_bounded(name: str, law: str, integrator: str) -> None:
     grid = {"pads.pad.rows": 5, "pads.pad.cols": 5} if name == "rolling" else {}
     for step in (5e-3, 2e-2):
         scene = load_scene(name, friction=law, overrides={**grid, "step": step, "integrator": integrator})

@@ -1,4 +1,4 @@
-"""Every part of the core, a few steps of each: what `make sanitize` runs, and a first look after a change of the core.
+"""A few steps with every part of the core; run by `make sanitize`, and as a quick check after changes of the core.
 
 Right or wrong is the other tests' business: here nothing may fail, and only finite numbers may come out.
 """
@@ -29,7 +29,7 @@ FEW: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(("law", "integrator", "precision"), WAYS)
 @pytest.mark.parametrize("name", SCENES)
-def test_scene(name: str, law: str, integrator: str, precision: Precision) -> None:
+def test_scene_with_every_option(name: str, law: str, integrator: str, precision: Precision) -> None:
     overrides = {"integrator": integrator, **FEW.get(name, {})}
     scene = load_scene(name, friction=law, overrides=overrides)
     sim, run = Simulator(scene, num_envs=3, threads=2, precision=precision), reference_motion(scene)
@@ -58,7 +58,7 @@ def test_scene(name: str, law: str, integrator: str, precision: Precision) -> No
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", SHAPES)
-def test_shape(kind: str, law: str) -> None:
+def test_contact_with_every_shape(kind: str, law: str) -> None:
     rng = np.random.default_rng(1)
     sim, u = pressed_cloud(kind, law, "bdf1" if law == "viscous" else "bdf2", rng)
     case = gradient_check.RolloutLoss.random(sim, u, "tactile", rng)
@@ -66,7 +66,7 @@ def test_shape(kind: str, law: str) -> None:
 
 
 def told(kind: str) -> dict[str, Any]:
-    """A rounded solid, or the grid of a sphere's distances, as the core takes it."""
+    """A rounded solid, or a sphere's distance grid, as arguments of the core."""
     if kind != "grid":
         return {"kind": kind, "size": (0.02, 0.02, 0.02), "rounding": 0.004}
     line = np.linspace(-0.04, 0.04, 17)
@@ -77,7 +77,7 @@ def told(kind: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["grid", "box", "cylinder"])
-def test_grid_and_rounding(kind: str) -> None:
+def test_distance_grid_and_rounded_solid(kind: str) -> None:
     points = np.random.default_rng(2).uniform(-0.03, 0.03, (200, 3))
     spec = _core.ModelSpec()
     body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
@@ -97,8 +97,8 @@ def test_grid_and_rounding(kind: str) -> None:
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_extremes(precision: Precision) -> None:
-    """The ways by softer friction and through substeps, forwards and back."""
+def test_stress_batch(precision: Precision) -> None:
+    """Continuation in the friction and substeps, forward and backward."""
     halved = 0
     for name in ("rolling", "insertion"):
         sim, u = StressTest(envs=16, steps=8, threads=2, seed=8).start(
@@ -111,7 +111,7 @@ def test_extremes(precision: Precision) -> None:
     assert halved
 
 
-def test_refusals() -> None:
+def test_invalid_input_raises() -> None:
     scene = load_scene("rolling", overrides=FEW["rolling"])
     sim = Simulator(scene)
     with pytest.raises(UsageError, match="is not finite"):

@@ -1,4 +1,4 @@
-"""Shapes that a distance grid describes, and rounded ones: consistent, smooth, and with exact gradients in contact."""
+"""Distance grids and rounded shapes: consistent, smooth, with exact gradients in contact."""
 
 import itertools
 from typing import Any
@@ -24,7 +24,7 @@ KINDS = ("grid", "box", "cylinder")
 
 
 def sphere_grid(cells: int) -> DistanceGrid:
-    """Of the exact distances to a sphere, `cells` along its diameter."""
+    """Grid of exact distances to a sphere, with `cells` along the diameter."""
     spacing = 2 * RADIUS / cells
     line = spacing * np.arange(cells + 7) - RADIUS - 3 * spacing
     x, y, z = np.meshgrid(line, line, line, indexing="ij")
@@ -41,14 +41,14 @@ def bracket_grid(cells: int) -> DistanceGrid:
 
 
 def told(grid: DistanceGrid | None) -> dict[str, Any]:
-    """How a grid is told to the core; nothing where there is none."""
+    """Arguments of a grid for the core; empty without a grid."""
     if grid is None:
         return {}
     return {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
 
 
 def model_of(kind: str, size: Any, points: Array | None = None, *, rounding: float = 0.0, **grid: Any) -> Any:
-    """A shape called "shape" that stands still, and markers of 1 N/m that don't move."""
+    """A fixed shape "shape" and fixed markers of 1 N/m."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
     body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
@@ -61,7 +61,7 @@ def model_of(kind: str, size: Any, points: Array | None = None, *, rounding: flo
 
 
 def shape_of(kind: str) -> Any:
-    """A model with one shape of the kind: a sphere's grid, or a rounded solid."""
+    """A model with one shape: a sphere's grid, or a rounded solid."""
     if kind == "grid":
         return model_of("grid", (1, 0, 0), **told(sphere_grid(16)))
     return model_of(kind, ROUNDED[kind], rounding=ROUNDING)
@@ -75,7 +75,7 @@ def inside_points(kind: str, count: int, seed: int = 0) -> Array:
 
 
 def differenced(model: Any, points: Array, step: float = 1e-7) -> tuple[Array, Array]:
-    """Gradient of d and derivative of n, by central differences."""
+    """Central differences: gradient of d and derivative of n."""
     ends = [[model.distance("shape", points + s * step * axis) for s in (-1, 1)] for axis in np.eye(3)]
     by = [[(high - low) / (2 * step) for low, high in zip(*pair, strict=True)] for pair in ends]
     return np.stack([d for d, _, _ in by], axis=-1), np.stack([n for _, n, _ in by], axis=-1)
@@ -103,7 +103,7 @@ def test_second_derivatives_are_continuous_across_cells() -> None:
         assert np.abs(high - low).max() < 1e-6 * np.abs(high).max()
 
 
-def test_a_sphere_converges_with_the_fourth_power() -> None:
+def test_grid_of_a_sphere_converges_at_fourth_order() -> None:
     points = inside_points("grid", 4000)
     length = np.linalg.norm(points, axis=1)
     points = points[(length > RADIUS / 2) & (length < RADIUS)]
@@ -123,7 +123,7 @@ def test_a_sphere_converges_with_the_fourth_power() -> None:
     assert np.abs(lengths - 1).max() < 1e-4
 
 
-def test_a_bracket_is_right_in_sign_everywhere() -> None:
+def test_sign_of_a_bracket_is_correct_everywhere() -> None:
     grid = bracket_grid(32)
     points = np.random.default_rng(2).uniform(-0.03, 0.07, (20_000, 3))  # far out of the grid too
     d, _, _ = model_of("grid", (1, 0, 0), **told(grid)).distance("shape", points)
@@ -133,8 +133,8 @@ def test_a_bracket_is_right_in_sign_everywhere() -> None:
     assert (exact < 0).sum() > 100
 
 
-def test_no_touching_point_is_passed_over() -> None:
-    """Markers are looked up in blocks; what the blocks rule out must not touch."""
+def test_broad_phase_keeps_all_markers_in_contact() -> None:
+    """Markers are tested in blocks; excluded blocks have no contact."""
     points = np.random.default_rng(3).uniform(-0.03, 0.07, (30_000, 3))
     for scale in (1.0, 0.7, 1.6):
         model = model_of("grid", (scale, 0, 0), points, **told(bracket_grid(20)))
@@ -145,7 +145,7 @@ def test_no_touching_point_is_passed_over() -> None:
 
 
 @pytest.mark.parametrize("kind", ROUNDED)
-def test_no_point_in_a_rounded_solid_is_passed_over(kind: str) -> None:
+def test_broad_phase_keeps_all_points_in_a_rounded_solid(kind: str) -> None:
     points = inside_points(kind, 5000)
     model = model_of(kind, ROUNDED[kind], points, rounding=ROUNDING)
     d, n, _ = model.distance("shape", points)
@@ -154,7 +154,7 @@ def test_no_point_in_a_rounded_solid_is_passed_over(kind: str) -> None:
 
 
 def rounded_distance(kind: str, points: Array) -> Array:
-    """Exact, from the distance to the smaller solid."""
+    """Exact distance, from that to the smaller solid."""
     a, b, c = ROUNDED[kind]
     if kind == "box":
         beyond = np.abs(points) - (np.array([a, b, c]) - ROUNDING)
@@ -167,7 +167,7 @@ def rounded_distance(kind: str, points: Array) -> Array:
 
 
 @pytest.mark.parametrize("kind", ROUNDED)
-def test_a_rounded_solid_is_exact_and_smooth_at_its_seams(kind: str) -> None:
+def test_rounded_solid_is_exact_and_smooth_between_its_faces(kind: str) -> None:
     model, points = shape_of(kind), inside_points(kind, 5000)
     d, n, _ = model.distance("shape", points)
     np.testing.assert_allclose(d, rounded_distance(kind, points), atol=1e-16)
@@ -190,7 +190,7 @@ def test_a_rounded_solid_is_exact_and_smooth_at_its_seams(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ROUNDED)
-def test_without_rounding_edges_are_sharp(kind: str) -> None:
+def test_edges_without_rounding_are_sharp(kind: str) -> None:
     points = inside_points(kind, 2000)
     sharp = model_of(kind, ROUNDED[kind]).distance("shape", points)
     none = model_of(kind, ROUNDED[kind], rounding=0.0).distance("shape", points)
@@ -203,7 +203,7 @@ def test_without_rounding_edges_are_sharp(kind: str) -> None:
 
 
 def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "double") -> tuple[Simulator, Array]:
-    """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge on a grid."""
+    """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge of a grid."""
     spec = _core.ModelSpec()
     spec.tolerance = 1e-13
     turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
@@ -247,8 +247,8 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
 @pytest.mark.parametrize("kind", [*KINDS, "edge"])
-def test_gradients_pressed_on_a_shape(kind: str, law: str) -> None:
-    """By controls, state and parameters: a grid's scale and a solid's rounding are among these."""
+def test_gradients_of_points_pressed_onto_a_shape(kind: str, law: str) -> None:
+    """With respect to controls, state and parameters, including the scale of a grid and the rounding of a solid."""
     left_out = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -268,14 +268,14 @@ def test_gradients_pressed_on_a_shape(kind: str, law: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["grid", "box"])
-def test_single_precision(kind: str) -> None:
+def test_single_precision_agrees_with_double(kind: str) -> None:
     runs = [pressed(kind, "elastic", np.random.default_rng(0), precision)[0] for precision in ("double", "single")]
     double, single = (sim.tactile()[0] for sim in runs)
     assert np.abs(double).max() > 1e-3
     np.testing.assert_allclose(single, double, atol=3e-3 * float(np.abs(double).max()))
 
 
-def test_a_grid_of_other_scale_is_a_larger_shape() -> None:
+def test_scaled_grid_equals_a_larger_shape() -> None:
     points = inside_points("grid", 1000)
     grid = told(sphere_grid(12))
     d, n, hessian = model_of("grid", (1, 0, 0), **grid).distance("shape", points)
@@ -296,12 +296,12 @@ GRID_FAULTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("numbers", "says"), GRID_FAULTS, ids=[says for _, says in GRID_FAULTS])
-def test_a_wrong_grid_is_refused(numbers: dict[str, Any], says: str) -> None:
+def test_invalid_grid_raises(numbers: dict[str, Any], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         _core.ModelSpec().add_shape("s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers})
 
 
 @pytest.mark.parametrize(("kind", "rounding"), list(itertools.product(ROUNDED, (-1e-3, 0.05, float("nan")))))
-def test_a_wrong_rounding_is_refused(kind: str, rounding: float) -> None:
+def test_invalid_rounding_raises(kind: str, rounding: float) -> None:
     with pytest.raises(ValueError, match="rounding must"):
         _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=rounding)

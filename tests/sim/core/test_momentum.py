@@ -1,4 +1,4 @@
-"""Newton's third law: what two touching bodies do to each other cancels, in every scene where two moving bodies touch.
+"""Newton's third law: contact forces between moving bodies cancel, in every scene with such contacts.
 
 The scene's bodies are cut loose: each floats where the scene's motion had carried it, without gravity, motors and
 joints, and what touched still touches, with the scene's points, shapes and numbers.
@@ -22,7 +22,7 @@ IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dcl
 
 
 class Loose:
-    """A model builder that makes every body float and leaves out what is not between two of them.
+    """Stands in for ModelSpec: makes every body free and drops everything that is not between two bodies.
 
     `centred`: each body's frame is moved to its centre of mass.
     """
@@ -64,7 +64,7 @@ class Loose:
 
 
 def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True) -> Simulator:
-    """The scene's bodies afloat in the middle of its motion, moving as they did there."""
+    """The bodies of a scene as free bodies, with the state in the middle of its motion."""
     scene = load_scene(name, friction=law)
     sim, moves = Simulator(scene), reference_motion(scene)
     sim.q[0] = moves.q0
@@ -93,22 +93,22 @@ def rotations(poses: Array) -> Array:
 
 
 def in_world(sim: Simulator, of_joints: Array) -> Array:
-    """What acts on (or moves with) each floating body, as (moment about the world's origin, force), (bodies, 6)."""
+    """Generalized forces (or momenta) of free bodies as (moment about the world origin, force), (bodies, 6)."""
     poses, parts = sim.poses()[0], of_joints.reshape(-1, 6)
     moment = np.einsum("bij,bj->bi", rotations(poses), parts[:, 3:]) + np.cross(poses[:, :3], parts[:, :3])
     return np.hstack([moment, parts[:, :3]])
 
 
 def momentum(sim: Simulator) -> Array:
-    """Of each body: (angular about the world's origin, linear)."""
+    """Momentum of each body: (angular about the world origin, linear)."""
     return in_world(sim, sim.mass_matrix()[0] @ sim.v[0])
 
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
 @pytest.mark.parametrize("name", scene_names())
-def test_forces_and_torques_of_touching_bodies_cancel(name: str, law: str) -> None:
-    """What each body feels, from its own equation of motion: their sum about one point is nothing, relative to them,
-    and on the first body of each contact it is the wrench that the simulator tells."""
+def test_contact_forces_and_moments_between_bodies_cancel(name: str, law: str) -> None:
+    """The wrenches from the bodies' equations of motion sum to zero, and equal the simulator's contact wrench on the
+    first body of each contact."""
     sim = cut_loose(name, law, 1e-5)  # fingers weigh 0.2 g and press with 5 N: soon they are off
     touched = 0.0
     for _ in range(10):
@@ -133,8 +133,8 @@ def test_forces_and_torques_of_touching_bodies_cancel(name: str, law: str) -> No
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
 @pytest.mark.parametrize("name", scene_names())
-def test_what_contacts_apply_to_the_joints_cancels_to_round_off(name: str, law: str) -> None:
-    """The generalized forces of a step's equation, as forces and moments on the floating bodies."""
+def test_generalized_contact_forces_cancel_to_rounding(name: str, law: str) -> None:
+    """Generalized contact forces of a step, as forces and moments on the free bodies."""
     sim = cut_loose(name, law, 1e-5)
     touched, worst = 0.0, 0.0
     for _ in range(10):
@@ -157,8 +157,8 @@ def test_what_contacts_apply_to_the_joints_cancels_to_round_off(name: str, law: 
 @pytest.mark.parametrize("centred", [True, False])
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
 @pytest.mark.parametrize("name", scene_names())
-def test_linear_momentum_is_kept_to_newton_s_tolerance(name: str, integrator: str, centred: bool) -> None:
-    """Wherever in the body its frame is."""
+def test_linear_momentum_is_conserved_to_the_newton_tolerance(name: str, integrator: str, centred: bool) -> None:
+    """For any location of the body frame."""
     sim = cut_loose(name, "elastic", integrator=integrator, centred=centred)
     start, mass = momentum(sim)[:, 3:].sum(0), sum(sim.param(f"{b}.mass")[0] for b in sim.model.body_names)
     largest, steps = 0.0, 200
@@ -172,7 +172,7 @@ def test_linear_momentum_is_kept_to_newton_s_tolerance(name: str, integrator: st
 
 
 def drift_of(law: str, step: float) -> float:
-    """How far the angular momentum of the pushing scene's bodies moves in 20 ms."""
+    """Change of the angular momentum of the pushing scene's bodies in 20 ms."""
     sim = cut_loose("pushing", law, step)
     start = momentum(sim).sum(0)
     sim.step(np.zeros(0), round(0.02 / step))
@@ -181,8 +181,8 @@ def drift_of(law: str, step: float) -> float:
 
 
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
-def test_the_error_of_angular_momentum_falls_with_the_step(law: str) -> None:
-    """BDF1 keeps it to first order: torques are those at a step's end, the lever arms move during the step."""
+def test_angular_momentum_error_is_of_first_order(law: str) -> None:
+    """Torques are those at the end of a BDF1 step, while lever arms change within the step."""
     drifts = [drift_of(law, step) for step in (2e-4, 1e-4, 5e-5, 2.5e-5)]
     slopes = -np.diff(np.log2(drifts))
     print(f"{law}: drifts {[f'{d:.1e}' for d in drifts]} N m s, slopes {slopes.round(2)}")

@@ -1,4 +1,4 @@
-"""Order of the integrators: halving the step halves BDF1's error and quarters BDF2's, where nothing switches."""
+"""Order of the integrators in smooth motion: halving the step halves the error of BDF1 and quarters that of BDF2."""
 
 import itertools
 
@@ -32,7 +32,7 @@ def at_rest() -> Array:
 
 
 def end(start: Array, steps: int, integrator: str) -> Array:
-    """State after a smooth push on the pad that rests on the ball."""
+    """State after a smooth push on the pad, which rests on the ball."""
     sim = rolling(TIME / steps, integrator)
     sim.q[:] = start
     for k in range(1, steps + 1):
@@ -43,7 +43,9 @@ def end(start: Array, steps: int, integrator: str) -> Array:
 
 
 @pytest.mark.parametrize(("integrator", "order", "within"), [("bdf1", 1, 0.2), ("bdf2", 2, 0.3)])
-def test_the_error_falls_with_the_step(at_rest: Array, integrator: str, order: int, within: float) -> None:
+def test_error_decreases_with_the_order_of_the_integrator(
+    at_rest: Array, integrator: str, order: int, within: float
+) -> None:
     exact = end(at_rest, 2048, "bdf2")
     errors = [np.abs(end(at_rest, steps, integrator) - exact).max() for steps in (16, 32, 64, 128, 256)]
     slopes = -np.diff(np.log2(errors))
@@ -51,8 +53,8 @@ def test_the_error_falls_with_the_step(at_rest: Array, integrator: str, order: i
     np.testing.assert_allclose(slopes, order, atol=within)
 
 
-def test_a_free_flight_is_as_exact_as_the_integrator() -> None:
-    """Thrown, without contact: BDF1 is off by g h t / 2; BDF2, whose first step is BDF1's, by that of one step."""
+def test_error_of_free_flight_equals_its_closed_form() -> None:
+    """The error is g h t / 2 for BDF1, and that of the first step for BDF2, which starts with BDF1."""
     heights = {}
     for integrator in ("bdf1", "bdf2"):
         sim = rolling(1e-3, integrator)
@@ -66,7 +68,7 @@ def test_a_free_flight_is_as_exact_as_the_integrator() -> None:
     assert abs(heights["bdf2"]) < 0.02 * abs(heights["bdf1"])
 
 
-def test_what_bdf2_remembers_belongs_to_the_state(at_rest: Array) -> None:
+def test_bdf2_history_is_part_of_the_state(at_rest: Array) -> None:
     sim = rolling(5e-3, "bdf2")
     sim.q[:] = at_rest
     u = np.tile([1e-3, 0, 0.2], (6, 1, 1))
@@ -88,8 +90,8 @@ def test_what_bdf2_remembers_belongs_to_the_state(at_rest: Array) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
-def test_a_step_tells_its_error(at_rest: Array, integrator: str) -> None:
-    """The estimate falls with the square of the step, as BDF1's local error does; BDF2's is no smaller."""
+def test_error_estimate_of_a_step(at_rest: Array, integrator: str) -> None:
+    """The estimate is of second order, like the local error of BDF1, and not smaller for BDF2."""
     estimates = []
     for step in (4e-3, 2e-3, 1e-3):
         sim = rolling(step, integrator)
@@ -105,7 +107,7 @@ def test_a_step_tells_its_error(at_rest: Array, integrator: str) -> None:
         sim.error_estimate([np.nan, 0, 0])
 
 
-def test_the_elastic_law_knows_the_time_of_touch_to_a_step() -> None:
+def test_elastic_law_resolves_the_start_of_contact_to_one_step() -> None:
     """An anchor is where the point is at the end of the step in which it touched: the shear lacks what was covered
     between the touch and there. That is of first order under BDF2 too; and since the rest of a step can stay the same
     while steps are halved, so can the error."""

@@ -1,5 +1,5 @@
-"""Motions with a closed form: a block that slides to rest, a pendulum that swings wide, a top that tumbles, a part that
-creeps in a viscous grasp."""
+"""Motions with a closed form: a block sliding to rest, a pendulum with large amplitude, a tumbling top, and creep in a
+viscous grasp."""
 
 import numpy as np
 import pytest
@@ -21,9 +21,9 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
 @pytest.mark.parametrize("law", ["viscous", "elastic"])
-def test_a_sliding_block_stops_after_v_squared_over_2_mu_g(law: str, integrator: str) -> None:
-    """BDF1 sums the velocities at the steps' ends, v h / 2 less. What the laws add at the end is far below a
-    thousandth: creep below µ m g / (n k_t) = 0.5 mm/s, or give of µ m g / (n k_s) = 0.01 mm."""
+def test_sliding_distance_of_a_block_is_v_squared_over_2_mu_g(law: str, integrator: str) -> None:
+    """BDF1 sums the velocities at the ends of steps, which is less by v h / 2. The contributions of the friction laws
+    are far below 1e-3: creep below µ m g / (n k_t) = 0.5 mm/s, or compliance of µ m g / (n k_s) = 0.01 mm."""
     mu, speed, step = 0.3, 0.8, 1e-3
     numbers = {"kn": 2e3, "kt": 200.0 if law == "viscous" else 5.0, "mu": mu, "kd": 1e4, "ks": 1e4 * (law == "elastic")}
     throw = ThrownBody("box", law, "depth", step, numbers, integrator=integrator, has_rotation=False)
@@ -51,8 +51,8 @@ def pendulum(step: float, integrator: str) -> Simulator:
 
 @pytest.mark.parametrize("amplitude", [0.5, 2.0, 3.0])
 @pytest.mark.parametrize(("integrator", "order"), [("bdf1", 1), ("bdf2", 2)])
-def test_a_pendulum_s_period_at_large_amplitudes(integrator: str, order: int, amplitude: float) -> None:
-    """A quarter of it is K(sin² θ₀/2) / ω, a complete elliptic integral; ω² = m g l / (I + m l²)."""
+def test_period_of_a_pendulum_at_large_amplitudes(integrator: str, order: int, amplitude: float) -> None:
+    """A quarter period is K(sin² θ₀/2) / ω, with the complete elliptic integral K and ω² = m g l / (I + m l²)."""
     omega = np.sqrt(2.0 * GRAVITY * 0.25 / (0.03 + 2.0 * 0.25**2))
     exact = ellipk(np.sin(amplitude / 2) ** 2) / omega
     errors = []
@@ -73,13 +73,13 @@ DURATION = 2.0  # [s]
 
 
 def euler(_: float, spin: Array) -> Array:
-    """Euler's equations of a body that nothing turns."""
+    """Euler's equations of a torque-free body."""
     return np.asarray(-np.cross(spin, INERTIA * spin) / INERTIA)
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("bdf1", 1), ("bdf2", 2)])
-def test_a_top_that_tumbles_about_its_middle_axis(integrator: str, order: int) -> None:
-    """Against Euler's equations to 1e-12; energy and angular momentum drift at the integrator's order."""
+def test_top_tumbling_about_its_intermediate_axis(integrator: str, order: int) -> None:
+    """Agrees with Euler's equations; energy and angular momentum drift at the order of the integrator."""
     path = solve_ivp(euler, (0, DURATION), SPIN, rtol=1e-12, atol=1e-12, dense_output=True)
     assert path.sol(np.linspace(0, DURATION, 200))[1].min() < -5  # it has turned over
     exact = path.y[:, -1]
@@ -104,7 +104,7 @@ def test_a_top_that_tumbles_about_its_middle_axis(integrator: str, order: int) -
     np.testing.assert_allclose(rows[-1][1] / energy, 0, atol=2e-3 if order == 1 else 1e-5)
 
 
-def test_a_part_in_a_viscous_grasp_creeps_at_m_g_over_n_k_t() -> None:
+def test_creep_rate_in_a_viscous_grasp_is_m_g_over_n_k_t() -> None:
     attempts = InsertionAttempts(1, scene=insertion_scene(friction="viscous"), randomization=NOMINAL)
     attempts.draw(np.random.default_rng(0))
     sim, scene, u = attempts.sim, attempts.scene, attempts._u
@@ -139,8 +139,8 @@ def thrown(free: bool, integrator: str, step: float, center: tuple[float, float,
 
 
 @pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
-def test_a_free_joint_is_three_slides_and_a_ball(integrator: str) -> None:
-    """A free body has equations of its own; as a chain of joints it has those of every tree."""
+def test_free_joint_equals_three_slides_and_a_ball_joint(integrator: str) -> None:
+    """Free bodies and chains of joints use different equations in the core."""
     free, chain = (thrown(kind, integrator, 2e-3, ORIGIN) for kind in (True, False))
     for sim in (free, chain):
         sim.step(np.zeros(0), 100)
@@ -151,8 +151,8 @@ def test_a_free_joint_is_three_slides_and_a_ball(integrator: str) -> None:
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("bdf1", 1), ("bdf2", 2)])
-def test_off_its_centre_of_mass_it_is_so_up_to_the_order_of_the_steps(integrator: str, order: int) -> None:
-    """There a free body keeps its linear momentum, which a chain does to that order."""
+def test_free_joint_off_the_centre_of_mass_agrees_at_the_order_of_the_integrator(integrator: str, order: int) -> None:
+    """A free body conserves linear momentum exactly, a chain to the order of the integrator."""
     apart, center = [], (0.02, -0.01, 0.03)
     for step in (2e-3, 1e-3, 5e-4, 2.5e-4):
         free, chain = (thrown(kind, integrator, step, center) for kind in (True, False))
@@ -167,7 +167,7 @@ def test_off_its_centre_of_mass_it_is_so_up_to_the_order_of_the_steps(integrator
     assert (slopes > order - 0.3).all()
 
 
-def test_a_hundred_bodies_fall_alike() -> None:
+def test_a_hundred_bodies_have_the_same_free_fall() -> None:
     spec = _core.ModelSpec()
     for i in range(100):
         body = spec.add_body(f"body{i}", -1, ORIGIN, UPRIGHT, 0.1 + i, ORIGIN, (1, 1, 1, 0, 0, 0))

@@ -1,4 +1,4 @@
-"""Shapes: distance and normal against independent formulas."""
+"""Distances and normals of shapes compared with independent formulas."""
 
 import itertools
 
@@ -23,7 +23,7 @@ SIZES = {
 
 
 def felt(kind: str, points: Array) -> tuple[Array, Array]:
-    """Depth (n,) and outward normal (n, 3) at points of a fixed shape, as markers of 1 N/m there show them."""
+    """Depth (n,) and outward normal (n, 3) at points of a fixed shape, from markers of 1 N/m."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
     body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
@@ -42,7 +42,7 @@ def outside_of_box(x: Array, half: Array) -> float:
 
 
 def distance(kind: str, x: Array) -> float:
-    """Signed distance by another way than the core's."""
+    """Signed distance by a formula independent of the core."""
     a, b, c = SIZES[kind]
     if kind == "sphere":
         return float(np.linalg.norm(x) - a)
@@ -66,7 +66,7 @@ def distance(kind: str, x: Array) -> float:
 
 
 @pytest.mark.parametrize("kind", SIZES)
-def test_depth_and_normal(kind: str) -> None:
+def test_depth_and_normal_equal_the_formulas(kind: str) -> None:
     rng = np.random.default_rng(1)
     reach = {"cylinder": (0.02, 0.02, 0.03), "capsule": (0.015, 0.015, 0.045)}.get(kind, SIZES[kind])
     points = rng.uniform(-1.1, 1.1, (40 if kind == "ellipsoid" else 400, 3)) * np.where(
@@ -83,7 +83,7 @@ def test_depth_and_normal(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", SIZES)
-def test_where_there_is_no_gradient_something_finite_is_felt(kind: str) -> None:
+def test_forces_are_finite_where_the_distance_has_no_gradient(kind: str) -> None:
     points = np.array([[0, 0, 0], [0, 0, 1e-3], [1e-3, 0, 0], [0, 1e-20, 0], [1e-3, 1e-3, 0]], dtype=float)
     depth, normal = felt(kind, points)
     assert (depth > 0).all()
@@ -99,6 +99,6 @@ def test_where_there_is_no_gradient_something_finite_is_felt(kind: str) -> None:
         ("capsule", (0.1, -0.1, 0), "size must be positive"),
     ],
 )
-def test_a_wrong_shape_is_refused(kind: str, size: tuple[float, float, float], says: str) -> None:
+def test_invalid_shape_raises(kind: str, size: tuple[float, float, float], says: str) -> None:
     with pytest.raises((UsageError, ValueError), match=says):
         _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), size)

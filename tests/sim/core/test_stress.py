@@ -1,5 +1,7 @@
-"""At the extremes nothing but numbers comes out, failures are rare, and what is at rest stays. What is drawn stands in
-gelflow.sim.validation.stress; benchmarks/extremes.py draws two million steps."""
+"""Stress tests: results are finite, failures are rare, and bodies at rest do not move.
+
+The distribution is described in gelflow.sim.validation.stress; benchmarks/stress.py runs two million steps.
+"""
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ BOTH: tuple[Precision, ...] = ("double", "single")
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("scene", SCENES)
-def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision: Precision) -> None:
+def test_results_are_finite(scene: str, law: str, integrator: str, precision: Precision) -> None:
     sim, u = StressTest(envs=24, steps=20, threads=1, seed=3).start(
         StressBatch(scene, law, integrator, "all", precision)
     )
@@ -34,7 +36,7 @@ def test_only_numbers_come_out(scene: str, law: str, integrator: str, precision:
 
 @pytest.mark.parametrize("precision", BOTH)
 @pytest.mark.parametrize("scene", SCENES)
-def test_nothing_fails_in_the_normal_range(scene: str, precision: Precision) -> None:
+def test_no_step_of_the_normal_range_fails(scene: str, precision: Precision) -> None:
     extremes = StressTest(envs=24, steps=20, threads=1, seed=4)
     for law in FRICTION_LAWS:
         for integrator in INTEGRATORS:
@@ -42,7 +44,7 @@ def test_nothing_fails_in_the_normal_range(scene: str, precision: Precision) -> 
             assert statistics.failed == 0 and statistics.steps == 24 * 20
 
 
-def test_failures_are_rare_and_iterations_capped() -> None:
+def test_failures_are_rare_and_iterations_limited() -> None:
     extremes, total = StressTest(envs=24, steps=20, threads=1, seed=5), StepStatistics()
     for draw in stress_batches(3):
         total.add(extremes.run(draw))
@@ -50,8 +52,8 @@ def test_failures_are_rare_and_iterations_capped() -> None:
     assert total.most_iterations <= _core.ModelSpec().max_step_iterations
 
 
-def test_a_step_that_must_be_halved_tells_its_error() -> None:
-    """Its parts are compared with shorter ones, which are halved in turn where they must be."""
+def test_error_estimate_of_steps_with_substeps() -> None:
+    """Substeps are compared with shorter ones, which are split again if needed."""
     sim, u = StressTest(envs=24, steps=20, threads=1, seed=3).start(StressBatch("insertion", "elastic", "bdf1", "all"))
     halved = 0
     for control in u:
@@ -66,8 +68,8 @@ def test_a_step_that_must_be_halved_tells_its_error() -> None:
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_what_lies_stays(law: str) -> None:
-    """A box at rest on the ground for a million steps, 83 minutes: as it lay, so it lies."""
+def test_resting_box_does_not_move(law: str) -> None:
+    """A million steps, 83 minutes."""
     sim = Simulator(load_scene("pushing", friction=law), threads=1)
     sim.q[0] = sim.scene.q0
     u = np.zeros(sim.model.nu)
@@ -79,7 +81,7 @@ def test_what_lies_stays(law: str) -> None:
 
 
 @pytest.mark.parametrize("step", [1e-6, 5e-2])
-def test_short_and_long_steps(step: float) -> None:
+def test_very_short_and_long_steps(step: float) -> None:
     sim = Simulator(load_scene("insertion", friction="elastic", overrides={"step": step}))
     sim.q[0] = sim.scene.q0
     u = np.zeros(sim.model.nu)
@@ -99,8 +101,8 @@ def free_body(spec: _core.ModelSpec, name: str, mass: float, height: float, half
     return body
 
 
-def test_a_heavy_block_on_a_light_one() -> None:
-    """100 kg on 1 mg, a ratio of 1e8, on springs that sag by 0.1 mm under it."""
+def test_heavy_block_on_a_light_one() -> None:
+    """100 kg on 1 mg, a ratio of 1e8, with a deflection of 0.1 mm."""
     spec, half = _core.ModelSpec(), 0.01
     bodies = [free_body(spec, "light", 1e-6, half), free_body(spec, "heavy", 100.0, 3 * half)]
     ground = spec.add_shape("ground", -1, "plane", [0, 0, 0], [1, 0, 0, 0], [0, 0, 0])
@@ -117,8 +119,8 @@ def test_a_heavy_block_on_a_light_one() -> None:
 
 
 @pytest.mark.parametrize("precision", BOTH)
-def test_a_spin_through_many_turns(precision: Precision) -> None:
-    """1000 rad/s about the axis of symmetry, 8 rad in every step, for 80 000 rad."""
+def test_spin_through_many_revolutions(precision: Precision) -> None:
+    """1000 rad/s about the axis of symmetry, 5 rad per step, 80 000 rad in total."""
     spec = _core.ModelSpec()
     spec.gravity = (0.0, 0.0, 0.0)
     free_body(spec, "top", 0.1, 0.0)
@@ -132,10 +134,10 @@ def test_a_spin_through_many_turns(precision: Precision) -> None:
 
 @pytest.mark.parametrize("precision", BOTH)
 @pytest.mark.parametrize("size", [1e-310, 1e-40, 1e12, 1e30, 1e150, 1e300])
-def test_denormal_and_enormous_numbers(size: float, precision: Precision) -> None:
-    """As velocity, as control, as stiffness and as place: moved on, or failed with a reason; never passed on as NaN."""
+def test_denormal_and_huge_values(size: float, precision: Precision) -> None:
+    """As velocity, control, stiffness and position: a finite result or a failure status, never NaN."""
     if precision == "single" and size > 1e38:
-        pytest.skip("no number of single precision")
+        pytest.skip("not representable in single precision")
     scene = load_scene("pushing", friction="elastic")
     sim = Simulator(scene, num_envs=4, precision=precision)
     sim.q[:] = scene.q0

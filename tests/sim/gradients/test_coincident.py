@@ -1,4 +1,4 @@
-"""Where geometry coincides to the last bit: a marker on an edge, faces in one plane, a pad that hangs over its body.
+"""Exactly coincident geometry: a marker on an edge, coplanar faces, a pad that overhangs its body.
 
 Lengths are powers of two, so that what coincides does so in single precision too.
 """
@@ -31,7 +31,7 @@ def law_of(law: str) -> dict[str, Any]:
 
 
 def marker(kind: str, at: tuple[float, float, float], law: str, precision: Any) -> Simulator:
-    """One marker, on three slides, at a place of a shape [UNIT]."""
+    """One marker on three slides, at a position relative to a shape [UNIT]."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
     body = spec.add_body("hand", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-3, 1e-3, 1e-3, 0, 0, 0))
@@ -44,7 +44,7 @@ def marker(kind: str, at: tuple[float, float, float], law: str, precision: Any) 
 
 
 def reading_by_q(sim: Simulator) -> tuple[Array, Array]:
-    """What the marker reads, as a force in the world, (3,), and its derivative by the three slides, (3, 3)."""
+    """World force of the marker, (3,), and its derivative with respect to the slides, (3, 3)."""
     run = sim.rollout(np.zeros((1, 1, 0)), read_after=[0])
     signs = np.array([1.0, 1.0, -1.0])
     rows = [sim.rollout_gradient(run, tactile=row).q[0] for row in np.diag(signs)]
@@ -54,8 +54,8 @@ def reading_by_q(sim: Simulator) -> tuple[Array, Array]:
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", SIZES)
-def test_a_marker_on_an_edge_feels_nothing_yet(kind: str, law: str, precision: str) -> None:
-    """As on the outside: force and gradient vanish, and so they do a little further out."""
+def test_marker_on_an_edge_has_no_force(kind: str, law: str, precision: str) -> None:
+    """Force and gradient are zero, as outside of the shape."""
     for at in ON_EDGES[kind]:
         for out in (1.0, 1 + 2.0**-10):
             x, y, z = (out * a for a in at)
@@ -66,10 +66,10 @@ def test_a_marker_on_an_edge_feels_nothing_yet(kind: str, law: str, precision: s
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize(("kind", "at"), [("box", (12, 0, 4)), ("cylinder", (4, 0, 12))])
-def test_a_marker_equally_near_to_both_faces_of_an_edge_takes_one(
+def test_marker_at_equal_distance_to_two_faces_uses_one_of_them(
     kind: str, at: tuple[float, float, float], law: str, precision: str
 ) -> None:
-    """The box's first face, the cylinder's wall; the gradient is that towards where this face is the nearer one."""
+    """The first face of a box, the wall of a cylinder; the gradient is that of the side where this face is nearer."""
     sim = marker(kind, at, law, precision)
     force, by_q = reading_by_q(sim)
     np.testing.assert_array_equal(force, [4, 0, 0])
@@ -85,7 +85,7 @@ def test_a_marker_equally_near_to_both_faces_of_an_edge_takes_one(
 
 
 def lattice(half: Array, counts: tuple[int, int, int]) -> Array:
-    """Points spread evenly over the surface of a box, edges and corners included, (points, 3)."""
+    """Points on the surface of a box, including edges and corners, (points, 3)."""
     all_points = np.array(list(product(*(np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)))))
     surface: Array = all_points[(np.abs(all_points) == half).any(axis=1)]
     return surface
@@ -94,7 +94,7 @@ def lattice(half: Array, counts: tuple[int, int, int]) -> Array:
 def fitted(
     boxes: dict[str, tuple[Any, Any]], law: str, precision: Any, gravity: tuple[float, float, float]
 ) -> Simulator:
-    """A floating cube of 16 UNIT against boxes that stand: name → centre and half sizes [UNIT]."""
+    """A free cube of 16 UNIT and fixed boxes (name → centre and half sizes [UNIT])."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.polish = gravity, 2.0**-9, 2
     inertia = 0.25 * (16 * UNIT) ** 2 / 6
@@ -123,8 +123,8 @@ HOLE = {  # as wide, long and deep as the cube
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
-def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precision: str) -> None:
-    """Unloaded, nothing moves by a bit; gradients are those of the free side, up and out."""
+def test_coplanar_faces_have_no_contact_force(boxes: dict[str, Any], law: str, precision: str) -> None:
+    """Without load nothing moves, and gradients are those of the side without contact."""
     sim = fitted(boxes, law, precision, (0, 0, 0))
     u, start = np.zeros((4, 1, 0)), sim.q.copy()
     run = sim.rollout(u)
@@ -149,7 +149,7 @@ def test_faces_in_one_plane_do_not_push(boxes: dict[str, Any], law: str, precisi
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
-def test_a_load_on_coincident_faces_is_carried_straight_down(boxes: dict[str, Any], law: str, precision: str) -> None:
+def test_load_on_coincident_faces_gives_a_vertical_force(boxes: dict[str, Any], law: str, precision: str) -> None:
     """On the box of its size by the nine points inside its face, as those on its edges stay on its edges; in the hole
     by all twenty-five. The walls beside it push as much from each side."""
     sim = fitted(boxes, law, precision, (0, 0, -8))
@@ -174,7 +174,7 @@ def test_a_load_on_coincident_faces_is_carried_straight_down(boxes: dict[str, An
 
 
 def hanging_over(law: str, precision: Any) -> Simulator:
-    """A pad of 8 × 8 markers that pushes, UNIT deep in a block that lies under four of its rows; one on its edge."""
+    """A colliding pad of 8 × 8 markers, UNIT deep in a block below four of its rows; one row is on its edge."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.polish = (0, 0, 0), 2.0**-14, 2
     hand = spec.add_body("hand", -1, (0, 0, -UNIT), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
@@ -194,9 +194,9 @@ def hanging_over(law: str, precision: Any) -> Simulator:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_a_pad_half_off_a_body(law: str, precision: str) -> None:
-    """Only the markers over it feel it, UNIT deep, and together they feel the contact's wrench; the one on its edge
-    feels nothing."""
+def test_pad_that_overhangs_a_body(law: str, precision: str) -> None:
+    """Only the markers above the body have forces, with depth UNIT, whose sum is the contact wrench; those on the edge
+    have none."""
     sim = hanging_over(law, precision)
     depth = sim.tactile()[0].reshape(8, 8, 3)[..., 2]
     np.testing.assert_array_equal(depth, np.repeat([1.0, 0.0], 4)[:, None] * np.ones(8))

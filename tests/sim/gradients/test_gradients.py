@@ -1,5 +1,5 @@
-"""Gradients by everything, in all scenes and on all shapes, under both laws and integrators: exact by dual numbers,
-right by central differences. `python benchmarks/gradients.py` does the same with many more states."""
+"""Gradients in all scenes and on all shapes, with both friction laws and integrators, compared with dual numbers and
+central differences. `python benchmarks/gradients.py` checks many more states."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ OUTPUTS: tuple[gradient_check.Output, ...] = ("q", "v", "tactile")
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", SCENES)
-def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> None:
+def test_gradients_equal_dual_numbers(name: str, law: str, integrator: str) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
         sim, u = scene_in_contact(name, law, integrator, rng)
@@ -28,8 +28,8 @@ def test_exact_against_dual_numbers(name: str, law: str, integrator: str) -> Non
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", SCENES)
-def test_right_against_central_differences(name: str, law: str, integrator: str) -> None:
-    """By controls and state for every output; by the parameters, which take most of the time, for one, in turn."""
+def test_gradients_agree_with_central_differences(name: str, law: str, integrator: str) -> None:
+    """Controls and state for every output; parameters, which take most of the time, for one output in turn."""
     agreements, with_params = [], (FRICTION_LAWS.index(law) + 2 * INTEGRATORS.index(integrator)) % len(OUTPUTS)
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(100 + seed)
@@ -45,8 +45,8 @@ def test_right_against_central_differences(name: str, law: str, integrator: str)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("kind", [*SHAPES, FREE])
-def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
-    """Pressed onto it; a free body that spins on a plane, and so takes the way by arcs (arc_correction.hpp)."""
+def test_gradients_on_every_shape(kind: str, law: str, integrator: str) -> None:
+    """Points pressed onto the shape; and a free body spinning on a plane, with arc corrections (arc_correction.hpp)."""
     left_out = []
     for seed, output in enumerate(OUTPUTS):
         rng = np.random.default_rng(seed)
@@ -62,8 +62,8 @@ def test_on_a_shape(kind: str, law: str, integrator: str) -> None:
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("law", FRICTION_LAWS)
-def test_the_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> None:
-    """Down onto the ball for 100 steps, then rolling: the end's positions, and a loss of all its marker readings."""
+def test_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> None:
+    """100 steps of descent onto the ball, then rolling; final positions, and a loss of all marker forces."""
     (down, push), (_, roll) = PUBLISHED_ROLLING_FORCES[:2]
     sim = converged_simulator("rolling", law, integrator)
     u = np.array([push] * down + [roll] * (110 - down))
@@ -77,7 +77,7 @@ def test_the_first_110_steps_of_the_rolling_run(law: str, integrator: str) -> No
         assert error < 1e-10
 
 
-def test_the_checker_notices_a_wrong_gradient() -> None:
+def test_check_detects_a_wrong_gradient() -> None:
     sim, u = scene_in_contact("rolling", "viscous", "bdf1", np.random.default_rng(0))
     case = gradient_check.RolloutLoss.random(sim, u, "v", np.random.default_rng(1))
     wrong = gradient_check.RolloutLoss(sim, u * (1 + 1e-3), case.output, case.weights)

@@ -1,4 +1,4 @@
-"""Gradients exactly where something switches: finite, repeatable, and those of the side that the step takes.
+"""Gradients exactly at kinks: finite, repeatable, and those of the mode that the step takes.
 
 Numbers are powers of two, so that a state lies on a border to the last bit; what moves there is held there by its joint
 or by the balance of its forces. The state is read at the start and after each step.
@@ -39,7 +39,7 @@ def probe(
     joint: dict[str, float] | None = None,
     actuator: dict[str, Any] | None = None,
 ) -> Simulator:
-    """A point that is a marker too, at a place of a shape, without weight, on slides."""
+    """A contact point with a marker at a position of a shape, without gravity, on slides."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
     spec.tolerance = 1e-13
@@ -120,7 +120,7 @@ DRIVEN = ("actuator at its force", "actuator at its control", "servo at its forc
 
 
 def gradient_of(sim: Simulator, name: str) -> tuple[Trajectory, TrajectoryGradient]:
-    """By everything, of a scalar of everything."""
+    """Gradient of a scalar of all outputs with respect to all inputs."""
     u = np.full((2, sim.num_envs, 1), 0.5 if name in DRIVEN else 0.0)
     run = sim.rollout(u, read_after=(0, 1, 2))
     assert not run.status.any()
@@ -135,7 +135,7 @@ def gradient_of(sim: Simulator, name: str) -> tuple[Trajectory, TrajectoryGradie
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", KINKS)
-def test_finite_and_repeatable(name: str, integrator: str) -> None:
+def test_gradients_at_kinks_are_finite_and_repeatable(name: str, integrator: str) -> None:
     _, first = gradient_of(KINKS[name](integrator), name)
     _, again = gradient_of(KINKS[name](integrator), name)
     one = KINKS[name](integrator)
@@ -154,8 +154,8 @@ def test_finite_and_repeatable(name: str, integrator: str) -> None:
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", KINKS)
-def test_of_the_side_that_the_step_takes(name: str, integrator: str) -> None:
-    """Dual numbers decide by values alone, and so go the same way."""
+def test_gradients_are_those_of_the_mode_of_the_step(name: str, integrator: str) -> None:
+    """Dual numbers branch by values only, and take the same mode."""
     sim, rng = KINKS[name](integrator), np.random.default_rng(1)
     u = np.full((2, 1), 0.5 if name in DRIVEN else 0.0)
     for output in ("q", "v", "tactile"):
@@ -164,8 +164,8 @@ def test_of_the_side_that_the_step_takes(name: str, integrator: str) -> None:
             assert compare_to_dual_numbers(replace(case, u=steps), rng, directions=2).error < 1e-10
 
 
-def test_they_are_on_the_border() -> None:
-    """To the last bit, at the start and after the steps: a little to either side other branches are taken."""
+def test_states_are_exactly_at_a_kink() -> None:
+    """At the start and after the steps, small displacements to either side give other contact modes."""
     for name, change, moves in (
         ("stick and slip, viscous", "v", 1),
         ("stick and slip, elastic", "anchors", 1),

@@ -1,4 +1,4 @@
-"""Gradients through torch: over a hundred steps, step by step, and by parameters that are fitted to a recorded run."""
+"""Gradients through PyTorch: over a hundred steps, step by step, and with respect to fitted parameters."""
 
 import numpy as np
 import pytest
@@ -23,10 +23,10 @@ def rollout_loss(sim: Simulator, u: torch.Tensor, q: torch.Tensor, v: torch.Tens
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", ("rolling", "insertion"))
-def test_hundred_steps_through_torch(name: str, law: str) -> None:
-    """dL/du, dL/dq0 and dL/dv0 of a loss with tactile terms, against central differences along random directions.
+def test_gradient_over_a_hundred_steps(name: str, law: str) -> None:
+    """dL/du, dL/dq0 and dL/dv0 of a loss with tactile terms agree with central differences along random directions.
 
-    Stencils that leave the branches of the middle run at any of the 100 steps are left out, and counted.
+    Stencils with other contact modes than the base run at any of the 100 steps are skipped and counted.
     """
     rng = np.random.default_rng(7)
     sim, u = scene_in_contact(name, law, "bdf1", rng)
@@ -66,7 +66,7 @@ def test_hundred_steps_through_torch(name: str, law: str) -> None:
         assert gradient_check.compare_to_dual_numbers(case, rng, directions=1, groups=False).error < 1e-6
 
 
-def test_steps_one_by_one_are_the_rollout() -> None:
+def test_single_steps_equal_the_rollout() -> None:
     sim, u = scene_in_contact("insertion", "elastic", "bdf1", np.random.default_rng(3))
     controls = torch.tensor(np.repeat(u[:, None], 4, axis=0), requires_grad=True)
     state = torch_layer.torch_state(sim)
@@ -79,7 +79,7 @@ def test_steps_one_by_one_are_the_rollout() -> None:
     assert torch.allclose(gradient_whole, gradient_steps, rtol=1e-9, atol=1e-9)
 
 
-def test_wrong_tensors_are_refused() -> None:
+def test_invalid_tensors_raise() -> None:
     sim = converged_simulator("rolling", "viscous", "bdf1")
     state = torch_layer.torch_state(sim)
     with pytest.raises(UsageError, match=r"u must be a CPU tensor of torch\.float64"):
@@ -90,8 +90,8 @@ def test_wrong_tensors_are_refused() -> None:
         torch_layer.torch_rollout(sim, state, torch.full((1, 1, 3), float("nan"), dtype=torch.float64))
 
 
-def test_stiffness_and_place_are_found_again() -> None:
-    """The markers' stiffness and the pad's place on its finger, from marker readings of a run that had others."""
+def test_fit_recovers_stiffness_and_position() -> None:
+    """Marker stiffness and pad position on the finger, from marker forces of a run with other values."""
     sim, u = scene_in_contact("rolling", "viscous", "bdf1", np.random.default_rng(5))
     controls, state = torch.from_numpy(np.repeat(u[:, None], 2, axis=0)), torch_layer.torch_state(sim)
     kept = sim.params.copy()
@@ -118,7 +118,7 @@ def test_stiffness_and_place_are_found_again() -> None:
     assert np.array_equal(sim.params, kept), "the simulator's own parameters stay"
 
 
-def test_parameters_of_each_environment_have_their_own_gradient() -> None:
+def test_parameters_of_environments_have_individual_gradients() -> None:
     one, u = scene_in_contact("pushing", "viscous", "bdf1", np.random.default_rng(2))
     sim = Simulator(one.model, num_envs=3)
     for name in ("q", "v", "params"):
@@ -139,7 +139,7 @@ def test_parameters_of_each_environment_have_their_own_gradient() -> None:
     assert float(common.grad) == pytest.approx(expected[:, sim.param_index["box_ground.mu"]].sum(), rel=1e-12)
 
 
-def test_wrong_parameters_are_refused() -> None:
+def test_invalid_parameters_raise() -> None:
     sim = converged_simulator("rolling", "viscous", "bdf1")
     state, u = torch_layer.torch_state(sim), torch.zeros((1, 1, 3), dtype=torch.float64)
     for name, value, message in (

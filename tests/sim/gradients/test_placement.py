@@ -1,4 +1,4 @@
-"""Where shapes, points and markers are, how they are turned and scaled, as parameters: the same as built that way."""
+"""Position, orientation and scale of shapes, points and markers as parameters, compared with built models."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ def quat(rotation: Rotation) -> Array:
 
 
 def moved(points: Array, what: str, scale: Array) -> Array:
-    """Points of FRAME, moved as parameters would."""
+    """Points of FRAME, displaced as by parameters."""
     pos, frame = FRAME
     if what == "as built":
         return np.asarray(pos + frame.apply(points))
@@ -33,7 +33,7 @@ def moved(points: Array, what: str, scale: Array) -> Array:
 
 
 def build(law: str, shape: str, points: str, markers: str) -> Simulator:
-    """A cloud on slides and a ball joint, over a box; each of them as built or moved."""
+    """A cloud on slides and a ball joint above a box; each placed when built or by parameters."""
     spec = _core.ModelSpec()
     spec.tolerance = 1e-13
     hand = spec.add_body("hand", -1, (0, 0, 0.02), (1, 0, 0, 0), 0.05, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
@@ -65,7 +65,7 @@ def move(sim: Simulator, owner: str, names: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("what", ["shape", "points", "markers"])
-def test_a_parameter_moves_as_if_built_there(what: str, law: str) -> None:
+def test_placement_by_parameters_equals_placement_when_built(what: str, law: str) -> None:
     places = {"shape": "as built", "points": "as built", "markers": "as built"}
     built, sim = build(law, **{**places, what: "moved"}), build(law, **places)
     owner = {"shape": "box.shape", "points": "cloud.points", "markers": "skin.markers"}[what]
@@ -82,7 +82,7 @@ def test_a_parameter_moves_as_if_built_there(what: str, law: str) -> None:
 
 
 def pressed_by(points: Array, areas: Array, depth: float) -> tuple[Simulator, Array]:
-    """Points with a stiffness per area, on a plane that their lowest reaches into by `depth`."""
+    """Points with stiffness per area on a plane, the lowest at `depth`."""
     spec = _core.ModelSpec()
     body = spec.add_body("part", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
     spec.add_joint("part", body, "free", (0, 0, 0), (0, 0, 1))
@@ -95,7 +95,7 @@ def pressed_by(points: Array, areas: Array, depth: float) -> tuple[Simulator, Ar
 
 
 @pytest.mark.parametrize("scale", [(1.2, 1.2, 1.2), (1.3, 0.8, 1.1)])
-def test_scaled_points_are_those_of_a_larger_box(scale: tuple[float, float, float]) -> None:
+def test_scaled_points_equal_those_of_a_larger_box(scale: tuple[float, float, float]) -> None:
     half = np.array([0.02, 0.03, 0.01])
     larger, expected = pressed_by(*box_surface(tuple(half * scale), (4, 5, 3)), 1e-3)
     sim, before = pressed_by(*box_surface(tuple(half), (4, 5, 3)), 1e-3)
@@ -107,7 +107,7 @@ def test_scaled_points_are_those_of_a_larger_box(scale: tuple[float, float, floa
     assert abs(expected[5] / before[5] - scale[0] * scale[1]) < 0.3
 
 
-def test_a_sphere_s_weights_grow_with_the_square_of_its_scale() -> None:
+def test_weights_of_a_sphere_grow_with_the_square_of_its_scale() -> None:
     larger, expected = pressed_by(*capsule(0.015, 0.0, count=200), 2e-3)
     sim, _ = pressed_by(*capsule(0.01, 0.0, count=200), 2e-3)
     for axis in "xyz":
@@ -116,7 +116,7 @@ def test_a_sphere_s_weights_grow_with_the_square_of_its_scale() -> None:
     np.testing.assert_allclose(sim.wrenches()[0, 0], expected, rtol=1e-9, atol=1e-12)
 
 
-def test_the_one_point_of_a_sphere_has_its_scale_as_size() -> None:
+def test_scale_of_an_exact_sphere_is_its_size() -> None:
     sim = Simulator(load_scene("rolling", overrides={"pads.pad.rows": 2, "pads.pad.cols": 2}), num_envs=2)
     sim.param("ball.points.scale.x")[1] = 1.25
     sim.q[:, sim.joint_q("pad_z")] = 1.0
@@ -126,7 +126,7 @@ def test_the_one_point_of_a_sphere_has_its_scale_as_size() -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_scene_has_them(name: str) -> None:
+def test_every_scene_has_placement_parameters(name: str) -> None:
     scene = load_scene(name)
     sim = Simulator(scene)
     for owner, pos in [
@@ -142,8 +142,8 @@ def test_every_scene_has_them(name: str) -> None:
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_a_moved_wall_is_felt_there(precision: Any, integrator: str) -> None:
-    """Each environment has its own hole: where a wall comes nearer, a part that hangs in it is pushed away."""
+def test_displaced_wall_pushes_the_part(precision: Any, integrator: str) -> None:
+    """Each environment has its own hole; a displaced wall pushes the part."""
     scene = load_scene("insertion", overrides={"integrator": integrator})
     sim = Simulator(scene, num_envs=3, precision=precision)
     sim.q[:] = scene.q0
@@ -159,7 +159,7 @@ def test_a_moved_wall_is_felt_there(precision: Any, integrator: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["wall_left.shape.pos.x", "floor.shape.turn.y", "part.points.scale.z"])
-def test_a_place_that_is_no_number_fails(name: str) -> None:
+def test_position_that_is_not_finite_gives_a_failure_status(name: str) -> None:
     scene = load_scene("insertion")
     sim = Simulator(scene, num_envs=2)
     sim.q[:] = scene.q0

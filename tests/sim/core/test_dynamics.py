@@ -1,4 +1,4 @@
-"""The core without contact: masses and forces against MuJoCo on random trees, motion against closed forms.
+"""The core without contact: random trees compared with MuJoCo, motions compared with closed forms.
 
 Tolerances come from where the figure comes from: rounding for what is algebra, Newton's tolerance for what the solved
 equation keeps, and for what the integrator (BDF1) approximates, an error that halves with the step.
@@ -36,7 +36,7 @@ class Link:
 
 
 def random_tree(rng: np.random.Generator, bodies: int, *, free: bool) -> list[Link]:
-    """A tree of bodies with one to three joints each; its roots float when `free`, and there is one root only."""
+    """A tree of bodies with one to three joints each; with `free` a single root on a free joint."""
     links: list[Link] = []
     for i in range(bodies):
         parent = -1 if i == 0 else int(rng.integers(0 if free else -1, i))
@@ -91,7 +91,7 @@ def their_model(links: list[Link], gravity: Array) -> mujoco.MjModel:
 
 
 def in_our_order(model: _core.Model, twin: mujoco.MjModel) -> tuple[list[int], list[int]]:
-    """Where our positions and velocities stand in MuJoCo, which numbers bodies depth first."""
+    """Indices of positions and velocities in MuJoCo, which orders bodies depth first."""
     positions: list[int] = []
     velocities: list[int] = []
     for name in model.joint_names:
@@ -124,7 +124,7 @@ def test_mass_matrix_and_bias_agree_with_mujoco(seed: int, free: bool) -> None:
 
 
 def mechanical_state(twin: mujoco.MjModel, q: Array, v: Array) -> tuple[Array, Array, float]:
-    """Linear and angular momentum (about the centre of mass) and energy, as MuJoCo has them."""
+    """Linear and angular momentum (about the centre of mass) and energy, from MuJoCo."""
     data = mujoco.MjData(twin)
     data.qpos[:], data.qvel[:] = q, v
     mujoco.mj_forward(twin, data)
@@ -137,7 +137,7 @@ def mechanical_state(twin: mujoco.MjModel, q: Array, v: Array) -> tuple[Array, A
 def drift(
     links: list[Link], gravity: Array, start_v: Array, step: float, duration: float
 ) -> tuple[float, float, float]:
-    """How far momenta and energy have moved after `duration`, relative to what is at work."""
+    """Relative drift of momenta and energy after `duration`."""
     twin = their_model(links, gravity)
     sim = Simulator(our_model(links, gravity, step))
     at_q, at_v = in_our_order(sim.model, twin)
@@ -156,7 +156,7 @@ def drift(
 
 
 @pytest.mark.parametrize("seed", [1, 4])
-def test_momenta_and_energy_of_a_floating_tree_drift_at_first_order(seed: int) -> None:
+def test_momenta_and_energy_of_a_free_tree_drift_at_first_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     links = random_tree(rng, 3, free=True)
     for link in links:  # a rotor's inertia is no part of a body: MuJoCo counts its energy, but not its momentum
@@ -178,8 +178,8 @@ def free_bodies(
     return Simulator(_core.Model(spec))
 
 
-def test_linear_momentum_is_kept_to_newton_s_tolerance() -> None:
-    """A body that tumbles about its centre of mass: whatever the turning does, the velocity stays."""
+def test_linear_momentum_is_conserved_to_the_newton_tolerance() -> None:
+    """The velocity of a body that tumbles about its centre of mass is constant."""
     steps, tolerance = 500, 1e-9
     sim = free_bodies(np.array([0.01, 0.02, 0.025, 0.001, 0.002, -0.001]), step=5e-3, tolerance=tolerance)
     sim.v[0] = 1.0, -2.0, 3.0, 20.0, 5.0, -7.0
@@ -199,15 +199,15 @@ def turned(quat: Array, vector: Array) -> Array:
 
 
 def free_precession(inertia: Array, spin: Array, duration: float) -> Array:
-    """Orientation of a symmetric top that started upright: it turns about its fixed angular momentum L at |L| / I₁,
-    and about its own axis z at (1 − I₃/I₁) ω₃ on top."""
+    """Orientation of a symmetric top, upright at the start: precession about the constant angular momentum L at
+    |L| / I₁, and rotation about its axis z at (1 − I₃/I₁) ω₃."""
     across, along = inertia[0], inertia[2]
     momentum = inertia * spin
     own = np.array([0.0, 0.0, (1 - along / across) * spin[2] * duration])
     return turned(turned(np.array(UPRIGHT), momentum / across * duration), own)
 
 
-def test_a_thrown_symmetric_top_follows_the_closed_form_at_first_order() -> None:
+def test_symmetric_top_converges_to_the_closed_form_at_first_order() -> None:
     inertia, spin, duration = np.array([0.02, 0.02, 0.01]), np.array([1.0, 0.5, 8.0]), 0.5
     expected = free_precession(inertia, spin, duration)
     errors, drifts = [], []
@@ -231,7 +231,7 @@ def test_a_thrown_symmetric_top_follows_the_closed_form_at_first_order() -> None
 def one_joint(
     kind: str, *, step: float = 1e-3, com: float = 0.0, actuator: Mapping[str, float] | None = None, **joint: float
 ) -> Simulator:
-    """A body of 2 kg on one joint along or about its x or z: a slide is vertical, a hinge horizontal."""
+    """A body of 2 kg on a vertical slide or a horizontal hinge."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), step, 1e-13
     spec.add_body("body", -1, ORIGIN, UPRIGHT, 2.0, (0, 0, -com), (0.03, 0.03, 0.03, 0, 0, 0))
@@ -241,8 +241,8 @@ def one_joint(
     return Simulator(_core.Model(spec))
 
 
-def test_a_pendulum_swings_with_its_small_angle_period() -> None:
-    """θ'' = −ω² θ taken by BDF1 is z_n = z_0 (1 + i ω h)^−n for z = ω θ + i θ', whose period is 2π h / atan(ω h)."""
+def test_pendulum_has_the_small_angle_period() -> None:
+    """BDF1 of θ'' = −ω² θ gives z_n = z_0 (1 + i ω h)^−n for z = ω θ + i θ', with period 2π h / atan(ω h)."""
     step, com = 1e-3, 0.25
     omega = np.sqrt(2.0 * GRAVITY * com / (0.03 + 2.0 * com**2))
     sim = one_joint("hinge", step=step, com=com)
@@ -255,8 +255,8 @@ def test_a_pendulum_swings_with_its_small_angle_period() -> None:
     assert 2 * np.pi / omega == pytest.approx(steps * step, rel=2e-3)
 
 
-def test_damping_and_spring() -> None:
-    """A damped slide loses 1 / (1 + h c / m) of its velocity per step; a spring's rest lies where it carries m g."""
+def test_joint_damping_and_spring() -> None:
+    """Damping multiplies the velocity by 1 / (1 + h c / m) per step; a spring at rest carries m g."""
     sim = one_joint("slide", damping=3.0, stiffness=0.0)
     sim.param("gravity.z")[:] = 0
     sim.v[0] = 5.0
@@ -268,7 +268,7 @@ def test_damping_and_spring() -> None:
     assert sprung.q[0, 0] == pytest.approx(0.1 - 2.0 * GRAVITY / 200.0, abs=1e-10)
 
 
-def test_a_position_servo_sags_by_its_load_and_clips() -> None:
+def test_position_servo_deflects_under_load_and_clips_its_control() -> None:
     servo = {"kp": 200.0, "kd": 20.0, "force_lower": -50.0, "force_upper": 50.0}
     sim = one_joint("slide", actuator=servo)
     sim.step([0.3], 8000)
@@ -283,7 +283,7 @@ def test_a_position_servo_sags_by_its_load_and_clips() -> None:
     assert sim.v[0, 0] == pytest.approx((-4.0 / 2.0 - GRAVITY) * 0.1, rel=1e-12)
 
 
-def test_a_gear_carries_force_to_the_joint_and_length_to_the_servo() -> None:
+def test_gear_scales_force_and_length() -> None:
     servo = {"kp": 200.0, "kd": 20.0, "gear": 3.0}
     sim = one_joint("slide", actuator=servo)
     sim.step([0.3], 8000)
@@ -291,7 +291,7 @@ def test_a_gear_carries_force_to_the_joint_and_length_to_the_servo() -> None:
 
 
 @pytest.mark.parametrize("up", [False, True])
-def test_a_limit_carries_the_load_and_never_pulls(up: bool) -> None:
+def test_joint_limit_carries_the_load_and_never_pulls(up: bool) -> None:
     sign = 1 if up else -1
     sim = one_joint("slide", lower=-0.05, upper=0.05, limit_stiffness=4e3, limit_damping=100.0)
     sim.param("gravity.z")[:] = sign * GRAVITY

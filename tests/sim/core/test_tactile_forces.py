@@ -1,4 +1,4 @@
-"""Readings marker by marker, beside eq. 8 written out: grids of any shape, flat and curved pads, several shapes."""
+"""Marker forces compared with eq. 8: grids of any shape, flat and curved pads, several shapes."""
 
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ SPEED = np.array([0.02, -0.01, -0.03])
 
 
 def pad_of(rows: int, cols: int, *, curved: bool) -> tuple[Array, Array, Array]:
-    """Places (n, 3), the frames' axes (n, 3, 3) in rows, and weights (n,) of a pad on 8 mm, all different."""
+    """Positions (n, 3), axes (n, 3, 3) in rows, and weights (n,) of markers on a pad of 8 mm, all different."""
     x, y = (0.008 * ((np.arange(n) + 0.5) / n - 0.5) for n in (rows, cols))
     places = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((rows, cols))], axis=-1).reshape(-1, 3)
     n = len(places)
@@ -30,7 +30,7 @@ def pad_of(rows: int, cols: int, *, curved: bool) -> tuple[Array, Array, Array]:
 
 
 def expected(places: Array, axes: Array, weights: Array, balls: int) -> Array:
-    """(n, 3), of places in the world that all move at SPEED."""
+    """Expected forces (n, 3) at world positions that move at SPEED."""
     total = np.zeros_like(places)
     for center in CENTERS[:balls]:
         away = places - center
@@ -48,10 +48,10 @@ def expected(places: Array, axes: Array, weights: Array, balls: int) -> Array:
 @pytest.mark.parametrize("curved", [False, True])
 @pytest.mark.parametrize("balls", [1, 2])
 @pytest.mark.parametrize(("rows", "cols"), [(1, 3), (1, 4), (3, 4), (5, 7), (6, 8), (9, 12), (13, 10), (40, 36)])
-def test_readings_are_those_of_their_markers(
+def test_forces_equal_the_formula_for_every_marker(
     rows: int, cols: int, balls: int, curved: bool, precision: Literal["double", "single"]
 ) -> None:
-    """In the order in which they were given, whatever stood in the array."""
+    """In the order of the markers, for any previous contents of the array."""
     spec = _core.ModelSpec()
     body = spec.add_body("pad", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
     for name, axis in zip("xyz", np.eye(3), strict=True):
@@ -80,8 +80,8 @@ def test_readings_are_those_of_their_markers(
 
 
 @pytest.mark.parametrize("side", [10, 60])
-def test_own_readings_are_those_of_a_fresh_array(side: int) -> None:
-    """The simulator's own array is written where markers touch or did; few, many and none of them here."""
+def test_own_array_equals_a_new_array(side: int) -> None:
+    """Only entries of markers with present or previous contact are written: few, many and none here."""
     scene = load_scene("rolling", overrides={"pads.pad.rows": side, "pads.pad.cols": side})
     moves = reference_motion(scene)
     sim = Simulator(scene, num_envs=2, threads=1)
@@ -101,7 +101,7 @@ def test_own_readings_are_those_of_a_fresh_array(side: int) -> None:
 
 
 @pytest.mark.parametrize("weight", [-1.0, np.nan, np.inf])
-def test_weights_of_markers_that_are_refused(weight: float) -> None:
+def test_invalid_marker_weights_raise(weight: float) -> None:
     spec = _core.ModelSpec()
     shape = spec.add_shape("ball", -1, "sphere", (0, 0, 0), (1, 0, 0, 0), (RADIUS, 0, 0))
     axes = [[axis] for axis in np.eye(3)]

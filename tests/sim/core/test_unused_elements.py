@@ -1,4 +1,4 @@
-"""What a scene does not need costs nothing: the same model, the same bits, the same number of instructions.
+"""Unused elements of a scene have no cost: same model, bitwise same results, same number of instructions.
 
 Instructions are counted by valgrind, in a process that only builds models and steps.
 """
@@ -71,7 +71,7 @@ MOST_PER_GROUP = 400  # instructions per step: a few evaluations of a step's equ
 
 
 def rolling_with(folder: Path, toml: str = "", world: str = "", pad: str = "", ball: str = "") -> Scene:
-    """A copy of the rolling scene in `folder`, with more in its files."""
+    """A copy of the rolling scene in `folder`, with additions to its files."""
     path = load_scene("rolling").path
     xml = path.with_suffix(".xml").read_text()
     for mark, more in (("<worldbody>", world), ('<body name="pad" pos="0 0 0.06">', pad), ('"ball"/>', ball)):
@@ -83,7 +83,7 @@ def rolling_with(folder: Path, toml: str = "", world: str = "", pad: str = "", b
 
 
 def described(scene: Scene) -> dict[str, Any]:
-    """What the core knows of a scene, but for pads and their numbers."""
+    """The core model of a scene, without pads and their parameters."""
     model = scene.build()
     names = ("nq", "nv", "nu", "step", "q0", "body_names", "joint_names", "contact_names", "actuator_names")
     pads = tuple(f"{name}." for name in model.pad_names)
@@ -97,7 +97,7 @@ def described(scene: Scene) -> dict[str, Any]:
 
 
 def run(scene: Scene) -> bytes:
-    """Every position, velocity and marker reading of the pad along the way; the unread pad is not read."""
+    """All positions and velocities, and the final marker forces of the pad; the unread pad is not evaluated."""
     sim = Simulator(scene)
     sim.q[:] = scene.q0
     parts = []
@@ -111,14 +111,14 @@ def run(scene: Scene) -> bytes:
 
 
 @pytest.mark.parametrize("added", ADDED)
-def test_what_is_not_needed_changes_no_bit(added: str, tmp_path: Path) -> None:
+def test_unused_elements_do_not_change_results(added: str, tmp_path: Path) -> None:
     plain, more = load_scene("rolling"), rolling_with(tmp_path, *ADDED[added])
     assert described(more) == described(plain)
     assert run(more) == run(plain)
 
 
 class Recorder:
-    """Takes what a scene tells a model builder, so that a process without MuJoCo can tell it again."""
+    """Stands in for ModelSpec: records calls, so that a process without MuJoCo can repeat them."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
@@ -158,7 +158,7 @@ for told, q, u in scenes:
 
 
 def instructions_per_step(scenes: list[Scene], folder: Path) -> list[float]:
-    """Of the steps after the first SHORT ones, without reading markers."""
+    """Instructions per step after the first SHORT steps, without evaluation of marker forces."""
     told = []
     for scene in scenes:
         recorder = Recorder()
@@ -186,7 +186,7 @@ def everything(folder: Path) -> Scene:
 
 @pytest.fixture(scope="module")
 def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
-    """Instructions per step of the scene as it is, with everything that is not needed, with a contact far away."""
+    """Instructions per step of the scene, of the scene with unused elements, and with a distant contact."""
     if shutil.which("valgrind") is None:
         pytest.skip("valgrind is not installed: instructions are not counted")
     if _core.LEVEL == "sanitize":
@@ -196,13 +196,13 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
     return dict(zip(("plain", "more", "far"), instructions_per_step(scenes, folders[0]), strict=True))
 
 
-def test_what_is_not_needed_costs_no_instruction(counted: dict[str, float]) -> None:
+def test_unused_elements_cost_no_instructions(counted: dict[str, float]) -> None:
     assert counted["plain"] > 10_000
     assert counted["more"] == pytest.approx(counted["plain"], rel=0.01)
 
 
-def test_a_contact_that_is_far_costs_a_bounds_test(counted: dict[str, float], tmp_path: Path) -> None:
-    """For each group of points and each shape, and nothing that depends on the number of points in a group."""
+def test_distant_contact_costs_one_bounds_test_per_group(counted: dict[str, float], tmp_path: Path) -> None:
+    """Per group of points and shape, independent of the number of points in a group."""
     far = rolling_with(tmp_path, FAR_CONTACT, FAR)
     assert run(far) == run(load_scene("rolling"))
     (pad,) = (p for p in far.points if p.name == "pad")
