@@ -270,5 +270,5 @@ def test_invalid_arguments_give_one_line_errors(
 def test_changed_model_file_raises(own: Path) -> None:
     scene = load_scene(own)
     shutil.copy(load_scene("rolling").path.with_suffix(".xml"), own.with_suffix(".xml"))
-    with pytest.raises(UsageError, match="has other bodies than the scene"):
+    with pytest.raises(UsageError, match="has other bodies than the loaded scene"):
         describe(scene)

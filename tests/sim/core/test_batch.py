@@ -210,7 +210,7 @@ def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
     sim.check()
 
 
-def test_iteration_limit_of_zero_gives_a_failure_status(insertion: Scene) -> None:
+def test_iteration_limit_gives_a_failure_status(insertion: Scene) -> None:
     spec = insertion.describe_to(_core.ModelSpec())
     spec.max_step_iterations = 1
     sim = Simulator(_core.Model(spec))
@@ -346,7 +346,7 @@ def test_portable_build_agrees_with_the_native_build(insertion: Scene, tmp_path:
 
 
 @pytest.mark.parametrize(("wanted", "says"), [("fast", "must be base or v3"), ("", "")])
-def test_unavailable_build_raises(wanted: str, says: str) -> None:
+def test_requested_build_is_loaded_or_raises(wanted: str, says: str) -> None:
     command = [sys.executable, "-c", "import gelflow.sim._core"]
     run = subprocess.run(command, env={**os.environ, "GELFLOW_CORE": wanted}, capture_output=True, text=True)
     assert (run.returncode == 0) == (not says)
