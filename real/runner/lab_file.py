@@ -9,6 +9,8 @@ from gelflow.errors import UsageError
 from gelflow.real.runner.lab import FORMAT, Lab
 from gelflow.toml_tables import TomlTable, read_toml
 
+_RENAMED_KEYS = {"clock_pace": "time_sync"}
+
 
 def load_lab(path: str | Path) -> Lab:
     """Read a lab file. Raises UsageError, in one line that names the file and the key."""
@@ -16,7 +18,7 @@ def load_lab(path: str | Path) -> Lab:
     table = TomlTable(read_toml(path), str(path))
     if (version := table.integer("format")) != FORMAT:
         raise UsageError(f"{path}: lab file format {version}; this gelflow reads format {FORMAT}")
-    return _with_calibrations(table.as_dataclass(Lab), path)
+    return _with_calibrations(table.as_dataclass(Lab, renamed=_RENAMED_KEYS), path)
 
 
 def _with_calibrations(lab: Lab, path: Path) -> Lab:

@@ -144,14 +144,14 @@ class TomlTable:
             raise UsageError(f"{self.location}: no {kind} {name!r}; {suggestion(name, list(items))}")
         return items[name]
 
-    def as_dataclass(self, cls: type[T]) -> T:
+    def as_dataclass(self, cls: type[T], *, renamed: Mapping[str, str] | None = None) -> T:
         """An instance of a dataclass: one key per field, one subtable per field that is a dataclass.
 
         Supports fields of type bool, int, float, str and fixed-length tuples of float. Errors of `__post_init__`
-        are prefixed with the location.
+        are prefixed with the location. `renamed` is that of `check_keys`, for this table only.
         """
         fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls))}
-        self.check_keys(fields)
+        self.check_keys(fields, renamed=renamed)
         types = typing.get_type_hints(cls)
         values = {}
         for name, field in fields.items():

@@ -61,6 +61,7 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
             "lab.toml, gripper: unknown key 'grasp_forc'; did you mean 'grasp_force'?",
         ),
         ("[hole] ", "[holes] ", "lab.toml: unknown key 'holes'; did you mean 'hole'?"),
+        ("format = 1", 'format = 1\nclock_pace = ""', "unknown key 'clock_pace'; it is now called 'time_sync'"),
         ("rows = 18", "row = 18", "lab.toml, cameras.left: unknown key 'row'; did you mean 'rows'?"),
         ("part_width = 0.035", "# none", "lab.toml, gripper: part_width is missing"),
         ("format = 1", "format = 2", "lab file format 2; this gelflow reads format 1"),
