@@ -1,4 +1,9 @@
-"""The vector environment that policies are trained and evaluated in: noisy flow maps in, pose corrections out."""
+"""The environment of insertion policies: a Gymnasium vector environment with noise on its flow maps.
+
+An episode is the insertion of one part. The first observation is the flow map of a first attempt; each step corrects
+the pose and makes another attempt. The true pose, from which the reward follows, is in the info of the environment
+under "pose"; policies do not receive it.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,30 +21,30 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FlowMapNoise:
-    """What a real pad adds to a flow map and the simulator does not; drawn anew for every part unless said.
+    """Noise of real pads and cameras that the simulator does not model, sampled per part unless stated otherwise.
 
-    Scales are those of a map whose longest vector has length 1.
+    Lengths are relative to the longest vector of the flow map.
     """
 
-    marker: float = 0.05  # largest standard deviation of one marker's vector, drawn anew for every attempt
-    offset: float = 0.03  # standard deviation of a whole pad's shift in an attempt (the reference drifted)
-    gain: float = 0.05  # standard deviation of a pad's gain (one gel softer than the other)
-    turn: float = 0.03  # standard deviation of a camera's turn against its pad [rad]
+    marker: float = 0.05  # largest standard deviation of marker vectors, sampled per attempt
+    offset: float = 0.03  # standard deviation of the common shift of a pad, sampled per attempt (reference drift)
+    gain: float = 0.05  # standard deviation of the logarithmic gain of a pad (gel stiffness)
+    turn: float = 0.03  # standard deviation of the rotation of a camera relative to its pad [rad]
 
-    def part(self, count: int, sensors: int, rng: np.random.Generator) -> Array:
-        """Per part: level of the marker noise, then gain and turn of every sensor; shape (count, 1 + 2 sensors)."""
+    def sample(self, count: int, sensors: int, rng: np.random.Generator) -> Array:
+        """Noise of `count` parts: marker level, gain and rotation of each sensor; shape (count, 1 + 2 sensors)."""
         level = rng.uniform(0, self.marker, (count, 1))
         gain = np.exp(rng.normal(0, self.gain, (count, sensors)))
         turn = rng.normal(0, self.turn, (count, sensors))
         return np.concatenate([level, gain, turn], axis=1)
 
-    def apply(self, images: NDArray[Any], part: Array, rng: np.random.Generator) -> NDArray[np.float32]:
-        """Noisy flow maps (n, frames * sensors * 2, rows, cols), normalized again to the length they had."""
+    def apply(self, images: NDArray[Any], part_noise: Array, rng: np.random.Generator) -> NDArray[np.float32]:
+        """Adds noise to flow maps (n, frames * sensors * 2, rows, cols); preserves the length of the longest vector."""
         n, channels, rows, cols = images.shape
-        sensors = (part.shape[1] - 1) // 2
+        sensors = (part_noise.shape[1] - 1) // 2
         flow = images.reshape(n, channels // (2 * sensors), sensors, 2, rows, cols).astype(np.float32)
-        longest = _longest(flow)
-        level, gain, turn = np.split(part.astype(np.float32), [1, 1 + sensors], axis=1)
+        max_length = _max_length(flow)
+        level, gain, turn = np.split(part_noise.astype(np.float32), [1, 1 + sensors], axis=1)
         scale = gain[:, None, :, None, None]
         cos, sin = np.cos(turn)[:, None, :, None, None], np.sin(turn)[:, None, :, None, None]
         x, y = flow[:, :, :, 0], flow[:, :, :, 1]
@@ -47,77 +52,77 @@ class FlowMapNoise:
         noisy += level[:, :, None, None, None, None] * rng.standard_normal(noisy.shape, dtype=np.float32)
         drift = rng.standard_normal((n, 1, sensors, 2, 1, 1), dtype=np.float32)
         noisy += np.float32(self.offset) * drift
-        noisy *= (longest / np.maximum(_longest(noisy), 1e-6))[:, None, None, None, None, None]
+        noisy *= (max_length / np.maximum(_max_length(noisy), 1e-6))[:, None, None, None, None, None]
         return np.asarray(noisy.reshape(images.shape))
 
 
-def _longest(flow: NDArray[Any]) -> NDArray[np.float32]:
+def _max_length(flow: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(np.sqrt((flow * flow).sum(3).max(axis=(1, 2, 3, 4))))
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step brought: arrays over the environments."""
+    """Result of one step; arrays over the environments."""
 
-    images: NDArray[np.float32]  # the newest flow maps, of the next part where `done`
+    images: NDArray[np.float32]  # flow maps of the latest attempt, of the next part where `done`
     reward: Array  # of the pose after the correction
-    better: Array  # reward gained over the pose before the correction
-    done: NDArray[np.bool_]  # inserted, or all attempts used up
+    improvement: Array  # reward minus the reward of the pose before the correction
+    done: NDArray[np.bool_]  # inserted, or no attempts left
     success: NDArray[np.bool_]  # inserted
 
 
 class PolicyEnv:
-    """A gymnasium vector environment of insertions, with noise on its flow maps."""
+    """A Gymnasium vector environment of insertions with noise on its flow maps."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any], task: InsertionTask, noise: FlowMapNoise | None = None) -> None:
-        """Raises UsageError when the environment's observations are not the task's, or it resets a step late."""
+        """Raises UsageError when `env` does not have the observations of `task`, or resets in the next step."""
         shape = env.single_observation_space.shape
         if shape != task.observation_shape:
             raise UsageError(f"environment observes {shape}; the task describes {task.observation_shape}")
         self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         if not self._same_step and env.metadata.get("autoreset_mode") != AutoresetMode.DISABLED:
-            raise UsageError("environment must reset in the same step or when told (metadata['autoreset_mode'])")
+            raise UsageError("environment must reset in the same step or on request (metadata['autoreset_mode'])")
         self.env = env
         self.task = task
         self.count = env.num_envs
         self.noise = noise
         self._rng = np.random.default_rng(0)
-        self._before: Array = np.zeros(self.count)
-        self._part: Array = np.zeros((self.count, 1 + 2 * task.sensors))
+        self._last_reward: Array = np.zeros(self.count)
+        self._part_noise: Array = np.zeros((self.count, 1 + 2 * task.sensors))
 
     def reset(self, seed: int) -> NDArray[np.float32]:
-        """New parts everywhere; returns the flow maps of their first attempts."""
+        """Resets all environments; returns the flow maps of the first attempts."""
         self._rng = np.random.default_rng(seed)
         images, info = self.env.reset(seed=seed)
-        self._before = self.task.reward(info["pose"])
-        return self._noisy(images, np.ones(self.count, dtype=bool))
+        self._last_reward = self.task.reward(info["pose"])
+        return self._add_noise(images, np.ones(self.count, dtype=bool))
 
     def step(self, corrections: Array) -> StepResult:
-        """Correct every pose by `corrections` (count, 3) [m, m, rad] and make the next attempt."""
+        """Corrects all poses by `corrections` (count, 3) [m, m, rad] and makes the next attempt."""
         actions = corrections / np.asarray(self.task.action_scale)
         images, reward, terminated, truncated, info = self.env.step(np.clip(actions, -1, 1).astype(np.float32))
         done = np.asarray(terminated | truncated)
         if done.any() and not self._same_step:
             images, info = self.env.reset(options={"reset_mask": done})
-        better = reward - self._before
-        self._before = self.task.reward(info["pose"])
+        improvement = reward - self._last_reward
+        self._last_reward = self.task.reward(info["pose"])
         return StepResult(
-            self._noisy(images, done), np.asarray(reward, dtype=float), better, done, np.asarray(terminated)
+            self._add_noise(images, done), np.asarray(reward, dtype=float), improvement, done, np.asarray(terminated)
         )
 
-    def _noisy(self, images: NDArray[Any], fresh: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def _add_noise(self, images: NDArray[Any], new_parts: NDArray[np.bool_]) -> NDArray[np.float32]:
         if self.noise is None:
             return np.asarray(images, dtype=np.float32)
-        if fresh.any():
-            self._part[fresh] = self.noise.part(int(fresh.sum()), self.task.sensors, self._rng)
-        return self.noise.apply(images, self._part, self._rng)
+        if new_parts.any():
+            self._part_noise[new_parts] = self.noise.sample(int(new_parts.sum()), self.task.sensors, self._rng)
+        return self.noise.apply(images, self._part_noise, self._rng)
 
 
 def make_insertion_env(
     count: int, *, noise: FlowMapNoise | None = None, preset: str | None = None, task: InsertionTask = INSERTION
 ) -> PolicyEnv:
-    """`count` simulated insertions side by side, domain randomized, with `noise` on their flow maps.
+    """`count` parallel simulated insertions with domain randomization and `noise` on the flow maps.
 
-    `preset` says how exactly they are simulated. Raises UsageError when the insertion scene has no such preset.
+    `preset` is a preset of the insertion scene. Raises UsageError when the scene has no such preset.
     """
     return PolicyEnv(InsertionVectorEnv(count, task=task, preset=preset), task, noise)

@@ -1,9 +1,4 @@
-"""Insertion attempts on a vector environment, seen one way by training and by evaluation.
-
-An episode is one part. Its first observation is the flow map of a first attempt; each step corrects the pose and
-makes another. Finished environments start the next part within the same step. The environment's info tells the true
-pose (key "pose"), which training takes its reward from and the policy never sees.
-"""
+"""Evaluation of policies over complete episodes."""
 
 from dataclasses import dataclass
 
@@ -19,21 +14,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Figures of one way to act over complete episodes."""
+    """Results of an actor over complete episodes."""
 
     name: str
     episodes: int
     successes: int
-    attempts: float  # mean over the successful episodes; nan when there is none
-    reward: float  # mean over episodes of the summed reward
+    attempts: float  # mean over the successful episodes; nan without any
+    reward: float  # mean return
 
     @property
     def success(self) -> float:
-        """Share of the episodes that ended inserted."""
+        """Success rate."""
         return self.successes / self.episodes
 
     def confidence_interval(self) -> tuple[float, float]:
-        """The 95 % interval of the share (Wilson)."""
+        """95 % Wilson score interval of the success rate."""
         n, z = self.episodes, 1.96
         middle = (self.success + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * np.sqrt(self.success * (1 - self.success) / n + z * z / (4 * n * n))
@@ -41,65 +36,66 @@ class EvaluationResult:
 
 
 class NetworkActor:
-    """A network acting on all environments at once."""
+    """A network that acts in `count` environments."""
 
     def __init__(self, network: Network, count: int) -> None:
         self._network = network
         self._history = network.history(count)
 
     def act(self, images: NDArray[np.float32]) -> Array:
-        """Corrections (count, 3) for the newest flow maps."""
+        """Corrections (count, 3) [m, m, rad] for the latest flow maps."""
         corrections = self._network.corrections(self._history.observe(self._network.encode(images)))
         self._history.record(corrections)
         return corrections
 
     def reset(self, done: NDArray[np.bool_]) -> None:
-        """New parts where `done`."""
+        """Clears the history of the environments marked in `done`."""
         self._history.reset(done)
 
 
 class RandomActor:
-    """Corrections drawn uniformly within ± `reach`."""
+    """Uniformly random corrections within ± `max_correction` [m, m, rad]."""
 
-    def __init__(self, reach: tuple[float, float, float], count: int, seed: int) -> None:
-        self._reach = np.asarray(reach)
+    def __init__(self, max_correction: tuple[float, float, float], count: int, seed: int) -> None:
+        self._max_correction = np.asarray(max_correction)
         self._count = count
         self._rng = np.random.default_rng(seed)
 
     def act(self, images: NDArray[np.float32]) -> Array:
-        """Corrections (count, 3), whatever was felt."""
-        return self._rng.uniform(-self._reach, self._reach, (self._count, 3))
+        """Corrections (count, 3) [m, m, rad], independent of the flow maps."""
+        return self._rng.uniform(-self._max_correction, self._max_correction, (self._count, 3))
 
     def reset(self, done: NDArray[np.bool_]) -> None:
-        """Nothing is remembered."""
+        """Does nothing: random corrections have no history."""
 
 
 def evaluate(
-    name: str, actor: NetworkActor | RandomActor, attempts: PolicyEnv, *, episodes: int, seed: int
+    name: str, actor: NetworkActor | RandomActor, env: PolicyEnv, *, episodes: int, seed: int
 ) -> EvaluationResult:
-    """Let `actor` insert at least `episodes` parts, equally many in every environment (short ones are not favoured).
+    """Evaluates `actor` over `episodes` episodes.
 
-    Returns figures of exactly `episodes` episodes. Raises UsageError when episodes < 1.
+    Each environment contributes equally many episodes (± 1), so that short episodes are not favoured. Raises
+    UsageError when episodes < 1.
     """
     if episodes < 1:
         raise UsageError(f"episodes must be at least 1, got {episodes}")
-    count = attempts.count
+    count = env.count
     quota = np.full(count, episodes // count) + (np.arange(count) < episodes % count)
-    finished, tries, reward = np.zeros(count, dtype=int), np.zeros(count), np.zeros(count)
+    completed, attempts_made, reward = np.zeros(count, dtype=int), np.zeros(count), np.zeros(count)
     lengths: list[float] = []
     rewards: list[float] = []
     actor.reset(np.ones(count, dtype=bool))
-    images = attempts.reset(seed)
-    while (finished < quota).any():
-        outcome = attempts.step(actor.act(images))
-        tries += 1
-        reward += outcome.reward
-        counted = outcome.done & (finished < quota)
-        lengths += list(tries[counted & outcome.success])
+    images = env.reset(seed)
+    while (completed < quota).any():
+        result = env.step(actor.act(images))
+        attempts_made += 1
+        reward += result.reward
+        counted = result.done & (completed < quota)
+        lengths += list(attempts_made[counted & result.success])
         rewards += list(reward[counted])
-        finished += outcome.done
-        tries[outcome.done] = reward[outcome.done] = 0
-        actor.reset(outcome.done)
-        images = outcome.images
+        completed += result.done
+        attempts_made[result.done] = reward[result.done] = 0
+        actor.reset(result.done)
+        images = result.images
     mean = float(np.mean(lengths)) if lengths else float("nan")
     return EvaluationResult(name, episodes, len(lengths), mean, float(np.mean(rewards)))

@@ -1,8 +1,8 @@
-"""Training of the insertion policy: PPO (stable-baselines3) over the history's input, exported to our checkpoint.
+"""Training of the insertion policy with PPO of stable-baselines3, exported to a checkpoint.
 
-The flow maps are reduced to their features before PPO sees them, so its buffers and updates are small. The reward is
-what the correction gained: the environment's reward of the pose after it, less that of the pose before. It comes at
-once, so the discount is small; and a part that happens to start far off does not drown what the correction did.
+PPO receives the features of the flow maps instead of the maps, which keeps its buffers and updates small. The training
+reward is the improvement by a correction: the reward of the pose after it minus that of the pose before. It is
+immediate, so the discount is small, and its variance does not depend on the initial misalignment.
 """
 
 import dataclasses
@@ -36,23 +36,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """Everything that decides a training run beside the environment; stored in the checkpoint."""
+    """Settings of a training run beside its environment; stored in the checkpoint."""
 
-    attempts: int = 200_000  # attempts in all
-    minutes: float = float("inf")  # stop after this time [min]; a run cut off by time can not be repeated exactly
+    attempts: int = 200_000  # total number of attempts
+    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not repeatable
     seed: int = 0
-    rollout: int = 16  # attempts of each environment between updates
-    batch: int = 256
-    epochs: int = 10
-    learning_rate: float = 2e-3  # falls to a tenth, linearly
+    rollout: int = 16  # attempts per environment between updates
+    batch: int = 256  # minibatch size
+    epochs: int = 10  # per update
+    learning_rate: float = 2e-3  # decreases linearly to a tenth
     discount: float = 0.5
-    gae: float = 0.95
-    clip: float = 0.2
-    value: float = 0.5
-    entropy: float = 0.0
-    gradient_norm: float = 0.5
-    spread: float = 0.4  # first standard deviation of the actions, in units of the reach
-    calibration: int = 2_000  # random attempts that give the features' root mean square
+    gae: float = 0.95  # λ of the generalized advantage estimate
+    clip: float = 0.2  # clip range of the policy ratio
+    value: float = 0.5  # coefficient of the value loss
+    entropy: float = 0.0  # coefficient of the entropy loss
+    gradient_norm: float = 0.5  # largest norm of the gradient
+    spread: float = 0.4  # initial standard deviation of the actions
+    calibration: int = 2_000  # random attempts that determine the scale of the features
     evaluate_every: int = 20_000  # attempts
     evaluate_episodes: int = 512
 
@@ -62,7 +62,7 @@ CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "lea
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a training run made."""
+    """The files of a training run, and its best validation result."""
 
     checkpoint: Path
     best: EvaluationResult
@@ -71,53 +71,54 @@ class TrainingResult:
 
 
 class HistoryVecEnv(VecEnv):
-    """Insertion attempts as stable-baselines3 wants them: observation is the history's input, action ±1 the reach."""
+    """`PolicyEnv` as an environment of stable-baselines3.
+
+    Observations are canonical inputs of the network, actions of ±1 correspond to `Architecture.reach`.
+    """
 
     render_mode = None
 
-    def __init__(
-        self, attempts: PolicyEnv, architecture: Architecture, basis: Array, scale: Array, *, seed: int
-    ) -> None:
-        size = architecture.inputs(attempts.task)
+    def __init__(self, env: PolicyEnv, architecture: Architecture, basis: Array, scale: Array, *, seed: int) -> None:
+        size = architecture.inputs(env.task)
         super().__init__(
-            attempts.count,
+            env.count,
             spaces.Box(-np.inf, np.inf, (size,), np.float32),
             spaces.Box(-1.0, 1.0, (3,), np.float32),
         )
-        tensors = _zeros(architecture, attempts) | {"basis": basis, "scale": scale}
-        self._attempts = attempts
-        self._network = Network(architecture, attempts.task, tensors)
-        self._history = self._network.history(attempts.count)
+        tensors = _zero_tensors(architecture, env) | {"basis": basis, "scale": scale}
+        self._env = env
+        self._network = Network(architecture, env.task, tensors)
+        self._history = self._network.history(env.count)
         self._reach = np.asarray(architecture.reach)
         self._seed = seed
-        self._actions: Array = np.zeros((attempts.count, 3))
-        self._signs: Array = np.ones((attempts.count, 3))
+        self._actions: Array = np.zeros((env.count, 3))
+        self._signs: Array = np.ones((env.count, 3))
         self.rewards: list[float] = []
         self.successes: deque[bool] = deque(maxlen=512)
 
     def reset(self) -> NDArray[np.float32]:
         self._history.reset()
-        return self._observe(self._attempts.reset(self._seed))
+        return self._observe(self._env.reset(self._seed))
 
     def step_async(self, actions: NDArray[Any]) -> None:
         self._actions = np.asarray(actions, dtype=float) * self._signs * self._reach
 
     def step_wait(self) -> VecEnvStepReturn:
         self._history.record(self._actions)
-        outcome = self._attempts.step(self._actions)
-        self.rewards.append(float(outcome.reward.mean()))
-        self.successes.extend(bool(value) for value in outcome.success[outcome.done])
-        self._history.reset(outcome.done)
-        # The attempts used up are part of the observation, so the last one is an end like any other.
+        result = self._env.step(self._actions)
+        self.rewards.append(float(result.reward.mean()))
+        self.successes.extend(bool(value) for value in result.success[result.done])
+        self._history.reset(result.done)
+        # The number of attempts is part of the observation, so the last attempt is a regular end of the episode.
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self._observe(outcome.images), outcome.better.astype(np.float32), outcome.done, infos
+        return self._observe(result.images), result.improvement.astype(np.float32), result.done, infos
 
     def _observe(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
         inputs, self._signs = self._network.canonical(self._history.observe(self._network.encode(images)))
         return inputs.astype(np.float32)
 
     def close(self) -> None:
-        self._attempts.env.close()
+        self._env.env.close()
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
         return [False] * self.num_envs
@@ -134,7 +135,7 @@ class HistoryVecEnv(VecEnv):
 
 @dataclass(frozen=True)
 class _Run:
-    """What belongs together while a run lasts."""
+    """The inputs of a training run."""
 
     env: HistoryVecEnv
     validation: PolicyEnv
@@ -149,7 +150,7 @@ class _Run:
 
 
 def train(
-    attempts: PolicyEnv,
+    env: PolicyEnv,
     validation: PolicyEnv,
     *,
     out: Path,
@@ -158,38 +159,42 @@ def train(
     command: Sequence[str] = (),
     report: Callable[[LearningCurvePoint], None] | None = None,
 ) -> TrainingResult:
-    """Train on `attempts`, keep the checkpoint that does best on `validation`.
+    """Trains a policy on `env` and keeps the checkpoint with the best result on `validation`.
 
     Parameters
     ----------
-    out: folder for insertion.safetensors, learning_curve.csv and learning_curve.png; made when missing
-    command: the command line to store in the checkpoint
-    report: called after every update and every evaluation
+    env: environment of the training
+    validation: environment of the evaluations
+    out: folder of insertion.safetensors, learning_curve.csv and learning_curve.png; created if missing
+    architecture: of the network
+    settings: of PPO
+    command: command line, stored in the checkpoint
+    report: called after each update and each evaluation
 
-    Raises UsageError when the settings do not fit each other, or `out` holds a trained policy already.
+    Raises UsageError for inconsistent settings, and when `out` already contains a trained policy.
     """
     architecture = architecture or Architecture()
     settings = settings or PPOSettings()
-    _check(settings, attempts)
-    if (out / CHECKPOINT).exists():  # hours of another run, perhaps one that is still going on
-        raise UsageError(f"{out} already holds a trained policy; give another folder, or delete that one")
+    _check_settings(settings, env)
+    if (out / CHECKPOINT).exists():  # never overwrite the result of another run
+        raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"cannot write into {out}: {error.strerror}") from error
-    torch.set_num_threads(1)  # the products are tiny, and one thread makes a run repeatable
-    basis = polynomial_basis(attempts.task.grid, architecture.degree)
-    scale = calibrate(attempts, architecture, basis, settings)
-    env = HistoryVecEnv(attempts, architecture, basis, scale, seed=settings.seed)
+    torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
+    basis = polynomial_basis(env.task.grid, architecture.degree)
+    scale = feature_scale(env, architecture, basis, settings)
+    history_env = HistoryVecEnv(env, architecture, basis, scale, seed=settings.seed)
     run = _Run(
-        env, validation, architecture, basis, scale, settings, attempts.noise, out, command=command, report=report
+        history_env, validation, architecture, basis, scale, settings, env.noise, out, command=command, report=report
     )
-    keeper = _Keeper(run)
-    _model(env, architecture, settings).learn(settings.attempts, callback=keeper)
-    return keeper.finish()
+    callback = _TrainingCallback(run)
+    _make_model(history_env, architecture, settings).learn(settings.attempts, callback=callback)
+    return callback.finish()
 
 
-def _model(env: HistoryVecEnv, architecture: Architecture, settings: PPOSettings) -> PPO:
+def _make_model(env: HistoryVecEnv, architecture: Architecture, settings: PPOSettings) -> PPO:
     return PPO(
         "MlpPolicy",
         env,
@@ -213,8 +218,8 @@ def _model(env: HistoryVecEnv, architecture: Architecture, settings: PPOSettings
     )
 
 
-def export(model: PPO, architecture: Architecture, basis: Array, scale: Array) -> dict[str, NDArray[Any]]:
-    """The actor of a PPO model as the tensors of our network."""
+def export_actor(model: PPO, architecture: Architecture, basis: Array, scale: Array) -> dict[str, NDArray[Any]]:
+    """The tensors of a `Network` from the actor of a PPO model."""
     modules = [*model.policy.mlp_extractor.policy_net.modules(), model.policy.action_net]
     linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
     tensors: dict[str, NDArray[Any]] = {"basis": basis, "scale": scale}
@@ -224,32 +229,32 @@ def export(model: PPO, architecture: Architecture, basis: Array, scale: Array) -
     return tensors
 
 
-def calibrate(attempts: PolicyEnv, architecture: Architecture, basis: Array, settings: PPOSettings) -> Array:
-    """Root mean square of every feature over random attempts, noise included: what the features are divided by.
+def feature_scale(env: PolicyEnv, architecture: Architecture, basis: Array, settings: PPOSettings) -> Array:
+    """Root mean square of each feature over random attempts with noise, the divisor of the features.
 
-    The same for both pads of a frame and never less than 1e-3, so that a feature which is only noise stays small.
+    It is common to both pads and at least 1e-3, so that features without signal stay small.
     """
     rng = np.random.default_rng([settings.seed, 1])
-    images = attempts.reset(settings.seed)
+    images = env.reset(settings.seed)
     squares = []
-    for _ in range(max(1, min(settings.calibration, settings.attempts) // attempts.count)):
+    for _ in range(max(1, min(settings.calibration, settings.attempts) // env.count)):
         squares.append(reduce_maps(images, basis) ** 2)
         reach = np.asarray(architecture.reach)
-        images = attempts.step(rng.uniform(-reach, reach, (attempts.count, 3)) / 2).images
+        images = env.step(rng.uniform(-reach, reach, (env.count, 3)) / 2).images
     mean = np.concatenate(squares).mean(0)
-    pads = mean.reshape(-1, attempts.task.sensors, 2, basis.shape[1])
+    pads = mean.reshape(-1, env.task.sensors, 2, basis.shape[1])
     mean = np.broadcast_to(pads.mean(axis=(0, 1), keepdims=True), pads.shape).reshape(-1)
     return np.asarray(np.maximum(np.sqrt(mean), 1e-3))
 
 
-class _Keeper(BaseCallback):
-    """Follows a run: points of the curve, evaluations, the best checkpoint, the end of the time."""
+class _TrainingCallback(BaseCallback):
+    """Records the learning curve, evaluates, saves the best checkpoint, and stops at the time limit."""
 
     def __init__(self, run: _Run) -> None:
         super().__init__()
         self._run = run
         self._start = time.monotonic()
-        self._next = run.settings.evaluate_every
+        self._next_evaluation = run.settings.evaluate_every
         self._best: EvaluationResult | None = None
         self._points: list[LearningCurvePoint] = []
 
@@ -257,11 +262,11 @@ class _Keeper(BaseCallback):
         return self._minutes() < self._run.settings.minutes
 
     def _on_rollout_end(self) -> None:
-        self._point(None)
+        self._add_point(None)
 
     def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= self._next:
-            self._next += self._run.settings.evaluate_every
+        if self.num_timesteps >= self._next_evaluation:
+            self._next_evaluation += self._run.settings.evaluate_every
             self._evaluate()
 
     def _on_training_end(self) -> None:
@@ -270,7 +275,7 @@ class _Keeper(BaseCallback):
     def _minutes(self) -> float:
         return (time.monotonic() - self._start) / 60
 
-    def _point(self, evaluation: EvaluationResult | None) -> None:
+    def _add_point(self, evaluation: EvaluationResult | None) -> None:
         env = self._run.env
         spread = float(torch.as_tensor(self.model.policy.log_std).detach().exp().mean())
         reward = float(np.mean(env.rewards)) if env.rewards else float("nan")
@@ -284,17 +289,17 @@ class _Keeper(BaseCallback):
     def _evaluate(self) -> None:
         run, settings = self._run, self._run.settings
         assert isinstance(self.model, PPO)
-        tensors = export(self.model, run.architecture, run.basis, run.scale)
+        tensors = export_actor(self.model, run.architecture, run.basis, run.scale)
         task = run.validation.task
         actor = NetworkActor(Network(run.architecture, task, tensors), run.validation.count)
-        seed = settings.seed + 1_000_003  # parts that training does not begin with
-        episodes = min(settings.evaluate_episodes, settings.attempts)  # a trial run is not mostly evaluation
+        seed = settings.seed + 1_000_003  # differs from the seed of the training
+        episodes = min(settings.evaluate_episodes, settings.attempts)  # limits the evaluations of short runs
         result = evaluate("validation", actor, run.validation, episodes=episodes, seed=seed)
         if self._best is None or (result.success, result.reward) > (self._best.success, self._best.reward):
             self._best = result
             training = {
                 "command": list(run.command),
-                "settings": _plain(settings),
+                "settings": _to_json(settings),
                 "noise": None if run.noise is None else dataclasses.asdict(run.noise),
                 "attempts": self.num_timesteps,
                 "validation": {"episodes": result.episodes, "success": result.success, "attempts": result.attempts},
@@ -304,33 +309,33 @@ class _Keeper(BaseCallback):
             checkpoint.save_checkpoint(
                 path, task=task, architecture=run.architecture, tensors=tensors, training=training
             )
-        self._point(result)
+        self._add_point(result)
         curve.write_table(run.out / CURVE, self._points)
 
     def finish(self) -> TrainingResult:
-        """Draw the curve; what was made."""
+        """Draws the learning curve and returns the result."""
         assert self._best is not None
         curve.draw(self._run.out / PICTURE, self._points)
         out = self._run.out
         return TrainingResult(out / CHECKPOINT, self._best, out / CURVE, out / PICTURE)
 
 
-def _plain(settings: PPOSettings) -> dict[str, Any]:
-    """Settings as JSON has them: no infinity."""
+def _to_json(settings: PPOSettings) -> dict[str, Any]:
+    """JSON data of the settings; infinity becomes None."""
     return {key: None if value == float("inf") else value for key, value in dataclasses.asdict(settings).items()}
 
 
-def _zeros(architecture: Architecture, attempts: PolicyEnv) -> dict[str, NDArray[Any]]:
-    return {name: np.zeros(shape) for name, shape in tensor_shapes(architecture, attempts.task).items()}
+def _zero_tensors(architecture: Architecture, env: PolicyEnv) -> dict[str, NDArray[Any]]:
+    return {name: np.zeros(shape) for name, shape in tensor_shapes(architecture, env.task).items()}
 
 
-def _check(settings: PPOSettings, attempts: PolicyEnv) -> None:
-    """One line for settings that stable-baselines3 would take and misuse, or refuse with a traceback."""
-    collected = settings.rollout * attempts.count
+def _check_settings(settings: PPOSettings, env: PolicyEnv) -> None:
+    """Raises UsageError for settings that stable-baselines3 misinterprets or rejects with a traceback."""
+    collected = settings.rollout * env.count
     if settings.attempts < 1 or not settings.minutes > 0:
-        raise UsageError(f"training needs attempts and minutes above 0, got {settings.attempts}, {settings.minutes}")
+        raise UsageError(f"training requires attempts and minutes above 0, got {settings.attempts}, {settings.minutes}")
     if collected < 2 or collected % min(settings.batch, collected):
         raise UsageError(
-            f"{attempts.count} environments × {settings.rollout} attempts must be a multiple of the batch,"
+            f"{env.count} environments × {settings.rollout} attempts must be a multiple of the batch,"
             f" {settings.batch}: choose another number of environments"
         )

@@ -1,4 +1,4 @@
-"""`gelflow train` and `gelflow eval` as a user starts them, and the policy that comes with gelflow, simulated."""
+"""The commands `gelflow train` and `gelflow eval`, and the shipped policy in simulation."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from gelflow.policies.evaluation import NetworkActor, evaluate
 from gelflow.task import INSERTION
 
 
-def test_the_policy_that_comes_with_gelflow_inserts_in_simulation() -> None:
+def test_the_shipped_policy_inserts_in_simulation() -> None:
     path = default_checkpoint()
     assert path.stat().st_size < 2_000_000
     checkpoint = load_checkpoint(path)
@@ -22,11 +22,11 @@ def test_the_policy_that_comes_with_gelflow_inserts_in_simulation() -> None:
     result = evaluate(
         "policy", NetworkActor(network, 32), make_insertion_env(32, noise=FlowMapNoise()), episodes=48, seed=5
     )
-    assert result.successes >= 36  # 48 · 0.9 less more than three standard deviations
+    assert result.successes >= 36  # more than three standard deviations below 48 · 0.9
     assert result.attempts < 8
 
 
-def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evaluation_loads_the_checkpoint_of_a_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["train", "insertion", "--attempts", "64", "--envs", "4", "--seed", "3", "--out", str(tmp_path / "run")]
     assert main(arguments) == 0
     assert "checkpoint" in capsys.readouterr().out
@@ -45,10 +45,10 @@ def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["eval", "insertion", "--checkpoint", "nowhere.safetensors"], "no checkpoint at nowhere.safetensors"),
-        (["eval", "insertion", "--checkpoint", "pyproject.toml"], "is no checkpoint"),
+        (["eval", "insertion", "--checkpoint", "pyproject.toml"], "is not a gelflow checkpoint"),
         (["eval", "insertion", "--episodes", "0"], "--episodes"),
         (["eval", "insertion", "--seed", "-1"], "--seed"),
         (["train", "insertion", "--envs", "0"], "--envs"),
@@ -59,7 +59,9 @@ def test_training_makes_a_checkpoint_that_evaluation_takes(tmp_path: Path, capsy
         (["train", "insertion", "--out", "pyproject.toml"], "pyproject.toml"),
     ],
 )
-def test_a_wrong_option_gives_one_line(arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_invalid_option_gives_a_message_of_one_line(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(arguments) == 2
     error = capsys.readouterr().err.strip()
-    assert says in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error
+    assert message in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error

@@ -1,7 +1,4 @@
-"""Training, use and storage of the insertion policy, on a toy whose flow map is a simple function of the misalignment.
-
-The toy stands in for the simulator alone (its speed decides whether these tests take seconds); everything else is real.
-"""
+"""Training, checkpoints and use of the insertion policy, on an analytic environment that replaces the simulator."""
 
 import dataclasses
 import json
@@ -38,9 +35,9 @@ SMALL = Architecture(hidden=(16, 16))
 
 
 class Toy(VectorEnv[Any, Any, Any]):
-    """Insertion as a formula: the part goes in when every error is below a third of the first misalignment.
+    """Analytic insertion: the part is inserted when every error is below a third of the largest misalignment.
 
-    Both pads feel an upward force; the pads' differences along x and y of the pad tell x and y, their sum along y yaw.
+    Both pads measure an upward force; the differences of the pads encode x and y, their sum along y encodes yaw.
     """
 
     def __init__(self, count: int, *, same_step: bool = True) -> None:
@@ -51,7 +48,7 @@ class Toy(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, count)
         self.action_space = batch_space(self.single_action_space, count)
         self.error = np.zeros((count, 3))
-        self.tries = np.zeros(count, dtype=int)
+        self.attempts = np.zeros(count, dtype=int)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
@@ -61,17 +58,17 @@ class Toy(VectorEnv[Any, Any, Any]):
 
     def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         self.error += actions * np.array(INSERTION.action_scale)
-        self.tries += 1
+        self.attempts += 1
         reward = INSERTION.reward(self.error)
         inserted = (np.abs(self.error) < np.array(INSERTION.misalignment) / 3).all(1)
-        ended = ~inserted & (self.tries >= INSERTION.attempts)
+        ended = ~inserted & (self.attempts >= INSERTION.attempts)
         if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
             self._restart(inserted | ended)
         return self._observe(), reward, inserted, ended, {"pose": self.error.copy()}
 
     def _restart(self, mask: NDArray[np.bool_]) -> None:
         self.error[mask] = self.np_random.uniform(-1, 1, (int(mask.sum()), 3)) * np.array(INSERTION.misalignment)
-        self.tries[mask] = 0
+        self.attempts[mask] = 0
 
     def _observe(self) -> NDArray[np.float32]:
         x, y, yaw = (self.error / np.array(INSERTION.misalignment)).T / 2
@@ -107,7 +104,7 @@ def stored(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_stored_policy_acts_as_before_and_twice_the_same(stored: Path) -> None:
+def test_a_saved_policy_acts_identically_after_loading_and_reset(stored: Path) -> None:
     before = NetworkActor(Network(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1)
     expected = [before.act(image[None])[0] for image in images(5)]
     policy = load_policy(stored)
@@ -121,7 +118,7 @@ def test_a_stored_policy_acts_as_before_and_twice_the_same(stored: Path) -> None
         assert all((policy.act(flow(image)) == want).all() for image, want in zip(images(5), expected, strict=True))
 
 
-def test_the_policy_fits_the_protocol_and_uses_its_memory(stored: Path) -> None:
+def test_the_policy_implements_the_protocol_and_uses_its_history(stored: Path) -> None:
     policy: Policy = load_policy(stored)
     first = policy.act(flow(images(1)[0]))
     assert first.shape == (3,) and first.dtype == float
@@ -131,7 +128,7 @@ def test_the_policy_fits_the_protocol_and_uses_its_memory(stored: Path) -> None:
     assert (policy.act(flow(images(1)[0])) == first).all()
 
 
-def test_a_wrong_map_is_refused(stored: Path) -> None:
+def test_an_invalid_flow_map_is_rejected(stored: Path) -> None:
     policy = load_policy(stored)
     with pytest.raises(UsageError, match=r"shape \(4, 10, 13\).*takes \(4, 13, 10\)"):
         policy.act(flow(images(1)[0].transpose(0, 2, 1)))
@@ -139,17 +136,17 @@ def test_a_wrong_map_is_refused(stored: Path) -> None:
         policy.act(flow(images(1)[0] * np.nan))
 
 
-def test_another_task_is_refused_by_the_names_of_its_fields(stored: Path) -> None:
+def test_a_checkpoint_of_another_task_is_rejected_with_the_differing_fields(stored: Path) -> None:
     other = dataclasses.replace(INSERTION, attempts=7, frame_depths=(1.0e-3,))
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises(UsageError) as error_info:
         load_policy(stored, task=other)
-    line = str(caught.value)
+    line = str(error_info.value)
     assert "attempts 15 (here 7)" in line and "frame_depths [0.0011] (here [0.001])" in line
     assert "workspace" not in line and "\n" not in line
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Save a checkpoint again with a changed header."""
+    """Rewrites a checkpoint with a changed header."""
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["gelflow"])
@@ -157,14 +154,14 @@ def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     path.write_bytes(safetensors.numpy.save(safetensors.numpy.load(data), metadata={"gelflow": json.dumps(header)}))
 
 
-def test_a_newer_format_is_refused(stored: Path) -> None:
+def test_a_newer_format_is_rejected(stored: Path) -> None:
     rewrite(stored, lambda header: header.update(format=2))
     with pytest.raises(UsageError, match="has format 2; this gelflow reads format 1"):
         load_policy(stored)
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda header: header["architecture"].update(kind="transformer"), "kind 'transformer'"),
         (lambda header: header["architecture"].update(depth=3), "unknown keys"),
@@ -173,41 +170,43 @@ def test_a_newer_format_is_refused(stored: Path) -> None:
         (lambda header: header.pop("training"), "damaged"),
     ],
 )
-def test_a_header_that_does_not_fit_gives_one_line(stored: Path, change: Callable[[Any], None], says: str) -> None:
+def test_an_inconsistent_header_gives_a_message_of_one_line(
+    stored: Path, change: Callable[[Any], None], message: str
+) -> None:
     rewrite(stored, change)
-    with pytest.raises(UsageError, match=says) as caught:
+    with pytest.raises(UsageError, match=message) as error_info:
         load_policy(stored)
-    assert "\n" not in str(caught.value) and str(stored) in str(caught.value)
+    assert "\n" not in str(error_info.value) and str(stored) in str(error_info.value)
 
 
-def test_every_cut_and_flipped_byte_gives_one_line(stored: Path, tmp_path: Path) -> None:
+def test_truncated_and_corrupted_files_give_a_message_of_one_line(stored: Path, tmp_path: Path) -> None:
     data = stored.read_bytes()
     damaged = tmp_path / "damaged.safetensors"
     rng = np.random.default_rng(0)
     header = 8 + int.from_bytes(data[:8], "little")
-    for place in [*range(0, 64, 7), *rng.integers(0, header, 20), *rng.integers(header, len(data), 20)]:
-        for bad in (data[:place], data[:place] + bytes([data[place] ^ 0x15]) + data[place + 1 :]):
+    for position in [*range(0, 64, 7), *rng.integers(0, header, 20), *rng.integers(header, len(data), 20)]:
+        for bad in (data[:position], data[:position] + bytes([data[position] ^ 0x15]) + data[position + 1 :]):
             damaged.write_bytes(bad)
             try:
                 load_policy(damaged)
             except UsageError as error:
                 assert "\n" not in str(error)
-            else:  # only a flip inside the words of the header, which no number depends on
-                assert place < header and len(bad) == len(data)
+            else:  # a flipped byte in the text of the header, which does not affect the network
+                assert position < header and len(bad) == len(data)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 a zip", b"\x80\x04\x95 a pickle", b"{}" * 40, b"\x00" * 100])
-def test_a_foreign_file_gives_one_line(tmp_path: Path, content: bytes) -> None:
+def test_a_foreign_file_is_rejected(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "foreign"
     path.write_bytes(content)
-    with pytest.raises(UsageError, match="no checkpoint of gelflow"):
+    with pytest.raises(UsageError, match="not a gelflow checkpoint"):
         load_policy(path)
     path.write_bytes(safetensors.numpy.save({"a": np.zeros(3)}))
-    with pytest.raises(UsageError, match="no checkpoint of gelflow"):
+    with pytest.raises(UsageError, match="not a gelflow checkpoint"):
         load_policy(path)
 
 
-def test_a_missing_file_a_folder_and_a_giant_are_refused(tmp_path: Path) -> None:
+def test_missing_files_folders_and_too_large_files_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no checkpoint at"):
         load_policy(tmp_path / "none.safetensors")
     with pytest.raises(UsageError, match="cannot read"):
@@ -216,7 +215,7 @@ def test_a_missing_file_a_folder_and_a_giant_are_refused(tmp_path: Path) -> None
         wide = Architecture(hidden=(800, 800))
         save_checkpoint(tmp_path / "giant", task=INSERTION, architecture=wide, tensors=tensors(wide), training={})
     (tmp_path / "giant").write_bytes(b"\0" * 2_000_001)
-    with pytest.raises(UsageError, match="larger than any checkpoint"):
+    with pytest.raises(UsageError, match="the limit of a gelflow checkpoint"):
         load_checkpoint(tmp_path / "giant")
 
 
@@ -231,7 +230,7 @@ def test_features_reproduce_low_polynomials_and_average_noise() -> None:
     assert np.allclose(reduce_maps(noise, basis).std(0), 1 / np.sqrt(130), rtol=0.1)
 
 
-def test_history_layout_and_the_way_as_the_gripper_sees_it() -> None:
+def test_history_layout_and_displacement_in_the_gripper_frame() -> None:
     one = Architecture(degree=0, history=2, reach=(1e-3, 1e-3, 0.1))
     history = History(one, INSERTION)
     first = history.observe(np.array([[1.0, 2, 3, 4]]))[0]
@@ -240,11 +239,13 @@ def test_history_layout_and_the_way_as_the_gripper_sees_it() -> None:
     second = history.observe(np.array([[5.0, 6, 7, 8]]))[0]
     assert second[:8].tolist() == [5, 6, 7, 8, 1, 2, 3, 4]
     assert np.allclose(second[8:12], [1, 0, np.pi / 0.2, 1])
-    assert np.allclose(second[12:], [0, -1, np.pi / 0.2, 2 / 15])  # turned left: the start's +x is now its -y
+    assert np.allclose(
+        second[12:], [0, -1, np.pi / 0.2, 2 / 15]
+    )  # after a rotation by +90°, +x of the start frame is -y of the gripper frame
     assert len(second) == one.inputs(INSERTION)
 
 
-def test_parts_in_one_history_do_not_mix() -> None:
+def test_parallel_histories_are_independent() -> None:
     network = Network(SMALL, INSERTION, tensors())
     together, alone = NetworkActor(network, 3), NetworkActor(network, 1)
     for i in range(6):
@@ -256,17 +257,17 @@ def test_parts_in_one_history_do_not_mix() -> None:
 
 
 def mirrored(image: NDArray[Any], in_x: bool, in_y: bool) -> NDArray[Any]:
-    """What the pads feel of a scene mirrored in the gripper's x, y or both, worked out pad by pad."""
+    """The flow map of a scene mirrored in x, y or both of the gripper frame, computed pad by pad."""
     pads = image.reshape(2, 2, 13, 10)
     if in_x:
         pads = pads[::-1]
-    if in_x != in_y:  # a reflection turns each pad's y axis over; mirroring both is a half turn and does not
+    if in_x != in_y:  # a reflection reverses the y axis of each pad; mirroring both axes is a rotation by 180°
         pads = pads[:, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
     return np.asarray(pads.reshape(image.shape))
 
 
 @pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
-def test_a_mirrored_part_gets_the_mirrored_corrections(in_x: bool, in_y: bool) -> None:
+def test_mirrored_flow_maps_give_mirrored_corrections(in_x: bool, in_y: bool) -> None:
     network = Network(SMALL, INSERTION, tensors())
     one, other = NetworkActor(network, 8), NetworkActor(network, 8)
     signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
@@ -276,22 +277,22 @@ def test_a_mirrored_part_gets_the_mirrored_corrections(in_x: bool, in_y: bool) -
         assert np.allclose(other.act(reflected), one.act(stack) * signs, atol=1e-9)
 
 
-def test_the_gain_of_an_attempt_adds_up_to_the_reward() -> None:
-    env = Toy(4)
-    attempts = PolicyEnv(env, INSERTION)
-    attempts.reset(0)
-    total = INSERTION.reward(env.error)
+def test_the_improvements_sum_to_the_change_of_the_reward() -> None:
+    toy = Toy(4)
+    env = PolicyEnv(toy, INSERTION)
+    env.reset(0)
+    total = INSERTION.reward(toy.error)
     for _ in range(3):
-        outcome = attempts.step(np.full((4, 3), 1e-3))
-        total = np.where(outcome.done, INSERTION.reward(env.error), total + outcome.better)
-        assert np.allclose(total[~outcome.done], outcome.reward[~outcome.done])
+        result = env.step(np.full((4, 3), 1e-3))
+        total = np.where(result.done, INSERTION.reward(toy.error), total + result.improvement)
+        assert np.allclose(total[~result.done], result.reward[~result.done])
 
 
 @pytest.mark.parametrize("same_step", [True, False])
-def test_random_actions_are_counted_by_episode(same_step: bool) -> None:
-    attempts = PolicyEnv(Toy(16, same_step=same_step), INSERTION)
-    result = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
-    again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), attempts, episodes=50, seed=3)
+def test_evaluation_counts_complete_episodes_and_is_repeatable(same_step: bool) -> None:
+    env = PolicyEnv(Toy(16, same_step=same_step), INSERTION)
+    result = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), env, episodes=50, seed=3)
+    again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), env, episodes=50, seed=3)
     assert result == again
     assert result.episodes == 50 and 0 < result.successes < 50
     assert 1 <= result.attempts <= INSERTION.attempts
@@ -299,7 +300,7 @@ def test_random_actions_are_counted_by_episode(same_step: bool) -> None:
     assert low < result.success < high
 
 
-def test_an_environment_of_another_shape_or_late_reset_is_refused() -> None:
+def test_environments_with_another_shape_or_reset_mode_are_rejected() -> None:
     with pytest.raises(UsageError, match=r"observes \(4, 13, 10\); the task describes \(8, 13, 10\)"):
         PolicyEnv(Toy(2), dataclasses.replace(INSERTION, frame_depths=(5e-4, 1.1e-3)))
     late = Toy(2)
@@ -308,26 +309,26 @@ def test_an_environment_of_another_shape_or_late_reset_is_refused() -> None:
         PolicyEnv(late, INSERTION)
 
 
-def test_noise_keeps_the_longest_vector_and_turns_both_components() -> None:
+def test_noise_preserves_the_length_of_the_longest_vector() -> None:
     rng = np.random.default_rng(0)
     maps = images(50)
     noise = FlowMapNoise()
-    noisy = noise.apply(maps, noise.part(50, 2, rng), rng)
+    noisy = noise.apply(maps, noise.sample(50, 2, rng), rng)
     length = np.sqrt((noisy.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2))
     assert np.allclose(length, np.sqrt((maps.reshape(50, 2, 2, 130) ** 2).sum(2)).max(axis=(1, 2)), rtol=1e-5)
     assert 0.02 < np.std(noisy - maps) < 0.2
     none = FlowMapNoise(marker=0, offset=0, gain=0, turn=0)
-    assert np.allclose(none.apply(maps, none.part(50, 2, rng), rng), maps, atol=1e-6)
-    still = np.zeros_like(maps)
-    assert not np.abs(noise.apply(still, noise.part(50, 2, rng), rng)).max() > 0
+    assert np.allclose(none.apply(maps, none.sample(50, 2, rng), rng), maps, atol=1e-6)
+    zero = np.zeros_like(maps)
+    assert not np.abs(noise.apply(zero, noise.sample(50, 2, rng), rng)).max() > 0
 
 
 SHORT = PPOSettings(attempts=20_480, batch=256, evaluate_every=5_000, evaluate_episodes=128, calibration=500)
 
 
-def test_a_short_run_beats_random_and_is_repeatable(tmp_path: Path) -> None:
+def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Path) -> None:
     points: list[Any] = []
-    made = train(
+    result = train(
         PolicyEnv(Toy(32), INSERTION, FlowMapNoise()),
         PolicyEnv(Toy(32, same_step=False), INSERTION, FlowMapNoise()),
         out=tmp_path / "run",
@@ -337,19 +338,19 @@ def test_a_short_run_beats_random_and_is_repeatable(tmp_path: Path) -> None:
         report=points.append,
     )
     random = evaluate("random", RandomActor(SMALL.reach, 32, 0), PolicyEnv(Toy(32), INSERTION), episodes=256, seed=1)
-    checkpoint = load_checkpoint(made.checkpoint)
+    checkpoint = load_checkpoint(result.checkpoint)
     actor = NetworkActor(Network(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
     policy = evaluate("policy", actor, PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), episodes=256, seed=1)
     assert policy.success > 0.9 and policy.success > random.success + 0.2
     assert policy.attempts < random.attempts
     assert checkpoint.training["command"] == ["gelflow", "train"]
-    assert checkpoint.training["validation"]["success"] == made.best.success
-    lines = made.curve.read_text().splitlines()
+    assert checkpoint.training["validation"]["success"] == result.best.success
+    lines = result.curve.read_text().splitlines()
     assert lines[0].startswith("attempts,minutes,reward,success") and len(lines) == 1 + len(points)
-    assert made.picture.read_bytes().startswith(b"\x89PNG")
+    assert result.picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_same_seed_makes_the_same_tensors_and_time_ends_a_run(tmp_path: Path) -> None:
+def test_training_is_repeatable_and_stops_at_the_time_limit(tmp_path: Path) -> None:
     def run(name: str, **changes: Any) -> Any:
         settings = dataclasses.replace(SHORT, attempts=2048, evaluate_episodes=32, **changes)
         sides = [PolicyEnv(Toy(32), INSERTION, FlowMapNoise()) for _ in range(2)]
@@ -361,7 +362,7 @@ def test_the_same_seed_makes_the_same_tensors_and_time_ends_a_run(tmp_path: Path
     assert run("d", minutes=1e-9).training["attempts"] <= 64
 
 
-def test_settings_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_inconsistent_settings_are_rejected(tmp_path: Path) -> None:
     for changes in ({"attempts": 0}, {"minutes": 0.0}, {"batch": 300}):
         with pytest.raises(UsageError):
             sides = [PolicyEnv(Toy(32), INSERTION) for _ in range(2)]
