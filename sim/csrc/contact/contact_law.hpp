@@ -1,35 +1,35 @@
-// The force of a shape on one point (eq. 8), its derivatives (eqs. 11-16), and the memory of the elastic law.
+// Contact law: the force of a shape on one point (eq. 8), its derivatives (eqs. 11-16), and the anchor of elastic
+// friction.
 //
 // In the shape's frame, x the point, v its velocity relative to the shape, d, n, H the distance there (d < 0 inside),
 // ḋ = n·v, v_t = v − ḋ n:
-//     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8, which has no max and can pull)
-//                 N = max(−k_n d − r k_d ḋ, 0)          plain damping, for grounds, r = min(−d / 1 µm, 1): switched on
-//                                                       at once, a light body that arrives fast would find no solution
-//     wanted      f* = −k_t v_t                         viscous friction
+//     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8 has no max and can pull)
+//                 N = max(−k_n d − r k_d ḋ, 0)          plain damping, for grounds; r = min(−d / 1 µm, 1), since a
+//                                                       light body that arrives fast has no solution without the ramp
+//     trial       f* = −k_t v_t                         viscous friction
 //                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
-//     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch: no division there; under the
-//                                                       elastic law with a slack of rounding size, see below
+//     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch, without division; under the
+//                                                       elastic law with a tolerance of rounding size, see force_terms
 //     force       f = N n + f_t
-// Under the elastic law e = x − X with the anchor X in the shape's frame; a point that just touched has e = 0. The one
-// moving point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
+// Under the elastic law e = x − X with the anchor X in the shape's frame; a new contact point has e = 0. The rolling
+// point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
 //
-// Spring and damper are side by side, and what slips is behind both. After a step of length h that ended in slip, the
-// rate w = (s − s_before)/h of the strain satisfies f_t = −k_s s − k_t w, so that friction takes what the point's motion
-// brings and the spring does not store. With s_before = s* − h v_t, s* the strain that f* speaks of (so it is under BDF1,
-// and under BDF2 but for terms of second order),
+// Spring and damper act in parallel, in series with the slider. After a step of length h that ended in slip, the rate
+// w = (s − s_before)/h of the strain satisfies f_t = −k_s s − k_t w: friction dissipates the work of the motion that the
+// spring does not store. With s_before = s* − h v_t, s* the strain in f* (exact under BDF1, to second order under BDF2),
 //     −k_s s = k_t v_t + q f_t + (1 − q) f*,     q = h k_s / (h k_s + k_t)
-// which is −k_s s* in stick, where f_t = f*: there the anchor stays. A point that just touched stores nothing.
+// which is −k_s s* in stick, where f_t = f* and the anchor stays. A new contact point stores nothing.
 #pragma once
 
 #include "geometry/shapes.hpp"
 
 namespace gelflow {
 
-// Everything is written for a lane type L: some points at once (simd_pack.hpp). A point of weight 0 feels nothing.
+// Coefficients of a pack of points (simd_pack.hpp), times the points' weights: the force at weight 0 is 0.
 template <class P>
 struct PointLaw {
-  P kn, kt, mu, kd, ks;  // of these points: already times their weights
-  P rounding;            // of places [m]
+  P kn, kt, mu, kd, ks;
+  P rounding;  // error of positions [m]
   DampingLaw damping;
   bool elastic;
 };
@@ -42,14 +42,14 @@ struct PointForce {
   Vec3<P> friction, slip_velocity, trial;  // f_t, v_t, f*
 };
 
-// What the force is made of.
+// The terms of the force.
 template <class P>
 struct ForceTerms {
   P rate, normal, normal_by_d, normal_by_rate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
   P normal_offset;                              // n·e
   Vec3<P> slip_velocity, trial;                 // v_t, f*
   Mask<P> sliding;
-  P inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where it slips, else 1
+  P inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where the point slides, else 1
 };
 template <class P>
 GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v, const Vec3<P>& e,
@@ -59,9 +59,9 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
   const Vec3<P>& n = at.n;
   p.rate = dot(n, v);
   if (law.damping == DampingLaw::depth) {
-    const P trial = law.kn - law.kd * p.rate;
-    const Mask<P> positive = trial > zero;
-    const P stiffness = select(positive, trial, zero);
+    const P unclipped = law.kn - law.kd * p.rate;
+    const Mask<P> positive = unclipped > zero;
+    const P stiffness = select(positive, unclipped, zero);
     p.normal = -stiffness * at.d;
     p.normal_by_d = -stiffness;
     p.normal_by_rate = select(positive, law.kd * at.d, zero);
@@ -69,9 +69,9 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
     const P ramp(1e-6);  // [m]
     const Mask<P> full = at.d < -ramp;
     const P r = select(full, one, -at.d / ramp);
-    const P push = -law.kn * at.d - r * law.kd * p.rate;
-    const Mask<P> positive = push > zero;
-    p.normal = select(positive, push, zero);
+    const P unclipped = -law.kn * at.d - r * law.kd * p.rate;
+    const Mask<P> positive = unclipped > zero;
+    p.normal = select(positive, unclipped, zero);
     p.normal_by_d = select(positive, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
     p.normal_by_rate = select(positive, -r * law.kd, zero);
   }
@@ -83,8 +83,8 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
     p.trial -= law.ks * (e - p.normal_offset * n);  // e is zero where there is no anchor
   }
   const P bound = law.mu * p.normal, squared = dot(p.trial, p.trial);
-  // After a slip without k_t the anchor leaves the point exactly on the cone. That counts as stick, rounding or not: the step, its
-  // reverse and the readings must not take different sides.
+  // After slip without k_t the anchor leaves the point exactly on the friction cone. The tolerance makes that stick in
+  // spite of rounding errors, so that the step, its adjoint and the readings take the same branch.
   const P limit = law.elastic ? bound * (one + P(1e-14)) + law.ks * law.rounding : bound;
   p.sliding = squared > limit * limit;
   p.inverse = p.ratio = one;
@@ -107,59 +107,59 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
   out.friction = p.ratio * p.trial;
   out.force = p.normal * n + out.friction;
   if constexpr (derivatives) {
-    // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature, the second only where there is an anchor, and
+    // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature terms, the second only with an anchor, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
     const P memory = law.elastic ? select(anchored, law.ks, zero) : zero;
     const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
     Vec3<P> normal_by_x = p.normal_by_d * n;
-    const Vec3<P> arm = n + law.mu * direction;  // what a change of N adds
-    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ), where t·n = 0 but for a field, whose ‖n‖ is not quite 1.
+    const Vec3<P> force_by_normal = n + law.mu * direction;  // ∂f/∂N
+    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ); t·n = 0 unless n is not of unit length (field form).
     Mat3<P> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
     if (at.form == HessianForm::field) [[unlikely]] {
       project += p.ratio * dot(direction, n) * outer(direction, n);
     }
     out.by_v = -law.kt * project;
-    out.by_v += outer(arm, p.normal_by_rate * n);
+    out.by_v += outer(force_by_normal, p.normal_by_rate * n);
     if (law.elastic) {
       out.by_x = -memory * project;
     } else {
       out.by_x = zero33<P>();
     }
     if (at.form != HessianForm::zero) {
-      const Mat3<P> bends = at.hessian_matrix();
-      const Vec3<P> hv = bends * v;
+      const Mat3<P> hessian = at.hessian_matrix();
+      const Vec3<P> hv = hessian * v;
       normal_by_x += p.normal_by_rate * hv;
-      Mat3<P> trial_by_x = law.kt * (outer(n, hv) + p.rate * bends);
-      if (law.elastic) trial_by_x += memory * (outer(n, bends * e) + p.normal_offset * bends);
+      Mat3<P> trial_by_x = law.kt * (outer(n, hv) + p.rate * hessian);
+      if (law.elastic) trial_by_x += memory * (outer(n, hessian * e) + p.normal_offset * hessian);
       out.by_x += p.ratio * (trial_by_x - outer(direction, transposed_times(trial_by_x, direction)));
-      out.by_x += p.normal * bends;
+      out.by_x += p.normal * hessian;
     }
-    out.by_x += outer(arm, normal_by_x);
+    out.by_x += outer(force_by_normal, normal_by_x);
   }
 }
 
-// The reverse: gradients with respect to N n, to f_t, to f* and to v_t, carried back to (x, v, X). The anchor moves the
-// friction alone.
+// Vector-Jacobian product: carries gradients with respect to N n, f_t, f* and v_t to (x, v, X). The anchor affects
+// friction only.
 template <class P>
 struct PointGradient {
   Vec3<P> x, v, anchor;
   Mask<P> sliding;
-  Vec3<P> force;  // what `point_force` says
+  Vec3<P> force;  // f
 };
 template <class P>
 GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v,
-                                                const Vec3<P>& e, const Mask<P>& anchored, const Vec3<P>& by_push,
-                                                const Vec3<P>& by_friction, const Vec3<P>& by_trial_direct,
-                                                const Vec3<P>& by_slip) {
+                                                const Vec3<P>& e, const Mask<P>& anchored,
+                                                const Vec3<P>& by_normal_force, const Vec3<P>& by_friction,
+                                                const Vec3<P>& by_trial_direct, const Vec3<P>& by_slip) {
   ForceTerms<P> p;
   force_terms(law, at, v, e, p);
   const P zero(0.0);
   const Vec3<P>& n = at.n;
   const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
-  const P drawn = dot(direction, by_friction);
-  const Vec3<P> by_trial = p.ratio * (by_friction - drawn * direction) + by_trial_direct;
-  const P by_normal = dot(n, by_push) + law.mu * drawn;
-  // slip = v − ḋ n, wanted = −k_t slip − k_s (e − (n·e) n)
+  const P by_direction = dot(direction, by_friction);
+  const Vec3<P> by_trial = p.ratio * (by_friction - by_direction * direction) + by_trial_direct;
+  const P by_normal = dot(n, by_normal_force) + law.mu * by_direction;
+  // v_t = v − ḋ n, f* = −k_t v_t − k_s (e − (n·e) n)
   const Vec3<P> by_slip_total = by_slip - law.kt * by_trial;
   const P by_rate = by_normal * p.normal_by_rate - dot(n, by_slip_total);
   PointGradient<P> g;
@@ -176,31 +176,31 @@ GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Di
     g.x -= g.anchor;
   }
   if (at.form != HessianForm::zero) {
-    Vec3<P> by_n = p.normal * by_push + by_rate * v - p.rate * by_slip_total;
+    Vec3<P> by_n = p.normal * by_normal_force + by_rate * v - p.rate * by_slip_total;
     if (law.elastic) by_n += by_normal_offset * e + select(anchored, law.ks, zero) * p.normal_offset * by_trial;
     g.x += at.hessian_times(by_n);
   }
   return g;
 }
 
-// q, see above.
+// q (see the head of this file).
 template <class P>
 GELFLOW_INLINE P relaxation_factor(const PointLaw<P>& law, const P& h) {
   const P spring = h * law.ks, both = spring + law.kt;
   return spring / select(both > P(0.0), both, P(1.0));
 }
 
-// The anchor after an accepted step of length h, for a point that is inside (outside, the anchor is cleared).
+// Anchor after an accepted step of length h, for an active point (else it is cleared).
 template <class P>
 GELFLOW_INLINE Vec3<P> next_anchor(const PointLaw<P>& law, const P& h, const PointForce<P>& f, const Vec3<P>& x,
                                    const Vec3<P>& anchor, const Mask<P>& anchored) {
-  const P stiffness = select(law.ks > P(0.0), law.ks, P(1.0));  // of weight 0: what comes out is not used
+  const P stiffness = select(law.ks > P(0.0), law.ks, P(1.0));  // at weight 0 the result is not used
   const P q = relaxation_factor(law, h);
   const Vec3<P> s = -(P(1.0) / stiffness) * (law.kt * f.slip_velocity + q * f.friction + (P(1.0) - q) * f.trial);
   return select3<P>(anchored, select3<P>(f.sliding, x - s, anchor), x);
 }
 
-// Gradient λ of the anchor after the step, carried back to (x, v, X); mirrors `next_anchor` branch by branch.
+// Vector-Jacobian product of `next_anchor`: carries the gradient λ of the anchor after the step to (x, v, X).
 template <class P>
 GELFLOW_INLINE PointGradient<P> next_anchor_vjp(const PointLaw<P>& law, const P& h, const Distance<P>& at,
                                                 const Vec3<P>& v, const Vec3<P>& e, const Mask<P>& anchored,

@@ -1,18 +1,18 @@
 // The reverse pass of one step (eqs. 19-23).
 //
-// With b the gradient arriving at v_t, directly and through the increment β h v_t + γ δ, and A = ∂g/∂v_t at the accepted
-// state:
+// With b the gradient with respect to v_t, directly and through the increment β h v_t + γ δ, and A = ∂g/∂v_t at the
+// accepted state:
 //     Aᵀ c = b,   ∂L/∂u −= cᵀ ∂g/∂u,   ∂L/∂v* = Mᵀ c,
 //     ∂L/∂q_{t-1} = (∂q_t/∂q_{t-1})ᵀ (∂L/∂q_t − (∂g/∂q_t)ᵀ c),   ∂L/∂X_{t-1} −= cᵀ ∂g/∂X_{t-1}.
-// The anchors after the step hang on the state at its end: their gradient joins ∂L/∂q_t and ∂L/∂v_t first. Under BDF2
-// the increment is the next step's δ, and v_{t-1} its v_{t-2}.
+// The anchors after the step depend on the state at its end: their gradient is added to ∂L/∂q_t and ∂L/∂v_t first. Under
+// BDF2 the increment is δ of the next step, and v_{t-1} its v_{t-2}.
 #pragma once
 
 #include "solver/step.hpp"
 
 namespace gelflow {
 
-// Gradients with respect to a state; q as a tangent vector.
+// Gradient with respect to a state; that of q is a tangent vector.
 template <class T>
 struct StateGradient {
   explicit StateGradient(const Model& m)
@@ -21,7 +21,7 @@ struct StateGradient {
   std::vector<V3<T>> anchors;
 };
 
-// What the reverse pass needs of one accepted substep.
+// Data of one accepted substep for the reverse pass.
 template <class T>
 struct SubstepRecord {
   SubstepRecord(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool full_step)
@@ -39,14 +39,14 @@ struct SubstepRecord {
     return {h, q0.data(), v_star.data(), nullptr, bdf2 ? history.data() : nullptr, anchors.data(), anchored.data(), u};
   }
   T h;
-  bool bdf2;       // a step of BDF2
-  bool full_step;  // not one of several substeps: BDF2 goes on from it
+  bool bdf2;       // the step used BDF2
+  bool full_step;  // not a part of a divided step: it is the history of a next step by BDF2
   VX<T> q0, v_star, history, v1;
   std::vector<V3<T>> anchors;
   std::vector<std::uint8_t> anchored;
 };
 
-// A state of one's own.
+// A state with its own memory.
 template <class T>
 struct StateCopy {
   StateCopy(const Model& m, const StateView<T>& s)
@@ -61,21 +61,29 @@ struct StateCopy {
   std::vector<std::uint8_t> anchored;
 };
 
-// `g` enters as the gradient at the substep's end and leaves as the gradient at its start; by_u is added to. Before the
-// anchors' gradient changes, multipliers(c) is called.
+// Adds the gradients with respect to the anchors after the substep to those of the state at its end, and returns the
+// part that belongs to the anchors before it.
+template <class T>
+std::vector<V3<T>> end_anchors_vjp(const Model& m, const T* params, const SubstepRecord<T>& r, const T& length,
+                                   StateGradient<T>& g, Workspace<T>& w) {
+  std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
+  if (m.na == 0) return by_anchor;
+  contact_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+                         by_anchor.data());
+  marker_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+                        by_anchor.data());
+  return by_anchor;
+}
+
+// Transforms g from the gradient at the substep's end to the gradient at its start, and adds to by_u. `multipliers`(c) is
+// called before the gradient of the anchors changes.
 template <class T, class Multipliers>
 void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecord<T>& r, StateGradient<T>& g, T* by_u,
                  StepMemory<T>& memory, Multipliers&& multipliers) {
   Workspace<T>& w = memory.work;
-  evaluate<true, T>(m, params, r.start(u), r.v1.data(), CacheState::stale, false, w);
-  std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
-  if (m.na > 0) {
-    const T length = r.start(u).length();
-    contact_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
-                           by_anchor.data());
-    marker_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
-                          by_anchor.data());
-  }
+  const StepStart<T> from = r.start(u);
+  evaluate<true, T>(m, params, from, r.v1.data(), CacheState::stale, false, w);
+  std::vector<V3<T>> by_anchor = end_anchors_vjp<T>(m, params, r, from.length(), g, w);
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
   if (m.nh > 0 && r.full_step) {
     by_increment = g.history.head(m.nv);
@@ -89,15 +97,15 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   multipliers(c);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
   const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c;
-  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_earlier = VX<T>::Zero(m.nv);
+  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
   by_increment += position_by_increment_vjp<T>(m, w.increment, by_q1);
-  free_bodies_vjp<T>(m, params, r.start(u), w, c, by_v_star, by_increment, by_earlier);
+  free_bodies_vjp<T>(m, params, from, w, c, by_v_star, by_increment, by_v_before);
   g.q = position_by_position_vjp<T>(m, w.increment, by_q1);
   g.v = by_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * by_v_star;
   g.history.setZero();
   if (r.bdf2) {
     g.history.head(m.nv) = by_increment / T(3);
-    g.history.segment(m.nv, m.nv) = by_earlier - by_v_star / T(3);
+    g.history.segment(m.nv, m.nv) = by_v_before - by_v_star / T(3);
   }
   if (m.na > 0) {
     residual_anchors_vjp<T>(m, params, r.h, r.bdf2, r.anchors.data(), r.anchored.data(), w, c, by_anchor.data());
@@ -105,7 +113,7 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   }
 }
 
-// Gradient of marker readings at a state, added to g.
+// Adds the gradient of marker readings at a state to g.
 template <class T>
 void tactile_vjp(const Model& m, const T* params, const StateView<T>& s, const T* by_reading, StateGradient<T>& g,
                  Workspace<T>& w) {

@@ -172,7 +172,8 @@ class NewtonSolver {
     test.reuses_jacobian =
         inexact_ && !jacobian_current_ && k <= max_reuse_iteration && norm_ < reuse_decrease * previous_norm_;
     test.skips_check = inexact_ && m_.na == 0 && polish_ <= 0 && (jacobian_current_ || test.reuses_jacobian);
-    test.residual = relative_norm(w_.residual, w_.impulses, m_.nv);
+    // At the initial guess both scales are the same.
+    test.residual = k == 0 ? norm_ : relative_norm(w_.residual, w_.impulses, m_.nv);
     test.within_tolerance = test.residual <= (jacobian_reused_ ? safety : 1.0) * tolerance_;
     test.converged = at_floor_ || (test.skips_check ? test.residual <= far_below * tolerance_ : test.within_tolerance);
     return test;

@@ -1,8 +1,8 @@
-// The residual g of one implicit step (step.hpp) and its derivatives, written as
+// The residual g of one implicit step (step.hpp) and its derivatives,
 //
 //     g(v_t) = β h · (inverse dynamics of (q_t, v_t, (v_t − v*)/(β h)) − f),    q_t = q_{t-1} ⊕ (β h v_t + γ δ)
 //
-// In the code h is β h.
+// In the code h stands for β h.
 #pragma once
 
 #include "contact/contact_forces.hpp"

@@ -4,8 +4,8 @@
 //     g(v_t) = M(q_t) (v_t − v*) + β h (C(q_t, v_t) − f(q_t, v_t, u)) = 0
 //     BDF1: β = 1, γ = 0, v* = v_{t-1}         BDF2: β = 2/3, γ = 1/3, v* = 4/3 v_{t-1} − 1/3 v_{t-2}
 //
-// solved for v_t (residual.hpp, newton.hpp). Where that does not succeed the step is taken in shorter ones. BDF2 starts
-// with one step of BDF1, whose local error is of BDF2's order, and does so again after a step that was not taken whole.
+// solved for v_t (residual.hpp, newton.hpp). If the solver fails, the step is divided into substeps. BDF2 starts with one
+// step of BDF1, whose local error is of the order of BDF2's, and restarts after a step that was divided.
 #pragma once
 
 #include <algorithm>
@@ -18,8 +18,8 @@
 
 namespace gelflow {
 
-// The state of one environment. Anchors live in the frame of the shape that they touch. History is BDF2's: δ (nv),
-// v_{t-2} (nv), and 1 where there is one, else 0.
+// The state of one environment. Anchors are expressed in the frame of the shape in contact. The history of BDF2: δ (nv),
+// v_{t-2} (nv), and 1 if it is valid, else 0.
 template <class T>
 struct StateView {
   T* q;
@@ -27,10 +27,10 @@ struct StateView {
   V3<T>* anchors;
   std::uint8_t* anchored;
   T* history;
-  T* q_rounding = nullptr;  // what q lacks in single precision, half a rounding unit at most: so small steps add up
+  T* q_rounding = nullptr;  // single precision: rounding residual of q, so that small steps accumulate
 };
 
-// Calls visit(i) where set[i] is not 0. Most are not: they are looked at eight at a time.
+// Calls visit(i) where set[i] is not 0. Most entries are 0: eight are tested at a time.
 template <class Visit>
 void for_each_set(const std::uint8_t* set, int n, Visit&& visit) {
   constexpr int word = sizeof(std::uint64_t);
@@ -47,18 +47,18 @@ void for_each_set(const std::uint8_t* set, int n, Visit&& visit) {
 struct StepReport {
   Status status = Status::ok;
   int iterations = 0;  // Newton iterations, substeps included
-  int halvings = 0;    // of the step, to get the shortest of its substeps
+  int halvings = 0;    // of the step length, for the shortest substep
 };
 
-// One environment's memory for steps: the state to fall back on, and the state in the making.
+// Memory for the steps of an environment: workspace, the state to restore after a failure, and the new state.
 template <class T>
 struct StepMemory {
   explicit StepMemory(const Model& m)
       : work(m), q(m.nq), q_rounding(VX<T>::Zero(m.nq)), v(m.nv), v_new(m.nv), v_star(m.nv), history(m.nh) {}
   Workspace<T> work;
   VX<T> q, q_rounding, v, v_new, v_star, history;
-  std::vector<std::pair<int, V3<T>>> anchors;  // those that are set
-  CacheState cache = CacheState::stale;        // what work was last used for
+  std::vector<std::pair<int, V3<T>>> anchors;  // index and value of those that are set
+  CacheState cache = CacheState::stale;        // state of the candidate points in `work`
 
   void save(const Model& m, const StateView<T>& s) {
     q = Eigen::Map<const VX<T>>(s.q, m.nq);
@@ -81,7 +81,8 @@ struct StepMemory {
   }
 };
 
-// How a substep of length h, `whole` or a part of the step, starts from state s: β, v*, which is kept in `memory`, and δ.
+// The start of a substep of length h from state s: β, v* (stored in `memory`) and δ. `full_step`: it is not a part of a
+// divided step.
 template <class T>
 StepStart<T> step_start(const Model& m, const T& h, bool full_step, const StateView<T>& s, const T* u,
                         StepMemory<T>& memory) {
@@ -94,14 +95,15 @@ StepStart<T> step_start(const Model& m, const T& h, bool full_step, const StateV
   return from;
 }
 
-// Called after each accepted substep with (its start, memory); memory.work holds the kinematics of its end.
+// Default observer. Observers are called after each accepted substep with (its start, memory); memory.work holds the
+// kinematics of its end.
 struct NoObserver {
   template <class... A>
   void operator()(const A&...) const {}
 };
 
-// One substep of length h from state s, which moves on only if the substep succeeds. `whole`: it is the step itself, not
-// a part of it.
+// Takes one substep of length h; updates the state s only if the solver succeeds. `full_step`: it is not a part of a
+// divided step.
 template <class T, class Observer>
 Status substep(const Model& m, const T* params, const T& h, bool full_step, const T* u, int polish,
                const StateView<T>& s, StepMemory<T>& memory, int& iterations, Observer&& accepted) {
@@ -133,28 +135,28 @@ Status substep(const Model& m, const T* params, const T& h, bool full_step, cons
   return Status::ok;
 }
 
-// One step of length m.step, or of one of its equal `parts`, which is always BDF1's. Where Newton does not converge, a
-// substep of half the length is tried, down to 2^-max_halvings of it, and after two that succeed one of twice the length
-// again. Where even the shortest fails, the state is left as it was and the report says why.
-// `follows`: memory was last used for a step of the same environment.
+// Takes one step of length m.step, or of one of its equal `parts`, which always use BDF1. If Newton's method fails, the
+// substep is halved, down to 2^-max_halvings of the step, and after two successful substeps doubled again. If the
+// shortest fails too, the state stays as it was and the report holds the reason. `same_environment`: memory was last
+// used for a step of the same environment.
 template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 bool same_environment, Observer&& accepted = {}, int parts = 1) {
   memory.cache = same_environment ? CacheState::warm : CacheState::stale;
   StepReport report;
   const double span = m.step / parts;
-  const int full_step = 1 << m.max_halvings;  // lengths in units of the shortest substep
-  for (int at = 0, length = full_step; at < full_step;) {
-    const T h = length == full_step ? T(span) : T(span * length / full_step);
-    const bool itself = length == full_step && parts == 1;
-    if (at == 0 && length == full_step / 2) memory.save(m, s);  // only a part of a step may have to be taken back
-    report.status = substep<T>(m, params, h, itself, u, polish, s, memory, report.iterations, accepted);
+  const int full_length = 1 << m.max_halvings;  // lengths in units of the shortest substep
+  for (int at = 0, length = full_length; at < full_length;) {
+    const T h = length == full_length ? T(span) : T(span * length / full_length);
+    const bool full_step = length == full_length && parts == 1;
+    if (at == 0 && length == full_length / 2) memory.save(m, s);  // only parts of a divided step may have to be undone
+    report.status = substep<T>(m, params, h, full_step, u, polish, s, memory, report.iterations, accepted);
     if (report.status == Status::ok) {
       at += length;
-      if (at % (2 * length) == 0 && at + 2 * length <= full_step) length *= 2;
+      if (at % (2 * length) == 0 && at + 2 * length <= full_length) length *= 2;
     } else if (length > 1 && report.iterations < m.max_step_iterations) {
       length /= 2;
-      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(full_step / length)));
+      report.halvings = std::max(report.halvings, std::countr_zero(static_cast<unsigned>(full_length / length)));
     } else {
       if (at > 0) memory.restore(m, s);
       return report;
