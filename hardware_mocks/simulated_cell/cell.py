@@ -128,7 +128,7 @@ class SimulatedCell:
     def run(self, ending: threading.Event, *, after_step: Callable[[], None] = lambda: None) -> None:
         """Step on the clock until `ending` is set. Raises SimulationError when the simulation fails.
 
-        A paced clock waits where this computer can't simulate as fast as it runs.
+        With time synchronization, robot time waits when this computer cannot simulate as fast.
         """
         step = self.config.step
         self._time = self._clock.now()

@@ -71,7 +71,7 @@ class EgmArm:
             self._wait(
                 lambda: self._opened().latest() is not None,
                 self._clock.wall(limit),
-                f"no EGM packet on UDP port {self.port} within {limit:g} s: "
+                f"no EGM message on UDP port {self.port} within {limit:g} s: "
                 "start the RAPID program with EGMRunPose, check UCDevice address",
             )
         except BaseException:
@@ -280,7 +280,7 @@ class EgmArm:
     def _latest(self) -> EgmCycle:
         record = self._opened().latest()
         if record is None:
-            raise PeerTimeout(f"no EGM packet on UDP port {self.port} yet")
+            raise PeerTimeout(f"no EGM message on UDP port {self.port} yet")
         return record
 
     def _running(self) -> bool:

@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
+from typing import Literal
 
 import numpy as np
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.protocols import CameraImage
+from gelflow.protocols import Gripper
 from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
@@ -35,7 +36,7 @@ class Cell:
     lab: Lab
     clock: ScaledClock
     arm: EgmArm
-    gripper: WsgGripper
+    gripper: Gripper
     cameras: tuple[StreamCamera, StreamCamera]  # of the left and of the right finger
     recorder: SessionRecorder
     dry_run: bool
@@ -50,34 +51,44 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
     """
     clock = lab.clock
     with contextlib.ExitStack() as stack:
-        cameras = []
-        for sensor, (name, camera) in enumerate((("left", lab.cameras.left), ("right", lab.cameras.right))):
-
-            def record(image: CameraImage, sensor: int = sensor) -> None:
-                recorder.image(sensor, image)
-
-            timeout = lab.limits.stale_frame
-            cameras.append(open_camera(camera.source, name, clock, timeout=timeout, on_image=record))
-            stack.callback(cameras[-1].close)
-        gripper = WsgGripper(
-            transport_for(lab.gripper.address, clock=clock),
-            clock=clock,
-            config=WsgConfig(
-                stale_after=lab.limits.stale_gripper,
-                reply_timeout=lab.limits.gripper_reply,
-                move_timeout=lab.limits.gripper_motion,
-                home_timeout=max(LIMITS.gripper_home_time, lab.limits.gripper_motion),
-                dry_run=dry_run,
-            ),
-            on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
-            on_measurement=recorder.gripper_state,
-        )
-        stack.enter_context(gripper)
+        left = stack.enter_context(_open_camera(lab, clock, "left", 0, recorder))
+        right = stack.enter_context(_open_camera(lab, clock, "right", 1, recorder))
+        gripper = stack.enter_context(_gripper(lab, clock, recorder, dry_run=dry_run))
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
         stack.callback(arm.close)
         arm.connect()
         stack.enter_context(_StopArm(arm, recorder))
-        yield Cell(lab, clock, arm, gripper, (cameras[0], cameras[1]), recorder, dry_run)
+        yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run)
+
+
+def _open_camera(
+    lab: Lab, clock: ScaledClock, name: Literal["left", "right"], sensor: int, recorder: SessionRecorder
+) -> StreamCamera:
+    """A connected camera that records every image."""
+    return open_camera(
+        getattr(lab.cameras, name).source,
+        name,
+        clock,
+        timeout=lab.limits.stale_frame,
+        on_image=lambda image: recorder.image(sensor, image),
+    )
+
+
+def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run: bool) -> WsgGripper:
+    """The gripper of the lab file, not yet connected. The driver of another gripper is created here."""
+    return WsgGripper(
+        transport_for(lab.gripper.address, clock=clock),
+        clock=clock,
+        config=WsgConfig(
+            stale_after=lab.limits.stale_gripper,
+            reply_timeout=lab.limits.gripper_reply,
+            move_timeout=lab.limits.gripper_motion,
+            home_timeout=max(LIMITS.gripper_home_time, lab.limits.gripper_motion),
+            dry_run=dry_run,
+        ),
+        on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
+        on_measurement=recorder.gripper_state,
+    )
 
 
 def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:

@@ -62,7 +62,7 @@ class TactileObserver:
         frame = self._frame(trackeds, images)
         if frame is None:
             raise MarkersUnreadable(
-                f"no reference frame: fewer than {_VISIBLE_FRACTION:.0%} of the markers are seen; look at the gels"
+                f"no reference frame: fewer than {_VISIBLE_FRACTION:.0%} of the markers are visible; inspect the gels"
             )
         self.reference = TactileReading(frame, images, 0.0, 0.0)
         return self.reference

@@ -159,8 +159,8 @@ def test_robot_time_waits_for_a_slow_simulation(tmp_path: Path) -> None:
             ending.set()
 
     cell.run(ending, after_step=delay)
-    gone = clock.now() - begun
-    assert 0.4 <= gone <= 0.44  # not the 2 s of the wall clock
+    elapsed = clock.now() - begun
+    assert 0.4 <= elapsed <= 0.44  # not the 2 s of the wall clock
     assert cell.truth()["waited"] == clock.delay > 0.5
 
 

@@ -131,7 +131,7 @@ def test_response_head_is_parsed_when_complete() -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "kind", "says"),
+    ("data", "kind", "text"),
     [
         (b"HTTP/1.1 404 Not Found\r\n\r\n", PeerRefused, "404 Not Found"),
         (b"HTTP/1.1 200\r\nContent-Type: image/jpeg\r\n\r\n", PeerError, "image/jpeg"),
@@ -143,8 +143,8 @@ def test_response_head_is_parsed_when_complete() -> None:
         (b"HTTP/1.0 200 OK\r\n" + b"X: y\r\n" * 5000, PeerError, "longer"),
     ],
 )
-def test_invalid_responses_are_reported(data: bytes, kind: type[PeerError], says: str) -> None:
-    with pytest.raises(kind, match=says) as caught:
+def test_invalid_responses_are_reported(data: bytes, kind: type[PeerError], text: str) -> None:
+    with pytest.raises(kind, match=text) as caught:
         head = codec.parse_head(data)
         assert head is not None
         head[0].boundary()

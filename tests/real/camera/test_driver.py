@@ -181,7 +181,7 @@ def test_unreachable_address_is_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "kind", "says"),
+    ("answer", "kind", "text"),
     [
         (b"", PeerTimeout, "no answer from"),
         (b"HTTP/1.0 200 O", PeerTimeout, "no answer from"),
@@ -190,8 +190,8 @@ def test_unreachable_address_is_reported() -> None:
         (b"HTTP/1.0 200 OK\r\nContent-Type: text/html\r\n\r\n", PeerError, "text/html"),
     ],
 )
-def test_other_servers_are_reported(answer: bytes, kind: type[PeerError], says: str) -> None:
-    with raw_server(answer) as url, pytest.raises(kind, match=says) as caught:
+def test_other_servers_are_reported(answer: bytes, kind: type[PeerError], text: str) -> None:
+    with raw_server(answer) as url, pytest.raises(kind, match=text) as caught:
         MjpegCamera(url, "left", CLOCK, connect_timeout=0.3 if kind is PeerTimeout else PATIENT).open()
     assert url in str(caught.value) and "\n" not in str(caught.value)
 

@@ -60,7 +60,7 @@ def test_missing_robot_gives_a_one_line_error_and_ends_the_process() -> None:
         with pytest.raises(PeerTimeout) as caught:
             arm.connect()
         assert str(caught.value) == (
-            f"no EGM packet on UDP port {arm.port} within 2 s: "
+            f"no EGM message on UDP port {arm.port} within 2 s: "
             "start the RAPID program with EGMRunPose, check UCDevice address"
         )
         assert arm.pid is None
@@ -201,7 +201,7 @@ def test_messages_of_other_addresses_than_the_configured_robot_are_ignored() -> 
     mock = MockEgmArm(plant, clock=ScaledClock(10), config=dataclasses.replace(MOCK, port=port))
     mock.start()
     try:
-        with pytest.raises(PeerTimeout, match="no EGM packet"):
+        with pytest.raises(PeerTimeout, match="no EGM message"):
             arm.connect(timeout=3)
     finally:
         mock.stop()

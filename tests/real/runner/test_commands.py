@@ -37,8 +37,8 @@ def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: p
         assert lab.clock_factor == FACTOR and lab.gripper.address.startswith("serial:")
         arguments = ["--lab", str(lab_path), "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out")]
         assert main(["run", "insertion", *arguments, "--dry-run"]) == 0
-        told = capsys.readouterr().out
-        assert "nothing was moved" in told and "252 of 252 markers" in told
+        output = capsys.readouterr().out
+        assert "nothing was moved" in output and "252 of 252 markers" in output
         # The session is never overwritten.
         assert main(["run", "insertion", *arguments, "--dry-run"]) == 2
         assert "a recording never overwrites" in capsys.readouterr().err
@@ -57,9 +57,9 @@ def test_demo_inserts_a_part_and_its_session_replays(
     out = tmp_path / "demo"
     options = ["--insertions", "1", "--factor", str(FACTOR), "--checkpoint", str(checkpoint), "--no-real-time"]
     assert main(["demo", "--out", str(out), "--preset", "fast", *options]) == 0
-    told = capsys.readouterr().out
-    assert "misalignment" in told and f"gelflow replay {out / 'session.mcap'}" in told.replace("\n", "")
-    assert "in truth" in told
+    output = capsys.readouterr().out
+    assert "misalignment" in output and f"gelflow replay {out / 'session.mcap'}" in output.replace("\n", "")
+    assert "in truth" in output
     picture = out / "insertion-1.png"
     assert picture.read_bytes()[:4] == b"\x89PNG" and picture.stat().st_size > 50_000
     assert main(["replay", str(out / "session.mcap")]) == 0
@@ -70,8 +70,8 @@ def test_mock_reports_why_it_cannot_start(capsys: pytest.CaptureFixture[str]) ->
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         assert main(["mock", "--tcp-port", port]) == 2
-    told = capsys.readouterr().err
-    assert port in told and told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert port in output and output.count("\n") == 1
 
 
 def test_demo_reports_a_mock_that_does_not_start() -> None:
@@ -91,5 +91,5 @@ def test_invalid_options_give_a_one_line_error(
     arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments) == 2
-    told = capsys.readouterr().err
-    assert named in told and told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert named in output and output.count("\n") == 1
