@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gelflow.clock import Clock
 from gelflow.errors import UsageError
+from gelflow.real.limits import LIMITS
 
 
 class GripperPlant(Protocol):
@@ -54,7 +55,7 @@ class KinematicGripper:
     or an end with the commanded force.
     """
 
-    STROKE = 0.110  # [m]
+    STROKE = LIMITS.gripper_width[1]  # [m]
 
     def __init__(self, clock: Clock, *, width: float = 0.050, part_width: float | None = None) -> None:
         if not 0 <= width <= self.STROKE:

@@ -80,7 +80,7 @@ class MockMjpegCamera:
 
     @property
     def url(self) -> str:
-        """Of the stream."""
+        """URL of the stream."""
         return f"http://{self._where[0]}:{self.port}/?action=stream"
 
     @property
