@@ -70,9 +70,8 @@ def test_tactile_forces_give_the_weight(mass: float) -> None:
     sim.param("bar.mass")[:] = mass
     lift(sim, closed(sim), 100)
     forces = sim.tactile()[0]
-    np.testing.assert_allclose(
-        forces[:130], forces[130:] * [1, -1, 1], atol=1e-9
-    )  # mirrored pads: y has the opposite sign
+    # The pads are mirrored: y has the opposite sign.
+    np.testing.assert_allclose(forces[:130], forces[130:] * [1, -1, 1], atol=1e-9)
     below_top = sim.poses()[0, scene.body("bar"), 2] + 0.0125 - sim.q[0, sim.joint_q("arm_z")]
     points = scene.points[0].points  # only one of the two faces of a pad is in contact
     point_stiffness = 2 * ((points[:, 2] < below_top) & (points[:, 0] > -1e-9)).sum() * scene.contacts[0].params["ks"]

@@ -97,7 +97,7 @@ def test_spheres_and_capsules(half: float, faces: tuple[str, ...]) -> None:
     assert np.linalg.norm(points - np.stack([0 * axis, 0 * axis, axis], -1), axis=1) == pytest.approx(0.2)
     assert areas.sum() == pytest.approx(len(faces) / 2 * (4 * np.pi * 0.2**2 + 4 * np.pi * 0.2 * half))
     assert ((points[:, 2] < 0) == (len(faces) == 2) | (faces == ("-z",)))[points[:, 2] < 0].all()
-    # Equal areas, near-uniform: nobody's neighbour is much nearer than the area says.
+    # Nearly uniform: nearest neighbours are not much closer than the spacing of a regular grid of equal areas.
     gaps = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(200)
     assert gaps.min() > 0.6 * np.sqrt(areas[0].sum())
 
