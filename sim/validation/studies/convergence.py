@@ -71,7 +71,7 @@ def simulator(scene: Scene, step: float, integrator: str, envs: int = 1) -> Simu
 
 
 @dataclass(frozen=True)
-class Course:
+class SampledMotion:
     """All variants of a motion, sampled every `LONGEST` seconds."""
 
     samples: dict[str, Array]  # quantity → (frames, variants, components)
@@ -79,7 +79,7 @@ class Course:
     halved: int  # steps that were split into substeps, all variants
 
 
-def run(scene: Scene, integrator: str, halvings: int, count: int) -> Course:
+def run(scene: Scene, integrator: str, halvings: int, count: int) -> SampledMotion:
     """Simulate all variants with steps of LONGEST / 2^halvings. Raises SimulationError when a step fails."""
     step, between = LONGEST / 2**halvings, 2**halvings
     moves = reference_motion(scene)
@@ -93,7 +93,7 @@ def run(scene: Scene, integrator: str, halvings: int, count: int) -> Course:
         for quantity, now in (("q", sim.q), ("v", sim.v), ("tactile", sim.tactile())):
             samples[quantity].append(now.reshape(count, -1).copy())
     sim.check()
-    return Course({k: np.array(v) for k, v in samples.items()}, int(sim.iterations[0]), int(sim.halved.sum()))
+    return SampledMotion({k: np.array(v) for k, v in samples.items()}, int(sim.iterations[0]), int(sim.halved.sum()))
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,18 @@ class Errors:
     halved: int
 
 
-def errors_of(course: Course, reference: Course, start: Array) -> Errors:
-    """Errors of a course relative to the reference; `start` (nq,) are the initial positions."""
+def errors_of(motion: SampledMotion, reference: SampledMotion, start: Array) -> Errors:
+    """Errors of a motion relative to the reference; `start` (nq,) are the initial positions."""
     mean, rms = {}, {}
     for quantity in QUANTITIES:
         exact = reference.samples[quantity]
-        off = np.linalg.norm(course.samples[quantity] - exact, axis=2)
+        off = np.linalg.norm(motion.samples[quantity] - exact, axis=2)
         size = np.linalg.norm(exact - start if quantity == "q" else exact, axis=2)
         mean[quantity] = (off.mean(0) / size.mean(0)).tolist()
         rms[quantity] = np.sqrt((off**2).mean(0) / (size**2).mean(0)).tolist()
-    last, right = course.samples["q"][-1, 0], reference.samples["q"][-1, 0]
+    last, right = motion.samples["q"][-1, 0], reference.samples["q"][-1, 0]
     end = float(np.linalg.norm(last - right) / np.linalg.norm(right - start))
-    return Errors(mean, rms, end, course.iterations, course.halved)
+    return Errors(mean, rms, end, motion.iterations, motion.halved)
 
 
 @dataclass(frozen=True)
@@ -168,20 +168,20 @@ def measure(less: int, threads: int, done: Callable[[float], None]) -> tuple[lis
     }
     whole = sum(2**k * SETUPS[setup][3] for (setup, _), ks in taken.items() for k in ks)
     whole += sum(2 ** most[setup][2] * SETUPS[setup][3] for setup in SETUPS)
-    references: dict[Setup, Course] = {}
+    references: dict[Setup, SampledMotion] = {}
 
-    def course(setup: Setup, integrator: str, halvings: int) -> Course:
+    def motion(setup: Setup, integrator: str, halvings: int) -> SampledMotion:
         result = run(scenes[setup], integrator, halvings, SETUPS[setup][3])
         done(2**halvings * SETUPS[setup][3] / whole)
         return result
 
     def errors(job: tuple[Setup, str, int]) -> Errors:
-        return errors_of(course(*job), references[job[0]], reference_motion(scenes[job[0]]).q0)
+        return errors_of(motion(*job), references[job[0]], reference_motion(scenes[job[0]]).q0)
 
     jobs = sorted(((*kind, k) for kind, ks in taken.items() for k in ks), key=lambda job: -job[2])  # longest first
     with ThreadPoolExecutor(threads) as pool:
         last = list(reversed(SETUPS))  # longest first
-        references |= zip(last, pool.map(lambda setup: course(setup, "bdf2", most[setup][2]), last), strict=True)
+        references |= zip(last, pool.map(lambda setup: motion(setup, "bdf2", most[setup][2]), last), strict=True)
         found = dict(zip(jobs, pool.map(errors, jobs), strict=True))
     result = [
         Convergence(*setup, integrator, [LONGEST / 2**k for k in ks], [found[setup, integrator, k] for k in ks])

@@ -109,10 +109,10 @@ def test_tree_shows_parameters_of_contacts_and_joints(capsys: pytest.CaptureFixt
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("name", scene_names())
 def test_json_output_agrees_with_the_model(name: str, law: str, capsys: pytest.CaptureFixture[str]) -> None:
-    told = json.loads(printed(capsys, name, "--friction", law, "--no-timing", "--json"))
+    description = json.loads(printed(capsys, name, "--friction", law, "--no-timing", "--json"))
     scene = load_scene(name, friction=law)
     sim = Simulator(scene)
-    size = told["size"]
+    size = description["size"]
     for key in ("nq", "nv", "nu"):
         assert size[key] == getattr(sim.model, key) == getattr(scene, key)
     assert size["markers"] == sim.model.markers == scene.num_markers
@@ -120,16 +120,16 @@ def test_json_output_agrees_with_the_model(name: str, law: str, capsys: pytest.C
     assert (size["anchors"] > 0) == (law == "elastic")
     assert size["parameters"] == len(sim.model.param_names)
     assert size["contact_pairs"] == len(sim.model.contact_names)
-    assert size["candidate_points"] == sum(c["candidates"] * len(c["against"]) for c in told["contacts"])
+    assert size["candidate_points"] == sum(c["candidates"] * len(c["against"]) for c in description["contacts"])
     assert size["parameter_bytes"] == sim.params.nbytes
     assert size["reading_bytes"] == sim.tactile().nbytes
     assert size["state_bytes"] >= sum(a.nbytes for a in (sim.q, sim.v, sim.anchors, sim.anchored))
-    joints = [joint for body in told["bodies"] for joint in body["joints"]]
+    joints = [joint for body in description["bodies"] for joint in body["joints"]]
     assert [joint["name"] for joint in joints] == list(sim.model.joint_names)
     actuators = [actuator["name"] for joint in joints for actuator in joint["actuators"]]
     assert sorted(actuators) == sorted(sim.model.actuator_names)
-    assert [pad["name"] for pad in told["pads"]] == list(sim.model.pad_names)
-    assert told["times"] is None
+    assert [pad["name"] for pad in description["pads"]] == list(sim.model.pad_names)
+    assert description["times"] is None
 
 
 def test_memory_sizes_grow_with_anchors_and_markers() -> None:
@@ -146,11 +146,11 @@ def test_memory_sizes_grow_with_anchors_and_markers() -> None:
 
 
 def test_elements_that_are_not_modelled_are_listed(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = describe(load_scene(own))
-    world, block, other = told.bodies
+    description = describe(load_scene(own))
+    world, block, other = description.bodies
     assert (world.merged, block.merged, other.merged) == (("table",), ("sticker",), ())
     assert block.geometry == ("box block", "box sticker")
-    assert told.not_modelled == (
+    assert description.not_modelled == (
         "box top: in no contact and under no pad",
         "box sticker: in no contact and under no pad",
         "sphere other: in no contact and under no pad",
@@ -162,7 +162,7 @@ def test_elements_that_are_not_modelled_are_listed(own: Path, capsys: pytest.Cap
         "MuJoCo's contact and solver settings: replaced by those of the scene file",
     )
     text = words(printed(capsys, str(own), "--no-timing"))
-    for line in told.not_modelled:
+    for line in description.not_modelled:
         assert line in text
     assert "attached: sticker" in text
     assert "joint lift: slide along (0 0 1), range -1 to 1 m (stop 100 N/m), damping 3 N s/m" in text
@@ -174,9 +174,9 @@ def test_elements_that_are_not_modelled_are_listed(own: Path, capsys: pytest.Cap
 
 def test_elastic_pad_is_not_listed_as_free_of_cost(own: Path) -> None:
     scene = load_scene(own, overrides={"pads.pad.law": "elastic", "pads.pad.ks": 1.0})
-    told = describe(scene)
-    assert not any(line.startswith("pad pad") for line in told.not_modelled)
-    assert told.size.anchors == 12
+    description = describe(scene)
+    assert not any(line.startswith("pad pad") for line in description.not_modelled)
+    assert description.size.anchors == 12
     assert [name for name, _ in with_duplicates(scene)] == ["contact stand", "pad pad: friction anchors of its markers"]
 
 
@@ -225,15 +225,15 @@ def test_holding_controls_keep_the_scene_at_its_start() -> None:
 
 
 def test_times_of_parts_add_up_to_the_step(capsys: pytest.CaptureFixture[str]) -> None:
-    told = json.loads(printed(capsys, "insertion", "--json", "--repeats", "2"))["times"]
-    names = [part["name"] for part in told["parts"]]
+    description = json.loads(printed(capsys, "insertion", "--json", "--repeats", "2"))["times"]
+    names = [part["name"] for part in description["parts"]]
     assert names[:2] == ["call from Python", "bodies, joints, actuators, solver"]
     assert names[2:6] == [f"contact {name}" for name in ("pad_left", "pad_right", "part_hole", "part_floor")]
     assert names[6:] == [f"pad {side}: friction anchors of its markers" for side in ("left", "right")]
-    assert sum(part["microseconds"] for part in told["parts"]) == pytest.approx(told["whole"])
-    assert sum(part["share"] for part in told["parts"]) == pytest.approx(1)
-    assert told["whole"] > 0 and told["at_start"] > 0 and told["reading"] > 0
-    assert told["repeats"] == 2 and told["timed_steps"] == 20 and told["run_steps"] == 100
+    assert sum(part["microseconds"] for part in description["parts"]) == pytest.approx(description["whole"])
+    assert sum(part["share"] for part in description["parts"]) == pytest.approx(1)
+    assert description["whole"] > 0 and description["at_start"] > 0 and description["reading"] > 0
+    assert description["repeats"] == 2 and description["timed_steps"] == 20 and description["run_steps"] == 100
 
 
 def test_scene_without_contacts_and_pads_is_timed(own: Path, capsys: pytest.CaptureFixture[str]) -> None:

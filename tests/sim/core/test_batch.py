@@ -61,7 +61,7 @@ def trace(sim: Simulator, u: Array) -> list[Array]:
 def test_results_are_bitwise_independent_of_threads_and_batch(insertion: Scene) -> None:
     u = controls(insertion)
     reference = trace(started(insertion, list(range(ENVS))), u)
-    assert len({row.tobytes() for row in reference}) == ENVS  # the environments do differ
+    assert len({row.tobytes() for row in reference}) == ENVS  # the environments differ
     for threads in (2, 3):
         again = trace(started(insertion, list(range(ENVS)), threads=threads), u)
         assert [row.tobytes() for row in again] == [row.tobytes() for row in reference]
@@ -99,7 +99,7 @@ def test_rollout_equals_steps(insertion: Scene) -> None:
     u = controls(insertion)
     sim = started(insertion, list(range(ENVS)), threads=2)
     run = sim.rollout(u, read_after=[0, STEPS])
-    np.testing.assert_array_equal(sim.tactile(), run.tactile[0])  # the simulator's own state is where it was
+    np.testing.assert_array_equal(sim.tactile(), run.tactile[0])  # the simulator's own state is unchanged
     for step in range(STEPS):
         np.testing.assert_array_equal(sim.q, run.q[step])
         sim.step(u[step])
@@ -140,7 +140,7 @@ def test_values_that_are_not_finite_raise_with_their_name(insertion: Scene, bad:
     with pytest.raises(UsageError, match=re.escape("q[4, 2] is not finite")):
         sim.step(u[0])
     sim.q[4, 2] = before[4, 2]
-    np.testing.assert_array_equal(sim.q, before)  # nothing moved
+    np.testing.assert_array_equal(sim.q, before)  # no step was taken
     assert not sim.status.any()
     sim.step(u[0])
     sim.check()
@@ -202,7 +202,7 @@ def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
         assert np.delete(ours, 2, axis=0).tobytes() == np.delete(theirs, 2, axis=0).tobytes()
     others = np.delete(sim.tactile(), 2, axis=0)
     assert others.tobytes() == np.delete(reference.tactile(), 2, axis=0).tobytes()
-    # Put right and reset, it goes on.
+    # A corrected and reset environment continues.
     sim.param(name)[2] = reference.param(name)[2]
     sim.reset(np.arange(ENVS) == 2)
     sim.q[2] = insertion.q0
@@ -237,7 +237,7 @@ def test_failed_environment_has_gradient_zero(insertion: Scene) -> None:
     assert gradient.u[:, 0].any()
 
 
-# Controls and for how many steps: until there is contact, and on.
+# Controls and number of steps, which include contact.
 PUSHES = {
     "rolling": [([0.0, 0.0, 0.2], 100), ([0.1, 0.05, 0.2], 40)],
     "pushing": [([0.4, 0.0, 0.0, 0.0, 0.0, 0.0], 60), ([0.4, 0.05, 0.0, 0.0, 0.0, 0.0], 40)],
@@ -290,7 +290,7 @@ def test_small_increments_accumulate_in_single_precision() -> None:
     for q in (stepped.q[0], end):
         assert q[0] - np.float32(0.5) == pytest.approx(1e-6, rel=0.1)
         assert q[6] == pytest.approx(0.5e-6, rel=1e-3)
-    stepped.q[0, 0] = 1e-7  # what half a metre lacked is none of its
+    stepped.q[0, 0] = 1e-7  # the rounding residual belongs to the previous position
     stepped.step(none[0])
     assert stepped.q[0, 0] == pytest.approx(1.01e-7, rel=1e-5)
 
@@ -308,7 +308,9 @@ def test_gradients_of_single_precision_agree_with_double(name: str, friction: st
         run = sim.rollout(u, read_after=(20, 40))
         weights = np.random.default_rng(0).normal(size=run.tactile.shape)
         back = sim.rollout_gradient(run, v=np.ones(()), tactile=weights, params=True)
-        alone = sim.rollout_gradient(run, v=np.ones(()), tactile=weights)  # readings go back in single precision
+        alone = sim.rollout_gradient(
+            run, v=np.ones(()), tactile=weights
+        )  # reverse pass of viscous forces in single precision
         found.append((back.u, back.q, back.v, back.params, alone.u, alone.q, alone.v))
     for exact, single in zip(*found, strict=True):
         assert np.linalg.norm(single - exact) <= 1e-3 * np.linalg.norm(exact)
@@ -345,12 +347,12 @@ def test_portable_build_agrees_with_the_native_build(insertion: Scene, tmp_path:
     np.testing.assert_allclose(sim.tactile(), other["tactile"], atol=1e-6)
 
 
-@pytest.mark.parametrize(("wanted", "says"), [("fast", "must be base or v3"), ("", "")])
-def test_requested_build_is_loaded_or_raises(wanted: str, says: str) -> None:
+@pytest.mark.parametrize(("wanted", "message"), [("fast", "must be base or v3"), ("", "")])
+def test_requested_build_is_loaded_or_raises(wanted: str, message: str) -> None:
     command = [sys.executable, "-c", "import gelflow.sim._core"]
     run = subprocess.run(command, env={**os.environ, "GELFLOW_CORE": wanted}, capture_output=True, text=True)
-    assert (run.returncode == 0) == (not says)
-    assert says in run.stderr
+    assert (run.returncode == 0) == (not message)
+    assert message in run.stderr
 
 
 def test_results_are_written_to_given_arrays(insertion: Scene) -> None:

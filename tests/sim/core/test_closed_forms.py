@@ -55,5 +55,5 @@ def test_grasped_part_does_not_creep_and_markers_show_its_load_under_the_elastic
     contacts = list(sim.model.contact_names)
     carried = sum(-sim.wrenches()[0, contacts.index(f"pad_{side}"), 5] for side in ("left", "right"))
     assert carried == pytest.approx(weight, rel=1e-6)
-    shear = sim.tactile()[0, :, 0]  # towards the tip, which is down
+    shear = sim.tactile()[0, :, 0]  # towards the fingertip, downwards
     assert (shear > 0).all() and shear.std() < 1e-3 * shear.mean()

@@ -59,7 +59,7 @@ def test_contact_forces_of_a_resting_block_carry_its_weight(law: str, damping: s
     settle(sim, 2.0)
     wrench = sim.wrenches()[0, 0]
     np.testing.assert_allclose(wrench[3:], [0, 0, MASS * G], atol=1e-9)
-    np.testing.assert_allclose(wrench[:3], 0, atol=1e-10)  # about the origin, above which the block stands
+    np.testing.assert_allclose(wrench[:3], 0, atol=1e-10)  # about the origin, below the block
     assert HALF - sim.q[0, 2] == pytest.approx(MASS * G / (4 * 2e3), rel=1e-8)
 
 
@@ -76,7 +76,7 @@ def test_sticking_block_creeps_under_the_viscous_law() -> None:
 
 def test_sticking_block_does_not_creep_under_the_elastic_law() -> None:
     """Its displacement is F / (N k_s), constant, and zero again without load."""
-    sim = block_on_plane("elastic", mu=2.0)  # so that no corner slips while the block sways
+    sim = block_on_plane("elastic", mu=2.0)  # no corner slips during the oscillation
     settle(sim, 1.0)
     rest = sim.q[0, 0]
     sim.param("gravity.x")[:] = G * 0.3
@@ -84,7 +84,7 @@ def test_sticking_block_does_not_creep_under_the_elastic_law() -> None:
     held = sim.q[0].copy()
     settle(sim, 2.0)
     np.testing.assert_allclose(sim.q[0], held, atol=1e-10)
-    lean = 2 * held[5]  # about y, so that the lower face lags the middle
+    lean = 2 * held[5]  # rotation about y moves the lower face relative to the centre
     assert held[0] - HALF * lean - rest == pytest.approx(MASS * G * 0.3 / (4 * 1e3), rel=1e-3)
     sim.param("gravity.x")[:] = 0
     settle(sim, 2.0)
@@ -113,7 +113,7 @@ def test_marker_forces_at_contact_points_add_up_to_the_contact_force(law: str, s
     sim.step(np.zeros(0), 60)
     quat = sim.poses()[0, 0, 3:]
     force = (sim.tactile()[0] * [1, 1, -1]).sum(0) @ matrix(quat).T
-    # The wrench is that of the state now, with the anchors of now, as the markers are.
+    # Wrench and marker forces use the present state and anchors.
     np.testing.assert_allclose(force, sim.wrenches()[0, 0, 3:], rtol=0, atol=1e-13)
     assert sim.tactile()[0, :, :2].any()
 
@@ -147,7 +147,7 @@ def two_blocks(law: str) -> Simulator:
 def test_contact_forces_on_two_bodies_are_equal_and_opposite(law: str) -> None:
     """The change of momentum in a step is the contact impulse, with opposite signs for the two bodies."""
     sim = two_blocks(law)
-    # The force of the implicit step is the one at its end, with the anchors of its start: those are put back to read.
+    # The force of the implicit step is that of its end with the anchors of its start, which are restored here.
     gained = 0.0
     for _ in range(40):
         before, anchors, anchored = sim.v[0].copy(), sim.anchors.copy(), sim.anchored.copy()
@@ -179,7 +179,7 @@ def test_contact_does_not_add_energy(law: str) -> None:
     sim.step(np.zeros(0), 400)
     sim.check()
     assert 0.5 * float(masses @ sim.v[0] ** 2) < start
-    np.testing.assert_array_equal(sim.wrenches(), 0)  # they have come apart
+    np.testing.assert_array_equal(sim.wrenches(), 0)  # separated
 
 
 def ball_on_plane(step: float = 1e-3) -> Simulator:

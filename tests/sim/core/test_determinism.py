@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 ENVS = 8
 STEPS = 3
 OVERRIDES = {"rolling": {"pads.pad.rows": 12, "pads.pad.cols": 12, "points.pad.resolution": [8, 8, 3]}}
-IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # [s] into the motion
+IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # time in contact [s]
 
 Compute = Callable[[Simulator, Array], list[NDArray[Any]]]  # (batch, controls (steps, N, nu)) → arrays with N first
 
@@ -120,10 +120,10 @@ def test_results_are_bitwise_independent_of_threads_and_batch(
 ) -> None:
     everyone = list(range(ENVS))
     reference = bits(COMPUTED[what], *batch(case, everyone, 1))
-    assert len(set(reference)) == ENVS  # the environments do differ
+    assert len(set(reference)) == ENVS  # the environments differ
     for threads in (2, 7):
         assert bits(COMPUTED[what], *batch(case, everyone, threads)) == reference
-    others = [6, 1, 1, 4, 0]  # other places, other neighbours, one of them a twin
+    others = [6, 1, 1, 4, 0]  # other order and size, one environment twice
     assert bits(COMPUTED[what], *batch(case, others, 2)) == [reference[env] for env in others]
     for env in (0, 5):
         assert bits(COMPUTED[what], *batch(case, [env], 7)) == [reference[env]]

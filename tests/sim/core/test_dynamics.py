@@ -40,7 +40,7 @@ def random_tree(rng: np.random.Generator, bodies: int, *, free: bool) -> list[Li
     links: list[Link] = []
     for i in range(bodies):
         parent = -1 if i == 0 else int(rng.integers(0 if free else -1, i))
-        atoms = rng.normal(size=(4, 3)) * 0.1  # four point masses: an inertia that a body can have
+        atoms = rng.normal(size=(4, 3)) * 0.1  # four point masses give a valid inertia
         shares = rng.uniform(0.1, 1.0, 4)
         com = shares @ atoms / shares.sum()
         arms = atoms - com
@@ -90,12 +90,12 @@ def their_model(links: list[Link], gravity: Array) -> mujoco.MjModel:
     return spec.compile()
 
 
-def in_our_order(model: _core.Model, twin: mujoco.MjModel) -> tuple[list[int], list[int]]:
+def joint_indices(model: _core.Model, reference: mujoco.MjModel) -> tuple[list[int], list[int]]:
     """Indices of positions and velocities in MuJoCo, which orders bodies depth first."""
     positions: list[int] = []
     velocities: list[int] = []
     for name in model.joint_names:
-        joint = twin.joint(name)
+        joint = reference.joint(name)
         wide = joint.type[0] == mujoco.mjtJoint.mjJNT_FREE
         positions += range(joint.qposadr[0], joint.qposadr[0] + (7 if wide else 1))
         velocities += range(joint.dofadr[0], joint.dofadr[0] + (6 if wide else 1))
@@ -108,46 +108,50 @@ def test_mass_matrix_and_bias_agree_with_mujoco(seed: int, free: bool) -> None:
     rng = np.random.default_rng(seed)
     links = random_tree(rng, 6, free=free)
     gravity = rng.normal(size=3) * 10
-    model, twin = our_model(links, gravity), their_model(links, gravity)
-    at_q, at_v = in_our_order(model, twin)
-    sim, data = Simulator(model, num_envs=3), mujoco.MjData(twin)
+    model, reference = our_model(links, gravity), their_model(links, gravity)
+    at_q, at_v = joint_indices(model, reference)
+    sim, data = Simulator(model, num_envs=3), mujoco.MjData(reference)
     for env in range(sim.num_envs):
-        data.qpos[:] = rng.normal(size=twin.nq)
-        data.qvel[:] = rng.normal(size=twin.nv) * 3
-        mujoco.mj_normalizeQuat(twin, data.qpos)
-        mujoco.mj_forward(twin, data)
+        data.qpos[:] = rng.normal(size=reference.nq)
+        data.qvel[:] = rng.normal(size=reference.nv) * 3
+        mujoco.mj_normalizeQuat(reference, data.qpos)
+        mujoco.mj_forward(reference, data)
         sim.q[env], sim.v[env] = data.qpos[at_q], data.qvel[at_v]
-        mass = np.zeros((twin.nv, twin.nv))
-        mujoco.mj_fullM(twin, data, mass)
+        mass = np.zeros((reference.nv, reference.nv))
+        mujoco.mj_fullM(reference, data, mass)
         np.testing.assert_allclose(sim.mass_matrix()[env], mass[np.ix_(at_v, at_v)], atol=1e-11)
         np.testing.assert_allclose(sim.bias()[env], data.qfrc_bias[at_v], rtol=1e-11, atol=1e-10)
 
 
-def mechanical_state(twin: mujoco.MjModel, q: Array, v: Array) -> tuple[Array, Array, float]:
+def mechanical_state(reference: mujoco.MjModel, q: Array, v: Array) -> tuple[Array, Array, float]:
     """Linear and angular momentum (about the centre of mass) and energy, from MuJoCo."""
-    data = mujoco.MjData(twin)
+    data = mujoco.MjData(reference)
     data.qpos[:], data.qvel[:] = q, v
-    mujoco.mj_forward(twin, data)
-    mujoco.mj_subtreeVel(twin, data)
-    mujoco.mj_energyPos(twin, data)
-    mujoco.mj_energyVel(twin, data)
-    return twin.body_subtreemass[0] * data.subtree_linvel[0], data.subtree_angmom[0].copy(), float(data.energy.sum())
+    mujoco.mj_forward(reference, data)
+    mujoco.mj_subtreeVel(reference, data)
+    mujoco.mj_energyPos(reference, data)
+    mujoco.mj_energyVel(reference, data)
+    return (
+        reference.body_subtreemass[0] * data.subtree_linvel[0],
+        data.subtree_angmom[0].copy(),
+        float(data.energy.sum()),
+    )
 
 
 def drift(
     links: list[Link], gravity: Array, start_v: Array, step: float, duration: float
 ) -> tuple[float, float, float]:
     """Relative drift of momenta and energy after `duration`."""
-    twin = their_model(links, gravity)
+    reference = their_model(links, gravity)
     sim = Simulator(our_model(links, gravity, step))
-    at_q, at_v = in_our_order(sim.model, twin)
+    at_q, at_v = joint_indices(sim.model, reference)
     back_q, back_v = np.argsort(at_q), np.argsort(at_v)
     sim.v[0] = start_v
-    linear, angular, energy = mechanical_state(twin, sim.q[0][back_q], sim.v[0][back_v])
+    linear, angular, energy = mechanical_state(reference, sim.q[0][back_q], sim.v[0][back_v])
     sim.step(np.zeros(0), round(duration / step))
     sim.check()
-    linear_1, angular_1, energy_1 = mechanical_state(twin, sim.q[0][back_q], sim.v[0][back_v])
-    fallen = twin.body_subtreemass[0] * gravity * duration
+    linear_1, angular_1, energy_1 = mechanical_state(reference, sim.q[0][back_q], sim.v[0][back_v])
+    fallen = reference.body_subtreemass[0] * gravity * duration
     return (
         float(np.linalg.norm(linear_1 - linear - fallen)),
         float(np.linalg.norm(angular_1 - angular)),
@@ -159,7 +163,7 @@ def drift(
 def test_momenta_and_energy_of_a_free_tree_drift_at_first_order(seed: int) -> None:
     rng = np.random.default_rng(seed)
     links = random_tree(rng, 3, free=True)
-    for link in links:  # a rotor's inertia is no part of a body: MuJoCo counts its energy, but not its momentum
+    for link in links:  # MuJoCo includes armature in the energy, not in the momentum
         link.joints = [(kind, pos, axis, 0.0) for kind, pos, axis, _ in link.joints]
     gravity = np.array([0.0, 0.0, -GRAVITY])
     start = rng.normal(size=our_model(links, gravity).nv)
@@ -216,7 +220,7 @@ def test_symmetric_top_converges_to_the_closed_form_at_first_order() -> None:
         sim.v[0] = 1.0, 2.0, 3.0, *spin
         sim.step(np.zeros(0), round(duration / step))
         flown = np.array([1.0, 2.0, 3.0 - GRAVITY * duration / 2]) * duration
-        # BDF1 takes the velocity at each step's end: the fall is g t (t + h) / 2, exactly.
+        # BDF1 uses the velocity at the end of each step: the fall is exactly g t (t + h) / 2.
         flown[2] -= GRAVITY * duration * step / 2
         np.testing.assert_allclose(sim.q[0, :3] - [0, 0, 1], flown, atol=1e-12)
         np.testing.assert_allclose(sim.v[0, :3], [1, 2, 3 - GRAVITY * duration], atol=1e-12)
@@ -250,7 +254,7 @@ def test_pendulum_has_the_small_angle_period() -> None:
     steps = round(2 * np.pi / np.arctan(omega * step))
     sim.step(np.zeros(0), steps)
     expected = omega * amplitude * (1 + 1j * omega * step) ** -steps
-    # What the small angle leaves out is of the third order in it.
+    # The small-angle error is of third order.
     assert abs(omega * sim.q[0, 0] + 1j * sim.v[0, 0] - expected) < 20 * amplitude**3
     assert 2 * np.pi / omega == pytest.approx(steps * step, rel=2e-3)
 
@@ -273,7 +277,7 @@ def test_position_servo_deflects_under_load_and_clips_its_control() -> None:
     sim = one_joint("slide", actuator=servo)
     sim.step([0.3], 8000)
     assert sim.q[0, 0] == pytest.approx(0.3 - 2.0 * GRAVITY / 200.0, abs=1e-10)
-    sim.param("servo.force_upper")[:] = 10.0  # less than the weight: it falls at the rest of it
+    sim.param("servo.force_upper")[:] = 10.0  # less than the weight: it accelerates with the remainder
     sim.reset()
     sim.step([0.3], 100)
     assert sim.v[0, 0] == pytest.approx((10.0 / 2.0 - GRAVITY) * 0.1, rel=1e-12)
@@ -298,12 +302,12 @@ def test_joint_limit_carries_the_load_and_never_pulls(up: bool) -> None:
     sim.q[0] = sign * 0.04
     sim.step(np.zeros(0), 3000)
     assert sim.q[0, 0] == pytest.approx(sign * (0.05 + 2.0 * GRAVITY / 4e3), abs=1e-10)
-    # Leaving fast, its damper alone would pull back: it lets go instead.
+    # At high separation speed the damper would pull; the limit releases instead.
     sim.param("gravity.z")[:] = 0
     sim.q[0], sim.v[0] = sign * 0.055, -sign * 1.0
     sim.step(np.zeros(0), 1)
     assert sim.v[0, 0] == pytest.approx(-sign * 1.0, abs=1e-12)
-    # Between the limits it does nothing.
+    # No force between the limits.
     sim.q[0], sim.v[0] = 0.0, sign * 0.3
     sim.step(np.zeros(0), 10)
     assert sim.v[0, 0] == pytest.approx(sign * 0.3, abs=1e-12)

@@ -108,11 +108,11 @@ def test_energy_terms_equal_their_formulas() -> None:
     np.testing.assert_allclose(energy.contact, [9 * 0.5 * 2e3 * 1e-8, 0], atol=1e-15)
     sim.v[:] = 0
     sim.step(np.zeros(0))
-    sim.q[0, 0] += 2e-5  # a strain that all nine points share
+    sim.q[0, 0] += 2e-5  # the same strain at all nine points
     np.testing.assert_allclose(gauge.read(sim).friction[0], 9 * 0.5 * 1e3 * 4e-10, rtol=1e-6)
 
 
-# What one step may gain at most beyond the motors' work, relative to all their work; BDF2 damps less than it errs.
+# Largest gain of a step beyond the motors' work, relative to their total work. BDF2 has errors above its dissipation.
 MOST = {
     ("viscous", "bdf1"): TOLERANCE,
     ("elastic", "bdf1"): TOLERANCE,
@@ -136,7 +136,7 @@ def test_energy_gain_of_scenes_is_bounded(name: str, law: str, integrator: str) 
             sim.step(u)
             done = actuator_forces(scene, sim, u)[0] @ (sim.q[0, driven] - start)
             after = gauge.read(sim).total[0]
-            if sim.halved[0] == halved:  # else the motors' work is not told by the step's end
+            if sim.halved[0] == halved:  # with substeps, the force at the end does not give the motors' work
                 gains.append(after - before - done)
             work += abs(done)
             before = after

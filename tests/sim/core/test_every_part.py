@@ -18,7 +18,7 @@ from gelflow.sim.validation.contact_states import SHAPES, pressed_cloud
 from gelflow.sim.validation.reference_motions import SCENES, reference_motion
 from gelflow.sim.validation.stress import Precision, StressBatch, StressTest
 
-# Elastic friction and BDF2 are the longer ways; the others take part in single precision.
+# Elastic friction and BDF2 use the most code; the viscous law and BDF1 run in single precision.
 WAYS: tuple[tuple[str, str, Precision], ...] = (("elastic", "bdf2", "double"), ("viscous", "bdf1", "single"))
 FEW: dict[str, dict[str, Any]] = {
     "rolling": {"pads.pad.rows": 8, "pads.pad.cols": 8, "points.pad.resolution": [8, 8, 2], "pads.pad.collides": True},
@@ -65,7 +65,7 @@ def test_contact_with_every_shape(kind: str, law: str) -> None:
     assert gradient_check.compare_to_dual_numbers(case, rng, directions=1, groups=False).error < 1e-10
 
 
-def told(kind: str) -> dict[str, Any]:
+def arguments_of(kind: str) -> dict[str, Any]:
     """A rounded solid, or a sphere's distance grid, as arguments of the core."""
     if kind != "grid":
         return {"kind": kind, "size": (0.02, 0.02, 0.02), "rounding": 0.004}
@@ -82,7 +82,7 @@ def test_distance_grid_and_rounded_solid(kind: str) -> None:
     spec = _core.ModelSpec()
     body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
     spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
-    shape = spec.add_shape("shape", -1, pos=(0, 0, 0), quat=(1, 0, 0, 0), **told(kind))
+    shape = spec.add_shape("shape", -1, pos=(0, 0, 0), quat=(1, 0, 0, 0), **arguments_of(kind))
     axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
     spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.1, mu=0.5, kd=0.1)
     model = _core.Model(spec)

@@ -40,7 +40,7 @@ def bracket_grid(cells: int) -> DistanceGrid:
     return spline_grid(distances.reshape(nodes.shape[:3]), low - 3 * spacing, spacing)
 
 
-def told(grid: DistanceGrid | None) -> dict[str, Any]:
+def arguments_of(grid: DistanceGrid | None) -> dict[str, Any]:
     """Arguments of a grid for the core; empty without a grid."""
     if grid is None:
         return {}
@@ -63,7 +63,7 @@ def model_of(kind: str, size: Any, points: Array | None = None, *, rounding: flo
 def shape_of(kind: str) -> Any:
     """A model with one shape: a sphere's grid, or a rounded solid."""
     if kind == "grid":
-        return model_of("grid", (1, 0, 0), **told(sphere_grid(16)))
+        return model_of("grid", (1, 0, 0), **arguments_of(sphere_grid(16)))
     return model_of(kind, ROUNDED[kind], rounding=ROUNDING)
 
 
@@ -71,7 +71,7 @@ def inside_points(kind: str, count: int, seed: int = 0) -> Array:
     reach = (RADIUS,) * 3 if kind == "grid" else (0.02, 0.02, 0.03) if kind == "cylinder" else ROUNDED[kind]
     points = np.random.default_rng(seed).uniform(-1.05, 1.05, (count, 3)) * reach
     kept: Array = points[np.linalg.norm(points, axis=1) > 2e-3]
-    return kept  # not near a sphere's centre, where all bends
+    return kept  # not near the centre of a sphere, where the curvature is unbounded
 
 
 def differenced(model: Any, points: Array, step: float = 1e-7) -> tuple[Array, Array]:
@@ -86,7 +86,7 @@ def test_normal_and_curvature_are_the_derivatives(kind: str) -> None:
     model, points = shape_of(kind), inside_points(kind, 3000)
     _, normal, hessian = model.distance("shape", points)
     by_d, by_n = differenced(model, points)
-    # Away from the seams of a rounded solid, where its curvature jumps, and its normal inside the smaller solid.
+    # Away from the transitions of a rounded solid, where the curvature jumps, and the normal inside the smaller solid.
     jumps = np.abs(by_n - hessian).max((1, 2)) > 1e-5 * np.abs(hessian).max()
     assert jumps.mean() < (1e-9 if kind == "grid" else 2e-3)
     np.testing.assert_allclose(by_d[~jumps], normal[~jumps], atol=1e-6)
@@ -95,9 +95,9 @@ def test_normal_and_curvature_are_the_derivatives(kind: str) -> None:
 
 def test_second_derivatives_are_continuous_across_cells() -> None:
     grid = sphere_grid(16)
-    model = model_of("grid", (1, 0, 0), **told(grid))
+    model = model_of("grid", (1, 0, 0), **arguments_of(grid))
     rng = np.random.default_rng(1)
-    border = grid.origin + grid.spacing * rng.integers(5, 18, (500, 3))  # corners of cells: all three indices change
+    border = grid.origin + grid.spacing * rng.integers(5, 18, (500, 3))  # cell corners, where all three indices change
     way = 1e-10 * rng.normal(size=(500, 3))
     for low, high in zip(model.distance("shape", border - way), model.distance("shape", border + way), strict=True):
         assert np.abs(high - low).max() < 1e-6 * np.abs(high).max()
@@ -110,7 +110,7 @@ def test_grid_of_a_sphere_converges_at_fourth_order() -> None:
     length = np.linalg.norm(points, axis=1)
     errors = []
     for cells in (8, 16, 32):
-        d, n, hessian = model_of("grid", (1, 0, 0), **told(sphere_grid(cells))).distance("shape", points)
+        d, n, hessian = model_of("grid", (1, 0, 0), **arguments_of(sphere_grid(cells))).distance("shape", points)
         outwards = points / length[:, None]
         round_about = (np.eye(3) - outwards[:, :, None] * outwards[:, None]) / length[:, None, None]
         errors.append(
@@ -125,8 +125,8 @@ def test_grid_of_a_sphere_converges_at_fourth_order() -> None:
 
 def test_sign_of_a_bracket_is_correct_everywhere() -> None:
     grid = bracket_grid(32)
-    points = np.random.default_rng(2).uniform(-0.03, 0.07, (20_000, 3))  # far out of the grid too
-    d, _, _ = model_of("grid", (1, 0, 0), **told(grid)).distance("shape", points)
+    points = np.random.default_rng(2).uniform(-0.03, 0.07, (20_000, 3))  # also far outside of the grid
+    d, _, _ = model_of("grid", (1, 0, 0), **arguments_of(grid)).distance("shape", points)
     exact = mesh_solids.bracket_distance(points, *BRACKET)
     clear = np.abs(exact) > 0.3 * grid.spacing  # sharp edges are rounded by a fraction of a cell
     assert ((d < 0) == (exact < 0))[clear].all()
@@ -137,7 +137,7 @@ def test_broad_phase_keeps_all_markers_in_contact() -> None:
     """Markers are tested in blocks; excluded blocks have no contact."""
     points = np.random.default_rng(3).uniform(-0.03, 0.07, (30_000, 3))
     for scale in (1.0, 0.7, 1.6):
-        model = model_of("grid", (scale, 0, 0), points, **told(bracket_grid(20)))
+        model = model_of("grid", (scale, 0, 0), points, **arguments_of(bracket_grid(20)))
         d, n, _ = model.distance("shape", points)
         force = Simulator(model).tactile()[0] * [1, 1, -1]
         np.testing.assert_allclose(force, np.where(d < 0, -d, 0)[:, None] * n, atol=1e-15)
@@ -172,7 +172,7 @@ def test_rounded_solid_is_exact_and_smooth_between_its_faces(kind: str) -> None:
     d, n, _ = model.distance("shape", points)
     np.testing.assert_allclose(d, rounded_distance(kind, points), atol=1e-16)
     np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-14)
-    # Seams between face and edge, edge and corner: where one coordinate is that of the smaller solid's face.
+    # Transitions between face, edge and corner: one coordinate is that of a face of the smaller solid.
     seam = points[:500].copy()
     radius, half = ROUNDED["cylinder"][0] - ROUNDING, ROUNDED["cylinder"][1] - ROUNDING
     if kind == "box":
@@ -218,11 +218,11 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
         shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=ROUNDING)
     elif kind == "grid":
         shape = spec.add_shape(
-            "shape", turret, "grid", (1e-3, 0, 0), (1, 0, 0, 0), (1.2, 0, 0), **told(sphere_grid(10))
+            "shape", turret, "grid", (1e-3, 0, 0), (1, 0, 0, 0), (1.2, 0, 0), **arguments_of(sphere_grid(10))
         )
     else:
         shape = spec.add_shape(
-            "shape", turret, "grid", (-0.01, -0.006, -0.01), (1, 0, 0, 0), (1, 0, 0), **told(bracket_grid(16))
+            "shape", turret, "grid", (-0.01, -0.006, -0.01), (1, 0, 0, 0), (1, 0, 0), **arguments_of(bracket_grid(16))
         )
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
@@ -235,7 +235,7 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
     spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0)
     sim = Simulator(_core.Model(spec), precision=precision)
     top = {"grid": 1.2 * RADIUS, "box": 0.01, "cylinder": 0.03, "edge": -1e-3}[kind]
-    # On a rounded solid, near the edge: over face and round at once.
+    # Near the edge of a rounded solid: on its face and its rounding.
     aside = {"grid": 0.0, "box": 0.024, "cylinder": 0.015, "edge": -0.012}[kind]
     height = top + 0.012
     sim.q[0, sim.model.joint_q[1]], sim.q[0, sim.model.joint_q[2]] = aside, height
@@ -258,8 +258,8 @@ def test_gradients_of_points_pressed_onto_a_shape(kind: str, law: str) -> None:
             case = gradient_check.RolloutLoss.random(sim, u, output, rng)
             assert gradient_check.compare_to_dual_numbers(case, rng, directions=1).error < 1e-10
         if kind == "edge":
-            # Where the normal is short, an elastic marker that has just slipped may be read as sticking or slipping:
-            # a kink that no signature tells. Positions and velocities have none.
+            # Where the normal is short, an elastic marker at the slip limit can be evaluated as sticking or slipping,
+            # a kink that is not in the contact mode signature. Positions and velocities have no such kink.
             case = gradient_check.RolloutLoss.random(sim, u, OUTPUTS[seed % 2], rng)
         agreement = gradient_check.compare_to_differences(case)
         left_out.append(agreement.skipped)
@@ -277,7 +277,7 @@ def test_single_precision_agrees_with_double(kind: str) -> None:
 
 def test_scaled_grid_equals_a_larger_shape() -> None:
     points = inside_points("grid", 1000)
-    grid = told(sphere_grid(12))
+    grid = arguments_of(sphere_grid(12))
     d, n, hessian = model_of("grid", (1, 0, 0), **grid).distance("shape", points)
     larger = model_of("grid", (2, 0, 0), **grid).distance("shape", 2 * points)
     for ours, expected in zip(larger, (2 * d, n, hessian / 2), strict=True):
@@ -295,9 +295,9 @@ GRID_FAULTS: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("numbers", "says"), GRID_FAULTS, ids=[says for _, says in GRID_FAULTS])
-def test_invalid_grid_raises(numbers: dict[str, Any], says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+@pytest.mark.parametrize(("numbers", "message"), GRID_FAULTS, ids=[message for _, message in GRID_FAULTS])
+def test_invalid_grid_raises(numbers: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         _core.ModelSpec().add_shape("s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers})
 
 

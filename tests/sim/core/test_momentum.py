@@ -18,7 +18,7 @@ from gelflow.sim.validation.reference_motions import reference_motion
 Array = NDArray[np.float64]
 
 TOLERANCE = 1e-11  # of Newton's method
-IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # [s] into the motion
+IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # time in contact [s]
 
 
 class Loose:
@@ -32,7 +32,7 @@ class Loose:
         self.spec.gravity, self.spec.step, self.spec.tolerance = (0.0, 0.0, 0.0), step, TOLERANCE
         self.poses = poses.copy()
         self._centred = centred
-        self._shift: list[Array] = []  # of each body's frame, in that frame
+        self._shift: list[Array] = []  # shift of each body's frame, in that frame
         self._on: list[int] = []  # the body of each shape
         self._of: list[int] = []  # the body of each point set
 
@@ -109,19 +109,19 @@ def momentum(sim: Simulator) -> Array:
 def test_contact_forces_and_moments_between_bodies_cancel(name: str, law: str) -> None:
     """The wrenches from the bodies' equations of motion sum to zero, and equal the simulator's contact wrench on the
     first body of each contact."""
-    sim = cut_loose(name, law, 1e-5)  # fingers weigh 0.2 g and press with 5 N: soon they are off
+    sim = cut_loose(name, law, 1e-5)  # fingers of 0.2 g pressed with 5 N separate within larger steps
     touched = 0.0
     for _ in range(10):
         before, anchors, anchored = sim.v[0].copy(), sim.anchors.copy(), sim.anchored.copy()
         sim.step(np.zeros(0))
         sim.check()
-        felt = sim.mass_matrix()[0] @ (sim.v[0] - before) / sim.model.step + sim.bias()[0]
-        on_bodies = in_world(sim, felt)
+        force = sim.mass_matrix()[0] @ (sim.v[0] - before) / sim.model.step + sim.bias()[0]
+        on_bodies = in_world(sim, force)
         after, set_after = sim.anchors.copy(), sim.anchored.copy()
-        sim.anchors[:], sim.anchored[:] = anchors, anchored  # those of the step
-        told = sim.wrenches()[0].copy()
+        sim.anchors[:], sim.anchored[:] = anchors, anchored  # those at the start of the step
+        wrenches = sim.wrenches()[0].copy()
         sim.anchors[:], sim.anchored[:] = after, set_after
-        size = np.abs(told).max(0, initial=0.0)
+        size = np.abs(wrenches).max(0, initial=0.0)
         size = np.repeat([size[:3].max(), size[3:].max()], 3)
         if size[3] < 1e-6:
             continue
@@ -140,14 +140,14 @@ def test_generalized_contact_forces_cancel_to_rounding(name: str, law: str) -> N
     for _ in range(10):
         sim.step(np.zeros(0))
         on_bodies = in_world(sim, sim.contact_forces()[0])
-        told = sim.wrenches()[0]
-        size = np.repeat(np.abs(told).reshape(-1, 2, 3).max((0, 2)), 3)
+        wrenches = sim.wrenches()[0]
+        size = np.repeat(np.abs(wrenches).reshape(-1, 2, 3).max((0, 2)), 3)
         if size[3] < 1e-6:
             continue
         touched = max(touched, float(size[3]))
         worst = max(worst, float(np.abs(on_bodies.sum(0) / size).max()))
-        if len(told) == 1:
-            np.testing.assert_allclose(np.abs(on_bodies), np.abs(told).repeat(2, 0), atol=1e-13 * size.max())
+        if len(wrenches) == 1:
+            np.testing.assert_allclose(np.abs(on_bodies), np.abs(wrenches).repeat(2, 0), atol=1e-13 * size.max())
     sim.check()
     print(f"{name}, {law}: pairs cancel to {worst:.0e}")
     assert touched > 1e-3

@@ -118,7 +118,9 @@ def test_elastic_law_resolves_the_start_of_contact_to_one_step() -> None:
         spec = _core.ModelSpec()
         spec.gravity, spec.step, spec.integrator = (0.0, 0.0, 0.0), step, "bdf2"
         body = spec.add_body("block", -1, (0, 0, height), (1, 0, 0, 0), 1e6, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-        for name, axis in zip("xz", ((1, 0, 0), (0, 0, 1)), strict=True):  # so heavy that nothing stops it
+        for name, axis in zip(
+            "xz", ((1, 0, 0), (0, 0, 1)), strict=True
+        ):  # heavy, so that contact forces do not decelerate it
             spec.add_joint(name, body, "slide", (0, 0, 0), axis)
         plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (1, 1, 1))
         axes = [[axis] for axis in np.eye(3)]
@@ -126,7 +128,7 @@ def test_elastic_law_resolves_the_start_of_contact_to_one_step() -> None:
         sim = Simulator(_core.Model(spec))
         sim.v[0] = speed, -fall
         sim.step([], round(time / step))
-        shear = -sim.tactile()[0, 0, 0]  # of a spring of 1 N/m: a length
+        shear = -sim.tactile()[0, 0, 0]  # stiffness 1 N/m: equals a displacement
         lacks[step] = speed * (time - touched) - shear
         assert lacks[step] == pytest.approx(speed * (np.ceil(touched / step) * step - touched), abs=1e-9)
-    assert lacks[4e-4] == pytest.approx(lacks[1e-4], abs=1e-9)  # 10.4 ms each time, after 10.39
+    assert lacks[4e-4] == pytest.approx(lacks[1e-4], abs=1e-9)  # contact is detected at 10.4 ms, after 10.39 ms

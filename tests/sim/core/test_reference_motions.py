@@ -31,7 +31,7 @@ def test_sliding_distance_of_a_block_is_v_squared_over_2_mu_g(law: str, integrat
     sim.q[0, 0], sim.q[0, 2] = (
         -10,
         0.012 - MASS * GRAVITY / (9 * numbers["kn"]),
-    )  # nine points touch; far from the slope
+    )  # nine points in contact, far from the slope
     sim.v[0, 0] = speed
     sim.step(np.zeros(0), 600)
     sim.check()
@@ -68,7 +68,7 @@ def test_period_of_a_pendulum_at_large_amplitudes(integrator: str, order: int, a
 
 
 INERTIA = np.array([0.01, 0.02, 0.03])
-SPIN = np.array([0.1, 6.0, -0.05])  # about the middle axis, which it leaves
+SPIN = np.array([0.1, 6.0, -0.05])  # about the unstable intermediate axis
 DURATION = 2.0  # [s]
 
 
@@ -81,7 +81,7 @@ def euler(_: float, spin: Array) -> Array:
 def test_top_tumbling_about_its_intermediate_axis(integrator: str, order: int) -> None:
     """Agrees with Euler's equations; energy and angular momentum drift at the order of the integrator."""
     path = solve_ivp(euler, (0, DURATION), SPIN, rtol=1e-12, atol=1e-12, dense_output=True)
-    assert path.sol(np.linspace(0, DURATION, 200))[1].min() < -5  # it has turned over
+    assert path.sol(np.linspace(0, DURATION, 200))[1].min() < -5  # it has flipped
     exact = path.y[:, -1]
     energy, momentum = 0.5 * INERTIA @ SPIN**2, np.linalg.norm(INERTIA * SPIN)
     rows = []
@@ -96,7 +96,7 @@ def test_top_tumbling_about_its_intermediate_axis(integrator: str, order: int) -
         sim.check()
         spin = sim.v[0, 3:]
         after = 0.5 * INERTIA @ spin**2
-        assert order == 2 or after <= energy  # BDF1: never more
+        assert order == 2 or after <= energy  # BDF1 never gains energy
         rows.append([np.linalg.norm(spin - exact), abs(after - energy), abs(np.linalg.norm(INERTIA * spin) - momentum)])
     slopes = -np.diff(np.log2(rows), axis=0)
     print(f"{integrator}: spin, energy, momentum off by {rows[-1]}, slopes {slopes[-1].round(2)}")
@@ -147,7 +147,7 @@ def test_free_joint_equals_three_slides_and_a_ball_joint(integrator: str) -> Non
         sim.check()
     np.testing.assert_allclose(free.q, chain.q, atol=1e-10)
     np.testing.assert_allclose(free.v, chain.v, atol=1e-8)
-    assert free.iterations == chain.iterations  # the derivatives are the same too
+    assert free.iterations == chain.iterations  # same Newton iterations: the derivatives agree
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("bdf1", 1), ("bdf2", 2)])

@@ -22,7 +22,7 @@ SIZES = {
 }
 
 
-def felt(kind: str, points: Array) -> tuple[Array, Array]:
+def depth_and_normal(kind: str, points: Array) -> tuple[Array, Array]:
     """Depth (n,) and outward normal (n, 3) at points of a fixed shape, from markers of 1 N/m."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
@@ -58,7 +58,7 @@ def distance(kind: str, x: Array) -> float:
         (ct, cp), (st, sp) = np.cos(angles), np.sin(angles)
         return np.array([radii[0] * ct * cp, radii[1] * st * cp, radii[2] * sp])
 
-    x = np.abs(x)  # the nearest point lies in the same octant
+    x = np.abs(x)  # the nearest point is in the same octant
     starts = itertools.product((0.3, 1.2), repeat=2)
     near = min(np.linalg.norm(surface(minimize(lambda s: ((surface(s) - x) ** 2).sum() * 1e4, s0, tol=1e-14).x) - x)
                for s0 in starts)  # fmt: skip
@@ -72,33 +72,33 @@ def test_depth_and_normal_equal_the_formulas(kind: str) -> None:
     points = rng.uniform(-1.1, 1.1, (40 if kind == "ellipsoid" else 400, 3)) * np.where(
         np.array(reach) > 0, reach, reach[0]
     )
-    depth, normal = felt(kind, points)
+    depth, normal = depth_and_normal(kind, points)
     expected = np.array([max(-distance(kind, x), 0.0) for x in points])
     assert 0.2 < (expected > 0).mean() < 1
     np.testing.assert_allclose(depth, expected, atol=2e-9 if kind == "ellipsoid" else 1e-15)
-    # Going along the normal by the depth leads onto the surface.
+    # The point displaced by the depth along the normal is on the surface.
     inside = expected > 1e-6
     ends = points[inside] + normal[inside] * depth[inside, None] * (1 - 1e-9)
-    assert felt(kind, ends)[0].max() < 1e-10
+    assert depth_and_normal(kind, ends)[0].max() < 1e-10
 
 
 @pytest.mark.parametrize("kind", SIZES)
 def test_forces_are_finite_where_the_distance_has_no_gradient(kind: str) -> None:
     points = np.array([[0, 0, 0], [0, 0, 1e-3], [1e-3, 0, 0], [0, 1e-20, 0], [1e-3, 1e-3, 0]], dtype=float)
-    depth, normal = felt(kind, points)
+    depth, normal = depth_and_normal(kind, points)
     assert (depth > 0).all()
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-12)
-    np.testing.assert_array_equal(normal, felt(kind, points)[1])
+    np.testing.assert_array_equal(normal, depth_and_normal(kind, points)[1])
 
 
 @pytest.mark.parametrize(
-    ("kind", "size", "says"),
+    ("kind", "size", "message"),
     [
         ("cone", (1, 1, 1), "kind 'cone' is not one of plane, sphere, box, cylinder, capsule, ellipsoid"),
         ("ellipsoid", (0.1, 0.1, 0), "size must be positive"),
         ("capsule", (0.1, -0.1, 0), "size must be positive"),
     ],
 )
-def test_invalid_shape_raises(kind: str, size: tuple[float, float, float], says: str) -> None:
-    with pytest.raises((UsageError, ValueError), match=says):
+def test_invalid_shape_raises(kind: str, size: tuple[float, float, float], message: str) -> None:
+    with pytest.raises((UsageError, ValueError), match=message):
         _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), size)

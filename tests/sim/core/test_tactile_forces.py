@@ -14,7 +14,7 @@ from gelflow.sim.validation.reference_motions import reference_motion
 Array = NDArray[Any]
 RADIUS, KN, KT, MU, KD = 0.02, 30.0, 0.4, 0.05, 2.0
 CENTERS = np.array([[0.0, 0.0, 0.0], [0.009, 0.003, 0.0]])  # of two balls [m]
-LIFT = (0.01995, 0.0180, 0.025)  # heights of the pad: few markers touch, nearly all, none [m]
+LIFT = (0.01995, 0.0180, 0.025)  # heights of the pad [m]: few, nearly all and no markers in contact
 SPEED = np.array([0.02, -0.01, -0.03])
 
 
@@ -70,7 +70,9 @@ def test_forces_equal_the_formula_for_every_marker(
         sim.q[0] = (0.001, 0.0, height)
         right = expected(places + sim.q[0], axes, weights, balls)
         size = max(float(np.abs(right).max()), 1e-3)
-        allowed = 1e-12 * size if precision == "double" else 2e-5 * size + 2 * KN * 5e-9  # places round by 5e-9 m
+        allowed = (
+            1e-12 * size if precision == "double" else 2e-5 * size + 2 * KN * 5e-9
+        )  # positions have rounding errors of 5e-9 m
         np.testing.assert_allclose(sim.tactile(), right[None], rtol=0, atol=allowed)
         given = sim.tactile(np.full((1, len(places), 3), np.nan, sim.dtype))
         np.testing.assert_array_equal(given, sim.tactile())
@@ -90,7 +92,7 @@ def test_own_array_equals_a_new_array(side: int) -> None:
     for block in np.array_split(moves.step_controls(scene.step), 40):
         for u in block:
             sim.step(u)
-        sim.q[1] = moves.q0 + 1e-3 * len(counts)  # this one jumps
+        sim.q[1] = moves.q0 + 1e-3 * len(counts)  # discontinuous state
         fresh = sim.tactile(np.full((2, side * side, 3), np.nan))
         own = sim.tactile()
         np.testing.assert_array_equal(own, fresh)

@@ -21,7 +21,7 @@ from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
 SHORT, LONG = 200, 400  # steps; the pad is on the ball after the short run
-PUSH = [0.02, 0.01, 0.2]  # on the pad [N]: down onto the ball, and slowly along
+PUSH = [0.02, 0.01, 0.2]  # force on the pad [N]: down onto the ball, and slowly sideways
 
 UNREAD_PAD = """
 [pads.unread]
@@ -44,14 +44,14 @@ DECORATIONS = "".join(
 POST = '<geom name="post" type="cylinder" pos="0.02 0 0.05" size="0.01 0.05"/>'
 RIB = '<geom name="rib" type="capsule" pos="0 0 0.01" size="0.002 0.01" mass="0"/>'
 
-# What is added: to the TOML file, to the world, to the pad's body and to the ball's.
+# Additions to the TOML file, the world, the pad's body and the ball's body.
 ADDED = {
     "unread pad": (UNREAD_PAD, "", "", ""),
     "welded decorations": ("", "", DECORATIONS, DECORATIONS.replace("decoration", "badge")),
     "geometry in no pair": ("", POST, RIB, RIB.replace("rib", "spot")),
 }
 
-# Geometry half a metre away from the pad's points.
+# Geometry 0.5 m away from the pad's points.
 FAR = """
 <geom name="far_plane" type="plane" size="1 1 0.1" pos="0 0 -0.5"/>
 <geom name="far_sphere" type="sphere" size="0.03" pos="0.5 0 0"/>
@@ -66,8 +66,10 @@ mu = 1.0
 kd = 1.0
 kt = 1.0
 """
-POINTS_PER_GROUP = 128  # that are passed over by one test of their bounding sphere
-MOST_PER_GROUP = 400  # instructions per step: a few evaluations of a step's equation, the pair's frame, one test each
+POINTS_PER_GROUP = 128  # points that share a bounding sphere
+MOST_PER_GROUP = (
+    400  # instructions per step: evaluations of the step equation, each with the relative pose and one bounds test
+)
 
 
 def rolling_with(folder: Path, toml: str = "", world: str = "", pad: str = "", ball: str = "") -> Scene:
@@ -140,17 +142,17 @@ from gelflow.sim.simulator import Simulator
 
 with open(sys.argv[1], "rb") as file:
     scenes = pickle.load(file)
-for told, q, u in scenes:
+for attributes, q, u in scenes:
     spec = _core.ModelSpec()
-    calls = told.pop("calls")
-    for name, value in told.items():
+    calls = attributes.pop("calls")
+    for name, value in attributes.items():
         setattr(spec, name, value)
     for name, args, numbers in calls:
         getattr(spec, name)(*args, **numbers)
     sim = Simulator(_core.Model(spec))
     sim.q[:] = q
     sim.step(u, int(sys.argv[2]))
-    os.getppid()  # here valgrind writes down what it has counted
+    os.getppid()  # valgrind dumps its counts here
     sim.step(u, int(sys.argv[3]))
     os.getppid()
     sim.check()
@@ -159,12 +161,12 @@ for told, q, u in scenes:
 
 def instructions_per_step(scenes: list[Scene], folder: Path) -> list[float]:
     """Instructions per step after the first SHORT steps, without evaluation of marker forces."""
-    told = []
+    recorded = []
     for scene in scenes:
         recorder = Recorder()
         scene.describe_to(recorder)
-        told.append((vars(recorder), scene.q0, PUSH))
-    (folder / "scenes.pickle").write_bytes(pickle.dumps(told))
+        recorded.append((vars(recorder), scene.q0, PUSH))
+    (folder / "scenes.pickle").write_bytes(pickle.dumps(recorded))
     out = folder / "callgrind"
     valgrind = ["valgrind", "-q", "--tool=callgrind", f"--callgrind-out-file={out}", "--dump-before=getppid"]
     steps = [str(SHORT), str(LONG - SHORT)]

@@ -80,7 +80,7 @@ def test_marker_at_equal_distance_to_two_faces_uses_one_of_them(
             sim.q[0] = 2.0**-30 * np.array(direction)
             slope = (sim.tactile()[0, 0] * [1, 1, -1] - force) / 2.0**-30
             np.testing.assert_allclose(by_q @ direction, slope, atol=1e-3)
-        sim.q[0] = -(2.0**-30), 0, 0  # to the other side
+        sim.q[0] = -(2.0**-30), 0, 0  # other side of the edge
         assert sim.tactile()[0, 0, 0] == 0
 
 
@@ -110,8 +110,8 @@ def fitted(
     return sim
 
 
-SAME = {"base": ((0, 0, -16), (8, 8, 8))}  # under the cube, of its size: five faces in planes of the cube's
-HOLE = {  # as wide, long and deep as the cube
+SAME = {"base": ((0, 0, -16), (8, 8, 8))}  # below the cube, same size: five faces coplanar with the cube's
+HOLE = {  # a hole of the cube's size
     "floor": ((0, 0, -16), (24, 24, 8)),
     "left": ((-16, 0, 0), (8, 24, 8)),
     "right": ((16, 0, 0), (8, 24, 8)),
@@ -160,7 +160,14 @@ def test_load_on_coincident_faces_gives_a_vertical_force(boxes: dict[str, Any], 
     assert sim.q[0, 2] == pytest.approx(-0.25 * 8 / (1024 * carrying), abs=newton)
     np.testing.assert_allclose(sim.q[0, :2], 0, atol=UNIT * ROUNDING[precision])
     np.testing.assert_allclose(sim.q[0, 3:], [1, 0, 0, 0], atol=ROUNDING[precision])
-    sim.v[0] = [1e-4, 2e-4, 3e-4, 1e-2, 2e-2, 3e-2]  # at rest the gradient by dry friction would be all rounding
+    sim.v[0] = [
+        1e-4,
+        2e-4,
+        3e-4,
+        1e-2,
+        2e-2,
+        3e-2,
+    ]  # at rest the gradient with respect to dry friction is dominated by rounding
     u = np.zeros((3, 1, 0))
     run = sim.rollout(u)
     gradient = sim.rollout_gradient(run, q=1.0, v=1.0)
@@ -182,7 +189,7 @@ def hanging_over(law: str, precision: Any) -> Simulator:
     block = spec.add_body("block", -1, (-16 * UNIT, 0, -8 * UNIT), (1, 0, 0, 0), 0.5, (0, 0, 0), (1e-4,) * 3 + (0,) * 3)
     spec.add_joint("block", block, "free", (0, 0, 0), (0, 0, 1))
     shape = spec.add_shape("block", block, "box", (0, 0, 0), (1, 0, 0, 0), UNIT * np.array([16, 16, 8]))
-    along = 2 * UNIT * np.arange(-4, 4)  # along x: four rows over the block, one on its edge at x = 0, three beside it
+    along = 2 * UNIT * np.arange(-4, 4)  # along x: four rows above the block, one on its edge at x = 0, three outside
     places = np.array([(x, y + UNIT, 0) for x in along for y in along])
     axes = [np.tile(axis, (64, 1)) for axis in ((1, 0, 0), (0, -1, 0), (0, 0, -1))]
     spec.add_pad("pad", hand, places, *axes, shapes=[shape], pushes=True, **law_of(law))
@@ -200,13 +207,13 @@ def test_pad_that_overhangs_a_body(law: str, precision: str) -> None:
     sim = hanging_over(law, precision)
     depth = sim.tactile()[0].reshape(8, 8, 3)[..., 2]
     np.testing.assert_array_equal(depth, np.repeat([1.0, 0.0], 4)[:, None] * np.ones(8))
-    sim.v[0, :2] = UNIT, -2 * UNIT  # drags it along
+    sim.v[0, :2] = UNIT, -2 * UNIT  # sliding
     sim.step(np.zeros(0), 2)
     sim.check()
     reading, wrench = sim.tactile()[0].reshape(8, 8, 3).astype(float), sim.wrenches()[0, 0]
     assert reading[:4].any(axis=2).all() and np.abs(reading[:4, :, :2]).max() > 1e-2
-    assert np.abs(reading[4]).max() < 1e-3 and not reading[5:].any()  # the block gives way and turns a little
-    axes = np.array([(1, 0, 0), (0, -1, 0), (0, 0, 1)])  # the pad's z is down, and the reading's normal part −f · z
+    assert np.abs(reading[4]).max() < 1e-3 and not reading[5:].any()  # the block rotates slightly
+    axes = np.array([(1, 0, 0), (0, -1, 0), (0, 0, 1)])  # the pad's z points down; the normal component is −f · z
     total = rotate(sim.q[0, 3:7], (reading @ axes).sum((0, 1)))
     size = np.linalg.norm(reading, axis=2).sum()
     np.testing.assert_allclose(total, wrench[3:], atol=ROUNDING[precision] * size)

@@ -69,7 +69,7 @@ def moving(sim: Simulator, v: float) -> Simulator:
     return sim
 
 
-# Where a shape's distance has no gradient, in UNITs. The point can only move along y, and nothing pushes it there.
+# Positions without a gradient of the distance [UNIT]. The point moves along y only, without force in y.
 PLACES: dict[str, dict[str, tuple[float, float, float]]] = {
     "sphere": {"centre": (0, 0, 0)},
     "box": {
@@ -181,7 +181,7 @@ def test_states_are_exactly_at_a_kink() -> None:
                 u += shift
             else:
                 getattr(sim, change)[..., 1 if change == "anchors" else 0] += shift
-            if moves:  # read where it is: a step would take it away
+            if moves:  # evaluated at the state: a step would leave it
                 reading = sim.tactile()[0, 0]
                 signatures.append(int(np.hypot(*reading[:2]) < LAW["mu"] * abs(reading[2])))
             else:

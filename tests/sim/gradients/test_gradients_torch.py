@@ -39,7 +39,7 @@ def test_gradient_over_a_hundred_steps(name: str, law: str) -> None:
     signature = sim.contact_modes(sim.rollout(controls.detach().numpy(), read_after=(50, 100)))
     straight = torch.ones_like(q)
     for at_q, _ in gradient_check.quaternion_joints(sim.model):
-        straight[:, at_q : at_q + 4] = 0  # a quaternion's entries can not be moved one by one
+        straight[:, at_q : at_q + 4] = 0  # components of a quaternion cannot be displaced individually
     kept = 0
     for tensor, size, mask in ((controls, 1e-6, 1.0), (q, 1e-8, straight), (v, 1e-6, 1.0)):
         for _ in range(5):
@@ -54,12 +54,12 @@ def test_gradient_over_a_hundred_steps(name: str, law: str) -> None:
                     low, high = (float(rollout_loss(sim, *x)) for x in moved)
                     assert tensor.grad is not None
                     ours = float((tensor.grad * d).sum())
-                    rounding = 1e-13 / (shrink * size)  # of two losses whose states are exact to 1e-13
+                    rounding = 1e-13 / (shrink * size)  # of two losses with states accurate to 1e-13
                     assert abs((high - low) / (2 * shrink * size) - ours) < 1e-4 * abs(ours) + rounding
                     kept += 1
                     break
-    # A hundred steps of stick and slip at 400 points cross a branch within nearly any stencil: differences see what is
-    # left of 15, dual numbers all of it.
+    # Nearly every stencil over a hundred steps of stick and slip at 400 points crosses a kink: differences cover the
+    # remaining ones of 15 directions, dual numbers all.
     assert kept >= 8
     for output in OUTPUTS:
         case = gradient_check.RolloutLoss.random(sim, controls.detach().numpy()[:, 0], output, rng)
@@ -102,7 +102,7 @@ def test_fit_recovers_stiffness_and_position() -> None:
 
     with torch.no_grad():
         recorded = readings(torch.tensor(1.3, dtype=torch.float64), torch.tensor(0.7e-3, dtype=torch.float64))
-    unknown = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True)  # of the stiffness, [mm]
+    unknown = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True)  # stiffness factor, offset [mm]
     optimizer = torch.optim.LBFGS([unknown], lr=1, max_iter=60, tolerance_change=1e-14, line_search_fn="strong_wolfe")
 
     def closure() -> float:

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 NUMBERS = {"kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
 POS, TURN, SCALE = np.array([2e-3, -1e-3, -4e-3]), np.array([0.02, -0.01, 0.3]), np.array([1.1, 0.95, 1.2])
-FRAME = np.array([3e-3, 1e-3, 0.0]), Rotation.from_rotvec([0.1, 0.2, -0.3])  # of points and markers in their body
+FRAME = np.array([3e-3, 1e-3, 0.0]), Rotation.from_rotvec([0.1, 0.2, -0.3])  # pose of points and markers in their body
 
 
 def quat(rotation: Rotation) -> Array:
@@ -70,15 +70,15 @@ def test_placement_by_parameters_equals_placement_when_built(what: str, law: str
     built, sim = build(law, **{**places, what: "moved"}), build(law, **places)
     owner = {"shape": "box.shape", "points": "cloud.points", "markers": "skin.markers"}[what]
     move(sim, owner, ("pos", "turn", "scale") if what == "points" else ("pos", "turn"))
-    felt = 0.0
+    largest_force = 0.0
     for _ in range(20):
         for each in (built, sim):
             each.step(np.zeros(0))
             each.check()
         np.testing.assert_allclose(sim.q, built.q, rtol=0, atol=1e-11)
         np.testing.assert_allclose(sim.tactile(), built.tactile(), rtol=0, atol=1e-8)
-        felt += float(np.abs(built.wrenches() if what == "points" else built.tactile()).max())
-    assert felt > 0.1 and np.abs(built.v).max() > 1e-3
+        largest_force += float(np.abs(built.wrenches() if what == "points" else built.tactile()).max())
+    assert largest_force > 0.1 and np.abs(built.v).max() > 1e-3
 
 
 def pressed_by(points: Array, areas: Array, depth: float) -> tuple[Simulator, Array]:
@@ -103,7 +103,7 @@ def test_scaled_points_equal_those_of_a_larger_box(scale: tuple[float, float, fl
         sim.param(f"part.points.scale.{axis}")[:] = value
     sim.q[:] = larger.q
     np.testing.assert_allclose(sim.wrenches()[0, 0], expected, rtol=1e-9, atol=1e-12)
-    # Of the lower face; its edges are the sides' too, and stand for half of what is next to them there.
+    # Weights of the lower face; its edge points are shared with the sides and count half of the adjacent area.
     assert abs(expected[5] / before[5] - scale[0] * scale[1]) < 0.3
 
 
@@ -121,7 +121,7 @@ def test_scale_of_an_exact_sphere_is_its_size() -> None:
     sim.param("ball.points.scale.x")[1] = 1.25
     sim.q[:, sim.joint_q("pad_z")] = 1.0
     sim.q[1, sim.joint_q("ball") + 2] = 0.025
-    sim.step(np.array([0, 0, 0.25]), 100)  # the pad's weight and damping keep it up
+    sim.step(np.array([0, 0, 0.25]), 100)  # the force carries the pad's weight: no contact
     np.testing.assert_allclose(sim.q[:, sim.joint_q("ball") + 2], [0.02, 0.025], atol=1e-5)
 
 
