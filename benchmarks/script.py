@@ -11,6 +11,7 @@ from typing import Any
 from rich.console import Console, RenderableType
 from rich.progress import Progress
 
+from gelflow.cli.options import add_json, add_out, add_quick, add_seed
 from gelflow.errors import GelflowError
 from gelflow.measurement.machine import processor
 from gelflow.sim.benchmark import versions
@@ -28,15 +29,15 @@ def parser(description: str, *, out: str, quick: str, seed: int | None = None) -
     ----------
     description: of the script
     out: name of the default output file in benchmarks/results
-    quick: what --quick reduces
+    quick: what a quick run covers
     seed: default of --seed; None for a script without random numbers
     """
-    result = argparse.ArgumentParser(description=description)
-    result.add_argument("--out", type=Path, default=RESULTS / out, metavar="FILE", help="file to write (%(default)s)")
-    result.add_argument("--quick", action="store_true", help=quick)
+    result = argparse.ArgumentParser(description=f"{description} Quick run: {quick}.")
+    add_out(result, "file to write", default=RESULTS / out)
+    add_quick(result)
+    add_json(result)
     if seed is not None:
-        result.add_argument("--seed", type=int, default=seed, metavar="N", help="of random numbers (%(default)s)")
-    result.add_argument("--json", action="store_true", help="print the record instead of tables")
+        add_seed(result, default=seed)
     return result
 
 

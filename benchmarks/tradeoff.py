@@ -8,11 +8,11 @@ require an idle machine; errors do not depend on the machine.
 import argparse
 import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import script
 
 from gelflow.cli.commands.tradeoff import short, table
+from gelflow.cli.options import add_json, add_out, add_quick, add_seed
 from gelflow.measurement.machine import processor
 from gelflow.sim.benchmark.tradeoff.page import preset_rows, update_page
 from gelflow.sim.benchmark.tradeoff.picture import draw
@@ -21,18 +21,19 @@ from gelflow.sim.benchmark.tradeoff.sweep import measure
 from gelflow.sim.scene import scene_names
 
 PAGE = script.ROOT / "docs" / "guide" / "tradeoff.md"
+DESCRIPTION = "Measure accuracy and speed of scene settings. Quick run: 3 repeats, 2 samples, no page or picture."
 HALVINGS = 8  # of a frame, for the references of the sampled physics
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Measure accuracy and speed of the settings of scenes.")
+    parser = argparse.ArgumentParser(description=DESCRIPTION)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="default: all included scenes")
-    parser.add_argument("--out", type=Path, default=script.RESULTS, metavar="DIR", help="folder of tradeoff_SCENE.json")
+    add_out(parser, "folder of tradeoff_SCENE.json", default=script.RESULTS, folder=True)
     parser.add_argument("--repeats", type=int, default=21, metavar="N", help="timed runs of each setting (%(default)s)")
     parser.add_argument("--draws", type=int, default=48, metavar="N", help="samples of the physics (%(default)s)")
-    parser.add_argument("--quick", action="store_true", help="fewer settings, 3 repeats, 2 samples; no page or picture")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="first seed of the samples (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the records instead of tables")
+    add_quick(parser)
+    add_seed(parser)
+    add_json(parser)
     args = parser.parse_args()
     for scene in args.scenes or scene_names():
         _measure_scene(scene, args)

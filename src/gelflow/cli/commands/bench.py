@@ -26,6 +26,7 @@ MEASUREMENTS = {
     "batch": "many environments on one core and on all cores",
     "markers": "reading of a marker and its gradient, for each shape",
     "precision": "single and double precision: errors and speed",
+    "startup": "imports and gelflow --help in fresh processes",
     "tracking": "marker tracking: errors on images with known truth and speed, beside Lucas-Kanade and dense flow",
     "growth": "time over the number of bodies, contact points, markers and environments",
 }
@@ -105,6 +106,10 @@ def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -
         return _measure_tracking(options, args.out)
     if name == "growth":
         return [_measure_growth(options, args.out)]
+    if name == "startup":
+        from gelflow.measurement.startup import measure_startup
+
+        return [measure_startup(options)]
     measure: Callable[..., Report] = getattr(import_module(f"gelflow.sim.benchmark.speed.{name}"), f"measure_{name}")
     more = {"paper_model": args.paper_model} if name == "rolling" else {}
     return [measure(options, **more)]
