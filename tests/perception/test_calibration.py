@@ -1,4 +1,4 @@
-"""Camera calibration: a known lens and perspective recovered from the grid, millimetres anywhere in the picture."""
+"""Camera calibration from the marker grid: recovery of lens and perspective, accuracy of the mapping, files."""
 
 import json
 from pathlib import Path
@@ -14,22 +14,22 @@ from gelflow.perception.tracker import MarkerTracker
 
 SIZE = (320, 240)
 ROWS, COLS, SPACING = 10, 13, 1.4
-NODES = (np.stack(np.meshgrid(np.arange(COLS), np.arange(ROWS)), axis=-1).reshape(-1, 2) - (6, 4.5)) * SPACING
-ALL = np.ones(len(NODES), dtype=bool)
+MARKERS = (np.stack(np.meshgrid(np.arange(COLS), np.arange(ROWS)), axis=-1).reshape(-1, 2) - (6, 4.5)) * SPACING
+ALL = np.ones(len(MARKERS), dtype=bool)
 
 
-def camera(places_mm: np.ndarray, *, barrel: float, keystone: float, center: tuple[float, float]) -> np.ndarray:
-    """An independent camera: tilted and keystoned plane, then Brown's polynomial lens about `center`, to [px]."""
+def camera(positions_mm: np.ndarray, *, barrel: float, keystone: float, center: tuple[float, float]) -> np.ndarray:
+    """Image positions [px] of an independent camera model: perspective, then Brown distortion about `center`."""
     turn = np.array([[np.cos(0.06), -np.sin(0.06), 0.5], [np.sin(0.06), np.cos(0.06), -0.3], [0, 0, 1]])
     plane = np.array([[15.5, 0, 159.5], [0, 15.0, 119.5], [keystone / 15, -keystone / 25, 1]]) @ turn
-    flat = np.column_stack([places_mm, np.ones(len(places_mm))]) @ plane.T
+    flat = np.column_stack([positions_mm, np.ones(len(positions_mm))]) @ plane.T
     offset = flat[:, :2] / flat[:, 2:] - center
     square = (offset**2).sum(axis=1) / 200**2
     return np.asarray(offset * (1 - barrel * square + 0.3 * barrel * square**2)[:, None] + center)
 
 
-def fitted(rest: np.ndarray, seen: np.ndarray = ALL) -> Calibration:
-    return fit_calibration(rest, seen, rows=ROWS, cols=COLS, spacing_mm=SPACING, size=SIZE)
+def fitted(rest: np.ndarray, visible: np.ndarray = ALL) -> Calibration:
+    return fit_calibration(rest, visible, rows=ROWS, cols=COLS, spacing_mm=SPACING, size=SIZE)
 
 
 def fitted_first(tracker: MarkerTracker, image: np.ndarray) -> Calibration:
@@ -47,48 +47,48 @@ CAMERAS = [
 
 
 @pytest.mark.parametrize(("barrel", "keystone", "center"), CAMERAS)
-def test_millimetres_are_right_anywhere_in_the_picture(
+def test_displacements_in_millimetres_are_accurate_in_the_whole_image(
     barrel: float, keystone: float, center: tuple[float, float]
 ) -> None:
     rng = np.random.default_rng(0)
-    rest = camera(NODES, barrel=barrel, keystone=keystone, center=center) + rng.normal(0, 0.02, NODES.shape)
+    rest = camera(MARKERS, barrel=barrel, keystone=keystone, center=center) + rng.normal(0, 0.02, MARKERS.shape)
     calibration = fitted(rest)
-    assert calibration.residual_px < 0.04  # √2 × 0.02 px is the noise itself
-    # Places all over the picture, not the grid alone, moved by 0.8 of a spacing.
-    places = rng.uniform(-1, 1, (2000, 2)) * (12, 9)
+    assert calibration.residual_px < 0.04  # the noise is √2 × 0.02 px
+    # Positions in the whole image, not only on the grid, displaced by 0.8 spacings.
+    positions = rng.uniform(-1, 1, (2000, 2)) * (12, 9)
     moved = rng.normal(size=(2000, 2))
     moved *= 0.8 * SPACING / np.linalg.norm(moved, axis=1)[:, None]
-    start, end = (camera(p, barrel=barrel, keystone=keystone, center=center) for p in (places, places + moved))
+    start, end = (camera(p, barrel=barrel, keystone=keystone, center=center) for p in (positions, positions + moved))
     shown = ((start > 0) & (end > 0) & (start < SIZE) & (end < SIZE)).all(axis=1)
-    places, moved, start, end = places[shown], moved[shown], start[shown], end[shown]
+    positions, moved, start, end = positions[shown], moved[shown], start[shown], end[shown]
     error = np.linalg.norm(calibration.displacement_mm(end, end - start) - moved, axis=1)
-    near = (np.abs(places) < np.abs(NODES).max(axis=0) + 0.5 * SPACING).all(axis=1)
-    assert error[near].max() < 0.015 and error.max() < 0.05  # one scale for all would be up to 0.3 mm off
+    near = (np.abs(positions) < np.abs(MARKERS).max(axis=0) + 0.5 * SPACING).all(axis=1)
+    assert error[near].max() < 0.015 and error.max() < 0.05  # a uniform scale has errors up to 0.3 mm
     assert np.abs(calibration.to_pixels(calibration.to_mm(start)) - start).max() < 1e-6
 
 
 @pytest.mark.parametrize("radial", [(), (-0.1,), (-0.1, -0.1)])
-def test_as_much_of_a_lens_is_fitted_as_the_markers_show(radial: tuple[float, ...]) -> None:
+def test_the_selected_lens_model_has_the_true_number_of_coefficients(radial: tuple[float, ...]) -> None:
     matrix = ((13.0, 0.2, 0.1), (-0.2, 13.0, 0.3), (0.0, 0.0, 1.0))
     true = Calibration(*SIZE, ROWS, COLS, SPACING, matrix, radial, (159.5, 119.5), 0.0, 0.0)
     for seed in range(3):
-        calibration = fitted(true.to_pixels(NODES) + np.random.default_rng(seed).normal(0, 0.05, NODES.shape))
+        calibration = fitted(true.to_pixels(MARKERS) + np.random.default_rng(seed).normal(0, 0.05, MARKERS.shape))
         assert len(calibration.radial) == len(radial) and calibration.center == true.center
         assert np.allclose(calibration.radial, radial, atol=0.03)
 
 
-def test_markers_not_seen_or_measured_wrongly_do_not_bend_it() -> None:
-    rest = camera(NODES, barrel=0.08, keystone=0.1, center=(159.5, 119.5))
-    seen = ALL.copy()
-    seen[[0, 40, 129]] = False
+def test_hidden_markers_and_outliers_do_not_affect_the_fit() -> None:
+    rest = camera(MARKERS, barrel=0.08, keystone=0.1, center=(159.5, 119.5))
+    visible = ALL.copy()
+    visible[[0, 40, 129]] = False
     bad = rest.copy()
-    bad[~seen] = 1000.0
+    bad[~visible] = 1000.0
     bad[[10, 77]] += (3.0, -4.0)
-    calibration = fitted(bad, seen)
-    assert np.abs(calibration.to_mm(rest) - NODES).max() < 0.005 and calibration.largest_px < 0.1
+    calibration = fitted(bad, visible)
+    assert np.abs(calibration.to_mm(rest) - MARKERS).max() < 0.005 and calibration.largest_px < 0.1
 
 
-def test_a_rendered_gel_end_to_end() -> None:
+def test_calibrated_displacements_of_a_rendered_gel_are_accurate() -> None:
     appearance = make_appearance("typical", keystone=0.15, barrel=0.08, seed=3)
     sequence = GelSequence(appearance, "twist", frames=31, peak=0.8)
     tracker, errors, with_one_scale = MarkerTracker(), [], []
@@ -101,39 +101,39 @@ def test_a_rendered_gel_end_to_end() -> None:
         errors += np.linalg.norm(moved - truth, axis=1)[tracked.valid].tolist()
         scaled = tracked.displacement / np.mean(calibration.pixels_per_mm())
         with_one_scale += np.linalg.norm(scaled - truth, axis=1)[tracked.valid].tolist()
-    # 0.03 and 0.06 px, what the tracker itself is held to, are 0.002 and 0.004 mm.
+    # The error bounds of the tracker, 0.03 and 0.06 px, are 0.002 and 0.004 mm.
     assert np.median(errors) < 0.004 and np.percentile(errors, 95) < 0.008
     assert np.percentile(with_one_scale, 95) > 0.04
 
 
-def test_a_rectified_picture_shows_the_grid_straight() -> None:
-    rest = camera(NODES, barrel=0.15, keystone=0.1, center=(159.5, 119.5))
+def test_rectification_straightens_the_grid() -> None:
+    rest = camera(MARKERS, barrel=0.15, keystone=0.1, center=(159.5, 119.5))
     calibration = fitted(rest)
     image = np.full((240, 320, 3), 200, dtype=np.uint8)
     down, right = np.indices((240, 320))
-    for place in rest:
-        ink = np.clip(4.5 - np.hypot(right - place[0], down - place[1]), 0, 1)
+    for position in rest:
+        ink = np.clip(4.5 - np.hypot(right - position[0], down - position[1]), 0, 1)
         image -= (160 * ink).astype(np.uint8)[..., None]
     tracker = MarkerTracker()
     tracker.start(calibration.rectify(image), rows=ROWS, cols=COLS)
     grid = tracker.rest.reshape(ROWS, COLS, 2)
     lines, columns = grid[..., 1], grid[..., 0]
-    assert lines.std(axis=1).mean() < 0.1 and columns.std(axis=0).mean() < 0.1  # several px in the image itself
+    assert lines.std(axis=1).mean() < 0.1 and columns.std(axis=0).mean() < 0.1  # several px before rectification
 
 
-def test_a_pressed_gel_and_too_few_markers_are_refused() -> None:
-    rest = camera(NODES, barrel=0.05, keystone=0.05, center=(159.5, 119.5))
-    bump = np.exp(-((NODES - (3.0, -2.0)) ** 2).sum(axis=1) / 18)[:, None]
+def test_a_deformed_gel_and_too_few_markers_are_rejected() -> None:
+    rest = camera(MARKERS, barrel=0.05, keystone=0.05, center=(159.5, 119.5))
+    bump = np.exp(-((MARKERS - (3.0, -2.0)) ** 2).sum(axis=1) / 18)[:, None]
     with pytest.raises(PeerError, match="check that the gel is undamaged"):
         fitted(rest + bump * (6.0, 4.0))
     with pytest.raises(PeerError, match="10 markers are visible, at least 16"):
-        fitted(rest, np.arange(len(NODES)) < 10)
+        fitted(rest, np.arange(len(MARKERS)) < 10)
     with pytest.raises(UsageError, match="spacing"):
         fit_calibration(rest, ALL, rows=ROWS, cols=COLS, spacing_mm=0.0, size=SIZE)
 
 
-def test_a_file_is_read_back_equal_and_never_overwritten(tmp_path: Path) -> None:
-    calibration = fitted(camera(NODES, barrel=0.08, keystone=0.1, center=(170.0, 119.5)))
+def test_a_saved_calibration_loads_equal_and_is_never_overwritten(tmp_path: Path) -> None:
+    calibration = fitted(camera(MARKERS, barrel=0.08, keystone=0.1, center=(170.0, 119.5)))
     save_calibration(calibration, tmp_path / "gel.json")
     assert load_calibration(tmp_path / "gel.json") == calibration
     with pytest.raises(UsageError, match="exists; name a new file"):
@@ -154,17 +154,17 @@ def test_a_file_is_read_back_equal_and_never_overwritten(tmp_path: Path) -> None
         ({"spacing_mm": -1.0}, "not a valid image-to-gel mapping"),
     ],
 )
-def test_a_wrong_file_is_refused(tmp_path: Path, change: dict[str, object], expected: str) -> None:
+def test_an_invalid_calibration_file_is_rejected(tmp_path: Path, change: dict[str, object], expected: str) -> None:
     path = tmp_path / "gel.json"
-    save_calibration(fitted(camera(NODES, barrel=0.0, keystone=0.0, center=(159.5, 119.5))), path)
+    save_calibration(fitted(camera(MARKERS, barrel=0.0, keystone=0.0, center=(159.5, 119.5))), path)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(UsageError) as refused:
+    with pytest.raises(UsageError) as error:
         load_calibration(path)
-    assert expected in str(refused.value) and "gel.json" in str(refused.value)
+    assert expected in str(error.value) and "gel.json" in str(error.value)
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "\xff\xfe", "{"])
-def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_foreign_file_is_rejected(tmp_path: Path, text: str) -> None:
     path = tmp_path / "gel.json"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(UsageError, match="is not a calibration"):
@@ -173,7 +173,7 @@ def test_what_is_no_calibration_is_refused(tmp_path: Path, text: str) -> None:
         load_calibration(tmp_path / "none.json")
 
 
-def test_images_of_another_size_are_refused() -> None:
-    calibration = fitted(camera(NODES, barrel=0.0, keystone=0.0, center=(159.5, 119.5)))
+def test_images_of_another_size_are_rejected() -> None:
+    calibration = fitted(camera(MARKERS, barrel=0.0, keystone=0.0, center=(159.5, 119.5)))
     with pytest.raises(PeerError, match="images of 320 × 240 px, this one has 640 × 480"):
         calibration.check_size(np.zeros((480, 640, 3), dtype=np.uint8))

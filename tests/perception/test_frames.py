@@ -1,4 +1,4 @@
-"""The camera's edge of the observation format: bytes to images, image axes to the pad's."""
+"""Decoding of camera images, and conversion of tracking results to tactile frames."""
 
 import json
 
@@ -18,13 +18,13 @@ SIZES = {0: (320, 427), 90: (427, 320), 180: (320, 427), 270: (427, 320)}
 
 @pytest.mark.parametrize("rotation", [0, 90, 180, 270])
 @pytest.mark.parametrize("mirrored", [True, False])
-def test_every_way_to_mount_a_camera_gives_the_pads_own_axes(rotation: int, mirrored: bool) -> None:
+def test_every_camera_orientation_gives_pad_coordinates(rotation: int, mirrored: bool) -> None:
     width, height = SIZES[rotation]
     appearance = GelAppearance(width=width, height=height, rotation=rotation, mirrored=mirrored)  # type: ignore[arg-type]
     mount = CameraMount(rotation=rotation, mirrored=mirrored, pixels_per_mm=appearance.pixels_per_mm)  # type: ignore[arg-type]
     renderer, tracker = FastGelRenderer(appearance), MarkerTracker(mount.tracker_config())
     x, y = appearance.positions_mm().T
-    field = np.stack([0.3 + 0.02 * y, -0.1 + 0.01 * x], axis=1)  # no symmetry that a wrong sign could hide in
+    field = np.stack([0.3 + 0.02 * y, -0.1 + 0.01 * x], axis=1)  # no symmetry, so that wrong signs are detected
     reference = tactile_frame([tracker.start(renderer.render(np.zeros_like(field)))], [mount], stamp=1.0)
     frame = tactile_frame([tracker.track(renderer.render(field, sequence=1))], [mount], stamp=2.0)
     assert frame.unit == "mm" and frame.grid == appearance.grid and frame.stamp == 2.0
@@ -42,15 +42,15 @@ def tracked(rows: int = 18, cols: int = 14) -> TrackingResult:
     return TrackingResult(np.zeros((n, 2)), displacement, valid, ~valid, valid.astype(float), rows, cols, 22.0)
 
 
-def test_without_a_scale_the_frame_is_in_pixels() -> None:
+def test_a_frame_without_scale_is_in_pixels() -> None:
     mounts = [CameraMount(mirrored=False), CameraMount(mirrored=False, pixels_per_mm=10.0)]
     frame = tactile_frame([tracked(), tracked()], mounts, stamp=0.0)
     assert frame.unit == "px"
-    assert np.allclose(frame.shear[:, 0], [2.0, 1.0])  # both in px, though one camera's scale is known
+    assert np.allclose(frame.shear[:, 0], [2.0, 1.0])  # both in px, although one camera has a scale
 
 
-def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() -> None:
-    # A camera that looks askew: its scale grows from 12 to 18 px/mm over the image. The finger's tip is at the right.
+def test_a_calibration_gives_millimetres_for_a_tilted_camera() -> None:
+    # A tilted camera: the scale grows from 12 to 18 px/mm over the image. The fingertip is at the right.
     matrix = ((13.5, 0.0, 0.0), (0.0, 13.5, 0.0), (0.2, 0.0, 1.0))
     calibration = Calibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
     mount = CameraMount(rotation=270, mirrored=True, calibration=calibration)
@@ -68,13 +68,13 @@ def test_a_calibration_gives_millimetres_on_the_pad_where_one_scale_would_not() 
         CameraMount(rotation=0, calibration=calibration)
 
 
-def test_a_marker_not_seen_is_invalid_and_never_zero() -> None:
+def test_an_invalid_marker_is_nan() -> None:
     frame = tactile_frame([tracked()], [CameraMount(mirrored=False)], stamp=0.0)
     assert np.flatnonzero(~frame.valid[0]).tolist() == [5]
     assert np.isnan(frame.shear[0, 5]).all() and np.isfinite(frame.shear[0][frame.valid[0]]).all()
 
 
-def test_grids_and_mounts_that_do_not_fit_are_refused() -> None:
+def test_results_that_do_not_match_their_mounts_are_rejected() -> None:
     with pytest.raises(UsageError, match="expects 14 rows of 18"):
         tactile_frame([tracked()], [CameraMount(rotation=90)], stamp=0.0)
     with pytest.raises(UsageError, match="one tracking result per mount"):
@@ -84,18 +84,18 @@ def test_grids_and_mounts_that_do_not_fit_are_refused() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"rotation": 45}, {"pixels_per_mm": 0.0}, {"rows": 0}, {"pitch": -1.0}])
-def test_impossible_mounts_are_refused(settings: dict[str, float]) -> None:
+def test_invalid_mounts_are_rejected(settings: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         CameraMount(**settings)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("data", [b"", b"no image at all", b"\xff\xd8\xff\xe0 cut off"])
-def test_bytes_that_are_no_image_are_refused(data: bytes) -> None:
+def test_bytes_that_are_not_an_image_are_rejected(data: bytes) -> None:
     with pytest.raises(PeerError, match="expected a JPEG or PNG image"):
         decode_image(data)
 
 
-def test_an_image_that_is_cut_off_is_told_so() -> None:
+def test_a_truncated_image_is_reported_as_truncated() -> None:
     renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
     with pytest.raises(PeerError, match="truncated or damaged"):

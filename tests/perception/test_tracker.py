@@ -1,4 +1,4 @@
-"""Markers in rendered gel images, against where they were drawn."""
+"""The marker tracker on rendered gel images with ground truth."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ SPACING = 1.4  # [mm]
 
 
 def press(rest: np.ndarray, rng: np.random.Generator, largest: float) -> np.ndarray:
-    """A smooth patch of displacement [mm] at a random place, `largest` at its centre."""
+    """A smooth displacement field [mm] around a random centre, of length `largest` there."""
     centre = rng.uniform((-4, -6), (8, 6))
     angle = rng.uniform(0, 2 * np.pi)
     bump = np.exp(-((rest - centre) ** 2).sum(1) / (2 * rng.uniform(3, 7) ** 2))
@@ -26,8 +26,8 @@ def press(rest: np.ndarray, rng: np.random.Generator, largest: float) -> np.ndar
     return field
 
 
-def follow(appearance: GelAppearance, fields: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Endpoint errors [px] of the valid markers and the valid flags, for each field after the one at rest."""
+def track_fields(appearance: GelAppearance, fields: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Errors [px] of the valid markers and the valid flags, for each displacement field after rest."""
     renderer, mount = (
         FastGelRenderer(appearance),
         CameraMount(mirrored=appearance.mirrored, pixels_per_mm=appearance.pixels_per_mm),
@@ -46,27 +46,27 @@ def follow(appearance: GelAppearance, fields: list[np.ndarray]) -> list[tuple[np
 
 @pytest.mark.parametrize("bright", [False, True])
 @pytest.mark.parametrize("missing", [0.0, 0.05])
-def test_markers_that_jump_half_a_spacing_are_found_to_a_tenth_of_a_pixel(missing: float, bright: bool) -> None:
+def test_jumps_by_half_a_spacing_are_tracked_to_a_tenth_of_a_pixel(missing: float, bright: bool) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)
         appearance = GelAppearance(seed=seed, missing=missing, bright=bright)
         rest = appearance.positions_mm()
-        # Each patch begins and ends within one image: between images markers move by up to half the spacing.
+        # Each field starts and ends within one image, so markers move by up to half a spacing between images.
         fields = [press(rest, rng, 0.5 * SPACING) if k % 2 else np.zeros_like(rest) for k in range(1, 9)]
-        for error, valid in follow(appearance, fields):
+        for error, valid in track_fields(appearance, fields):
             assert valid.sum() == round((1 - missing) * valid.size)
             assert np.median(error) < 0.1
-            assert error.max() < 0.5  # nobody is taken for a neighbour
+            assert error.max() < 0.5  # no identity switches
 
 
-def test_a_common_shift_of_nearly_half_a_spacing_is_not_taken_for_the_opposite_one() -> None:
+def test_a_common_shift_of_nearly_half_a_spacing_keeps_its_sign() -> None:
     appearance = GelAppearance(seed=4, missing=0.05)
     shifts = [np.tile(np.array(s) * SPACING, (252, 1)) for s in ((0.45, 0), (0, 0.0), (0.3, -0.3), (-0.1, 0.1))]
-    for error, valid in follow(appearance, shifts):
+    for error, valid in track_fields(appearance, shifts):
         assert valid.mean() > 0.93 and error.max() < 0.5
 
 
-def test_noise_blur_and_weak_contrast_do_not_break_it() -> None:
+def test_tracking_works_with_noise_blur_and_low_contrast() -> None:
     rng = np.random.default_rng(0)
     for appearance in (
         GelAppearance(noise=5.0),
@@ -74,11 +74,11 @@ def test_noise_blur_and_weak_contrast_do_not_break_it() -> None:
         GelAppearance(contrast=0.3, colour=0.8),
         GelAppearance(light=60.0),
     ):
-        for error, valid in follow(appearance, [press(appearance.positions_mm(), rng, 0.5)]):
+        for error, valid in track_fields(appearance, [press(appearance.positions_mm(), rng, 0.5)]):
             assert valid.mean() > 0.98 and np.median(error) < 0.15 and error.max() < 1.0
 
 
-def test_other_numbers_of_lines_are_found_without_being_told() -> None:
+def test_the_numbers_of_rows_and_columns_are_detected() -> None:
     appearance = GelAppearance(grid=Grid(rows=10, cols=7, pitch=2.6), radius=6.0)
     renderer = FastGelRenderer(appearance)
     tracked = MarkerTracker().start(renderer.render(np.zeros((70, 2))))
@@ -86,7 +86,7 @@ def test_other_numbers_of_lines_are_found_without_being_told() -> None:
     assert np.abs(tracked.spacing - 2.6 * appearance.pixels_per_mm) < 0.5
 
 
-def test_the_same_images_give_the_same_numbers() -> None:
+def test_equal_images_give_identical_results() -> None:
     renderer = FastGelRenderer(GelAppearance(missing=0.05))
     rng = np.random.default_rng(1)
     data = [renderer.encode(renderer.render(rng.normal(0, 0.1, (252, 2)), sequence=k)) for k in range(4)]
@@ -99,7 +99,7 @@ def test_the_same_images_give_the_same_numbers() -> None:
         assert a.displacement.tobytes() == b.displacement.tobytes() and (a.valid == b.valid).all()
 
 
-def test_another_start_takes_a_new_reference() -> None:
+def test_a_second_start_replaces_the_reference() -> None:
     renderer = FastGelRenderer()
     moved = renderer.render(np.full((252, 2), 0.3))
     tracker = MarkerTracker()
@@ -108,24 +108,24 @@ def test_another_start_takes_a_new_reference() -> None:
     assert not tracker.start(moved).displacement.any()
 
 
-def test_a_covered_marker_is_invalid_and_comes_back() -> None:
+def test_a_covered_marker_is_inferred_and_recovers() -> None:
     renderer = FastGelRenderer()
     rest = renderer.render(np.zeros((252, 2)))
     tracker = MarkerTracker(MOUNT.tracker_config())
     first = tracker.start(rest)
     covered = rest.copy()
-    place = first.position[100]
-    right, down = place.round().astype(int)
+    position = first.position[100]
+    right, down = position.round().astype(int)
     covered[down - 8 : down + 9, right - 8 : right + 9] = covered[down - 10, right - 10]
     lost = tracker.track(covered)
     assert np.flatnonzero(~lost.valid).tolist() == [100]
     assert np.flatnonzero(lost.inferred).tolist() == [100] and lost.quality[100] == 0
-    assert np.linalg.norm(lost.position[100] - place) < 0.5  # expected where its neighbours say
+    assert np.linalg.norm(lost.position[100] - position) < 0.5  # interpolated from the neighbours
     back = tracker.track(rest)
     assert back.valid.all() and np.linalg.norm(back.displacement[100]) < 0.1
 
 
-def test_two_merged_markers_are_not_believed() -> None:
+def test_two_merged_markers_are_not_valid() -> None:
     renderer = FastGelRenderer()
     field = np.zeros((252, 2))
     field[100], field[101] = (0, 0.55), (0, -0.55)  # neighbours in a row meet
@@ -137,7 +137,7 @@ def test_two_merged_markers_are_not_believed() -> None:
     assert frame.valid[0].sum() >= 248
 
 
-def test_it_recovers_after_blank_images() -> None:
+def test_tracking_recovers_after_blank_images() -> None:
     renderer = FastGelRenderer()
     tracker = MarkerTracker(MOUNT.tracker_config())
     tracker.start(renderer.render(np.zeros((252, 2))))
@@ -150,25 +150,25 @@ def test_it_recovers_after_blank_images() -> None:
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(17, 14), (19, 14), (14, 18), (10, 7)])
-def test_wrong_rows_and_columns_are_refused(rows: int, cols: int) -> None:
+def test_a_grid_of_another_shape_is_rejected(rows: int, cols: int) -> None:
     image = FastGelRenderer().render(np.zeros((252, 2)))
     with pytest.raises(TrackerInitError, match="18 rows of 14 entire markers"):
         MarkerTracker(TrackerConfig(rows=rows, cols=cols, either_way=False)).start(image)
 
 
-def test_rows_and_columns_may_be_turned_unless_forbidden() -> None:
+def test_transposed_rows_and_columns_are_accepted_by_default() -> None:
     image = FastGelRenderer().render(np.zeros((252, 2)))
     tracked = MarkerTracker(TrackerConfig(rows=14, cols=18)).start(image)
     assert (tracked.rows, tracked.cols) == (18, 14)
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(18, None), (2, 14), (18, 1000)])
-def test_impossible_numbers_are_refused(rows: int, cols: int | None) -> None:
+def test_impossible_numbers_of_rows_and_columns_are_rejected(rows: int, cols: int | None) -> None:
     with pytest.raises(UsageError):
         MarkerTracker(TrackerConfig(rows=rows, cols=cols)).start(FastGelRenderer().render(np.zeros((252, 2))))
 
 
-def test_an_image_of_another_size_is_refused() -> None:
+def test_an_image_of_another_size_is_rejected() -> None:
     image = FastGelRenderer().render(np.zeros((252, 2)))
     tracker = MarkerTracker()
     tracker.start(image)
@@ -176,8 +176,8 @@ def test_an_image_of_another_size_is_refused() -> None:
         tracker.track(image[:400])
 
 
-def through(sequence: GelSequence) -> list[tuple[RenderedImage, TrackingResult, np.ndarray]]:
-    """For each image after the first: the truth, what was tracked, and how far the displacements are off [px]."""
+def track_sequence(sequence: GelSequence) -> list[tuple[RenderedImage, TrackingResult, np.ndarray]]:
+    """For each image after the first: ground truth, tracking result and displacement errors [px]."""
     tracker, frames = MarkerTracker(), list(sequence)
     first = tracker.start(frames[0].image)
     assert (first.rows, first.cols) == (sequence.appearance.grid.rows, sequence.appearance.grid.cols)
@@ -189,18 +189,21 @@ def through(sequence: GelSequence) -> list[tuple[RenderedImage, TrackingResult, 
     return results
 
 
-def near(sequence: GelSequence) -> float:
-    """Share of the visible markers that are said to be within 0.1 spacing of where they are."""
+def near_fraction(sequence: GelSequence) -> float:
+    """Fraction of the visible markers with errors below 0.1 spacings."""
     return float(
-        np.mean(np.concatenate([off[f.visible] for f, _, off in through(sequence)]) < 0.1 * sequence.appearance.spacing)
+        np.mean(
+            np.concatenate([off[f.visible] for f, _, off in track_sequence(sequence)])
+            < 0.1 * sequence.appearance.spacing
+        )
     )
 
 
 @pytest.mark.parametrize(
     ("preset", "median", "high"), [("clean", 0.02, 0.04), ("typical", 0.03, 0.06), ("hard", 0.08, 0.5)]
 )
-def test_errors_are_near_what_noise_allows(preset: str, median: float, high: float) -> None:
-    results = through(GelSequence(make_appearance(preset, seed=1), "twist", frames=10, period=12))
+def test_errors_are_close_to_the_error_bound(preset: str, median: float, high: float) -> None:
+    results = track_sequence(GelSequence(make_appearance(preset, seed=1), "twist", frames=10, period=12))
     errors = np.concatenate([off[tracked.valid & frame.visible] for frame, tracked, off in results])
     assert np.median(errors) < median and np.quantile(errors, 0.95) < high
     assert np.mean([tracked.valid[frame.visible].mean() for frame, tracked, _ in results]) > 0.98
@@ -208,73 +211,76 @@ def test_errors_are_near_what_noise_allows(preset: str, median: float, high: flo
 
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("changed", [{}, {"missing": 0.05, "bridges": 2}, {"cut_row": True, "markers": 63}])
-def test_a_jump_by_most_of_a_spacing_exchanges_no_marker(field: Field, changed: dict[str, float]) -> None:
+def test_a_jump_by_most_of_a_spacing_causes_no_identity_switch(field: Field, changed: dict[str, float]) -> None:
     appearance = make_appearance("typical", seed=2, **changed)  # type: ignore[arg-type]
-    for frame, tracked, off in through(GelSequence(appearance, field, frames=5, motion="jump", peak=0.7)):
+    for frame, tracked, off in track_sequence(GelSequence(appearance, field, frames=5, motion="jump", peak=0.7)):
         assert tracked.valid[frame.visible].mean() > 0.99
         assert (off[tracked.valid] < 0.1 * appearance.spacing).all()
 
 
-def test_a_whole_grid_that_jumps_back_and_forth_is_told_from_its_neighbouring_line() -> None:
+def test_a_jump_of_the_whole_grid_is_not_confused_with_its_neighbouring_row() -> None:
     appearance = make_appearance("typical", cut_row=True)
     renderer, tracker, still = AccurateGelRenderer(appearance), MarkerTracker(), np.zeros((130, 2))
     rest = renderer.render(still).position
     tracker.start(renderer.render(still).image)
-    for number, way in enumerate([(0.7, 0.0), (0.0, 0.0), (-0.5, 0.4), (-0.1, -0.1)], start=1):
-        frame = renderer.render(still + np.array(way) * appearance.grid.pitch, number=number)
+    for number, shift in enumerate([(0.7, 0.0), (0.0, 0.0), (-0.5, 0.4), (-0.1, -0.1)], start=1):
+        frame = renderer.render(still + np.array(shift) * appearance.grid.pitch, number=number)
         tracked = tracker.track(frame.image)
         assert tracked.valid.all() and np.abs(tracked.displacement - (frame.position - rest)).max() < 0.5
 
 
 @pytest.mark.parametrize("name", FACTORS)
-def test_every_kind_of_image_is_tracked_without_being_told(name: str) -> None:
-    assert near(GelSequence(make_appearance("typical", seed=3, **FACTORS[name]), "press", frames=5, period=5)) > 0.99
+def test_every_image_class_is_tracked_without_prior_knowledge(name: str) -> None:
+    assert (
+        near_fraction(GelSequence(make_appearance("typical", seed=3, **FACTORS[name]), "press", frames=5, period=5))
+        > 0.99
+    )
 
 
-def test_what_is_hidden_is_guessed_and_found_again() -> None:
-    results = through(GelSequence(make_appearance("typical", occluders=1), "shear", frames=24, period=30))
+def test_hidden_markers_are_inferred_and_recovered() -> None:
+    results = track_sequence(GelSequence(make_appearance("typical", occluders=1), "shear", frames=24, period=30))
     hidden = np.array([~frame.visible for frame, _, _ in results])
     valid, inferred = (np.array([getattr(one, name) for _, one, _ in results]) for name in ("valid", "inferred"))
     quality, spacing = np.array([one.quality for _, one, _ in results]), results[0][1].spacing
     far = np.array([off for _, _, off in results]) > 0.1 * spacing
-    assert hidden.sum() > 30 and inferred[hidden].mean() > 0.5  # of many a dot enough is seen to measure it
+    assert hidden.sum() > 30 and inferred[hidden].mean() > 0.5  # partly covered dots may still be measured
     assert (far & valid)[hidden].mean() < 0.05 and far[hidden].mean() < 0.1
     assert (valid ^ inferred).all() and not quality[inferred].any() and quality[~hidden].min() > 0.5
     assert valid[-1].all() and not far[-1].any()
 
 
-def test_at_rest_nothing_jitters_or_drifts_and_the_reference_gets_finer() -> None:
+def test_jitter_and_drift_at_rest_are_small_and_the_reference_improves() -> None:
     frames = list(GelSequence(make_appearance("typical"), motion="rest", frames=16))
     tracker = MarkerTracker()
     tracker.start(frames[0].image)
     one = tracker.rest
-    places = np.array([tracker.track(frame.image).position for frame in frames[1:]])
-    assert np.median(places.std(axis=0)) < 0.02
+    positions = np.array([tracker.track(frame.image).position for frame in frames[1:]])
+    assert np.median(positions.std(axis=0)) < 0.02
     error, finer = (np.linalg.norm(rest - frames[0].position, axis=1).mean() for rest in (one, tracker.rest))
     assert finer < 0.7 * error
     moved = GelSequence(make_appearance("typical"), "shear", frames=64, period=30)
-    _, _, off = through(moved)[-1]
+    _, _, off = track_sequence(moved)[-1]
     assert np.median(off) < 0.05
 
 
-def garbage(kind: str) -> np.ndarray:
+def image_without_markers(kind: str) -> np.ndarray:
     rng = np.random.default_rng(0)
     if kind == "noise":
         return rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
     if kind == "soft noise":
-        return np.asarray(cv2.GaussianBlur(garbage("noise"), (0, 0), 3))
+        return np.asarray(cv2.GaussianBlur(image_without_markers("noise"), (0, 0), 3))
     image = np.full((240, 320, 3), {"black": 0, "white": 255}.get(kind, 150), dtype=np.uint8)
-    for place in rng.integers((0, 0), (320, 240), ({"one dot": 1, "10 000 dots": 10_000}.get(kind, 0), 2)).tolist():
-        cv2.circle(image, place, 2, (20, 20, 20), -1)
+    for position in rng.integers((0, 0), (320, 240), ({"one dot": 1, "10 000 dots": 10_000}.get(kind, 0), 2)).tolist():
+        cv2.circle(image, position, 2, (20, 20, 20), -1)
     return image
 
 
 @pytest.mark.parametrize("kind", ["noise", "soft noise", "black", "white", "one dot", "10 000 dots"])
-def test_an_image_without_markers_is_refused_and_does_no_harm(kind: str) -> None:
-    image = garbage(kind)
-    with pytest.raises(TrackerInitError, match=r"dots detected|same shape|lie between|no regular grid") as refusal:
+def test_images_without_markers_are_rejected_and_tracking_continues(kind: str) -> None:
+    image = image_without_markers(kind)
+    with pytest.raises(TrackerInitError, match=r"dots detected|same shape|lie between|no regular grid") as error:
         MarkerTracker().start(image)
-    assert refusal.value.picture.shape == image.shape and refusal.value.picture.dtype == np.uint8
+    assert error.value.picture.shape == image.shape and error.value.picture.dtype == np.uint8
     renderer, still = AccurateGelRenderer(make_appearance("typical")), np.zeros((130, 2))
     tracker = MarkerTracker()
     tracker.start(renderer.render(still).image)
@@ -284,7 +290,7 @@ def test_an_image_without_markers_is_refused_and_does_no_harm(kind: str) -> None
     assert tracker.track(renderer.render(still, number=1).image).valid.all()
 
 
-def test_a_grid_turned_too_far_is_not_taken_for_one_of_its_diagonals() -> None:
+def test_a_grid_rotated_too_far_is_not_confused_with_its_diagonals() -> None:
     image = AccurateGelRenderer(make_appearance("typical")).render(np.zeros((130, 2))).image
     for angle, right in ((25, True), (43, False)):
         turn = cv2.getRotationMatrix2D((160, 120), angle, 0.7)
@@ -296,31 +302,31 @@ def test_a_grid_turned_too_far_is_not_taken_for_one_of_its_diagonals() -> None:
                 MarkerTracker().start(turned)
 
 
-def test_what_is_no_image_is_refused() -> None:
+def test_values_that_are_no_images_are_rejected() -> None:
     image = AccurateGelRenderer(make_appearance("typical")).render(np.zeros((130, 2))).image
     tracker = MarkerTracker()
     tracker.start(image)
     wrong = [image.astype(float), image[..., :2], np.dstack([image, image[..., :1]]), image[:0], image.tobytes(), None]
-    for thing in wrong:
+    for value in wrong:
         for use in (MarkerTracker().start, tracker.track):
             with pytest.raises(UsageError, match="expected an image"):
-                use(thing)  # type: ignore[arg-type]
+                use(value)  # type: ignore[arg-type]
 
 
-def test_size_one_images_and_strips_are_refused() -> None:
+def test_tiny_images_and_strips_are_rejected() -> None:
     for shape in ((1, 1, 3), (1, 300, 3), (900, 2, 3), (7, 7, 3)):
         with pytest.raises(GelflowError, match="no grid of markers"):
             MarkerTracker().start(np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8))
 
 
-def test_grey_images_and_views_are_images_too() -> None:
+def test_grey_images_and_array_views_are_accepted() -> None:
     image = AccurateGelRenderer(make_appearance("typical")).render(np.zeros((130, 2))).image
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-    places = [MarkerTracker().start(one).position for one in (image, np.stack([image, image], axis=1)[:, 0], grey)]
-    assert (places[0] == places[1]).all() and np.abs(places[0] - places[2]).max() < 0.02
+    positions = [MarkerTracker().start(one).position for one in (image, np.stack([image, image], axis=1)[:, 0], grey)]
+    assert (positions[0] == positions[1]).all() and np.abs(positions[0] - positions[2]).max() < 0.02
 
 
-def test_of_an_image_whose_lower_half_did_not_arrive_the_upper_one_is_tracked() -> None:
+def test_the_upper_half_is_tracked_when_the_lower_half_of_an_image_is_missing() -> None:
     image = AccurateGelRenderer(make_appearance("typical")).render(np.zeros((130, 2))).image
     tracker = MarkerTracker()
     tracker.start(image)
@@ -330,6 +336,6 @@ def test_of_an_image_whose_lower_half_did_not_arrive_the_upper_one_is_tracked() 
     assert valid[:4].all() and not valid[-4:].any() and (tracked.inferred ^ tracked.valid).all()
 
 
-def test_before_the_start_there_is_no_rest() -> None:
+def test_rest_positions_require_a_start() -> None:
     with pytest.raises(UsageError, match="no rest positions yet"):
         _ = MarkerTracker().rest

@@ -1,4 +1,4 @@
-"""Recorded sequences with their truth, tests/data/tracking: read as any recording is, and tracked as well as ever."""
+"""Tracking of the stored sequences with ground truth in tests/data/tracking."""
 
 from pathlib import Path
 
@@ -16,10 +16,10 @@ DATA = Path(__file__).parents[1] / "data" / "tracking"
     ("name", "kind", "median", "high"), [("press", "folder", 0.03, 0.08), ("twist.mjpeg", "video", 0.08, 0.3)]
 )
 def test_a_recorded_sequence_is_tracked(name: str, kind: str, median: float, high: float) -> None:
-    """The median error [px] is what must hold for its class: the folder is of the typical one, the video of the hard.
+    """`median` [px] bounds the position error of the class: "typical" for the folder, "hard" for the video.
 
-    `high` [px] is for the displacement's 95th percentile: where a damaged dot's middle was printed can't be seen, but
-    how far it went can.
+    `high` [px] bounds the 95th percentile of the displacement error, which excludes the constant position error of
+    damaged dots.
     """
     source, truth = image_source(str(DATA / name)), read_truth(truth_file(DATA / name))
     assert source.kind == kind
@@ -37,4 +37,4 @@ def test_a_recorded_sequence_is_tracked(name: str, kind: str, median: float, hig
     assert np.percentile(np.linalg.norm(moved, axis=-1)[valid & first.valid], 95) < high
     visible = truth.visible[1:]
     assert (off[visible] < 0.1 * truth.spacing).mean() > 0.99
-    assert not valid[:, ~truth.visible.any(axis=0)].any(), "what was never printed is never measured"
+    assert not valid[:, ~truth.visible.any(axis=0)].any(), "a missing dot is never measured"

@@ -1,4 +1,4 @@
-"""The gel renderer: its truth is where the dots are, its flaws are what their names say, and it repeats itself."""
+"""The accurate gel renderer: ground truth, image degradations and repeatability."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, SIZES, make_appearance
 from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
-# Even light, no noise: then a dot's centre is the mean place of what it darkens.
+# Uniform light without noise, so that the centre of a dot is the centroid of its ink.
 EVEN: dict[str, Any] = {
     **{"noise": 0.0, "shot": 0.0, "gradient": 0.0, "colour": 0.0, "shading": 0.0, "ridges": 0.0, "dust": 0},
     **{"occluders": 0, "damaged": 0.0, "bridges": 0, "missing": 0.0, "quality": 100},
@@ -19,7 +19,7 @@ EVEN: dict[str, Any] = {
 
 
 def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarray:
-    """Mean place of the ink within `reach` pixels of each of `centers`, on a gel whose light is even."""
+    """Centroid of the ink within `reach` pixels of each of `centers`, for uniform light."""
     found = np.zeros_like(centers)
     ink = picture[..., 1] - np.median(picture[..., 1])
     for k, (right, down) in enumerate(np.rint(centers).astype(int)):
@@ -40,7 +40,7 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
     ],
     ids=lambda changed: " ".join(changed) or "plain",
 )
-def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
+def test_the_ground_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
     appearance = make_appearance("typical", markers=63, seed=1, **{**EVEN, **changed})
     exposed = AccurateGelRenderer(appearance).render_noiseless(GelSequence(appearance, "twist").displacement(20))
     assert exposed.visible.all()
@@ -48,7 +48,7 @@ def test_the_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
     assert np.abs(off).max() < 0.003
 
 
-def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
+def test_motion_blur_lengthens_a_dot_and_keeps_its_centre() -> None:
     appearance = make_appearance("typical", markers=63, **EVEN)
     renderer, still = AccurateGelRenderer(appearance), np.zeros((63, 2))
     smeared = renderer.render_noiseless(still, motion_blur=np.tile([4.0, 0.0], (63, 1)))
@@ -58,7 +58,7 @@ def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
     ink = [(np.median(picture) - picture[..., 1]).clip(0) for picture in (plain, smeared.picture)]
     right = np.arange(appearance.width)
     variance = []
-    for layer in ink:  # of the first dot across, over which a box of 4 px is folded: 4²/12 more
+    for layer in ink:  # horizontal variance of the first dot; convolution with a box of 4 px adds 4²/12
         x, y = np.rint(smeared.position[0]).astype(int)
         weight = layer[y - 12 : y + 13, x - 12 : x + 13].sum(axis=0)
         at = right[x - 12 : x + 13]
@@ -68,7 +68,7 @@ def test_smear_lengthens_a_dot_and_keeps_its_centre() -> None:
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_sequence_goes_from_rest_to_its_peak_and_back(field: Any) -> None:
+def test_a_sequence_moves_from_rest_to_its_peak_and_back(field: Any) -> None:
     appearance = make_appearance("hard", markers=63, seed=2)
     sequence = GelSequence(appearance, field, peak=0.4)
     frames = [sequence.displacement(number) for number in range(len(sequence))]
@@ -84,21 +84,21 @@ def test_a_sequence_goes_from_rest_to_its_peak_and_back(field: Any) -> None:
     )
 
 
-def test_the_same_sequence_gives_the_same_images() -> None:
+def test_equal_sequences_give_identical_images() -> None:
     appearance = make_appearance("hard", seed=5)
     one, other = (list(GelSequence(appearance, "slip", frames=6)) for _ in range(2))
     assert [frame.jpeg for frame in one] == [frame.jpeg for frame in other]
-    assert len({frame.jpeg for frame in one}) == 6, "noise differs from image to image, at rest too"
+    assert len({frame.jpeg for frame in one}) == 6, "the noise differs between images, also at rest"
     assert next(iter(GelSequence(make_appearance("hard", seed=6), frames=1))).jpeg != one[0].jpeg
 
 
-def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
+def test_occluded_markers_are_temporarily_not_visible() -> None:
     sequence = list(GelSequence(make_appearance("typical", occluders=2, missing=0.05, seed=1), frames=25))
     visible = np.array([frame.visible for frame in sequence])
     assert visible[0].sum() == visible[-1].sum() == 130 - round(0.05 * 130)
     hidden_once = visible[0] & ~visible.all(axis=0)
     assert 8 < hidden_once.sum() < 80
-    for frame in sequence:  # where a dot is visible it is darker than around it
+    for frame in sequence:  # a visible dot is darker than its surroundings
         grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
         right, down = np.rint(frame.position[visible[0] & frame.visible]).astype(int).T
         assert (grey[down, right] < 0.8 * cv2.blur(grey, (23, 23))[down, right]).all()
@@ -107,7 +107,7 @@ def test_what_is_hidden_is_not_visible_and_shows_again() -> None:
 @pytest.mark.parametrize(
     ("name", "markers"), [*((name, 130) for name in (*PRESETS, *FACTORS)), *(("hard", markers) for markers in SIZES)]
 )
-def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -> None:
+def test_every_image_class_factor_and_size_can_be_rendered(name: str, markers: int) -> None:
     appearance = (
         make_appearance(name, markers=markers) if name in PRESETS else make_appearance(markers=markers, **FACTORS[name])
     )
@@ -118,7 +118,7 @@ def test_every_class_and_factor_and_size_can_be_drawn(name: str, markers: int) -
     assert frame.visible.sum() == markers - round(appearance.missing * markers)
 
 
-def test_wrong_looks_and_sequences_are_refused() -> None:
+def test_invalid_appearances_and_sequences_are_rejected() -> None:
     for wrong, message in (
         ({"preset": "dirty"}, "image class must be one of clean, typical, hard, got 'dirty'"),
         ({"markers": 100}, "markers must be one of 35, 63, 130, 154, 252, got 100"),
