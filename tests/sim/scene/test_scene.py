@@ -1,4 +1,4 @@
-"""Scenes built in Python, without files."""
+"""Public names of gelflow.sim.scene, and scenes built in Python without files."""
 
 from pathlib import Path
 
@@ -7,11 +7,16 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose
-from gelflow.sim import Simulator
+from gelflow.sim import Simulator, scene
 from gelflow.sim.scene import WORLD, BodyDef, ContactDef, JointDef, JointLimit, PadDef, PointsDef, Scene, ShapeDef
 
 RADIUS, MASS, KN = 0.02, 0.1, 500.0
 PARAMS = {"kn": KN, "kt": 1.0, "mu": 0.5, "kd": 100.0, "ks": 0.0}
+
+
+def test_every_public_name_resolves() -> None:
+    assert set(scene.__all__) <= set(dir(scene))
+    assert [name for name in scene.__all__ if not hasattr(scene, name)] == []
 
 
 def ball_on_ground() -> Scene:
@@ -47,10 +52,10 @@ def ball_on_ground() -> Scene:
 
 
 def test_a_scene_built_in_python_is_simulated() -> None:
-    scene = ball_on_ground()
-    assert (scene.nq, scene.nv, scene.nu, scene.num_markers) == (7, 6, 0, 1)
-    sim = Simulator(scene)
-    sim.q[:] = scene.q0
+    ball = ball_on_ground()
+    assert (ball.nq, ball.nv, ball.nu, ball.num_markers) == (7, 6, 0, 1)
+    sim = Simulator(ball)
+    sim.q[:] = ball.q0
     sim.step(np.zeros((1, 0)), 1000)
     sim.check()
     depth = MASS * 9.81 / KN
