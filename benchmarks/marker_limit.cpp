@@ -1,5 +1,5 @@
-// What a marker costs at least: the viscous law on a sphere as one plain loop over places side by side, results side by
-// side too. No frames, no weights, no search, no other shape, no array of (markers, 3). From the repository's root:
+// Lower bound on the time per marker: the viscous law on a sphere as one loop over arrays of coordinates, without frames,
+// weights, broad phase or other shapes, and with results in separate arrays. From the repository's root:
 //     c++ -O3 -march=x86-64-v3 -fno-math-errno -fno-trapping-math benchmarks/marker_limit.cpp -o build/limit
 //     build/limit
 #include <algorithm>

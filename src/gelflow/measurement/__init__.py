@@ -1,1 +1,1 @@
-"""Timing of code, and the machine and versions a measurement ran with."""
+"""Timing of workloads, start-up times, and the machine and versions of a measurement."""

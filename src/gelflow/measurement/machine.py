@@ -1,4 +1,4 @@
-"""The machine and the package versions that are stored with every measurement."""
+"""Processor and package versions, which are stored with every measurement."""
 
 import os
 import platform
@@ -9,12 +9,12 @@ from gelflow import __version__
 
 
 def cores() -> int:
-    """How many of this machine's cores are ours."""
+    """Number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def processor() -> str:
-    """Name of this machine's processor, and how many of its cores are ours."""
+    """Name of the processor, and number of cores available to this process."""
     name = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -26,10 +26,10 @@ def processor() -> str:
 
 def versions() -> dict[str, str]:
     """Versions of gelflow, Python, the operating system, NumPy and MuJoCo."""
-    found = {"gelflow": __version__, "python": platform.python_version(), "system": platform.platform()}
+    result = {"gelflow": __version__, "python": platform.python_version(), "system": platform.platform()}
     for package in ("numpy", "mujoco"):
         try:
-            found[package] = version(package)
-        except PackageNotFoundError:  # run from a tree that was not installed with pip
-            found[package] = "unknown"
-    return found
+            result[package] = version(package)
+        except PackageNotFoundError:  # not installed as a distribution
+            result[package] = "unknown"
+    return result
