@@ -1,4 +1,4 @@
-"""What all tests share: pictures without a display, and examples that are the same on every machine."""
+"""Shared test set-up: pictures without a display, reproducible examples, a separate cache."""
 
 import os
 from collections.abc import Iterator
@@ -8,14 +8,14 @@ from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# No deadline: no test depends on how fast the machine is. The same examples each time: a red run can be repeated.
+# No deadline: tests do not depend on the speed of the machine. Derandomized: a failed run is reproducible.
 settings.register_profile("gelflow", deadline=None, derandomize=True)
 settings.load_profile("gelflow")
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Grids of meshes are kept in a folder of this run, not in the user's."""
+    """Distance grids are cached in a folder of this run instead of the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("GELFLOW_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield

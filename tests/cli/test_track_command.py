@@ -27,7 +27,7 @@ LOOK = GelAppearance(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320
 
 
 def track(*arguments: str) -> tuple[int, str]:
-    """Exit status and standard error of the command in a process of its own: video libraries write there too."""
+    """Exit status and standard error of the command in a separate process: video libraries also write to stderr."""
     run = subprocess.run([*MAIN, "track", *arguments], capture_output=True, text=True)
     return run.returncode, run.stderr
 
@@ -95,7 +95,7 @@ def test_written_files_contain_the_rendered_motion(tmp_path: Path, capsys: pytes
         records = [record.value for record in reader.records(["/left/markers"])]
         assert reader.counts()["/left/image"] == len(records) == 12
     assert np.allclose(records[-1]["displacement_mm"][0], [-field(11)[0, 1], field(11)[0, 0]], atol=0.02)
-    # Tracked once more from the recording: the same numbers.
+    # Tracking the recording gives the same numbers.
     assert main(["track", str(session), "--out", str(tmp_path / "again.csv")]) == 0
     same = [(a["x_px"], a["dx_px"], a["quality"]) for a in rows_of(tmp_path / "again.csv")]
     assert same == [(a["x_px"], a["dx_px"], a["quality"]) for a in rows]
@@ -104,7 +104,7 @@ def test_written_files_contain_the_rendered_motion(tmp_path: Path, capsys: pytes
 def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
     folder = draw(tmp_path / "images", 12)
     files = list(folder.iterdir())
-    for number in range(12, 3000):  # far more than it will get to
+    for number in range(12, 3000):  # more than it can process before the kill
         (folder / f"{number}.jpg").hardlink_to(files[number % 12])
     table, video, session = (tmp_path / name for name in ("t.csv", "o.mkv", "s.mcap"))
     outputs = ["--out", str(table), "--out", str(video), "--out", str(session)]
@@ -121,7 +121,7 @@ def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
     assert sum(film.read()[0] for _ in range(images)) > 5
     recover(session, tmp_path / "whole.mcap")
     with SessionReader(tmp_path / "whole.mcap") as reader:
-        assert reader.counts()["/left/markers"] >= images // 50 * 50  # every 50 images it waits for the disk
+        assert reader.counts()["/left/markers"] >= images // 50 * 50  # the recorder waits for the disk every 50 images
 
 
 def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -172,7 +172,7 @@ def test_jitter_is_the_noise_without_the_motion() -> None:
     rest = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2) * 20.0
     summary, yes = TrackingSummary(), np.ones(130, dtype=bool)
     for number in range(60):
-        shake = rng.normal(0, 1.0, 2)  # of the whole camera
+        shake = rng.normal(0, 1.0, 2)  # motion of the camera
         moved = 0.05 * number * np.sin(rest / 100) + shake + rng.normal(0, 0.03, rest.shape)
         tracked = TrackingResult(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
         summary.add(TrackedImage(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)

@@ -14,22 +14,22 @@ from gelflow.time_sync import CONTROLLER, SIMULATED_CELL, TimeSync
 
 
 @pytest.fixture
-def paced(tmp_path: Path) -> tuple[ScaledClock, ScaledClock]:
+def synchronized(tmp_path: Path) -> tuple[ScaledClock, ScaledClock]:
     """Clocks of two processes of one mock robot."""
     TimeSync.create(path := str(tmp_path / "time_sync"))
     return ScaledClock(100.0, path), ScaledClock(100.0, path)
 
 
-def test_without_limits_robot_time_runs_at_full_speed(paced: tuple[ScaledClock, ScaledClock]) -> None:
-    clock, _ = paced
+def test_without_limits_robot_time_runs_at_full_speed(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, _ = synchronized
     assert clock.now() == pytest.approx(ScaledClock(100.0).now(), abs=1.0)
     assert clock.delay == 0
 
 
 def test_robot_time_stops_at_the_earliest_limit_and_does_not_jump_after_it(
-    paced: tuple[ScaledClock, ScaledClock],
+    synchronized: tuple[ScaledClock, ScaledClock],
 ) -> None:
-    clock, other = paced
+    clock, other = synchronized
     start = clock.now()
     clock.grant(SIMULATED_CELL, start + 1.0)
     clock.grant(CONTROLLER, start + 0.5)
@@ -42,8 +42,8 @@ def test_robot_time_stops_at_the_earliest_limit_and_does_not_jump_after_it(
     assert start + 0.5 <= other.now() < start + 0.5 + clock.delay
 
 
-def test_sleep_waits_for_robot_time(paced: tuple[ScaledClock, ScaledClock]) -> None:
-    clock, other = paced
+def test_sleep_waits_for_robot_time(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, other = synchronized
     start = clock.now()
     clock.grant(SIMULATED_CELL, start + 0.1)
     sleeper = threading.Thread(target=clock.sleep, args=(1.0,))
@@ -57,9 +57,9 @@ def test_sleep_waits_for_robot_time(paced: tuple[ScaledClock, ScaledClock]) -> N
 
 
 def test_a_slot_without_grants_is_ignored_after_its_timeout(
-    paced: tuple[ScaledClock, ScaledClock], monkeypatch: pytest.MonkeyPatch
+    synchronized: tuple[ScaledClock, ScaledClock], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock, _ = paced
+    clock, _ = synchronized
     limit = clock.now()
     clock.grant(SIMULATED_CELL, limit)
     real = time.monotonic
@@ -67,8 +67,8 @@ def test_a_slot_without_grants_is_ignored_after_its_timeout(
     assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
 
 
-def test_robot_time_is_monotonic_under_concurrent_grants(paced: tuple[ScaledClock, ScaledClock]) -> None:
-    clock, other = paced
+def test_robot_time_is_monotonic_under_concurrent_grants(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, other = synchronized
     ending = threading.Event()
 
     def world() -> None:

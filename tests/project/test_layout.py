@@ -47,7 +47,7 @@ def test_a_bare_import_is_a_lint_error(folder: str, form: str) -> None:
 
 @pytest.fixture(scope="module")
 def skeleton(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package's modules, all empty, with the project's import rules: only the test's own imports can break them."""
+    """Empty modules with the names of the package, and the project's import rules: only imports of a test can fail."""
     top = tmp_path_factory.mktemp("skeleton")
     shutil.copy(ROOT / "pyproject.toml", top)
     for folder in (*FOLDERS, "src/gelflow"):
@@ -98,7 +98,7 @@ def lint_imports(skeleton: Path, edges: list[tuple[str, str]]) -> subprocess.Com
     for folder in {folder for folder, _ in edges}:
         lines = [f"import {target}\n" for source, target in edges if source == folder]
         (skeleton / folder / "edge.py").write_text("".join(lines))
-    # -S: without the editable install's own import hook, which would lead back to this tree.
+    # -S disables the import hook of the editable install, which would import this tree.
     code = (
         f"import sys; sys.path[:0] = ['src', {str(Path(importlinter.__file__).parents[1])!r}]; "
         "from importlinter.cli import lint_imports; "
@@ -130,7 +130,7 @@ def test_a_wheel_contains_data_and_no_c_sources(tmp_path: Path) -> None:
         ".git", ".venv", "build", "dist", "out", "sessions", "runs", "__pycache__", ".*_cache"
     )
     shutil.copytree(ROOT, tree, symlinks=True, ignore=skip)
-    (tree / "sim" / "_core.stale.so").touch()  # what development leaves behind must not travel
+    (tree / "sim" / "_core.stale.so").touch()  # leftovers of development must not be packaged
     command = [sys.executable, "-m", "pip", "wheel", "--no-index", "--no-deps", "--no-build-isolation", "-q"]
     subprocess.run([*command, "-Cwheel.cmake=false", "-w", tmp_path, tree], check=True, capture_output=True)
     (wheel,) = tmp_path.glob("gelflow-*.whl")

@@ -180,7 +180,7 @@ def test_records_are_flushed_periodically(tmp_path: Path) -> None:
         while not found and time.monotonic() < given_up:
             time.sleep(0.05)
             shutil.copy(tmp_path / "a.mcap", tmp_path / "copy.mcap")
-            with contextlib.suppress(PeerError):  # not one whole message yet
+            with contextlib.suppress(PeerError):  # no complete message yet
                 found = recover(tmp_path / "copy.mcap", tmp_path / "b.mcap").messages
     assert found == 1
 
@@ -204,7 +204,7 @@ def test_many_threads_record_concurrently(tmp_path: Path) -> None:
 
 
 class StuckClock(ScaledClock):
-    """Holds the writer thread, as a disk that does not answer would."""
+    """Blocks the writer thread, like a disk that does not respond."""
 
     free = threading.Event()
 
@@ -298,8 +298,8 @@ def test_a_decision_that_cannot_be_recomputed_is_rejected() -> None:
         ({"reference": [3]}, "reference has 1 images"),
         ({"flow_shape": [1, 2, 3]}, "reshape"),
     ]
-    for change, says in changes:
-        with pytest.raises(PeerError, match=says):
+    for change, message in changes:
+        with pytest.raises(PeerError, match=message):
             Decision.from_json(good | change)
 
 
@@ -321,7 +321,7 @@ def test_wrong_files_are_rejected_with_one_line(tmp_path: Path) -> None:
     write_foreign(tmp_path / "foreign.mcap", None)
     write_foreign(tmp_path / "newer.mcap", {"format": "2"})
     write_foreign(tmp_path / "odd.mcap", {"version": "?"})
-    for name, kind, says in [
+    for name, kind, message in [
         ("missing.mcap", UsageError, "No such file"),
         (".", UsageError, "Is a directory"),
         ("text.mcap", UsageError, "is not an MCAP file"),
@@ -330,7 +330,7 @@ def test_wrong_files_are_rejected_with_one_line(tmp_path: Path) -> None:
         ("newer.mcap", UsageError, "has session format 2; this gelflow reads format 1"),
         ("odd.mcap", PeerError, "damaged"),
     ]:
-        with pytest.raises(kind, match=says) as caught:
+        with pytest.raises(kind, match=message) as caught:
             SessionReader(tmp_path / name).open()
         assert "\n" not in str(caught.value) and name in str(caught.value)
 
@@ -369,6 +369,6 @@ def test_dataclasses_are_restored() -> None:
 
     grid = Grid(3, 4, 1.5, (1.0, 2.0))
     assert from_plain(Grid, json.loads(to_json(grid)), what="grid") == grid
-    for wrong, says in [({"rowz": 3}, "unknown keys"), ([1], "expected the keys"), ({"rows": 0}, "missing|rows")]:
-        with pytest.raises(UsageError, match=says):
+    for wrong, message in [({"rowz": 3}, "unknown keys"), ([1], "expected the keys"), ({"rows": 0}, "missing|rows")]:
+        with pytest.raises(UsageError, match=message):
             from_plain(Grid, wrong, what="grid")

@@ -30,11 +30,11 @@ CLOCK = ScaledClock(1.0)
 SMALL = InsertionTask(grid=Grid(2, 3, 1.0))
 
 
-# A stand-in: an "image" is 12 numbers, a tracker sums what it has seen, a policy remembers its last answer.
+# Substitutes: an image is 12 numbers, the tracker sums its images, the policy keeps its last answer.
 
 
 class SumTracker:
-    """Keeps a state that depends on every image in its order."""
+    """A tracker whose state depends on all images and their order."""
 
     def __init__(self, sensor: int) -> None:
         self.state = np.full(12, float(sensor))
@@ -54,7 +54,7 @@ def sum_frame(tracked: Sequence[NDArray[np.float64]], stamp: float) -> TactileFr
 
 
 class EchoPolicy:
-    """Its answer depends on the map and on all answers since the reset."""
+    """A policy whose answer depends on the flow map and on all answers since the reset."""
 
     def __init__(self, gain: float = 1.0) -> None:
         self.gain = gain
@@ -74,7 +74,7 @@ Change = Callable[[Decision], Decision]
 
 
 def run_live(recorder: SessionRecorder, *, change: Change = lambda decision: decision, lose: int | None = None) -> None:
-    """Two insertions of three attempts; the cameras give more images than are tracked, and not in step."""
+    """Two insertions of three attempts; the cameras are not synchronized and send more images than are tracked."""
     rng = np.random.default_rng(5)
     policy = EchoPolicy()
     count = [0, 10]
@@ -168,8 +168,8 @@ def test_a_missing_image_is_an_error(tmp_path: Path) -> None:
         replayed(tmp_path / "a.mcap")
 
 
-class FussyTracker(SumTracker):
-    """Refuses one image, and keeps its state then."""
+class RejectingTracker(SumTracker):
+    """Rejects one image and keeps its state."""
 
     refused = b""
 
@@ -185,12 +185,12 @@ def test_an_image_that_the_tracker_rejects_is_an_error_only_if_required(tmp_path
     with SessionReader(tmp_path / "a.mcap") as session:
         data = {record.value.sequence: record.value.data for record in session.records(["/left/image"])}
         first = next(session.decisions())
-    fussy = PerceptionPipeline(FussyTracker, sum_frame)
-    FussyTracker.refused = data[first.tracked[0][1]]
-    assert not replayed(tmp_path / "a.mcap", perception=fussy)[0].identical
-    FussyTracker.refused = data[first.frames[0][0]]
+    rejecting = PerceptionPipeline(RejectingTracker, sum_frame)
+    RejectingTracker.refused = data[first.tracked[0][1]]
+    assert not replayed(tmp_path / "a.mcap", perception=rejecting)[0].identical
+    RejectingTracker.refused = data[first.frames[0][0]]
     with pytest.raises(PeerError, match="no markers"):
-        replayed(tmp_path / "a.mcap", perception=fussy)
+        replayed(tmp_path / "a.mcap", perception=rejecting)
 
 
 def test_difference_of_arrays() -> None:
@@ -199,14 +199,14 @@ def test_difference_of_arrays() -> None:
     assert difference(np.zeros(2), np.zeros(3)) == np.inf
 
 
-# The real tracker and a real checkpoint, through the command
+# The replay command with the marker tracker and a checkpoint
 
 LOOK = GelAppearance()
 MOUNT = CameraMount(pixels_per_mm=LOOK.pixels_per_mm)
 
 
 def untrained(path: Path, seed: int) -> Path:
-    """A checkpoint of random numbers."""
+    """A checkpoint with random weights."""
     rng = np.random.default_rng(seed)
     shape = Architecture(hidden=(8,))
     tensors = {name: 0.1 * rng.normal(size=size) for name, size in tensor_shapes(shape, INSERTION).items()}
@@ -271,7 +271,7 @@ def test_the_command_reports_identical_decisions(
     out = capsys.readouterr().out
     with SessionReader(real_session) as session:
         actions = {tuple(decision.action) for decision in session.decisions()}
-    assert len(actions) == 3 and all(0 < abs(x) < 8e-3 for x, _, _ in actions)  # the policy did answer
+    assert len(actions) == 3 and all(0 < abs(x) < 8e-3 for x, _, _ in actions)  # not zero: the policy was evaluated
     assert "all 3 decisions identical" in out and "note:" not in out
     drawn = cv2.imread(str(picture))
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
@@ -299,7 +299,7 @@ def test_the_command_rejects_wrong_input_with_one_line(
         recorder.metadata({})
     with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
         recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
-    for arguments, says in [
+    for arguments, message in [
         ([str(tmp_path / "none.mcap")], "No such file"),
         ([str(cut)], f"recover it with: gelflow recover {cut}"),
         ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
@@ -311,4 +311,4 @@ def test_the_command_rejects_wrong_input_with_one_line(
     ]:
         assert main(["replay", *arguments]) == 2
         error = capsys.readouterr().err
-        assert says in error and error.count("\n") == 1, error
+        assert message in error and error.count("\n") == 1, error

@@ -38,7 +38,7 @@ class PerceptionPipeline:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A recorded decision beside the recomputed one."""
+    """A recorded decision and the recomputed one."""
 
     recorded: Decision
     flow: FlowMap  # recomputed

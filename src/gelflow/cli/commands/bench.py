@@ -27,7 +27,7 @@ MEASUREMENTS = {
     "markers": "reading of a marker and its gradient, for each shape",
     "precision": "single and double precision: errors and speed",
     "startup": "imports and gelflow --help in fresh processes",
-    "tracking": "marker tracking: errors on images with known truth and speed, beside Lucas-Kanade and dense flow",
+    "tracking": "marker tracking: errors on images with known truth and speed, with Lucas-Kanade and dense flow",
     "growth": "time over the number of bodies, contact points, markers and environments",
 }
 _LONG = ("tracking", "growth")  # measured only on request
