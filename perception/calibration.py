@@ -36,7 +36,7 @@ _NEWTON_STEPS = 12  # of the inverse distortion; it converges earlier
 _MIN_INLIERS = 0.9  # fraction of inliers among the visible markers
 _EXACT = 1e-3  # [px]: residuals below do not discriminate models
 
-# Lens models beside the homography: (radial coefficients, whether the lens centre is fitted).
+# Lens models: (number of radial coefficients, whether the lens centre is fitted).
 _MODELS = ((0, False), (1, False), (2, False), (3, False), (1, True), (2, True), (3, True))
 
 Floats = NDArray[np.float64]

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """Settings of a training run beside its environment; stored in the checkpoint."""
+    """Settings of a training run, stored in the checkpoint."""
 
     attempts: int = 200_000  # total number of attempts
     minutes: float = float("inf")  # time limit [min]; a run that reaches it is not repeatable

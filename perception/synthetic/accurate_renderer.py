@@ -118,7 +118,7 @@ class AccurateGelRenderer:
     def _compose(
         self, clear: image_layers.Layer, contact: Contact | None, progress: float
     ) -> tuple[image_layers.Layer, image_layers.Layer]:
-        """The sharp image from the transmission `clear` of the print, and the opacity of what covers the dots."""
+        """The sharp image for the transmission `clear` of the print, and the opacity of highlights and occluders."""
         appearance = self.appearance
         shading = image_layers.shading(appearance, contact, self._angle) if contact else None
         picture = self._light.copy() if shading is None else self._light * shading

@@ -90,9 +90,9 @@ def dust(appearance: DegradedGelAppearance, rng: np.random.Generator) -> Layer:
     right, down = pixel_coordinates(appearance)
     left = np.ones_like(right)
     for _ in range(appearance.dust):
-        place = rng.uniform((0, 0), (appearance.width, appearance.height))
+        centre = rng.uniform((0, 0), (appearance.width, appearance.height))
         radius, wide, dark = rng.uniform(1.0, 2.2), rng.uniform(1.0, 1.6), rng.uniform(0.5, 0.8)
-        reach = np.hypot((right - place[0]) / wide, down - place[1])
+        reach = np.hypot((right - centre[0]) / wide, down - centre[1])
         left = left * (1 - dark * ndtr((radius - reach) / SHARP))
     return np.asarray(left, dtype=np.float32)
 
@@ -117,15 +117,15 @@ def occluder_radius(appearance: DegradedGelAppearance) -> float:
 def occluder_paths(appearance: DegradedGelAppearance, rng: np.random.Generator) -> NDArray[np.float64]:
     """Start and end of the path of each occluder, both outside the image [px], shape (occluders, 2, 2)."""
     middle = np.array([appearance.width, appearance.height]) / 2
-    far = float(np.linalg.norm(middle)) + 1.3 * occluder_radius(appearance)
+    distance = float(np.linalg.norm(middle)) + 1.3 * occluder_radius(appearance)
     first = rng.uniform(0, 2 * np.pi)
     paths = []
     for k in range(appearance.occluders):
         turn = first + 0.5 * np.pi * k * rng.uniform(0.6, 1.2)
-        way = np.array([np.cos(turn), np.sin(turn)])
+        direction = np.array([np.cos(turn), np.sin(turn)])
         aside = (-1) ** k * rng.uniform(0.2, 0.6) * middle[1]  # paths do not cross at the image centre
-        past = middle + aside * np.array([-way[1], way[0]])
-        paths.append((past - far * way, past + far * way))
+        past = middle + aside * np.array([-direction[1], direction[0]])
+        paths.append((past - distance * direction, past + distance * direction))
     return np.array(paths).reshape(-1, 2, 2)
 
 

@@ -109,9 +109,9 @@ class DotPatches:
         steep = np.maximum(np.hypot(right, down), np.float32(1e-6))
         variance = np.float32(SHARP**2)
         if self.motion_blur.any():
-            way = self.motion_blur.astype(np.float32)[:, :, None, None]
+            motion = self.motion_blur.astype(np.float32)[:, :, None, None]
             # A Gaussian edge with the variance of a box filter of the motion's length.
-            variance = variance + ((right * way[:, 0] + down * way[:, 1]) / steep) ** 2 / 12
+            variance = variance + ((right * motion[:, 0] + down * motion[:, 1]) / steep) ** 2 / 12
         return np.asarray(ndtr((1 - distance) / (steep * np.sqrt(variance))))
 
     def transmission(self, ink: NDArray[np.floating]) -> Layer:
@@ -174,9 +174,9 @@ class DotPrint:
     def _random_bridges(self, rng: np.random.Generator) -> list[tuple[int, int, float]]:
         """Disjoint pairs of printed neighbours, and the half width of the bar between them in radii."""
         number = np.arange(self.printed.size).reshape(self.appearance.grid.rows, self.appearance.grid.cols)
-        beside = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
-        below = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
-        pairs = np.concatenate([beside, below])
+        rightward = np.stack([number[:, :-1].ravel(), number[:, 1:].ravel()], axis=1)
+        downward = np.stack([number[:-1].ravel(), number[1:].ravel()], axis=1)
+        pairs = np.concatenate([rightward, downward])
         found: list[tuple[int, int, float]] = []
         free = self.printed.copy()
         for k in rng.permutation(len(pairs)):

@@ -23,6 +23,7 @@ def test_a_recorded_sequence_is_tracked(name: str, kind: str, median: float, hig
     """
     source, truth = image_source(str(DATA / name)), read_truth(truth_file(DATA / name))
     assert source.kind == kind
+    assert truth.made_from["appearance"]["grid"]  # the stored files have the former key "look"
     images = [frame.image for frame in source]
     assert len(images) == len(truth.position)
     tracker = MarkerTracker()
