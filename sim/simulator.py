@@ -193,7 +193,7 @@ class Simulator:
         if out is not None:
             self._batch.tactile(out)
             return out
-        self._batch.tactile()
+        self._batch.update_readings()
         if self._tactile is None:
             self._tactile = self._batch.readings
         return self._tactile
@@ -332,7 +332,7 @@ class Simulator:
             if not np.isfinite(start).all():
                 raise UsageError(f"{name}{np.argwhere(~np.isfinite(start))[0].tolist()} is not finite")
         try:
-            self._batch.rollout(*self._arguments(result))
+            self._batch.rollout(_arrays(result))
         except ValueError as error:
             raise UsageError(str(error)) from None
         return result
@@ -343,12 +343,7 @@ class Simulator:
         Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
         at which they were evaluated.
         """
-        result: NDArray[np.uint64] = self._batch.branches(*self._arguments(trajectory))
-        return result
-
-    @staticmethod
-    def _arguments(t: Trajectory) -> tuple[NDArray[Any], ...]:
-        return (t.u, t.q, t.v, t.anchors, t.anchored, t.history, t.halvings, t.status, t.read_after, t.tactile)
+        return self._batch.contact_modes(_arrays(trajectory))
 
     def rollout_gradient(
         self,
@@ -378,13 +373,16 @@ class Simulator:
                 return np.zeros(like.shape, self.dtype)
             return np.ascontiguousarray(np.broadcast_to(np.asarray(value, self.dtype), like.shape))
 
-        gradients = self._batch.rollout_transposed(
-            *self._arguments(trajectory),
-            shaped(q, trajectory.q),
-            shaped(v, trajectory.v),
-            shaped(anchors_end, trajectory.anchors[0]),
-            shaped(history_end, trajectory.history[0]),
-            shaped(tactile, trajectory.tactile),
-            params,
+        cotangent = _core.TrajectoryCotangent(
+            q=shaped(q, trajectory.q),
+            v=shaped(v, trajectory.v),
+            anchors_end=shaped(anchors_end, trajectory.anchors[0]),
+            history_end=shaped(history_end, trajectory.history[0]),
+            tactile=shaped(tactile, trajectory.tactile),
         )
-        return TrajectoryGradient(*gradients)
+        g = self._batch.rollout_vjp(_arrays(trajectory), cotangent, params)
+        return TrajectoryGradient(u=g.u, q=g.q, v=g.v, anchors=g.anchors, history=g.history, params=g.params)
+
+
+def _arrays(trajectory: Trajectory) -> _core.Trajectory:
+    return _core.Trajectory(**vars(trajectory))

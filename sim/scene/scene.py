@@ -1,10 +1,9 @@
 """The description of a scene as plain, immutable data."""
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,9 @@ from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.toml_tables import suggestion
+
+if TYPE_CHECKING:
+    from gelflow.sim import _core
 
 Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
@@ -110,119 +112,32 @@ class Scene:
         start = sum(len(p.positions) for p in self.pads[:index])
         return slice(start, start + len(self.pads[index].positions))
 
-    def build(self) -> Any:
-        """Compile the scene to a model of the C++ core (gelflow.sim._core.Model)."""
-        core = importlib.import_module("gelflow.sim._core")  # lazy: loading a scene does not need the compiled core
-        return core.Model(self.describe_to(core.ModelSpec()))
+    def model_spec(self) -> "_core.ModelSpec":
+        """The definitions of all elements of the scene, from which the C++ core builds a model.
 
-    def describe_to(self, spec: Any) -> Any:
-        """Add every element of the scene to `spec` (gelflow.sim._core.ModelSpec) and return it."""
-        spec.gravity = tuple(self.gravity)
+        Raises ValueError if they are inconsistent.
+        """
+        from gelflow.sim import _core  # lazy: loading a scene does not need the compiled core
+        from gelflow.sim.scene.model_spec import add_actuators, add_bodies, add_contacts
+
+        spec = _core.ModelSpec()
+        spec.gravity = self.gravity
         spec.step = self.step
         spec.integrator = self.integrator
         spec.tolerance = self.tolerance
-        for index, body in enumerate(self.bodies):
-            spec.add_body(
-                body.name, body.parent, body.pose.position, body.pose.quaternion, body.mass, body.com, body.inertia
-            )
-            for joint, limit in zip(self.joints, self.limits, strict=True):
-                if joint.body == index:
-                    _add_joint(spec, joint, limit)
-        shapes = {shape.name: _add_shape(spec, shape) for shape in self.shapes}
-        points = {
-            p.name: spec.add_points(
-                p.name,
-                p.body,
-                p.points,
-                p.weights,
-                radius=p.radius,
-                pos=p.pose.position,
-                quat=p.pose.quaternion,
-                areas=p.areas if p.per_area else None,
-            )
-            for p in self.points
-        }
-        for contact in self.contacts:
-            spec.add_contact(
-                contact.name,
-                points[contact.points],
-                shapes[contact.shape],
-                law=contact.law,
-                damping=contact.damping,
-                **contact.params,
-            )
-        for pad in self.pads:
-            frames = [np.ascontiguousarray(pad.axes[..., axis]) for axis in range(3)]
-            spec.add_pad(
-                pad.name,
-                pad.body,
-                pad.positions,
-                *frames,
-                shapes=[shapes[name] for name in pad.against],
-                law=pad.law,
-                weights=pad.weights,
-                pos=pad.pose.position,
-                quat=pad.pose.quaternion,
-                pushes=pad.collides,
-                **pad.params,
-            )
-        for a in self.actuators:
-            spec.add_actuator(
-                a.name,
-                a.joint,
-                kind=a.kind,
-                gear=a.gear,
-                kp=a.kp,
-                kd=a.kd,
-                force_lower=a.force_range[0],
-                force_upper=a.force_range[1],
-                ctrl_lower=a.ctrl_range[0],
-                ctrl_upper=a.ctrl_range[1],
-                gain=a.gain,
-                bias=a.bias,
-            )
+        add_bodies(spec, self.bodies, self.joints, self.limits)
+        add_contacts(spec, self.shapes, self.points, self.contacts, self.pads)
+        add_actuators(spec, self.actuators)
         return spec
+
+    def build(self) -> "_core.Model":
+        """The model of the scene in the C++ core."""
+        from gelflow.sim import _core
+
+        return _core.Model(self.model_spec())
 
     def _joint(self, name: str) -> JointDef:
         return self.joints[_index("joint", name, [joint.name for joint in self.joints])]
-
-
-def _add_shape(spec: Any, shape: ShapeDef) -> int:
-    geometry = (shape.pose.position, shape.pose.quaternion, shape.size)
-    if shape.grid is None:
-        return int(spec.add_shape(shape.name, shape.body, shape.kind, *geometry, rounding=shape.rounding))
-    return int(
-        spec.add_shape(
-            shape.name,
-            shape.body,
-            "grid",
-            *geometry,
-            origin=shape.grid.origin,
-            spacing=shape.grid.spacing,
-            coefficients=shape.grid.coefficients,
-        )
-    )
-
-
-def _add_joint(spec: Any, joint: JointDef, limit: JointLimit) -> None:
-    low, high = joint.range or (-np.inf, np.inf)
-    spec.add_joint(
-        joint.name,
-        joint.body,
-        joint.type,
-        joint.pos,
-        joint.axis,
-        damping=joint.damping,
-        armature=joint.armature,
-        stiffness=joint.stiffness,
-        springref=joint.springref,
-        lower=low,
-        upper=high,
-        limit_stiffness=limit.stiffness,
-        limit_damping=limit.damping,
-        ref=joint.ref,
-        frictionloss=joint.frictionloss,
-    )
 
 
 def _index(kind: str, name: str, names: list[str]) -> int:

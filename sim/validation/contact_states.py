@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from gelflow.sim import _core
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, spline_grid
+from gelflow.sim.scene.model_spec import core_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_meshes import bracket_distance
 
@@ -44,7 +45,7 @@ def converged_simulator(name: str, law: str, integrator: str) -> Simulator:
     """Simulator of a scene, solved to rounding errors; the rolling pad has 24 × 24 markers."""
     overrides = {"pads.pad.rows": 24, "pads.pad.cols": 24} if name == "rolling" else {}
     scene = load_scene(name, friction=law, overrides={**overrides, "integrator": integrator})
-    spec = scene.describe_to(_core.ModelSpec())
+    spec = scene.model_spec()
     spec.polish = POLISH
     sim = Simulator(_core.Model(spec))
     sim.scene = scene
@@ -153,25 +154,36 @@ def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator
     spec = _core.ModelSpec()
     spec.polish = POLISH
     spec.integrator = integrator
-    turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
-    hinge = spec.add_joint("turn", turret, "hinge", (0, 0, 0), (0.3, 0.2, 1), damping=1e-3, frictionloss=1e-4)
-    carriage = spec.add_body("carriage", -1, (0, 0, 0), (1, 0, 0, 0), 0.05, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    turret = spec.add_body(_core.BodyDef(name="turret", mass=0.1, inertia=(1e-4, 1e-4, 1e-4, 0, 0, 0)))
+    hinge = spec.add_joint(
+        _core.JointDef(name="turn", body=turret, type="hinge", axis=(0.3, 0.2, 1), damping=1e-3, frictionloss=1e-4)
+    )
+    carriage = spec.add_body(_core.BodyDef(name="carriage", mass=0.05, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0)))
     slides = [
-        spec.add_joint(name, carriage, "slide", (0, 0, 0), axis, damping=0.5)
+        spec.add_joint(_core.JointDef(name=name, body=carriage, type="slide", axis=axis, damping=0.5))
         for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
     ]
-    hand = spec.add_body("hand", carriage, (0, 0, 0.005), (1, 0, 0, 0), 0.02, (0, 0, 1e-3), (1e-5, 2e-5, 1e-5, 0, 0, 0))
-    spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
-    grid_arguments: dict[str, Any] = {}
-    if kind == "mesh":
-        grid = bracket_grid()
-        grid_arguments = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
-    in_core = "grid" if kind == "mesh" else kind
-    shape = spec.add_shape("shape", turret, in_core, (1e-3, 0, 0), (1, 0, 0, 0), SHAPES[kind], **grid_arguments)
+    hand = spec.add_body(
+        _core.BodyDef(
+            name="hand",
+            parent=carriage,
+            pos=(0, 0, 0.005),
+            mass=0.02,
+            com=(0, 0, 1e-3),
+            inertia=(1e-5, 2e-5, 1e-5, 0, 0, 0),
+        )
+    )
+    spec.add_joint(_core.JointDef(name="ball", body=hand, type="ball", pos=(0, 0, 0.002), damping=1e-3))
+    core_kind, grid = ("grid", core_grid(bracket_grid())) if kind == "mesh" else (kind, None)
+    shape = spec.add_shape(
+        _core.ShapeDef(name="shape", body=turret, kind=core_kind, pos=(1e-3, 0, 0), size=SHAPES[kind], grid=grid)
+    )
     _add_cloud(spec, hand, {"press": shape}, law, rng)
-    spec.add_actuator("turn", hinge, "velocity", kd=2e-3)
-    spec.add_actuator("x", slides[0], "general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1)
-    spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0, ctrl_lower=-1.0, ctrl_upper=1.0)
+    spec.add_actuator(_core.ActuatorDef(name="turn", joint=hinge, kind="velocity", kd=2e-3))
+    spec.add_actuator(_core.ActuatorDef(name="x", joint=slides[0], kind="general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1))
+    spec.add_actuator(
+        _core.ActuatorDef(name="z", joint=slides[1], kind="position", kp=300.0, kd=1.0, ctrl_lower=-1.0, ctrl_upper=1.0)
+    )
     sim = Simulator(_core.Model(spec))
     height = _TOPS[kind] + 0.012 - 0.005
     sim.q[0, sim.joint_q("z")] = height
@@ -185,17 +197,18 @@ def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Sim
     """A spinning free body, centre of mass offset, on the ground and at a pusher; and random controls (steps, 1)."""
     spec = _core.ModelSpec()
     spec.polish, spec.integrator, spec.gravity = POLISH, integrator, (0.0, 0.0, -60.0)  # strong enough to keep contact
-    upright = (1.0, 0.0, 0.0, 0.0)
     body = spec.add_body(
-        "body", -1, (0, 0, 0), upright, 0.05, (2e-3, -1e-3, 3e-3), (3e-6, 4e-6, 5e-6, 2e-7, -3e-7, 4e-7)
+        _core.BodyDef(name="body", mass=0.05, com=(2e-3, -1e-3, 3e-3), inertia=(3e-6, 4e-6, 5e-6, 2e-7, -3e-7, 4e-7))
     )
-    spec.add_joint("free", body, "free", (0, 0, 0), (0, 0, 1))
-    pusher = spec.add_body("pusher", -1, (-0.03, 0, 0.01), upright, 0.02, (0, 0, 0), (1e-6, 1e-6, 1e-6, 0, 0, 0))
-    slide = spec.add_joint("x", pusher, "slide", (0, 0, 0), (1, 0, 0), damping=0.5)
-    ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (0.98, 0.14, 0.14, 0.02), (0, 0, 0))
-    ball = spec.add_shape("ball", pusher, "sphere", (0, 0, 0), upright, (0.02, 0, 0))
+    spec.add_joint(_core.JointDef(name="free", body=body, type="free"))
+    pusher = spec.add_body(
+        _core.BodyDef(name="pusher", pos=(-0.03, 0, 0.01), mass=0.02, inertia=(1e-6, 1e-6, 1e-6, 0, 0, 0))
+    )
+    slide = spec.add_joint(_core.JointDef(name="x", body=pusher, type="slide", axis=(1, 0, 0), damping=0.5))
+    ground = spec.add_shape(_core.ShapeDef(name="ground", kind="plane", quat=(0.98, 0.14, 0.14, 0.02)))
+    ball = spec.add_shape(_core.ShapeDef(name="ball", body=pusher, kind="sphere", size=(0.02, 0, 0)))
     _add_cloud(spec, body, {"on ground": ground, "on pusher": ball}, law, rng)
-    spec.add_actuator("push", slide, "motor")
+    spec.add_actuator(_core.ActuatorDef(name="push", joint=slide, kind="motor"))
     sim = Simulator(_core.Model(spec))
     sim.q[0, :3] = 0, 0, 0.011
     sim.v[0, 3:6] = rng.normal(size=3) * 60  # about 0.3 rad per step
@@ -208,10 +221,13 @@ def _add_cloud(spec: Any, body: int, contacts: dict[str, int], law: str, rng: np
     """Add points around a body, their contacts with shapes (contact name → shape), and markers just outside of them."""
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
-    points = spec.add_points("cloud", body, cloud, np.ones(60))
+    points = spec.add_points(_core.PointsDef(name="cloud", body=body, points=cloud))
     numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.4, "kd": 20.0}
     numbers["ks"] = 100.0 if law == "elastic" else 0.0
     for name, shape in contacts.items():
-        spec.add_contact(name, points, shape, **numbers)
-    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
-    spec.add_pad("skin", body, cloud * 1.01, *axes, shapes=list(contacts.values()), **{**numbers, "kn": 50.0})
+        spec.add_contact(_core.ContactDef(name=name, points=points, shape=shape, **numbers))
+    spec.add_pad(
+        _core.PadDef(
+            name="skin", body=body, positions=cloud * 1.01, shapes=list(contacts.values()), **{**numbers, "kn": 50.0}
+        )
+    )

@@ -6,7 +6,7 @@ has the same points, shapes and anchors as markers of stiffness 1, whose forces 
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +22,10 @@ Array = NDArray[np.float64]
 _UNBOUNDED = 1e18  # friction coefficient without slip
 
 
-class Describes(Protocol):
-    """An object that adds its parts to a ModelSpec, such as `gelflow.sim.Scene`."""
+class HasModelSpec(Protocol):
+    """An object with the definitions of a model, such as `gelflow.sim.Scene`."""
 
-    def describe_to(self, spec: Any) -> Any: ...
+    def model_spec(self) -> _core.ModelSpec: ...
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,13 @@ class EnergyGauge:
 
     Parameters
     ----------
-    scene: the `Scene`, or another object that described the simulator's model
+    scene: the `Scene`, or another object with the definitions of the simulator's model
     num_envs: number of environments of the simulators
     """
 
-    def __init__(self, scene: Describes, *, num_envs: int = 1) -> None:
-        self._parts = _Parts()
-        scene.describe_to(self._parts)
-        self._probe = Simulator(_core.Model(self._parts.spec), num_envs=num_envs)
+    def __init__(self, scene: HasModelSpec, *, num_envs: int = 1) -> None:
+        spec, self._weights = _probe_spec(scene.model_spec())
+        self._probe = Simulator(_core.Model(spec), num_envs=num_envs)
 
     def read(self, sim: Simulator) -> Energy:
         """Energy of the present state of a simulator."""
@@ -69,7 +68,7 @@ class EnergyGauge:
     def points(self, sim: Simulator) -> tuple[Array, Array]:
         """Depth (N, points), 0 outside, and strain (N, points, 3) in the body's axes, of all contact points [m].
 
-        Points are ordered by contact, as in the scene.
+        Points are ordered by contact: those of `ModelSpec.contacts`, then those of colliding pads.
         """
         probe, numbers = self._probe, set(CONTACT_PARAMS)
         columns = {name: i for i, name in enumerate(sim.model.param_names)}
@@ -78,12 +77,12 @@ class EnergyGauge:
                 probe.params[:, i] = sim.params[:, columns[name]]
         probe.q[:], probe.v[:] = sim.q, 0
         probe.anchored[:] = 0
-        first = 0
-        for block, count in zip(self._parts.anchors, self._parts.counts, strict=True):
-            if block is not None:
-                probe.anchors[:, first : first + count] = sim.anchors[:, block : block + count]
-                probe.anchored[:, first : first + count] = sim.anchored[:, block : block + count]
-            first += count
+        for name, start in _anchor_starts(sim).items():
+            if start >= 0:
+                own = probe.pad(name)
+                theirs = slice(start, start + own.stop - own.start)
+                probe.anchors[:, own] = sim.anchors[:, theirs]
+                probe.anchored[:, own] = sim.anchored[:, theirs]
         forces = []
         for mu in (0.0, _UNBOUNDED):
             for name in probe.model.pad_names:
@@ -93,10 +92,11 @@ class EnergyGauge:
 
     def _stored(self, sim: Simulator, depth: Array, strain: Array) -> tuple[Array, Array]:
         contact, friction = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
-        for n, name in enumerate(self._probe.model.pad_names):
-            own, weights = self._probe.pad(name), self._parts.weights[n]
+        anchor_starts = _anchor_starts(sim)
+        for name, weights in self._weights.items():
+            own = self._probe.pad(name)
             contact += 0.5 * _number(sim, name, "kn") * (depth[:, own] ** 2 @ weights)
-            if self._parts.anchors[n] is not None:
+            if anchor_starts[name] >= 0:
                 friction += 0.5 * _number(sim, name, "ks") * ((strain[:, own] ** 2).sum(2) @ weights)
         return contact, friction
 
@@ -150,87 +150,66 @@ def _joints(sim: Simulator) -> tuple[Array, Array]:
     return springs, limits
 
 
-class _Parts:
-    """Stands in for ModelSpec: builds the probe, with markers in place of contact points."""
+def _anchor_starts(sim: Simulator) -> dict[str, int]:
+    """First anchor of each contact, by name; -1 under the viscous law."""
+    return dict(zip(sim.model.contact_names, sim.model.contact_anchors, strict=True))
 
-    gravity: Any
-    step: float
-    integrator: str
-    tolerance: float
 
-    def __init__(self) -> None:
-        self.spec = _core.ModelSpec()
-        self.anchors: list[int | None] = []  # first anchor of each contact; None without anchors
-        self.counts: list[int] = []  # points of each contact
-        self.weights: list[Array] = []
-        self._anchors = 0
-        self._points: list[tuple[int, Array, Array, float, dict[str, Array]]] = []
-        self._shapes: list[tuple[Any, ...]] = []
+def _probe_spec(spec: _core.ModelSpec) -> tuple[_core.ModelSpec, dict[str, Array]]:
+    """The probe: the same bodies and shapes, a pad in place of each contact; and the weights of its points, by name.
 
-    def add_body(self, *args: Any, **more: Any) -> int:
-        return int(self.spec.add_body(*args, **more))
-
-    def add_joint(self, *args: Any, **more: Any) -> None:
-        self.spec.add_joint(*args, **more)
-
-    def add_actuator(self, *args: Any, **more: Any) -> None:
-        pass
-
-    def add_shape(self, name: str, body: int, kind: str, pos: Any, quat: Any, size: Any, **more: Any) -> int:
-        self._shapes.append((name, body, kind, pos, quat, size))
-        self.spec.add_shape(name, body, kind, pos, quat, size, **more)
-        return len(self._shapes) - 1
-
-    def add_points(
-        self,
-        name: str,
-        body: int,
-        points: ArrayLike,
-        weights: ArrayLike,
-        radius: float = 0.0,
-        pos: ArrayLike = (0, 0, 0),
-        quat: ArrayLike = (1, 0, 0, 0),
-        areas: Any = None,
-    ) -> int:
-        place = {"pos": np.array(pos, float), "quat": np.array(quat, float)}
-        self._points.append((body, np.array(points, float), np.array(weights, float), radius, place))
-        return len(self._points) - 1
-
-    def add_contact(self, name: str, points: int, shape: int, *, law: str = "viscous", **numbers: Any) -> None:
-        body, places, weights, radius, place = self._points[points]
-        if radius > 0:  # lowest point of a sphere: its centre against a plane shifted by the radius
-            owner, on, kind, pos, quat, size = self._shapes[shape]
-            w, x, y, z = np.asarray(quat, float) / np.linalg.norm(quat)
-            normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-            shape = self.add_shape(f"{owner} below {name}", on, kind, np.asarray(pos) + radius * normal, quat, size)
-        axes = [np.tile(axis, (len(places), 1)) for axis in np.eye(3)]
-        self.spec.add_pad(
-            name, body, places, *axes, shapes=[shape], law="elastic", kn=1.0, kt=0.0, mu=0.0, kd=0.0, ks=1.0, **place
+    The pads are elastic, of stiffness 1, so that marker i has anchor i.
+    """
+    result, shapes, weights = _core.ModelSpec(), spec.shapes, {}
+    for body in spec.bodies:
+        result.add_body(body)
+    for joint in spec.joints:
+        result.add_joint(joint)
+    for shape in shapes:
+        result.add_shape(shape)
+    sets = spec.points
+    contacts = [(c.name, sets[c.points], c.shape) for c in spec.contacts]
+    for pad in spec.pads:
+        if pad.collides:
+            points = _core.PointsDef(
+                name=pad.name, body=pad.body, points=pad.positions, weights=pad.weights, pos=pad.pos, quat=pad.quat
+            )
+            contacts += [(_pad_contact(pad, shapes[index]), points, index) for index in pad.shapes]
+    for name, points, index in contacts:
+        touched = index if points.radius == 0 else result.add_shape(_raised(shapes[index], points.radius, name))
+        result.add_pad(
+            _core.PadDef(
+                name=name,
+                body=points.body,
+                positions=points.points,
+                shapes=[touched],
+                law="elastic",
+                kn=1.0,
+                kt=0.0,
+                mu=0.0,
+                kd=0.0,
+                ks=1.0,
+                pos=points.pos,
+                quat=points.quat,
+            )
         )
-        self.weights.append(weights)
-        self.counts.append(len(places))
-        self.anchors.append(self._anchors if law == "elastic" else None)
-        self._anchors += len(places) if law == "elastic" else 0
+        weights[name] = np.ones(len(points.points)) if points.weights is None else np.array(points.weights)
+    return result, weights
 
-    def add_pad(
-        self,
-        name: str,
-        body: int,
-        positions: ArrayLike,
-        *axes: Any,
-        shapes: Any,
-        law: str = "viscous",
-        weights: ArrayLike | None = None,
-        pos: ArrayLike = (0, 0, 0),
-        quat: ArrayLike = (1, 0, 0, 0),
-        pushes: bool = False,
-        **_: Any,
-    ) -> None:
-        count = len(np.asarray(positions))
-        if not pushes:
-            self._anchors += count * len(shapes) if law == "elastic" else 0
-            return
-        points = self.add_points(name, body, positions, np.ones(count) if weights is None else weights, 0.0, pos, quat)
-        for shape in shapes:
-            own = name if len(shapes) == 1 else f"{name}/{self._shapes[shape][0]}"
-            self.add_contact(own, points, shape, law=law)
+
+def _pad_contact(pad: _core.PadDef, shape: _core.ShapeDef) -> str:
+    """The name that the core gives to the contact of a colliding pad with a shape."""
+    return pad.name if len(pad.shapes) == 1 else f"{pad.name}/{shape.name}"
+
+
+def _raised(plane: _core.ShapeDef, radius: float, contact: str) -> _core.ShapeDef:
+    """The plane raised by the radius of a sphere: its distance to the centre is that of `plane` to the sphere."""
+    normal = rotate(plane.quat, np.array([0.0, 0.0, 1.0]))
+    return _core.ShapeDef(
+        name=f"{plane.name} below {contact}",
+        body=plane.body,
+        kind=plane.kind,
+        pos=plane.pos + radius * np.array(normal),
+        quat=plane.quat,
+        size=plane.size,
+    )

@@ -161,6 +161,15 @@ def compare_to_dual_numbers(
     differences: list[tuple[str, float, float]] = []  # input, difference, size
     tries = [(only, group == only) for only in np.unique(group)] if groups else []
     tries += [(only, np.ones(len(scale), bool)) for only in [*parts, "all"]] * directions
+    start = _core.RolloutInput(
+        params=sim.params[0],
+        q=sim.q[0],
+        v=sim.v[0],
+        anchors=sim.anchors[0],
+        anchored=sim.anchored[0],
+        history=sim.history[0],
+        u=loss.u,
+    )
     for only, chosen in tries:
         d = {name: np.zeros_like(value) for name, value in gradient.items()}
         for name in parts if only == "all" else [only if only in parts else "params"]:
@@ -168,15 +177,16 @@ def compare_to_dual_numbers(
         d["anchors"][~set_now] = 0
         d["params"] *= scale * chosen
         d["history"][-1:] = 0  # flag of an existing previous step
-        exact = _core.directional_rollout(
-            model, sim.params[0], sim.q[0], sim.v[0], sim.anchors[0], sim.anchored[0], sim.history[0], loss.u,
-            d["params"], d["q"], d["v"], d["anchors"], d["history"], d["u"],
-        )  # fmt: skip
-        along = loss.weights.ravel() @ exact["d" + loss.output]
-        size = np.linalg.norm(loss.weights) * np.linalg.norm(exact["d" + loss.output])
+        direction = _core.RolloutInput(
+            params=d["params"], q=d["q"], v=d["v"], anchors=d["anchors"], history=d["history"], u=d["u"]
+        )
+        exact = _core.directional_rollout(model, start, direction)
+        derivative = getattr(exact.derivative, loss.output)
+        along = loss.weights.ravel() @ derivative
+        size = np.linalg.norm(loss.weights) * np.linalg.norm(derivative)
         ours = sum(float((gradient[name] * d[name]).sum()) for name in gradient)
         differences.append((str(only), abs(float(along) - ours), float(size)))
-        if np.abs(exact["q"] - trajectory.q[-1, 0]).max() > 1e-9:
+        if np.abs(exact.end.q - trajectory.q[-1, 0]).max() > 1e-9:
             raise SimulationError("the run with dual numbers differs from the recorded run")
     floor = 1e-6 * max(size for *_, size in differences) + 1e-300  # below it rounding errors dominate
     error, most = max((difference / max(size, floor), only) for only, difference, size in differences)

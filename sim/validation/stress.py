@@ -102,7 +102,7 @@ class StressTest:
         rng, n = self._rng, self.envs
         scene = self._scene(batch)
         extreme = set(QUANTITIES) if batch.kind == "all" else {batch.kind}
-        spec = scene.describe_to(_core.ModelSpec())
+        spec = scene.model_spec()
         spec.step = float(self._log(1e-6, 5e-2, 1)[0] if "step" in extreme else self._log(1e-3, 1e-2, 1)[0])
         sim = Simulator(_core.Model(spec), num_envs=n, precision=batch.precision, threads=self.threads)
         for i, name in enumerate(sim.model.param_names):

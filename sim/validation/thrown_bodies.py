@@ -55,24 +55,30 @@ class ThrownBody:
         points, _, radius = _body(self.kind)
         return float(np.linalg.norm(points, axis=1).max()) + radius
 
-    def describe_to(self, spec: Any) -> Any:
-        """Add all parts to a ModelSpec; returns it."""
+    def model_spec(self) -> _core.ModelSpec:
+        """The definitions of the body and the planes."""
+        spec = _core.ModelSpec()
         points, moments, radius = _body(self.kind)
         spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), self.step, self.tolerance
         spec.integrator = self.integrator
-        still, upright = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        body = spec.add_body("body", -1, still, upright, MASS, self.center, (*(MASS * moments), 0.0, 0.0, 0.0))
+        body = spec.add_body(
+            _core.BodyDef(name="body", mass=MASS, com=self.center, inertia=(*(MASS * moments), 0.0, 0.0, 0.0))
+        )
         if self.has_rotation:
-            spec.add_joint("free", body, "free", still, (0.0, 0.0, 1.0))
+            spec.add_joint(_core.JointDef(name="free", body=body, type="free"))
         else:
             for name, axis in zip("xyz", np.eye(3), strict=True):
-                spec.add_joint(name, body, "slide", still, axis)
-        sampled = spec.add_points("points", body, points, np.ones(len(points)), radius=radius)
+                spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
+        sampled = spec.add_points(_core.PointsDef(name="points", body=body, points=points, radius=radius))
         lean = (np.cos(np.pi / 8), 0.0, -np.sin(np.pi / 8), 0.0)  # normal (−1, 0, 1) / √2
-        planes = {"ground": (still, upright), "slope": ((3 * SIZE, 0.0, 0.0), lean)}
+        planes = {"ground": ((0, 0, 0), (1, 0, 0, 0)), "slope": ((3 * SIZE, 0, 0), lean)}
         for name, (pos, quat) in planes.items():
-            plane = spec.add_shape(name, -1, "plane", pos, quat, (1.0, 1.0, 1.0))
-            spec.add_contact(f"on {name}", sampled, plane, law=self.law, damping=self.damping, **self.numbers)
+            plane = spec.add_shape(_core.ShapeDef(name=name, kind="plane", pos=pos, quat=quat, size=(1.0, 1.0, 1.0)))
+            spec.add_contact(
+                _core.ContactDef(
+                    name=f"on {name}", points=sampled, shape=plane, law=self.law, damping=self.damping, **self.numbers
+                )
+            )
         return spec
 
 
@@ -88,7 +94,7 @@ class EnergyChange:
 
 def throw_bodies(body: ThrownBody, rng: np.random.Generator, *, bodies: int, steps: int) -> EnergyChange:
     """ThrownBody bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
-    sim = Simulator(_core.Model(body.describe_to(_core.ModelSpec())), num_envs=bodies, threads=1)
+    sim = Simulator(_core.Model(body.model_spec()), num_envs=bodies, threads=1)
     gauge = EnergyGauge(body, num_envs=bodies)
     speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)
     sim.v[:, :3] = speed * rng.normal(size=(bodies, 3))

@@ -77,7 +77,7 @@ def _workloads(sizes: Sequence[int], steps: int) -> tuple[dict[Key, Workload], d
     run = motion_run(scene, steps=steps)
 
     def batch(size: int, threads: int | None) -> Simulator:
-        sim = simulator(scene.describe_to, num_envs=size, threads=threads)
+        sim = simulator(scene.model_spec, num_envs=size, threads=threads)
         perturb_stiffness(sim)
         return sim
 
@@ -88,7 +88,7 @@ def _workloads(sizes: Sequence[int], steps: int) -> tuple[dict[Key, Workload], d
     checks = {}
     for size in sizes:
         all_cores = batch(size, None)
-        checks[size] = check_accuracy(run, all_cores, scene.describe_to)
+        checks[size] = check_accuracy(run, all_cores, scene.model_spec)
         workloads["step", size, 1] = warmed_up(run.workload, batch(size, 1))
         workloads["step", size, None] = warmed_up(run.workload, all_cores)
         if size <= LARGEST_ROLLOUT:

@@ -55,7 +55,7 @@ class _Setup:
     def __init__(self, case: GradientBenchmark, steps: int) -> None:
         self.scene: Scene = rolling_scene(case.side) if case.side else load_scene(case.scene, friction="viscous")
         self.run: TimedRun = motion_run(self.scene, steps=START + steps)
-        self.sim = simulator(self.scene.describe_to)
+        self.sim = simulator(self.scene.model_spec)
         rows = [u for count, u, _ in self.run.blocks for _ in range(count)]
         self._before, self._u = rows[:START], np.array(rows[START:])[:, np.newaxis]
         self._reads = range(1, len(rows) - START + 1) if case.read else ()
@@ -92,8 +92,8 @@ class _Setup:
 
     def checks(self) -> tuple[AccuracyCheck, float]:
         """Accuracy of the run, and relative difference of the gradient to that of the converged reference."""
-        reference = converged_reference(self.sim, self.scene.describe_to)
-        accuracy = check_accuracy(self.run, simulator(self.scene.describe_to), self.scene.describe_to)
+        reference = converged_reference(self.sim, self.scene.model_spec)
+        accuracy = check_accuracy(self.run, simulator(self.scene.model_spec), self.scene.model_spec)
         self.start(reference)
         right = self.backward(reference, self.forward(reference))
         found = self.both()

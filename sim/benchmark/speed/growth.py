@@ -2,17 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, time_interleaved
+from gelflow.sim import _core
 from gelflow.sim.benchmark.speed.batch import perturb_stiffness
 from gelflow.sim.benchmark.speed.rolling import rolling_run, rolling_scene
 from gelflow.sim.benchmark.speed.timed_run import (
     AccuracyCheck,
-    Describe,
+    SpecFactory,
     TimedRun,
     check_accuracy,
     motion_run,
@@ -62,69 +62,84 @@ def exponent(sizes: Sequence[int], seconds: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes[-count:]), np.log(seconds[-count:]), 1)[0])
 
 
-def balls(count: int) -> Describe:
+def balls(count: int) -> SpecFactory:
     """Independent balls at rest on the ground, each on its own slide joint."""
 
-    def describe(spec: Any) -> Any:
-        ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
+    def make_spec() -> _core.ModelSpec:
+        spec = _core.ModelSpec()
+        ground = spec.add_shape(_core.ShapeDef(name="ground", kind="plane"))
         for i in range(count):
             body = _body(spec, f"ball{i}", -1, (3 * RADIUS * i, 0, RADIUS))
-            spec.add_joint(f"z{i}", body, "slide", (0, 0, 0), (0, 0, 1), damping=0.01)
-            points = spec.add_points(f"lowest{i}", body, np.array([[0, 0, -RADIUS]]), [1.0])
-            spec.add_contact(f"ground{i}", points, ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3)
+            spec.add_joint(_core.JointDef(name=f"z{i}", body=body, type="slide", damping=0.01))
+            points = spec.add_points(_core.PointsDef(name=f"lowest{i}", body=body, points=np.array([[0, 0, -RADIUS]])))
+            spec.add_contact(
+                _core.ContactDef(name=f"ground{i}", points=points, shape=ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3)
+            )
         return spec
 
-    return describe
+    return make_spec
 
 
-def chain(count: int) -> Describe:
+def chain(count: int) -> SpecFactory:
     """A swinging chain of balls on hinge joints whose last ball slides on a wall."""
 
-    def describe(spec: Any) -> Any:
-        wall = spec.add_shape("wall", -1, "plane", (-1e-4, 0, 0), (np.sqrt(0.5), 0, np.sqrt(0.5), 0), (0, 0, 0))
+    def make_spec() -> _core.ModelSpec:
+        spec = _core.ModelSpec()
+        wall = spec.add_shape(
+            _core.ShapeDef(name="wall", kind="plane", pos=(-1e-4, 0, 0), quat=(np.sqrt(0.5), 0, np.sqrt(0.5), 0))
+        )
         parent = -1
         for i in range(count):
             parent = _body(spec, f"link{i}", parent, (0, 0, -2 * RADIUS if i else 0.0))
-            spec.add_joint(f"hinge{i}", parent, "hinge", (0, 0, RADIUS), (0, 1, 0), damping=1e-4)
-        points = spec.add_points("end", parent, np.array([[0, 0, -RADIUS]]), [1.0])
-        spec.add_contact("wall", points, wall, kn=1e2, kt=0.1, mu=0.3, kd=1e2)
+            spec.add_joint(
+                _core.JointDef(
+                    name=f"hinge{i}", body=parent, type="hinge", pos=(0, 0, RADIUS), axis=(0, 1, 0), damping=1e-4
+                )
+            )
+        points = spec.add_points(_core.PointsDef(name="end", body=parent, points=np.array([[0, 0, -RADIUS]])))
+        spec.add_contact(_core.ContactDef(name="wall", points=points, shape=wall, kn=1e2, kt=0.1, mu=0.3, kd=1e2))
         return spec
 
-    return describe
+    return make_spec
 
 
-def plate(count: int) -> Describe:
+def plate(count: int) -> SpecFactory:
     """A plate that slides on the ground, with `count` contact points."""
 
-    def describe(spec: Any) -> Any:
-        ground = spec.add_shape("ground", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
+    def make_spec() -> _core.ModelSpec:
+        spec = _core.ModelSpec()
+        ground = spec.add_shape(_core.ShapeDef(name="ground", kind="plane"))
         body = _body(spec, "plate", -1, (0, 0, 0))
         for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
-            joint = spec.add_joint(name, body, "slide", (0, 0, 0), axis, damping=0.01)
+            joint = spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis, damping=0.01))
             if name == "x":
-                spec.add_actuator("x", joint, "motor")
+                spec.add_actuator(_core.ActuatorDef(name="x", joint=joint, kind="motor"))
         turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
         spread = 0.05 * np.sqrt((np.arange(count) + 0.5) / count)
         at = np.stack([spread * np.cos(turn), spread * np.sin(turn), np.full(count, -1e-5)], axis=1)
-        points = spec.add_points("face", body, at, np.full(count, 1.0 / count))
-        spec.add_contact("ground", points, ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3)
+        points = spec.add_points(
+            _core.PointsDef(name="face", body=body, points=at, weights=np.full(count, 1.0 / count))
+        )
+        spec.add_contact(_core.ContactDef(name="ground", points=points, shape=ground, kn=1e4, kt=1.0, mu=0.5, kd=1e3))
         return spec
 
-    return describe
+    return make_spec
 
 
-def _body(spec: Any, name: str, parent: int, pos: tuple[float, float, float]) -> int:
+def _body(spec: _core.ModelSpec, name: str, parent: int, pos: tuple[float, float, float]) -> int:
     inertia = 4e-6 * RADIUS  # a ball of 10 g
-    return int(spec.add_body(name, parent, pos, (1, 0, 0, 0), 0.01, (0, 0, 0), (inertia,) * 3 + (0, 0, 0)))
+    return spec.add_body(
+        _core.BodyDef(name=name, parent=parent, pos=pos, mass=0.01, inertia=(inertia,) * 3 + (0, 0, 0))
+    )
 
 
-def _pushed(describe: Describe, push: float) -> tuple[Workload, AccuracyCheck]:
+def _pushed(make_spec: SpecFactory, push: float) -> tuple[Workload, AccuracyCheck]:
     """A model whose actuators all apply `push` [N]."""
-    sim = simulator(describe)
+    sim = simulator(make_spec)
     q0 = sim.q[0].copy()
     q0[0] += 0.02 if sim.model.joint_names[0] == "hinge0" else 0.0
     run = TimedRun(q0, ((STEPS, np.full(sim.model.nu, push), False),))
-    return run.workload(sim), check_accuracy(run, sim, describe)
+    return run.workload(sim), check_accuracy(run, sim, make_spec)
 
 
 def _bodies(count: int) -> tuple[Workload, AccuracyCheck]:
@@ -142,17 +157,17 @@ def _points(count: int) -> tuple[Workload, AccuracyCheck]:
 def _markers(count: int) -> tuple[Workload, AccuracyCheck]:
     """The ball rolling run; tactile forces are evaluated every 5 steps."""
     scene = rolling_scene(round(count**0.5))
-    run, sim = rolling_run(scene, 5), simulator(scene.describe_to)
-    return run.workload(sim), check_accuracy(run, sim, scene.describe_to)
+    run, sim = rolling_run(scene, 5), simulator(scene.model_spec)
+    return run.workload(sim), check_accuracy(run, sim, scene.model_spec)
 
 
 def _environments(count: int) -> tuple[Workload, AccuracyCheck]:
     """The first steps of pushing, on all cores."""
     scene = load_scene("pushing")
-    run, sim = motion_run(scene, steps=STEPS), simulator(scene.describe_to, num_envs=count, threads=None)
+    run, sim = motion_run(scene, steps=STEPS), simulator(scene.model_spec, num_envs=count, threads=None)
     perturb_stiffness(sim)
     return Workload(lambda: run.execute(sim), run.steps, lambda: run.start(sim)), check_accuracy(
-        run, sim, scene.describe_to
+        run, sim, scene.model_spec
     )
 
 

@@ -11,6 +11,7 @@ from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workloa
 from gelflow.sim import _core
 from gelflow.sim.benchmark.speed.timed_run import FORCE
 from gelflow.sim.scene.geometry.distance_grid import spline_grid
+from gelflow.sim.scene.model_spec import core_grid
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -35,13 +36,12 @@ PRECISIONS: tuple[Precision, ...] = ("double", "single")
 GRADIENT = 1e-3  # largest relative difference between the gradients in single and double precision
 
 
-def ball_grid(radius: float) -> dict[str, Any]:
-    """Signed distance grid of a ball, as arguments of `add_shape`."""
+def ball_grid(radius: float) -> _core.DistanceGrid:
+    """Signed distance grid of a ball."""
     spacing = 2 * radius / CELLS
     nodes = spacing * np.arange(-CELLS // 2 - 3, CELLS // 2 + 4)
     distances = np.sqrt(sum(np.meshgrid(nodes**2, nodes**2, nodes**2, indexing="ij"))) - radius
-    grid = spline_grid(distances, np.full(3, nodes[0]), spacing)
-    return {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
+    return core_grid(spline_grid(distances, np.full(3, nodes[0]), spacing))
 
 
 def pressed_pad(kind: str, side: int) -> _core.Model:
@@ -49,17 +49,29 @@ def pressed_pad(kind: str, side: int) -> _core.Model:
     spec = _core.ModelSpec()
     size, top = SHAPES[kind]
     extra: dict[str, Any] = {"rounding": ROUNDING} if kind == "rounded box" else {}
-    extra |= ball_grid(top) if kind == "grid" else {}
+    extra |= {"grid": ball_grid(top)} if kind == "grid" else {}
     core_kind = "box" if kind == "rounded box" else kind
-    shape = spec.add_shape("shape", -1, core_kind, (0, 0, 0), (1, 0, 0, 0), size, **extra)
-    body = spec.add_body("pad", -1, (0, 0, top - DEPTH), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    shape = spec.add_shape(_core.ShapeDef(name="shape", kind=core_kind, size=size, **extra))
+    body = spec.add_body(
+        _core.BodyDef(name="pad", pos=(0, 0, top - DEPTH), mass=0.1, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0))
+    )
     for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
-        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+        spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
     at = PAD * ((np.arange(side) + 0.5) / side - 0.5)
     positions = np.stack([*np.meshgrid(at, at, indexing="ij"), np.zeros((side, side))], axis=-1).reshape(-1, 3)
     axes = [np.tile(axis, (side**2, 1)) for axis in ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))]
-    numbers = {"kn": 1.0, "kt": 0.01, "mu": 2.0, "kd": 0.003}
-    spec.add_pad("pad", body, positions, *axes, shapes=[shape], law="viscous", **numbers)
+    numbers: dict[str, Any] = {"kn": 1.0, "kt": 0.01, "mu": 2.0, "kd": 0.003}
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=positions,
+            axes=np.stack(axes, axis=-1),
+            shapes=[shape],
+            law="viscous",
+            **numbers,
+        )
+    )
     return _core.Model(spec)
 
 

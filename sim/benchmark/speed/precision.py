@@ -38,7 +38,7 @@ def measure_precision(options: BenchmarkOptions) -> Report:
         double, single = (_record(scene, precision, steps) for precision in ("double", "single"))
         found.append(_differences(single, double))
         for precision in ("double", "single"):
-            workloads.append(run.workload(simulator(scene.describe_to, precision=precision)))
+            workloads.append(run.workload(simulator(scene.model_spec, precision=precision)))
     options.progress.begin("precision", len(workloads) * (options.repeats + 1))
     timings = time_interleaved(workloads, options)
     rows, results = [], []

@@ -109,8 +109,8 @@ def measure_rolling(
 def _prepare(config: RollingConfig, paper_model: Path | None) -> _Comparison:
     """The workloads of one configuration, and the accuracy of gelflow's run."""
     scene = rolling_scene(config.side)
-    run, sim = rolling_run(scene, config.every), simulator(scene.describe_to, tolerance=TIMED["viscous"])
-    accuracy = check_accuracy(run, sim, scene.describe_to)
+    run, sim = rolling_run(scene, config.every), simulator(scene.model_spec, tolerance=TIMED["viscous"])
+    accuracy = check_accuracy(run, sim, scene.model_spec)
     workloads = {"gelflow": run.workload(sim), "mujoco": MujocoRolling(scene, run).workload()}
     if paper_model is not None:
         workloads["paper_build"] = RedMaxRolling(paper_model, config.side, run).workload()

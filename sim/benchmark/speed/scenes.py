@@ -18,8 +18,8 @@ def measure_scenes(options: BenchmarkOptions, *, steps: int | None = None) -> Re
     workloads, checks = [], []
     for name, law in cases:
         scene = rolling_scene(SIDE, law) if name == "rolling" else load_scene(name, friction=law)
-        run, sim = motion_run(scene, steps=steps), simulator(scene.describe_to, tolerance=TIMED[law])
-        checks.append(check_accuracy(run, sim, scene.describe_to))
+        run, sim = motion_run(scene, steps=steps), simulator(scene.model_spec, tolerance=TIMED[law])
+        checks.append(check_accuracy(run, sim, scene.model_spec))
         workloads.append(run.workload(sim))
     options.progress.begin("scenes", len(workloads) * (options.repeats + 1))
     timings = time_interleaved(workloads, options)

@@ -15,7 +15,7 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 
 Array = NDArray[np.float64]
-Describe = Callable[[Any], Any]  # adds all parts to a ModelSpec, such as `Scene.describe_to`
+SpecFactory = Callable[[], _core.ModelSpec]  # such as `Scene.model_spec`
 
 CONVERGED = 1e-12  # Newton tolerance of the reference
 # Newton tolerances of runs timed against other simulators: the loosest ones that meet the bounds below.
@@ -71,23 +71,23 @@ def motion_run(scene: Scene, *, steps: int | None = None) -> TimedRun:
 
 
 def simulator(
-    describe: Describe,
+    make_spec: SpecFactory,
     *,
     num_envs: int = 1,
     threads: int | None = 1,
     tolerance: float | None = None,
     precision: Literal["double", "single"] = "double",
 ) -> Simulator:
-    """Simulator of the parts that `describe` adds, with the default Newton tolerance or another one."""
-    spec = describe(_core.ModelSpec())
+    """Simulator of a specification, with its own Newton tolerance or another one."""
+    spec = make_spec()
     if tolerance is not None:
         spec.tolerance = tolerance
     return Simulator(_core.Model(spec), num_envs=num_envs, threads=threads, precision=precision)
 
 
-def converged_reference(sim: Simulator, describe: Describe) -> Simulator:
+def converged_reference(sim: Simulator, make_spec: SpecFactory) -> Simulator:
     """A copy of the simulator with the same parameters and a fully converged solver."""
-    reference = simulator(describe, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
+    reference = simulator(make_spec, num_envs=sim.num_envs, threads=None, tolerance=CONVERGED)
     reference.params[:] = sim.params
     return reference
 
@@ -122,9 +122,9 @@ class AccuracyCheck:
         ]
 
 
-def check_accuracy(run: TimedRun, sim: Simulator, describe: Describe) -> AccuracyCheck:
+def check_accuracy(run: TimedRun, sim: Simulator, make_spec: SpecFactory) -> AccuracyCheck:
     """Execute the run together with its reference. Raises SimulationError when a step fails."""
-    reference = converged_reference(sim, describe)
+    reference = converged_reference(sim, make_spec)
     position = turn = difference = largest = 0.0
     force_sum: Array = np.zeros(3)
     for one in (sim, reference):

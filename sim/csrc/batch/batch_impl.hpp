@@ -1,4 +1,4 @@
-// The members of Batch, compiled once per precision: batch_double.cpp, batch_float.cpp.
+// Members of Batch. batch_double.cpp and batch_float.cpp compile them once per precision.
 #pragma once
 
 #include <stdexcept>
@@ -80,13 +80,12 @@ void Batch<T>::check_state() const {
 
 template <class T>
 void Batch<T>::step(const Controls<T>& u, int steps) {
-  check_controls(u.numbers, u.alike ? 1 : n);
+  check_controls(u.u, u.shared ? 1 : n);
   check_state();
-  const std::size_t apart = u.alike ? 0 : model->actuators.size();
   pool_.run(n, [&](int e, int thread) {
     for (int i = 0; i < steps && status[e] == 0; ++i) {
-      const StepReport report = gelflow::step<T>(*model, params_of(e), u.numbers + static_cast<std::size_t>(e) * apart,
-                                                 model->polish, state(e), memory_[thread], i > 0);
+      const StepReport report =
+          gelflow::step<T>(*model, params_of(e), controls_of(u, e), model->polish, state(e), memory_[thread], i > 0);
       status[e] = static_cast<std::int32_t>(report.status);
       iterations[e] += report.iterations;
       halved[e] += report.halvings > 0 ? 1 : 0;
@@ -94,15 +93,29 @@ void Batch<T>::step(const Controls<T>& u, int steps) {
   });
 }
 
+// The tangent vector from positions q0 to positions q1 that are less than half a turn away: q1 ⊖ q0.
+template <class T>
+void position_difference(const Model& m, const T* q0, const T* q1, T* out) {
+  for (const Joint& joint : m.joints) {
+    for (int a = 0; a < joint.scalar_dofs(); ++a) out[joint.v + a] = q1[joint.q + a] - q0[joint.q + a];
+    if (!joint.has_quaternion()) continue;
+    V4<T> conjugate = vec4(q0 + joint.quaternion_q());
+    conjugate.template tail<3>() *= T(-1);
+    const V4<T> rotation = quaternion_product<T>(conjugate, vec4(q1 + joint.quaternion_q()));
+    const T sine = rotation.template tail<3>().norm();
+    const T scale = sine > T(1e-12) ? T(2) * std::atan2(sine, rotation[0]) / sine : T(2);
+    for (int a = 0; a < 3; ++a) out[joint.angular_v() + a] = scale * rotation[1 + a];
+  }
+}
+
 template <class T>
 void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
-  check_controls(u.numbers, u.alike ? 1 : n);
+  check_controls(u.u, u.shared ? 1 : n);
   check_state();
   const Model& m = *model;
-  const std::size_t apart = u.alike ? 0 : m.actuators.size();
   pool_.run(n, [&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
-    const T* const control = u.numbers + static_cast<std::size_t>(e) * apart;
+    const T* const control = controls_of(u, e);
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
     const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory, false);
     Status status = taken.status;
@@ -114,19 +127,7 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
     failures[e] = static_cast<std::int32_t>(status);
     T* const difference = out + static_cast<std::size_t>(e) * m.nv;
     std::fill_n(difference, m.nv, T(0));
-    if (status != Status::ok) return;
-    for (const Joint& joint : m.joints) {
-      for (int a = 0; a < joint.scalar_dofs(); ++a) {
-        difference[joint.v + a] = whole.q[joint.q + a] - halves.q[joint.q + a];
-      }
-      if (!joint.has_quaternion()) continue;
-      V4<T> back = vec4(halves.q.data() + joint.quaternion_q());
-      back.template tail<3>() *= T(-1);
-      const V4<T> turn = quaternion_product<T>(back, vec4(whole.q.data() + joint.quaternion_q()));
-      const T sine = turn.template tail<3>().norm();  // a step turns by far less than half a turn
-      const T scale = sine > T(1e-12) ? T(2) * std::atan2(sine, turn[0]) / sine : T(2);
-      for (int a = 0; a < 3; ++a) difference[joint.angular_v() + a] = scale * turn[1 + a];
-    }
+    if (status == Status::ok) position_difference<T>(m, halves.q.data(), whole.q.data(), difference);
   });
 }
 
@@ -142,7 +143,7 @@ void Batch<T>::tactile(T* out) {
 }
 
 template <class T>
-void Batch<T>::tactile() {
+void Batch<T>::update_readings() {
   if (dirty_.empty()) {
     readings.resize(static_cast<std::size_t>(n) * model->markers * 3);
     dirty_.resize(n);
@@ -209,7 +210,7 @@ void Batch<T>::mass_matrix(T* out) {
     w.by_v.setZero();
     add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     for (const Joint& joint : model->joints) {
-      for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += params_of(e)[joint.param + 1];
+      for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += joint.params.in(params_of(e)).armature;
     }
     for (int k = 0; k < model->nv; ++k) std::copy_n(&w.mass(k, 0), model->nv, out + k * model->nv);
   }
@@ -226,118 +227,151 @@ void Batch<T>::bias(T* out) {
   }
 }
 
+// Copies one state to the next row; of the anchors only those that are set.
 template <class T>
-void Batch<T>::rollout(const Rollout<T>& r) {
-  const Model& m = *model;
-  const std::size_t nu = m.actuators.size(), na = m.na, N = n;
-  check_controls(r.u, r.steps * n);
-  pool_.run(n, [&](int env, int thread) {
-    const std::size_t e = env;
-    StepMemory<T>& memory = memory_[thread];
-    r.status[e] = 0;
-    int read = 0;
-    VX<T> q_rounding = VX<T>::Zero(std::is_same_v<T, PositionScalar<T>> ? 0 : m.nq);  // goes along with the last state
-    const auto at = [&](int t) {
-      const std::size_t row = t * N + e;
-      return StateView<T>{
-          r.q + row * m.nq,      r.v + row * m.nv,       reinterpret_cast<V3<T>*>(r.anchors) + row * na,
-          r.anchored + row * na, r.history + row * m.nh, q_rounding.size() == 0 ? nullptr : q_rounding.data()};
-    };
-    for (int t = 0;; ++t) {
-      const StateView<T> now = at(t);
-      for (; read < r.reads && r.read_after[read] == t; ++read) {
-        forward_state<false, T>(m, params_of(env), now.q, now.q_rounding, now.v, memory.work);
-        read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work,
-                        r.tactile + (read * N + e) * m.markers * 3, nullptr);
-      }
-      if (t == r.steps) break;
-      const StateView<T> next = at(t + 1);
-      std::copy(now.q, now.q + m.nq, next.q);
-      std::copy(now.v, now.v + m.nv, next.v);
-      std::copy(now.anchored, now.anchored + na, next.anchored);
-      for_each_set(now.anchored, m.na, [&](int i) { next.anchors[i] = now.anchors[i]; });
-      std::copy(now.history, now.history + m.nh, next.history);
-      if (r.status[e] != 0) continue;
-      const StepReport report =
-          gelflow::step<T>(m, params_of(env), r.u + (t * N + e) * nu, m.polish, next, memory, t > 0);
-      r.status[e] = static_cast<std::int32_t>(report.status);
-      r.halvings[t * N + e] = static_cast<std::int8_t>(report.halvings);
-    }
-  });
+void copy_state(const Model& m, const StateView<T>& from, const StateView<T>& to) {
+  std::copy_n(from.q, m.nq, to.q);
+  std::copy_n(from.v, m.nv, to.v);
+  std::copy_n(from.anchored, m.na, to.anchored);
+  for_each_set(from.anchored, m.na, [&](int i) { to.anchors[i] = from.anchors[i]; });
+  std::copy_n(from.history, m.nh, to.history);
 }
 
 template <class T>
-void Batch<T>::branches(const Rollout<T>& r, std::uint64_t* out) {
+void Batch<T>::rollout_one(const Trajectory<T>& r, int env, StepMemory<T>& memory) {
   const Model& m = *model;
-  const std::size_t N = n;
+  const std::size_t e = env;
+  r.status[e] = 0;
+  int read = 0;
+  VX<T> rounding = VX<T>::Zero(std::is_same_v<T, PositionScalar<T>> ? 0 : m.nq);  // of q in the last state
+  T* const q_rounding = rounding.size() == 0 ? nullptr : rounding.data();
+  for (int t = 0;; ++t) {
+    const StateView<T> now = r.state(m, t, e, q_rounding);
+    for (; read < r.reads && r.read_after[read] == t; ++read) {
+      forward_state<false, T>(m, params_of(env), now.q, now.q_rounding, now.v, memory.work);
+      read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work, r.tactile + r.reading(m, read, e),
+                      nullptr);
+    }
+    if (t == r.steps) break;
+    const StateView<T> next = r.state(m, t + 1, e, q_rounding);
+    copy_state<T>(m, now, next);
+    if (r.status[e] != 0) continue;
+    const StepReport report = gelflow::step<T>(m, params_of(env), r.controls(m, t, e), m.polish, next, memory, t > 0);
+    r.status[e] = static_cast<std::int32_t>(report.status);
+    r.halvings[r.row(t, e)] = static_cast<std::int8_t>(report.halvings);
+  }
+}
+
+template <class T>
+void Batch<T>::rollout(const Trajectory<T>& r) {
+  check_controls(r.u, r.steps * n);
+  pool_.run(n, [&](int env, int thread) { rollout_one(r, env, memory_[thread]); });
+}
+
+template <class T>
+void Batch<T>::contact_modes(const Trajectory<T>& r, std::uint64_t* out) {
+  const Model& m = *model;
   pool_.run(n, [&](int env, int thread) {
     const std::size_t e = env;
     for (int t = 0; t < r.steps; ++t) {
-      const std::size_t before = t * N + e, after = before + N;
       const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
+      const StateView<T> before = r.state(m, t, e), after = r.state(m, t + 1, e);
       ModeHash hash;
-      hash.add(contact_mode_signature<T>(m, params_of(env), r.q + after * m.nq, r.v + after * m.nv,
-                                         reinterpret_cast<const V3<T>*>(r.anchors) + before * m.na,
-                                         r.anchored + before * m.na, r.u + before * m.actuators.size(), read,
-                                         memory_[thread].work));
-      hash.add(static_cast<std::uint64_t>(r.halvings[before]));
-      out[before] = hash.value();
+      hash.add(contact_mode_signature<T>(m, params_of(env), after.q, after.v, before.anchors, before.anchored,
+                                         r.controls(m, t, e), read, memory_[thread].work));
+      hash.add(static_cast<std::uint64_t>(r.halvings[r.row(t, e)]));
+      out[r.row(t, e)] = hash.value();
+    }
+  });
+}
+
+// Double-precision copies of a trajectory and its cotangent, and memory for the gradient.
+template <class T>
+struct DoubleTrajectory {
+  std::vector<double> u, q, v, anchors, history;
+  std::vector<double> by_q, by_v, by_anchors_end, by_history_end, by_tactile;
+  std::vector<double> by_u, by_q0, by_v0, by_anchors0, by_history0;
+  Trajectory<double> trajectory;
+
+  DoubleTrajectory(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int reads)
+      : by_q0(r.row(1, 0) * m.nq), by_v0(r.row(1, 0) * m.nv) {
+    const std::size_t n = r.environments, rows = r.row(r.steps + 1, 0), nu = m.actuators.size();
+    const auto copy = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
+    u = copy(r.u, (rows - n) * nu);
+    q = copy(r.q, rows * m.nq);
+    v = copy(r.v, rows * m.nv);
+    anchors = copy(r.anchors, rows * m.na * 3);
+    history = copy(r.history, rows * m.nh);
+    by_q = copy(cotangent.q, rows * m.nq);
+    by_v = copy(cotangent.v, rows * m.nv);
+    by_anchors_end = copy(cotangent.anchors_end, n * m.na * 3);
+    by_history_end = copy(cotangent.history_end, n * m.nh);
+    by_tactile = copy(cotangent.tactile, r.row(reads, 0) * m.markers * 3);
+    by_u.resize(u.size());
+    by_anchors0.resize(by_anchors_end.size());
+    by_history0.resize(by_history_end.size());
+    trajectory = {r.steps,        reads,      r.environments, u.data(), q.data(),     v.data(), anchors.data(),
+                  history.data(), r.anchored, r.halvings,     r.status, r.read_after, nullptr};
+  }
+  TrajectoryCotangent<double> cotangent() const {
+    return {by_q.data(), by_v.data(), by_anchors_end.data(), by_history_end.data(), by_tactile.data()};
+  }
+  TrajectoryGradient<double> gradient(double* by_params) {
+    return {by_u.data(), by_q0.data(), by_v0.data(), by_anchors0.data(), by_history0.data(), by_params};
+  }
+  void copy_gradient(const TrajectoryGradient<T>& out) const {
+    std::copy(by_u.begin(), by_u.end(), out.u);
+    std::copy(by_q0.begin(), by_q0.end(), out.q);
+    std::copy(by_v0.begin(), by_v0.end(), out.v);
+    std::copy(by_anchors0.begin(), by_anchors0.end(), out.anchors);
+    std::copy(by_history0.begin(), by_history0.end(), out.history);
+  }
+};
+
+// Adds the gradient through all marker readings to by_q and by_v, shaped as in the trajectory. For models without
+// anchors, whose readings depend on the state alone.
+template <class T>
+void Batch<T>::add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q,
+                                double* by_v) {
+  const Model& m = *model;
+  pool_.run(n, [&](int e, int thread) {
+    for (int read = 0; read < r.reads && r.status[e] == 0; ++read) {
+      const int t = r.read_after[read];
+      const StateView<T> now = r.state(m, t, e);
+      StateGradient<T> gradient(m);
+      tactile_vjp<T>(m, params_of(e), now, cotangent.tactile + r.reading(m, read, e), gradient, memory_[thread].work);
+      const VX<double> q = Eigen::Map<const VX<T>>(now.q, m.nq).template cast<double>();
+      add_from_tangent<double>(m, q.data(), gradient.q.template cast<double>(), by_q + r.row(t, e) * m.nq);
+      for (int k = 0; k < m.nv; ++k) by_v[r.row(t, e) * m.nv + k] += gradient.v[k];
     }
   });
 }
 
 template <class T>
-void Batch<T>::rollout_transposed(const Rollout<T>& r, const RolloutGradient<T>& g) {
-  const std::size_t N = n;
+void Batch<T>::rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent,
+                           const TrajectoryGradient<T>& out) {
+  const Model& m = *model;
   if constexpr (std::is_same_v<T, double>) {
-    std::fill_n(g.u, static_cast<std::size_t>(r.steps) * N * model->actuators.size(), 0.0);
-    std::fill_n(g.q0, N * model->nq, 0.0);
-    std::fill_n(g.v0, N * model->nv, 0.0);
-    std::fill_n(g.anchors0, N * model->na * 3, 0.0);
-    std::fill_n(g.history0, N * model->nh, 0.0);
-    if (g.params) std::fill_n(g.params, N * model->param_names.size(), 0.0);
-    pool_.run(n, [&](int e, int thread) {  // a failed environment has gradient zero
-      if (r.status[e] == 0) transpose_one<T>(*model, params_of(e), e, N, r, g, memory_[thread]);
+    const std::size_t N = n;
+    std::fill_n(out.u, r.row(r.steps, 0) * m.actuators.size(), 0.0);
+    std::fill_n(out.q, N * m.nq, 0.0);
+    std::fill_n(out.v, N * m.nv, 0.0);
+    std::fill_n(out.anchors, N * m.na * 3, 0.0);
+    std::fill_n(out.history, N * m.nh, 0.0);
+    if (out.params) std::fill_n(out.params, N * m.param_names.size(), 0.0);
+    pool_.run(n, [&](int e, int thread) {
+      if (r.status[e] == 0) gelflow::rollout_vjp<T>(m, params_of(e), e, r, cotangent, out, memory_[thread]);
     });
   } else {
-    // In double precision, at the states that were reached in single: rounding errors would add up on the way back. Not
-    // so in readings without a memory, each of which speaks of its own state alone: they come in single precision.
-    if (!exact_) exact_ = std::make_unique<Batch<double>>(model, n, threads());
-    const Model& m = *model;
-    std::copy(params.begin(), params.end(), exact_->params.begin());
-    const std::size_t rows = static_cast<std::size_t>(r.steps + 1) * N, nu = m.actuators.size();
-    const bool apart = m.na == 0 && g.params == nullptr;
-    const int reads = apart ? 0 : r.reads;
-    const auto exact = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
-    const auto u = exact(r.u, (rows - N) * nu);
-    auto q = exact(r.q, rows * m.nq), v = exact(r.v, rows * m.nv);
-    auto anchors = exact(r.anchors, rows * m.na * 3), history = exact(r.history, rows * m.nh);
-    auto by_q = exact(g.q, rows * m.nq), by_v = exact(g.v, rows * m.nv);
-    const auto by_anchors = exact(g.anchors_end, N * m.na * 3);
-    const auto by_history = exact(g.history_end, N * m.nh);
-    const auto by_tactile = exact(g.tactile, static_cast<std::size_t>(reads) * N * m.markers * 3);
-    pool_.run(apart ? n : 0, [&](int e, int thread) {
-      for (int read = 0; read < r.reads && r.status[e] == 0; ++read) {
-        const std::size_t row = r.read_after[read] * N + e;
-        const StateView<T> now{r.q + row * m.nq, r.v + row * m.nv, nullptr, nullptr, nullptr};
-        StateGradient<T> share(m);
-        tactile_vjp<T>(m, params_of(e), now, g.tactile + (read * N + e) * m.markers * 3, share, memory_[thread].work);
-        add_from_tangent<double>(m, q.data() + row * m.nq, share.q.template cast<double>(), by_q.data() + row * m.nq);
-        for (int k = 0; k < m.nv; ++k) by_v[row * m.nv + k] += share.v[k];
-      }
-    });
-    std::vector<double> by_u(u.size()), by_q0(N * m.nq), by_v0(N * m.nv), by_anchors0(by_anchors.size());
-    std::vector<double> by_history0(by_history.size());
-    exact_->rollout_transposed(
-        {r.steps, reads, u.data(), q.data(), v.data(), anchors.data(), history.data(), r.anchored, r.halvings, r.status,
-         r.read_after, nullptr},
-        {by_q.data(), by_v.data(), by_anchors.data(), by_history.data(), by_tactile.data(), by_u.data(), by_q0.data(),
-         by_v0.data(), by_anchors0.data(), by_history0.data(), g.params});
-    std::copy(by_u.begin(), by_u.end(), g.u);
-    std::copy(by_q0.begin(), by_q0.end(), g.q0);
-    std::copy(by_v0.begin(), by_v0.end(), g.v0);
-    std::copy(by_anchors0.begin(), by_anchors0.end(), g.anchors0);
-    std::copy(by_history0.begin(), by_history0.end(), g.history0);
+    // Computed in double precision at the states of the single-precision trajectory, because rounding errors grow on the
+    // way back. Readings that depend on one state only do not need it: their gradient is computed in single precision.
+    if (!double_batch_) double_batch_ = std::make_unique<Batch<double>>(model, n, threads());
+    std::copy(params.begin(), params.end(), double_batch_->params.begin());
+    const bool separate_readings = m.na == 0 && out.params == nullptr;
+    DoubleTrajectory<T> doubles(m, r, cotangent, separate_readings ? 0 : r.reads);
+    if (separate_readings) add_readings_vjp(r, cotangent, doubles.by_q.data(), doubles.by_v.data());
+    double_batch_->rollout_vjp(doubles.trajectory, doubles.cotangent(), doubles.gradient(out.params));
+    doubles.copy_gradient(out);
   }
 }
 

@@ -1,8 +1,6 @@
-// Gradients by physical parameters: what the step's residual, the anchors' turn and the readings say of them directly.
-// All else comes through the state, where the reverse pass has it already (adjoint.hpp).
+// clang-format off: the templates of the core need the overloads of tape.hpp
 #include "math/tape.hpp"
-
-// The core's headers look for the overloads of tape.hpp.
+// clang-format on
 #include "batch/param_gradient.hpp"
 #include "solver/step.hpp"
 
@@ -10,7 +8,7 @@ namespace gelflow {
 
 namespace {
 
-// The core's view of one state, in taped numbers, with the parameters watched.
+// One state as taped numbers; the parameters are the inputs of the tape.
 struct TapedState {
   std::vector<Taped> params, q0, v0, history, v1, u;
   std::vector<V3<Taped>> anchors;
@@ -26,14 +24,15 @@ struct TapedState {
     for (int i = 0; i < m.na; ++i) anchors.push_back(s.anchors[i].cast<Taped>());
   }
 
-  // Adds the gradient by the parameters, whose entries come first on the tape; weights: of all its entries.
+  // Adds the gradient with respect to the parameters, which are the first entries on the tape. `weights` are the
+  // gradients of all its entries.
   void add_to(double* by_params, std::vector<double>& weights) const {
     Tape::current().back(weights);
     for (std::size_t i = 0; i < params.size(); ++i) by_params[i] += weights[i];
   }
 };
 
-void weigh(std::vector<double>& weights, const Taped& result, double weight) {
+void set_weight(std::vector<double>& weights, const Taped& result, double weight) {
   if (result.entry >= 0) weights[result.entry] += weight;
 }
 
@@ -57,9 +56,9 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
                                   next_set.data());
   }
   std::vector<double> weights(Tape::current().size(), 0.0);
-  for (int k = 0; k < m.nv; ++k) weigh(weights, w.residual[k], -multipliers[k]);
+  for (int k = 0; k < m.nv; ++k) set_weight(weights, w.residual[k], -multipliers[k]);
   for (int i = 0; i < m.na; ++i) {
-    for (int a = 0; next_set[i] && a < 3; ++a) weigh(weights, next[i][a], by_next[i][a]);
+    for (int a = 0; next_set[i] && a < 3; ++a) set_weight(weights, next[i][a], by_next[i][a]);
   }
   t.add_to(by_params, weights);
 }
@@ -72,7 +71,7 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
   std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
   read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
   std::vector<double> weights(Tape::current().size(), 0.0);
-  for (std::size_t i = 0; i < readings.size(); ++i) weigh(weights, readings[i], by_reading[i]);
+  for (std::size_t i = 0; i < readings.size(); ++i) set_weight(weights, readings[i], by_reading[i]);
   t.add_to(by_params, weights);
 }
 

@@ -1,14 +1,15 @@
-// Gradients by physical parameters; the implementation is compiled once, in double precision.
+// Partial derivatives with respect to the physical parameters; compiled once, in double precision. Derivatives through
+// the state come from the reverse pass (adjoint.hpp).
 #pragma once
 
 #include "model/model.hpp"
 
 namespace gelflow {
 
-// A step (StepStart of residual.hpp) to v1; or, for a reading, the state (q0, v0) alone.
+// A step from (q0, v0) to v1, see StepStart; or the state (q0, v0) of a reading, with null pointers for the rest.
 struct ParamState {
   double h;
-  const double *q0, *v0, *history, *v1, *u;  // v0 is the step's v*
+  const double *q0, *v0, *history, *v1, *u;  // v0 is v* of a step
   const V3<double>* anchors;
   const std::uint8_t* anchored;
 };

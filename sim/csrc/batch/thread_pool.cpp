@@ -1,12 +1,13 @@
+#include "batch/thread_pool.hpp"
+
 #include <algorithm>
 #include <chrono>
+#include <thread>
 
 #ifdef __linux__
 #include <pthread.h>
 #include <sched.h>
 #endif
-
-#include "batch/batch.hpp"
 
 namespace gelflow {
 
@@ -14,22 +15,22 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// How long to look out before one sleeps: to be woken takes some 100 µs, much more on a virtual machine. Who worked for
-// longer may look out for longer, for a share of that time.
-constexpr std::chrono::microseconds least_patience(100), most_patience(500);
-constexpr int share = 2;
+// Spin time before sleeping. A wake-up takes about 100 µs, much more on a virtual machine; the spin time is a share of
+// the duration of the last work, within these bounds.
+constexpr std::chrono::microseconds min_spin_time(100), max_spin_time(500);
+constexpr int spin_share = 2;
 
-Clock::duration patience_after(Clock::time_point begun) {
-  return std::clamp<Clock::duration>((Clock::now() - begun) / share, least_patience, most_patience);
+Clock::duration spin_time_after(Clock::time_point start) {
+  return std::clamp<Clock::duration>((Clock::now() - start) / spin_share, min_spin_time, max_spin_time);
 }
 
-// Looks out for that long. Whether it came true.
+// Spins until the condition holds, at most for that long; returns whether it holds.
 template <class Condition>
-bool soon(const Condition& condition, Clock::duration patience) {
-  constexpr int looks = 64;
-  const Clock::time_point end = Clock::now() + patience;
+bool spin_until(const Condition& condition, Clock::duration spin_time) {
+  constexpr int checks_per_clock_read = 64;
+  const Clock::time_point end = Clock::now() + spin_time;
   do {
-    for (int i = 0; i < looks; ++i) {
+    for (int i = 0; i < checks_per_clock_read; ++i) {
       if (condition()) return true;
 #ifdef __x86_64__
       __builtin_ia32_pause();
@@ -39,7 +40,7 @@ bool soon(const Condition& condition, Clock::duration patience) {
   return false;
 }
 
-int core_here() {
+int current_cpu() {
 #ifdef __linux__
   return sched_getcpu();
 #else
@@ -49,39 +50,39 @@ int core_here() {
 
 }  // namespace
 
-// A helper that waits on the core where the caller runs, or wakes up there, gets it only now and then, and Linux may leave
-// it there for milliseconds while another core is idle. So it is told to go elsewhere, until it is at work.
-struct ThreadPool::Helper {
+// A worker on the caller's CPU competes with it, and Linux may leave it there for milliseconds while another CPU is idle.
+// The caller therefore excludes its own CPU from the worker's affinity until the worker runs.
+struct ThreadPool::Worker {
   std::thread thread;
-  static constexpr int asleep = -2;
-  std::atomic<int> core{asleep};  // where it was when it began to look out
+  static constexpr int sleeping = -2;
+  std::atomic<int> cpu{sleeping};  // where it began to spin
 
 #ifdef __linux__
-  void make_way(int caller) {
-    if (core != caller && core != asleep) return;
+  void move_off(int caller_cpu) {
+    if (cpu != caller_cpu && cpu != sleeping) return;
     if (sched_getaffinity(0, sizeof allowed_, &allowed_) != 0) return;
-    cpu_set_t elsewhere = allowed_;
-    CPU_CLR(caller, &elsewhere);
-    if (CPU_COUNT(&elsewhere) == 0) return;
-    sent_away_ = pthread_setaffinity_np(thread.native_handle(), sizeof elsewhere, &elsewhere) == 0;
+    cpu_set_t others = allowed_;
+    CPU_CLR(caller_cpu, &others);
+    if (CPU_COUNT(&others) == 0) return;
+    restricted_ = pthread_setaffinity_np(thread.native_handle(), sizeof others, &others) == 0;
   }
-  void settle() {
-    if (sent_away_.exchange(false)) pthread_setaffinity_np(pthread_self(), sizeof allowed_, &allowed_);
+  void restore_affinity() {
+    if (restricted_.exchange(false)) pthread_setaffinity_np(pthread_self(), sizeof allowed_, &allowed_);
   }
 
  private:
   cpu_set_t allowed_;  // of the caller
-  std::atomic<bool> sent_away_{false};
+  std::atomic<bool> restricted_{false};
 #else
-  void make_way(int) {}
-  void settle() {}
+  void move_off(int) {}
+  void restore_affinity() {}
 #endif
 };
 
 ThreadPool::ThreadPool(int threads) {
   for (int i = 1; i < threads; ++i) {
-    Helper& helper = *helpers_.emplace_back(std::make_unique<Helper>());
-    helper.thread = std::thread([this, &helper, i] { loop(helper, i); });
+    Worker& worker = *workers_.emplace_back(std::make_unique<Worker>());
+    worker.thread = std::thread([this, &worker, i] { loop(worker, i); });
   }
 }
 
@@ -91,34 +92,34 @@ ThreadPool::~ThreadPool() {
     stop_ = true;
   }
   start_.notify_all();
-  for (const auto& helper : helpers_) helper->thread.join();
+  for (const auto& worker : workers_) worker->thread.join();
 }
 
-int ThreadPool::size() const { return static_cast<int>(helpers_.size()) + 1; }
+int ThreadPool::size() const { return static_cast<int>(workers_.size()) + 1; }
 
-void ThreadPool::take(int thread) {
+void ThreadPool::work_on_items(int thread) {
   for (int item = next_.fetch_add(1); item < items_; item = next_.fetch_add(1)) (*work_)(item, thread);
 }
 
-void ThreadPool::loop(Helper& helper, int thread) {
-  std::uint64_t seen = 0;
-  Clock::duration patience = least_patience;
-  const auto called = [&] { return stop_ || round_ != seen; };
+void ThreadPool::loop(Worker& worker, int thread) {
+  std::uint64_t runs_seen = 0;
+  Clock::duration spin_time = min_spin_time;
+  const auto called = [&] { return stop_ || run_count_ != runs_seen; };
   for (;;) {
-    helper.core = core_here();
-    if (!soon(called, patience)) {
+    worker.cpu = current_cpu();
+    if (!spin_until(called, spin_time)) {
       std::unique_lock lock(mutex_);
-      ++asleep_;
-      helper.core = Helper::asleep;
+      ++sleeping_;
+      worker.cpu = Worker::sleeping;
       start_.wait(lock, called);
-      --asleep_;
+      --sleeping_;
     }
     if (stop_) return;
-    seen = round_;
-    helper.settle();
-    const Clock::time_point begun = Clock::now();
-    take(thread);
-    patience = patience_after(begun);
+    runs_seen = run_count_;
+    worker.restore_affinity();
+    const Clock::time_point start = Clock::now();
+    work_on_items(thread);
+    spin_time = spin_time_after(start);
     if (--busy_ > 0) continue;
     const std::lock_guard lock(mutex_);
     done_.notify_one();
@@ -126,27 +127,27 @@ void ThreadPool::loop(Helper& helper, int thread) {
 }
 
 void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
-  if (helpers_.empty() || items <= 1) {
+  if (workers_.empty() || items <= 1) {
     for (int i = 0; i < items; ++i) work(i, 0);
     return;
   }
-  const Clock::time_point begun = Clock::now();
-  const int here = core_here();
-  for (const auto& helper : helpers_) helper->make_way(here);
+  const Clock::time_point start = Clock::now();
+  const int cpu = current_cpu();
+  for (const auto& worker : workers_) worker->move_off(cpu);
   bool wake = false;
   {
     const std::lock_guard lock(mutex_);
     work_ = &work;
     items_ = items;
     next_ = 0;
-    busy_ = static_cast<int>(helpers_.size());
-    ++round_;
-    wake = asleep_ > 0;
+    busy_ = static_cast<int>(workers_.size());
+    ++run_count_;
+    wake = sleeping_ > 0;
   }
   if (wake) start_.notify_all();
-  take(0);
+  work_on_items(0);
   const auto done = [&] { return busy_ == 0; };
-  if (soon(done, patience_after(begun))) return;
+  if (spin_until(done, spin_time_after(start))) return;
   std::unique_lock lock(mutex_);
   done_.wait(lock, done);
 }

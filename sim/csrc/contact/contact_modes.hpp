@@ -50,11 +50,11 @@ template <class T>
 void add_joint_modes(const Model& m, const T* params, const T* q, const T* v, const T* u, ModeHash& hash) {
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
-    hash.add(static_cast<std::uint64_t>(actuator_force<T>(actuator, params + actuator.param, u[a], q, v).clipped));
+    hash.add(static_cast<std::uint64_t>(actuator_force<T>(actuator, actuator.params.in(params), u[a], q, v).clipped));
   }
   for (const Joint& joint : m.joints) {
-    const T* p = params + joint.param;
-    for (int k = joint.v; p[8] != T(0) && k < joint.v + joint.dofs; ++k) {
+    const JointParams<T>& p = joint.params.in(params);
+    for (int k = joint.v; p.frictionloss != T(0) && k < joint.v + joint.dofs; ++k) {
       hash.add(v[k] > T(friction_creep) ? 1 : v[k] < T(-friction_creep) ? 2 : 0);
     }
     if (joint.has_quaternion()) continue;

@@ -7,7 +7,7 @@ namespace gelflow {
 
 template <class T>
 struct ContactSettings {
-  const T* params;  // kn, kt, mu, kd, ks
+  const ContactParams<T>& params;
   FrictionLaw law;
   DampingLaw damping;
   T rolling_radius;              // of a sphere whose lowest point makes contact; 0: the points themselves do
@@ -23,8 +23,8 @@ ContactSettings<T> contact_settings(const Model& m, const Contact& contact, cons
   const int slot = contact.anchor < 0 ? 0 : contact.anchor;
   const PointSet& set = m.point_sets[contact.points];
   // The first scale scales a sphere's radius; point sets without a radius may have no scales (pads with contacts).
-  const T radius = set.radius > 0 ? T(T(set.radius) * params[set.mount.pose_param + 6]) : T(0);
-  return {params + contact.param, contact.law, contact.damping, radius, anchors + slot, anchored + slot, 1, h};
+  const T radius = set.radius > 0 ? T(T(set.radius) * set.mount.scale.in(params).scale[0]) : T(0);
+  return {contact.params.in(params), contact.law, contact.damping, radius, anchors + slot, anchored + slot, 1, h};
 }
 
 // The markers of a pad against its shape number s.
@@ -32,7 +32,7 @@ template <class T>
 ContactSettings<T> contact_settings(const Pad& pad, std::size_t s, const T* params, const V3<T>* anchors,
                                     const std::uint8_t* anchored, const T& h = T(0)) {
   const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
-  return {params + pad.param, pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot, 1, h};
+  return {pad.params.in(params), pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot, 1, h};
 }
 
 }  // namespace gelflow

@@ -84,7 +84,7 @@ template <class T>
 void advance_marker_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
-    if (pad.anchor < 0 || pad.pushes) continue;
+    if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
@@ -153,7 +153,7 @@ template <class T>
 void marker_anchors_vjp(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
                         Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
   for (const Pad& pad : m.pads) {
-    if (pad.anchor < 0 || pad.pushes) continue;
+    if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();

@@ -1,11 +1,11 @@
-// Where every body is and how it moves; and the group operations q ⊕ h v of the configuration space.
+// Forward kinematics of positions, velocities and accelerations, and the operations q ⊕ h v of the configuration space.
 //
 // Joints act in order on the body's frame, as in MuJoCo. A free joint is three slides along the world's axes followed
 // by a ball: velocities are (linear in the world frame, angular in the body frame). A ball's velocity is angular, in the
-// frame that it turns. With S_k the motion that dof k makes possible (world frame, at the world's origin), a displacement
-// of dof j carries everything behind it along:
-//     ∂S_k/∂q_j = S_j × S_k   for every k behind j or in j's group (`Model::carries`),
-// which is the only derivative of kinematics that the rest of the core needs.
+// frame that it rotates. With S_k the motion subspace of dof k (world frame, at the world's origin), a displacement of
+// dof j moves its subtree rigidly:
+//     ∂S_k/∂q_j = S_j × S_k   for each k in the subtree or the group of j (`Model::is_ancestor`).
+// The rest of the core needs no other derivative of kinematics.
 #pragma once
 
 #include "model/workspace.hpp"
@@ -22,8 +22,8 @@ V4<T> vec4(const T* p) {
   return {p[0], p[1], p[2], p[3]};
 }
 
-// A position and what it lacks. That is ignored where it is no rounding error of this position: another was written
-// since.
+// q[i] plus its rounding residual (StateView::q_rounding). The residual is ignored where it is not smaller than the
+// rounding of q[i]: then q was written since.
 template <class T>
 PositionScalar<T> position_with_rounding(const T* q, const T* q_rounding, int i) {
   if (std::is_same_v<T, PositionScalar<T>> || q_rounding == nullptr) return PositionScalar<T>(q[i]);
@@ -31,79 +31,123 @@ PositionScalar<T> position_with_rounding(const T* q, const T* q_rounding, int i)
   return T(sum) == q[i] ? sum : PositionScalar<T>(q[i]);
 }
 
-template <class T>
-void forward_positions(const Model& m, const T* params, const PositionScalar<T>* q, Workspace<T>& w) {
-  using Scalar = PositionScalar<T>;
-  const auto set_axis = [&](int k, const V3<Scalar>& moment, const V3<Scalar>& direction) {
-    w.axis.set(k, as<T>(stack<Scalar>(moment, direction)));
-  };
-  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
-    const Body& body = m.bodies[i];
-    const bool root = body.parent == world;
-    M3<Scalar> r = body.rotation.template cast<Scalar>();
-    V3<Scalar> p = as<Scalar>(vec3(params + body.pos));
-    if (!root) {
-      p = (w.position[body.parent] + w.rotation[body.parent] * p).eval();
-      r = (w.rotation[body.parent] * r).eval();
-    }
-    for (int j = body.joint_begin; j < body.joint_end; ++j) {
-      const Joint& joint = m.joints[j];
-      const Scalar* value = q + joint.q;
-      if (joint.type == JointType::free) {
-        p = vec3(value);
-        r = rotation_of<Scalar>(V4<Scalar>(value[3], value[4], value[5], value[6]));
-        for (int a = 0; a < 3; ++a) {
-          set_axis(joint.v + a, V3<Scalar>::Zero(), V3<Scalar>::Unit(a));
-          const V3<Scalar> turn = r.col(a);
-          set_axis(joint.v + 3 + a, turn, cross<Scalar>(p, turn));
-        }
-        continue;
-      }
-      if (joint.type == JointType::ball) {
-        const V3<Scalar> offset = joint.pos.template cast<Scalar>();
-        const V3<Scalar> anchor = p + r * offset;
-        r = (r * rotation_of<Scalar>(V4<Scalar>(value[0], value[1], value[2], value[3]))).eval();
-        p = anchor - r * offset;
-        for (int a = 0; a < 3; ++a) {
-          const V3<Scalar> turn = r.col(a);
-          set_axis(joint.v + a, turn, cross<Scalar>(anchor, turn));
-        }
-        continue;
-      }
-      const V3<Scalar> local = joint.axis.template cast<Scalar>();
-      const V3<Scalar> direction = r * local;
-      if (joint.type == JointType::slide) {
-        set_axis(joint.v, V3<Scalar>::Zero(), direction);
-        p += direction * (value[0] - Scalar(joint.ref));
-      } else {
-        const V3<Scalar> offset = joint.pos.template cast<Scalar>();
-        const V3<Scalar> anchor = p + r * offset;
-        set_axis(joint.v, direction, cross<Scalar>(anchor, direction));
-        r = (r * axis_rotation<Scalar>(local, value[0] - Scalar(joint.ref))).eval();
-        p = anchor - r * offset;
-      }
-    }
-    w.rotation[i] = r;
-    w.position[i] = p;
+template <class Scalar>
+struct FramePose {
+  M3<Scalar> rotation;
+  V3<Scalar> position;
+};
+
+// Sets the axis S_k from its angular and linear parts.
+template <class T, class Scalar>
+GELFLOW_INLINE void set_axis(Workspace<T>& w, int k, const V3<Scalar>& angular, const V3<Scalar>& linear) {
+  w.axis.set(k, as<T>(stack<Scalar>(angular, linear)));
+}
+
+// Axes of the three rotational dofs from k on: the axes of the rotated frame, through a point.
+template <class T, class Scalar>
+GELFLOW_INLINE void set_rotation_axes(Workspace<T>& w, int k, const M3<Scalar>& rotation, const V3<Scalar>& point) {
+  for (int a = 0; a < 3; ++a) {
+    const V3<Scalar> direction = rotation.col(a);
+    set_axis<T, Scalar>(w, k + a, direction, cross<Scalar>(point, direction));
   }
 }
 
-// Twists V and accelerations A of every body; gravity enters as an acceleration of the world. `around`: also what is
-// before and after each dof, which derivatives need. What is before slides that nothing turns is not written down: only
-// its turning would count, and there is none. Bodies that float have no accelerations here (inverse_dynamics.hpp).
-template <bool around, class T>
+// Moves the body frame by one joint, with positions `value`, and sets the joint's axes.
+template <class T, class Scalar>
+GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, FramePose<Scalar>& frame, Workspace<T>& w) {
+  M3<Scalar>& r = frame.rotation;
+  V3<Scalar>& p = frame.position;
+  if (joint.type == JointType::free) {
+    p = vec3(value);
+    r = rotation_of<Scalar>(V4<Scalar>(value[3], value[4], value[5], value[6]));
+    for (int a = 0; a < 3; ++a) set_axis<T, Scalar>(w, joint.v + a, V3<Scalar>::Zero(), V3<Scalar>::Unit(a));
+    set_rotation_axes<T, Scalar>(w, joint.v + 3, r, p);
+    return;
+  }
+  const V3<Scalar> offset = joint.pos.template cast<Scalar>();
+  if (joint.type == JointType::ball) {
+    const V3<Scalar> anchor = p + r * offset;
+    r = (r * rotation_of<Scalar>(V4<Scalar>(value[0], value[1], value[2], value[3]))).eval();
+    p = anchor - r * offset;
+    set_rotation_axes<T, Scalar>(w, joint.v, r, anchor);
+    return;
+  }
+  const V3<Scalar> local = joint.axis.template cast<Scalar>();
+  const V3<Scalar> direction = r * local;
+  if (joint.type == JointType::slide) {
+    set_axis<T, Scalar>(w, joint.v, V3<Scalar>::Zero(), direction);
+    p += direction * (value[0] - Scalar(joint.ref));
+    return;
+  }
+  const V3<Scalar> anchor = p + r * offset;
+  set_axis<T, Scalar>(w, joint.v, direction, cross<Scalar>(anchor, direction));
+  r = (r * axis_rotation<Scalar>(local, value[0] - Scalar(joint.ref))).eval();
+  p = anchor - r * offset;
+}
+
+// Poses of all bodies and axes of all dofs at positions q.
+template <class T>
+void forward_positions(const Model& m, const T* params, const PositionScalar<T>* q, Workspace<T>& w) {
+  using Scalar = PositionScalar<T>;
+  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
+    const Body& body = m.bodies[i];
+    FramePose<Scalar> frame{body.rotation.template cast<Scalar>(), as<Scalar>(body.params.in(params).pos)};
+    if (body.parent != world) {
+      frame.position = (w.position[body.parent] + w.rotation[body.parent] * frame.position).eval();
+      frame.rotation = (w.rotation[body.parent] * frame.rotation).eval();
+    }
+    for (int j = body.joint_begin; j < body.joint_end; ++j) {
+      apply_joint<T, Scalar>(m.joints[j], q + m.joints[j].q, frame, w);
+    }
+    w.rotation[i] = frame.rotation;
+    w.position[i] = frame.position;
+  }
+}
+
+// Twist of a free body. Its acceleration is computed in its own frame (free_body.hpp).
+template <bool store_before, class T>
+GELFLOW_INLINE void free_body_velocity(const Model& m, std::size_t i, const T* v, Workspace<T>& w) {
+  const int k = m.joints[m.bodies[i].joint_begin].v;
+  const V3<T> linear = vec3(v + k), angular = as<T>(w.rotation[i]) * vec3(v + k + 3);
+  w.twist[i] = stack<T>(angular, linear + cross<T>(as<T>(w.position[i]), angular));
+  if constexpr (store_before) {
+    const V6<T> before = stack<T>(V3<T>::Zero(), linear);
+    for (int g = k + 3; g < k + 6; ++g) w.twist_before.set(g, before);
+  }
+}
+
+// Adds one group of dofs (k … end) to the twist and the acceleration of a body.
+template <bool store_before, class T>
+GELFLOW_INLINE void add_group_velocity(int k, int end, const T* v, const T* a, V6<T>& twist, V6<T>& acceleration,
+                                       Workspace<T>& w) {
+  const V6<T> before = twist;
+  V6<T> own = V6<T>::Zero(), own_rate = own;
+  for (int g = k; g < end; ++g) {
+    const V6<T> axis = w.axis[g];
+    own += axis * v[g];
+    own_rate += axis * a[g];
+  }
+  twist += own;
+  if constexpr (store_before) {
+    for (int g = k; g < end; ++g) {
+      w.twist_before.set(g, before);
+      w.twist_after[g] = twist;
+      w.acceleration_before[g] = acceleration;
+    }
+  }
+  acceleration += own_rate + cross_motion<T>(before, own);
+}
+
+// Twists V and accelerations A of all bodies; gravity enters as an acceleration of the world. `store_before` also stores
+// twist and acceleration before each dof and the twist after it, for derivatives; not for translations without a rotation
+// before them (Model::translation_only), where these are not needed.
+template <bool store_before, class T>
 void forward_velocities(const Model& m, const T* params, const T* v, const T* a, Workspace<T>& w) {
-  const V6<T> base = stack<T>(V3<T>::Zero(), -vec3(params + m.gravity));
+  const V6<T> base = stack<T>(V3<T>::Zero(), -m.gravity.in(params).acceleration);
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     if (body.is_free) {
-      const int k = m.joints[body.joint_begin].v;
-      const V3<T> slide = vec3(v + k), turn = as<T>(w.rotation[i]) * vec3(v + k + 3);
-      w.twist[i] = stack<T>(turn, slide + cross<T>(as<T>(w.position[i]), turn));
-      if constexpr (around) {
-        const V6<T> before = stack<T>(V3<T>::Zero(), slide);
-        for (int g = k + 3; g < k + 6; ++g) w.twist_before.set(g, before);
-      }
+      free_body_velocity<store_before, T>(m, i, v, w);
       continue;
     }
     V6<T> twist = body.parent == world ? V6<T>(V6<T>::Zero()) : w.twist[body.parent];
@@ -120,22 +164,7 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
           continue;
         }
         const int end = m.group_end[k];
-        const V6<T> before = twist;
-        V6<T> own = V6<T>::Zero(), own_rate = own;
-        for (int g = k; g < end; ++g) {
-          const V6<T> axis = w.axis[g];
-          own += axis * v[g];
-          own_rate += axis * a[g];
-        }
-        twist += own;
-        if constexpr (around) {
-          for (int g = k; g < end; ++g) {
-            w.twist_before.set(g, before);
-            w.twist_after[g] = twist;
-            w.acceleration_before[g] = acceleration;
-          }
-        }
-        acceleration += own_rate + cross_motion<T>(before, own);
+        add_group_velocity<store_before, T>(k, end, v, a, twist, acceleration, w);
         k = end;
       }
     }
@@ -144,16 +173,16 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
   }
 }
 
-// Both of a state (q, v) with accelerations zero; `low`: what q lacks, or null.
-template <bool around, class T>
+// Positions and velocities of the state (q, v), with zero accelerations. `q_rounding`: see StateView, or null.
+template <bool store_before, class T>
 void forward_state(const Model& m, const T* params, const T* q, const T* q_rounding, const T* v, Workspace<T>& w) {
   w.update.setZero();
   for (int i = 0; i < m.nq; ++i) w.q[i] = position_with_rounding(q, q_rounding, i);
   forward_positions<T>(m, params, w.q.data(), w);
-  forward_velocities<around, T>(m, params, v, w.update.data(), w);
+  forward_velocities<store_before, T>(m, params, v, w.update.data(), w);
 }
 
-// q_t = q_{t-1} ⊕ increment; `low`: what q_{t-1} lacks, or null.
+// q_t = q_{t-1} ⊕ increment. `q_rounding` is that of q_{t-1} (StateView), or null.
 template <class T>
 void integrate(const Model& m, const T* q0, const T* q_rounding, const VX<T>& increment, PositionScalar<T>* q1) {
   using Scalar = PositionScalar<T>;
@@ -173,7 +202,7 @@ void integrate(const Model& m, const T* q0, const T* q_rounding, const VX<T>& in
   }
 }
 
-// columns ← columns · ∂q_t/∂increment, where the columns belong to the tangent of q_t: Jr(φ) on turning dofs.
+// columns ← columns · ∂q_t/∂increment, where the columns refer to the tangent of q_t: Jr(φ) on rotational dofs.
 template <class T>
 void times_position_by_increment(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
   for (const Joint& joint : m.joints) {
@@ -209,7 +238,7 @@ VX<T> position_by_position_vjp(const Model& m, const VX<T>& increment, VX<T> lam
   return lambda;
 }
 
-// Gradients of a unit quaternion: from the four numbers to the tangent (right perturbation) and back.
+// Gradients with respect to q: from quaternion components to the tangent (right perturbation), and back.
 template <class T>
 VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
   VX<T> result(m.nv);

@@ -53,14 +53,14 @@ struct PairFrame {
 
 // Whether values differ from the nominal ones; always true for values with derivatives.
 template <class T>
-GELFLOW_INLINE bool differs_from_nominal(const T* numbers, const V3<double>& nominal) {
+GELFLOW_INLINE bool differs_from_nominal(const V3<T>& numbers, const V3<double>& nominal) {
   if constexpr (!std::is_floating_point_v<T>) return true;
   return numbers[0] != T(nominal[0]) || numbers[1] != T(nominal[1]) || numbers[2] != T(nominal[2]);
 }
 
 template <class T>
-M3<T> rotation_exp(const T* turn) {
-  return rotation_of<T>(quaternion_exp<T>(vec3(turn)));
+M3<T> rotation_exp(const V3<T>& turn) {
+  return rotation_of<T>(quaternion_exp<T>(turn));
 }
 
 // With R, p the nominal frame in the body and the parameters position p', rotation φ and scale S, a point x of the body
@@ -68,14 +68,15 @@ M3<T> rotation_exp(const T* turn) {
 //     x' = p' + R exp(φ) S Rᵀ (x − p) = A x + b,    A − 1 = R (exp(φ) S − 1) Rᵀ,    b = (p' − p) − (A − 1) p
 // (without rounding errors where nothing moves). Composes the body's pose with (A, b).
 template <class T>
-__attribute__((noinline)) void move_mount(const T* pose, const Mount& mount, M3<PositionScalar<T>>& rotation,
+__attribute__((noinline)) void move_mount(const T* params, const Mount& mount, M3<PositionScalar<T>>& rotation,
                                           V3<PositionScalar<T>>& position, PairFrame<T>& f) {
   using Scalar = PositionScalar<T>;
   const M3<Scalar> r = mount.rotation.template cast<Scalar>();
   const V3<Scalar> p = mount.pos.template cast<Scalar>();
-  M3<Scalar> change = as<Scalar>(rotation_exp<T>(pose + 3));
-  if (mount.scales) {
-    const T* s = pose + 6;
+  const PoseParams<T>& pose = mount.pose.in(params);
+  M3<Scalar> change = as<Scalar>(rotation_exp<T>(pose.turn));
+  if (mount.has_scale()) {
+    const V3<T>& s = mount.scale.in(params).scale;
     for (int a = 0; a < 3; ++a) change.col(a) *= Scalar(s[a]);
     f.scaled = !std::is_floating_point_v<T> || differs_from_nominal<T>(s, V3<double>::Ones());
     f.max_scale = std::max({s[0], s[1], s[2]});
@@ -83,7 +84,7 @@ __attribute__((noinline)) void move_mount(const T* pose, const Mount& mount, M3<
   }
   change -= M3<Scalar>::Identity();
   change = (r * change * r.transpose()).eval();
-  position += rotation * V3<Scalar>(as<Scalar>(vec3(pose)) - p - change * p);
+  position += rotation * V3<Scalar>(as<Scalar>(pose.pos) - p - change * p);
   rotation += (rotation * change).eval();
 }
 
@@ -93,13 +94,14 @@ PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape,
   PairFrame<T> f;
   const int first = mount.body;
   f.kind = shape.kind;
-  f.size = params + shape.size;
+  f.size = params + shape.size.offset;
   f.grid = shape.grid.get();
   M3<Scalar> to_world = shape.rotation.template cast<Scalar>();
-  if (differs_from_nominal<T>(params + shape.pose_param + 3, V3<double>::Zero())) {
-    to_world = (to_world * as<Scalar>(rotation_exp<T>(params + shape.pose_param + 3))).eval();
+  const PoseParams<T>& shape_pose = shape.pose.in(params);
+  if (differs_from_nominal<T>(shape_pose.turn, V3<double>::Zero())) {
+    to_world = (to_world * as<Scalar>(rotation_exp<T>(shape_pose.turn))).eval();
   }
-  V3<Scalar> origin = as<Scalar>(vec3(params + shape.pose_param));
+  V3<Scalar> origin = as<Scalar>(shape_pose.pos);
   V6<T> twist = first == world ? V6<T>(V6<T>::Zero()) : w.twist[first];
   if (shape.body != world) {
     origin = (w.position[shape.body] + w.rotation[shape.body] * origin).eval();
@@ -109,10 +111,10 @@ PairFrame<T> pair_frame(const T* params, const Mount& mount, const Shape& shape,
   M3<Scalar> first_rotation = first == world ? M3<Scalar>(M3<Scalar>::Identity()) : w.rotation[first];
   V3<Scalar> first_position = first == world ? V3<Scalar>(V3<Scalar>::Zero()) : w.position[first];
   f.scaled = false;
-  const T* pose = params + mount.pose_param;
-  if (differs_from_nominal<T>(pose, mount.pos) || differs_from_nominal<T>(pose + 3, V3<double>::Zero()) ||
-      (mount.scales && differs_from_nominal<T>(pose + 6, V3<double>::Ones()))) {
-    move_mount<T>(pose, mount, first_rotation, first_position, f);
+  const PoseParams<T>& pose = mount.pose.in(params);
+  if (differs_from_nominal<T>(pose.pos, mount.pos) || differs_from_nominal<T>(pose.turn, V3<double>::Zero()) ||
+      (mount.has_scale() && differs_from_nominal<T>(mount.scale.in(params).scale, V3<double>::Ones()))) {
+    move_mount<T>(params, mount, first_rotation, first_position, f);
   }
   const M3<Scalar> rotation = to_world.transpose() * first_rotation;
   const V3<Scalar> offset = to_world.transpose() * (first_position - origin);

@@ -1,16 +1,16 @@
-// The immutable model: what is in the scene and how it hangs together. Numbers that randomization, calibration and
-// gradients change live in Params, one flat array per environment; the model holds the offsets and the names.
+// The immutable model: the elements of a scene and its kinematic tree. Numbers that randomization, calibration and
+// gradients change are physical parameters, one flat array per environment (parameters.hpp); the model has their offsets
+// and names.
 #pragma once
 
-#include <array>
 #include <cstdint>
-#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
 
 #include "geometry/distance_grid.hpp"
 #include "geometry/point_cloud.hpp"
+#include "model/parameters.hpp"
 
 namespace gelflow {
 
@@ -27,35 +27,32 @@ enum class ShapeKind : std::uint8_t {
   grid
 };
 enum class FrictionLaw : std::uint8_t { viscous, elastic };
-enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not (ground)
+enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not
 enum class ActuatorKind : std::uint8_t { motor, position, velocity, general };
-
-constexpr int world = -1;
 
 struct Body {
   std::string name;
   int parent;           // moving body, or world
-  V4<double> quat;      // of the frame in the parent's frame at q = 0;
-  M3<double> rotation;  // the same
+  V4<double> quat;      // of the body frame in the parent's frame at q = 0
+  M3<double> rotation;  // the same as a matrix
   int joint_begin, joint_end;
-  int mass, pos;                  // offsets in Params: mass, com (3), inertia (6); pos (3)
+  ParamBlock<BodyParams> params;
   std::vector<int> dofs;          // all dofs that move this body, root first
-  bool translation_only = false;  // all of them do (Model::translates)
-  bool is_free = false;           // a free joint, and no body on it
+  bool translation_only = false;  // all of them are slides
+  bool is_free = false;           // it has a free joint and no child
 };
 
 struct Joint {
   std::string name;
   JointType type;
   int body;
-  V3<double> pos, axis;  // in the body's frame
+  V3<double> pos, axis;  // in the body frame
   int q, v;              // first position and first velocity
   int dofs;              // 1, 3 (ball) or 6 (free)
-  double ref;            // position at which the joint does not move its body
-  int param;             // damping, armature, stiffness, springref, lower, upper, limit_stiffness, limit_damping,
-                         // frictionloss
+  double ref;            // position of a slide or hinge at which the body has the pose of its definition
+  ParamBlock<JointParams> params;
 
-  // A ball or free joint turns by a unit quaternion; before it come `plain` positions that are just numbers.
+  // The positions of a joint are `scalar_dofs` numbers, then the unit quaternion of a ball or free joint.
   bool has_quaternion() const { return type == JointType::ball || type == JointType::free; }
   int scalar_dofs() const { return type == JointType::free ? 3 : type == JointType::ball ? 0 : 1; }
   int quaternion_q() const { return q + scalar_dofs(); }
@@ -66,21 +63,22 @@ struct Shape {
   std::string name;
   ShapeKind kind;
   int body;
-  M3<double> rotation;  // in the body's frame, before it is turned
-  int size;  // offset in Params (3): half sizes or half axes; radius, then half length along z; a grid's scale. The
-             // rounding is the fourth, where there is one
-  int pose_param;                            // offset in Params (6): pos, turn
-  std::shared_ptr<const DistanceGrid> grid;  // of the kind grid
+  M3<double> rotation;          // in the body frame, before the rotation of `pose`
+  ParamBlock<SizeParams> size;  // followed by RoundingParams where the shape is rounded
+  ParamBlock<PoseParams> pose;
+  std::shared_ptr<const DistanceGrid> grid;  // of a shape of kind grid
 };
 
-// The frame of a point set or a pad in its body, as its points were given. Params may have it elsewhere, turned and
-// scaled: then the points follow (pair_frame.hpp).
+// The frame of a point set or a pad in its body frame. Where the parameters differ from it, the points follow them
+// (pair_frame.hpp).
 struct Mount {
   int body;
   V3<double> pos;
   M3<double> rotation;
-  int pose_param;  // offset in Params (6): pos, turn; (9) where it scales: scale
-  bool scales;     // points do, pads do not
+  ParamBlock<PoseParams> pose;
+  ParamBlock<ScaleParams> scale;  // of point sets; pads have none
+
+  bool has_scale() const { return scale.offset >= 0; }
 };
 
 struct PointSet {
@@ -90,15 +88,16 @@ struct PointSet {
   PointCloud cloud;
 };
 
-// The dofs that move one body of a pair and not the other; they alone change the relative motion. In packs of
-// neighbouring dofs, for each of the widths that numbers come in (simd_pack.hpp).
+// The dofs that move one body of a pair and not the other: only these change the relative motion. They are the columns
+// of the contact Jacobian, in packs of neighbouring dofs, one packing for each SIMD width (simd_pack.hpp).
 struct PackedDofs {
   std::vector<int> start;    // first dof of each pack
-  std::vector<int> dof;      // per column, −1 where the column is none of the pair's
-  std::vector<double> sign;  // +1 where the dof moves the first body, −1 the second, 0 none of the pair's
+  std::vector<int> dof;      // per column; −1 where the dof moves neither body or both
+  std::vector<double> sign;  // per column: +1 where the dof moves the first body, −1 the second, else 0
   std::vector<double>
       axis_coupling;  // columns × columns: 1 where ∂S_row/∂q_column counts (contact_jacobian.hpp), else 0
-  std::vector<std::uint8_t> linear, has_coupling;  // per column: it never turns; as a row of `turned` it has a 1
+  std::vector<std::uint8_t> linear;        // per column: it is a translation
+  std::vector<std::uint8_t> has_coupling;  // per column: its row of `axis_coupling` has a 1
 };
 struct PairDofs {
   PackedDofs single, four, eight;
@@ -114,7 +113,7 @@ struct Contact {
   int points, shape;
   FrictionLaw law;
   DampingLaw damping;
-  int param;   // kn, kt, mu, kd, ks
+  ParamBlock<ContactParams> params;
   int anchor;  // first anchor slot, −1 under the viscous law
   PairDofs pair;
   bool uses_arc_correction = false;  // a free body on a plane of the world (arc_correction.hpp)
@@ -125,13 +124,13 @@ struct Pad {
   Mount mount;
   PointCloud cloud;
   std::vector<M3<double>> frames;  // sorted like the cloud; columns x, y, z
-  bool flat;                       // they are all the same
+  bool flat;                       // all frames are equal
   std::vector<int> shapes;
   FrictionLaw law;
-  int param;                    // kn, kt, mu, kd, ks
-  int anchor;                   // first anchor slot; shape s, marker i is at anchor + s * markers + i
-  int first_marker;             // in the tactile output
-  bool pushes;                  // its markers are contact points: contacts of its own have its numbers and anchors
+  ParamBlock<ContactParams> params;
+  int anchor;        // first anchor slot; shape s, marker i is at anchor + s * markers + i
+  int first_marker;  // in the tactile output
+  bool collides;     // the markers are contact points: one contact per shape shares its parameters and anchors
   std::vector<PairDofs> pairs;  // one per shape
 };
 
@@ -139,10 +138,20 @@ struct Actuator {
   std::string name;
   ActuatorKind kind;
   int dof, q;
-  int param;  // gear, kp, kd, force_lower, force_upper, ctrl_lower, ctrl_upper, gain, bias
+  ParamBlock<ActuatorParams> params;
 };
 
-struct Model {
+// Settings of the integrator and of Newton's method.
+struct SolverOptions {
+  double step = 5e-3;       // h [s]
+  double tolerance = 1e-7;  // of Newton's method: residual relative to the acting forces
+  int max_iterations = 50;
+  int max_step_iterations = 1000;  // in all attempts and substeps of one step
+  int max_halvings = 6;
+  int polish = 0;  // Newton iterations after convergence
+};
+
+struct Model : SolverOptions {
   std::vector<Body> bodies;
   std::vector<Joint> joints;
   std::vector<Shape> shapes;
@@ -153,75 +162,22 @@ struct Model {
 
   std::vector<std::string> param_names;
   std::vector<double> param_defaults;
-  int gravity = 0;  // offset in Params (3)
+  ParamBlock<GravityParams> gravity;
 
   int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
-  int nh = 0;                               // BDF2's history: 2 nv + 1 numbers, see step.hpp; BDF1 has none
-  int jacobian_columns = 0;                 // the most that a pair has, see PackedDofs
+  int nh = 0;                               // numbers in the history of BDF2, 2 nv + 1 (step.hpp); 0 under BDF1
+  int jacobian_columns = 0;                 // the most columns of a pair (PackedDofs)
   std::vector<double> q0;                   // reference positions
 
-  // Per dof: its body, its group (dofs of one ball turn together), whether it is an angle, whether it and all before it
-  // on its chain are slides, its joint.
+  // Per dof: its body, its joint; its group, the three rotational dofs of a ball or free joint, else itself; whether it
+  // is a rotation; whether it and all its ancestors are translations.
   std::vector<int> dof_body, dof_joint;
   std::vector<int> group_begin, group_end;
-  std::vector<int> articulated_dofs;  // dofs of bodies that do not float
   std::vector<std::uint8_t> angular, translation_only;
-  // carries(j, k): moving dof j carries dof k's axis along (j is before k on its chain, or in its group).
-  std::vector<std::uint8_t> ancestor_;
-  bool is_ancestor(int j, int k) const { return ancestor_[static_cast<std::size_t>(j) * nv + k] != 0; }
-
-  double step = 5e-3;       // h [s]
-  double tolerance = 1e-7;  // Newton: residual relative to the forces at work
-  int max_iterations = 50;
-  int max_step_iterations = 1000;  // of all attempts and substeps of one step
-  int max_halvings = 6;
-  int polish = 0;  // Newton iterations after it has converged
-
-  PairDofs pair_dofs(int first, int second);
-};
-
-// Collects a scene piece by piece, checks each, and hands out the Model.
-class ModelSpec {
- public:
-  V3<double> gravity{0, 0, -9.8};
-  double step = 5e-3;
-  double tolerance = 1e-7;
-  int max_iterations = 50;
-  int max_step_iterations = 1000;  // of all attempts and substeps of one step
-  int max_halvings = 6;
-  int polish = 0;
-  std::string integrator = "bdf1";
-
-  static constexpr double inf = std::numeric_limits<double>::infinity();
-
-  int add_body(const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat, double mass,
-               const V3<double>& com, const V6<double>& inertia);
-  int add_joint(const std::string& name, int body, const std::string& type, const V3<double>& pos,
-                const V3<double>& axis, double damping, double armature, double stiffness, double springref,
-                double lower, double upper, double limit_stiffness, double limit_damping, double ref,
-                double frictionloss);
-  int add_shape(const std::string& name, int body, const std::string& kind, const V3<double>& pos,
-                const V4<double>& quat, const V3<double>& size, double rounding,
-                std::shared_ptr<const DistanceGrid> grid);
-  int add_points(const std::string& name, int body, const std::vector<V3<double>>& points,
-                 const std::vector<double>& weights, double radius, const V3<double>& pos, const V4<double>& quat,
-                 const std::vector<V3<double>>& areas);
-  int add_contact(const std::string& name, int points, int shape, const std::string& law, const std::string& damping,
-                  const std::array<double, 5>& law_numbers);
-  int add_pad(const std::string& name, int body, const std::vector<V3<double>>& positions,
-              const std::vector<M3<double>>& frames, const std::vector<int>& shapes, const std::string& law,
-              const std::array<double, 5>& law_numbers, const std::vector<double>& weights, const V3<double>& pos,
-              const V4<double>& quat, bool pushes);
-  int add_actuator(const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
-                   double force_lower, double force_upper, double ctrl_lower, double ctrl_upper, double gain,
-                   double bias);
-  Model build() const;
-
- private:
-  Model model_;
-  int add_params(const std::string& owner, const std::vector<std::string>& names, const std::vector<double>& values);
-  void check_body(const std::string& what, int body, bool world_allowed) const;
-  int add_pose_params(const std::string& owner, const V3<double>& pos, bool scales);
+  std::vector<int> articulated_dofs;  // dofs of bodies that are not free
+  std::vector<std::uint8_t> ancestor_table;
+  // Moving dof j moves the axis of dof k: j is an ancestor of k, or in its group.
+  bool is_ancestor(int j, int k) const { return ancestor_table[static_cast<std::size_t>(j) * nv + k] != 0; }
 };
 
 }  // namespace gelflow

@@ -9,7 +9,7 @@
 
 namespace gelflow {
 
-// Spatial vectors side by side: number a of all of them in row a, with room for a pack behind the last.
+// Spatial vectors as structure of arrays: component a of all vectors in row a, padded for packs.
 template <class T>
 struct SixRows {
   explicit SixRows(int n) : stride_(n + PointCloud::padding), numbers_(6 * static_cast<std::size_t>(stride_), T(0)) {}
@@ -29,12 +29,12 @@ struct SixRows {
   std::vector<T> numbers_;
 };
 
-// The same for packs that are taken one by one: the six of a pack stand together.
+// Spatial vectors as array of structures of packs: the six components of a pack are contiguous.
 template <class T>
 struct SixPacks {
   static constexpr int width = pack_width<T>;
   explicit SixPacks(int n) : numbers_(6 * static_cast<std::size_t>((n + width - 1) / width * width), T(0)) {}
-  // Number a of the pack that begins with vector i.
+  // Component a of the pack that begins with vector i.
   T* at(int i, int a) { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
   const T* at(int i, int a) const { return numbers_.data() + 6 * static_cast<std::ptrdiff_t>(i) + a * width; }
   V6<T> operator[](int i) const {
@@ -47,21 +47,21 @@ struct SixPacks {
   std::vector<T> numbers_;
 };
 
-// Bodies that move together, about the world's origin (inverse_dynamics.hpp).
+// Inertia of a subtree about the world's origin (inverse_dynamics.hpp).
 template <class T>
 struct Composite {
   T mass;
   V3<T> moment;    // Σ m c
   M3<T> inertia;   // J
   M3<T> rate;      // B₁
-  V3<T> momentum;  // linear
+  V3<T> momentum;  // linear momentum p
 };
 
-// What the near points of a step were found for before: another environment perhaps; an earlier step of the same one; the
-// same step.
+// What the candidate points in a workspace belong to: possibly another environment; an earlier step of the same
+// environment; the present step.
 enum class CacheState : std::uint8_t { stale, warm, current };
 
-// Where a search for near points was made, and how far around the shape.
+// The pose and the margin around the shape at which candidate points were searched.
 template <class T>
 struct BroadPhaseQuery {
   M3<T> rotation;  // first body → shape
@@ -69,44 +69,45 @@ struct BroadPhaseQuery {
   double margin;  // [m]
 };
 
-// The points of one cloud that may touch one shape, side by side (broad_phase.hpp).
+// The points of one cloud that may touch one shape, as structure of arrays (broad_phase.hpp).
 template <class T>
 struct CandidatePoints {
   int count = 0, capacity = 0;
   std::vector<int> index;                                   // in the cloud
   std::vector<T> x, y, z, weight;                           // in the first body's frame
-  std::vector<T> anchor_x, anchor_y, anchor_z, has_anchor;  // in the shape's frame, 1 where there is one; elastic law
+  std::vector<T> anchor_x, anchor_y, anchor_z, has_anchor;  // in the shape's frame; 1 where it is set; elastic law
   BroadPhaseQuery<T> query;
-  // Those among which the next steps look.
+  // Points within a larger margin, among which the next steps search.
   std::vector<int> neighbors;
   std::vector<double> neighbor_x, neighbor_y, neighbor_z;
   BroadPhaseQuery<T> neighbor_query;
 };
 
-// The dofs of a pair in the shape's frame (contact_jacobian.hpp).
+// Contact Jacobian of a pair in the shape's frame (contact_jacobian.hpp).
 template <class T>
 struct ContactJacobian {
   explicit ContactJacobian(int capacity)
       : s(capacity), y(capacity), wrench_by_q(capacity), wrench_by_v(capacity), axis_wrench(capacity) {}
   const PackedDofs* dofs = nullptr;
-  int n = 0;                                          // columns, a whole number of packs
-  SixPacks<T> s, y;                                   // S and Y, signs applied
-  SixPacks<T> wrench_by_q, wrench_by_v, axis_wrench;  // what their displacements change (contact_forces.hpp)
+  int n = 0;         // columns, a whole number of packs
+  SixPacks<T> s, y;  // S and Y, signs applied
+  SixPacks<T> wrench_by_q, wrench_by_v,
+      axis_wrench;  // derivatives of the contact forces by the columns' dofs (contact_forces.hpp)
 };
 
-// What a step's residual needs beside v_t.
+// The start of a step: the arguments of its residual other than v_t.
 template <class T>
 struct StepStart {
   T h;  // β h
   const T *q0, *v_star;
-  const T* q_rounding;  // what q0 lacks, or null (StateView)
+  const T* q_rounding;  // rounding residual of q0, or null (StateView)
   const T* history;     // δ and v_{t-2}; null under BDF1
   const V3<T>* anchors;
   const std::uint8_t* anchored;
   const T* u;
-  CacheState cache = CacheState::stale;  // what the workspace was last used for
-  double continuation =
-      1;  // share of k_t, k_s, dry friction's slope and actuators' gains at work: 1 but on Newton's way
+  CacheState cache = CacheState::stale;  // of the workspace
+  // Continuation factor on k_t, k_s, the slope of dry friction and actuator gains; 1 except in Newton's homotopy.
+  double continuation = 1;
 
   T length() const { return history == nullptr ? h : T(h * T(1.5)); }  // of the step itself
 };
@@ -126,8 +127,8 @@ struct Workspace {
         twist_after(m.nv),
         acceleration_before(m.nv),
         p(m.nv),
-        q_missing(m.nv),
-        v_missing(m.nv),
+        motion_by_q(m.nv),
+        motion_by_v(m.nv),
         residual(stride),
         impulses(stride),
         residual_scale(stride),
@@ -151,22 +152,22 @@ struct Workspace {
     tangent.setZero();
   }
 
-  // Rows of matrices are longer than they need to be, so that packs may be added to them anywhere.
+  // Rows of matrices are padded, so that packs can be added at any column.
   using Rows = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
   int stride;
 
-  // Kinematics, world frame; spatial vectors at the world's origin.
+  // Kinematics in the world frame; spatial vectors at the world's origin.
   std::vector<M3<PositionScalar<T>>> rotation;
   std::vector<V3<PositionScalar<T>>> position;
   std::vector<V6<T>> twist, acceleration, force;
   std::vector<Composite<T>> composite;  // of the subtree (inverse_dynamics.hpp)
   SixRows<T> axis;                      // S_k per dof
-  SixRows<T> twist_before;              // around the dof's group
+  SixRows<T> twist_before;              // before the dof's group
   std::vector<V6<T>> twist_after, acceleration_before;
 
-  std::vector<V6<T>> p, q_missing, v_missing;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
+  std::vector<V6<T>> p, motion_by_q, motion_by_v;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
 
-  // The step's residual g and its derivatives.
+  // Residual g of the step and its derivatives.
   VX<T> residual, impulses, residual_scale;  // behind the last number as many zeros as rows have (newton.hpp)
   VX<T> increment;                           // q_t = q_{t-1} ⊕ increment
   VX<T> update, trial;                       // accelerations; v_t − v*
@@ -177,9 +178,9 @@ struct Workspace {
   VX<PositionScalar<T>> q;  // q_t of the trial velocity
   std::vector<int> pivots;
 
-  ContactJacobian<T> jacobian;                 // of the pair at work
+  ContactJacobian<T> jacobian;                 // of the current pair
   std::vector<CandidatePoints<T>> candidates;  // per contact
-  CandidatePoints<T> marker_candidates;        // of the pad at work
+  CandidatePoints<T> marker_candidates;        // of the current pad
 };
 
 }  // namespace gelflow

@@ -8,17 +8,17 @@ namespace gelflow {
 // Dry friction in a joint is viscous below this speed [m/s or rad/s].
 constexpr double friction_creep = 1e-3;
 
-// A joint limit is a damped spring that never outs; p: the joint's parameters.
+// A joint limit is a damped spring that never pulls.
 template <class T>
 struct LimitForce {
   T force, by_q, by_v;
 };
 template <class T>
-LimitForce<T> limit_force(const T* p, const T& value, const T& v) {
-  const bool above = value > p[5], below = value < p[4];
+LimitForce<T> limit_force(const JointParams<T>& p, const T& value, const T& v) {
+  const bool above = value > p.upper, below = value < p.lower;
   if (!above && !below) return {T(0), T(0), T(0)};
-  const T force = p[6] * (value - (above ? p[5] : p[4])) + p[7] * v;
-  if (above ? force > T(0) : force < T(0)) return {force, p[6], p[7]};
+  const T force = p.limit_stiffness * (value - (above ? p.upper : p.lower)) + p.limit_damping * v;
+  if (above ? force > T(0) : force < T(0)) return {force, p.limit_stiffness, p.limit_damping};
   return {T(0), T(0), T(0)};
 }
 
@@ -29,9 +29,9 @@ struct ActuatorForce {
   int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
 };
 template <class T, class Q>
-ActuatorForce<T> actuator_force(const Actuator& actuator, const T* p, const T& u, const Q* q, const T* v,
-                                double continuation = 1) {
-  const T gear = p[0], kp = p[1], kd = p[2];
+ActuatorForce<T> actuator_force(const Actuator& actuator, const ActuatorParams<T>& p, const T& u, const Q* q,
+                                const T* v, double continuation = 1) {
+  const T gear = p.gear, kp = p.kp, kd = p.kd;
   ActuatorForce<T> out{T(0), T(1), T(0), T(0), 0};
   T bias = T(0);
   switch (actuator.kind) {
@@ -44,15 +44,15 @@ ActuatorForce<T> actuator_force(const Actuator& actuator, const T* p, const T& u
       out = {T(0), kd, T(0), -kd, 0};
       break;
     case ActuatorKind::general:
-      out = {T(0), p[7], -kp, -kd, 0};
-      bias = p[8];
+      out = {T(0), p.gain, -kp, -kd, 0};
+      bias = p.bias;
       break;
   }
   const T gain = out.by_u;
   T control = u;
-  if (u < p[5] || u > p[6]) {
-    out.clipped = u < p[5] ? 1 : 2;
-    control = u < p[5] ? p[5] : p[6];
+  if (u < p.ctrl_lower || u > p.ctrl_upper) {
+    out.clipped = u < p.ctrl_lower ? 1 : 2;
+    control = u < p.ctrl_lower ? p.ctrl_lower : p.ctrl_upper;
     out.by_u = T(0);
   }
   out.force =
@@ -62,28 +62,28 @@ ActuatorForce<T> actuator_force(const Actuator& actuator, const T* p, const T& u
     out.by_length *= T(continuation);
     out.by_speed *= T(continuation);
   }
-  if (out.force < p[3] || out.force > p[4]) {
-    const bool below = out.force < p[3];
-    return {below ? p[3] : p[4], T(0), T(0), T(0), out.clipped | (below ? 4 : 8)};
+  if (out.force < p.force_lower || out.force > p.force_upper) {
+    const bool below = out.force < p.force_lower;
+    return {below ? p.force_lower : p.force_upper, T(0), T(0), T(0), out.clipped | (below ? 4 : 8)};
   }
   return out;
 }
 
 // Damping, dry friction and armature of all dofs of a joint.
 template <bool derivatives, class T>
-GELFLOW_INLINE void add_dof_forces(const Joint& joint, const T* p, const T& h, const T* v, const T& creep,
+GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, const T& h, const T* v, const T& creep,
                                    bool add_impulses, Workspace<T>& w) {
   using std::abs;
-  const T damping = p[0], armature = p[1];
+  const T damping = p.damping, armature = p.armature;
   for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
     w.residual[k] += h * damping * v[k];
     if constexpr (derivatives) w.by_v(k, k) += h * damping;
-    if (p[8] != T(0)) {
+    if (p.frictionloss != T(0)) {
       const bool slides = abs(v[k]) > creep;
-      const T force = slides ? T(v[k] > T(0) ? p[8] : -p[8]) : T(p[8] / creep * v[k]);
+      const T force = slides ? T(v[k] > T(0) ? p.frictionloss : -p.frictionloss) : T(p.frictionloss / creep * v[k]);
       w.residual[k] += h * force;
-      if (add_impulses) w.impulses[k] += h * p[8];
-      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p[8] / creep);
+      if (add_impulses) w.impulses[k] += h * p.frictionloss;
+      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p.frictionloss / creep);
     }
     if (armature != T(0)) {
       w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
@@ -97,9 +97,9 @@ GELFLOW_INLINE void add_dof_forces(const Joint& joint, const T* p, const T& h, c
 
 // Spring and limit of a slide or hinge.
 template <bool derivatives, class T>
-GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const T* p, const T& h, const PositionScalar<T>* q,
-                                         const T* v, Workspace<T>& w) {
-  const T stiffness = p[2], springref = p[3];
+GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const JointParams<T>& p, const T& h,
+                                         const PositionScalar<T>* q, const T* v, Workspace<T>& w) {
+  const T stiffness = p.stiffness, springref = p.springref;
   const int k = joint.v;
   const T value(q[joint.q]);
   w.residual[k] += h * stiffness * (value - springref);
@@ -119,14 +119,14 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Po
   using std::abs;
   const T creep(friction_creep / continuation);
   for (const Joint& joint : m.joints) {
-    const T* p = params + joint.param;
+    const JointParams<T>& p = joint.params.in(params);
     add_dof_forces<derivatives, T>(joint, p, h, v, creep, add_impulses, w);
     if (!joint.has_quaternion()) add_spring_and_limit<derivatives, T>(joint, p, h, q, v, w);
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
-    const T* p = params + actuator.param;
-    const T gear = p[0];
+    const ActuatorParams<T>& p = actuator.params.in(params);
+    const T gear = p.gear;
     const int k = actuator.dof;
     const ActuatorForce<T> out = actuator_force<T>(actuator, p, u[a], q, v, continuation);
     w.residual[k] -= h * gear * out.force;

@@ -48,7 +48,7 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
   for (const Joint& joint : m.joints) {
     if (joint.type == JointType::hinge) angle = std::max(angle, std::abs(real_part(from.q0[joint.q])));
   }
-  for (const Body& body : m.bodies) mass += std::abs(real_part(params[body.mass]));
+  for (const Body& body : m.bodies) mass += std::abs(real_part(body.params.in(params).mass));
   for (int k = 0; k < m.nv; ++k) {
     double& fastest = m.angular[k] ? spin : speed;
     fastest = std::max(fastest, std::abs(real_part(from.v_star[k])));

@@ -65,7 +65,7 @@ def variants(moves: ReferenceMotion, count: int) -> list[ReferenceMotion]:
 
 def simulator(scene: Scene, step: float, integrator: str, envs: int = 1) -> Simulator:
     """A simulator of the scene with another step and integrator, solved to `TOLERANCE`."""
-    spec = scene.describe_to(_core.ModelSpec())
+    spec = scene.model_spec()
     spec.step, spec.integrator, spec.tolerance = step, integrator, TOLERANCE
     return Simulator(_core.Model(spec), num_envs=envs, threads=1)
 

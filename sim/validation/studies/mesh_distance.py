@@ -23,6 +23,7 @@ from gelflow.sim import _core
 from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, build_grid
 from gelflow.sim.scene.geometry.mesh import TriangleMesh, nearest_points
 from gelflow.sim.scene.geometry.sampling import capsule, mesh_surface
+from gelflow.sim.scene.model_spec import core_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import reference_meshes as mesh_solids
 
@@ -70,17 +71,17 @@ class Result:
     bytes: int
 
 
-def spec_with(kind: str, size: Any, *, grid: DistanceGrid | None = None, rounding: float = 0.0) -> tuple[Any, int]:
+def spec_with(
+    kind: str, size: Any, *, grid: DistanceGrid | None = None, rounding: float = 0.0
+) -> tuple[_core.ModelSpec, int]:
     """A ModelSpec with a fixed shape "shape" and a ball on three slides, and the index of the shape."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
-    grid_arguments = {}
-    if grid is not None:
-        grid_arguments = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
-    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), size, rounding=rounding, **grid_arguments)
-    body = spec.add_body("ball", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    distances = core_grid(grid) if grid is not None else None
+    shape = spec.add_shape(_core.ShapeDef(name="shape", kind=kind, size=size, rounding=rounding, grid=distances))
+    body = spec.add_body(_core.BodyDef(name="ball", mass=0.1, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0)))
     for name, axis in zip("xyz", np.eye(3), strict=True):
-        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+        spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
     return spec, shape
 
 
@@ -138,7 +139,17 @@ def force_errors(solid: Solid, grid: DistanceGrid) -> tuple[float, float, float]
     areas = across.sum(1)
     spec, shape = spec_with("grid", (1, 0, 0), grid=grid)
     stiffness = 1e7  # [N/m³]
-    spec.add_contact("press", spec.add_points("ball", 0, ball, areas), shape, kn=stiffness, kt=0.0, mu=0.0, kd=0.0)
+    spec.add_contact(
+        _core.ContactDef(
+            name="press",
+            points=spec.add_points(_core.PointsDef(name="ball", body=0, points=ball, weights=areas)),
+            shape=shape,
+            kn=stiffness,
+            kt=0.0,
+            mu=0.0,
+            kd=0.0,
+        )
+    )
     centers = ball_centers(solid)
     sim = Simulator(_core.Model(spec), num_envs=len(centers), threads=1)
     sim.q[:] = centers
@@ -182,10 +193,16 @@ def microseconds_per_point(kind: str, grid: DistanceGrid | None, repeats: int) -
     for count in (200, 5000):
         line = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * (0.01, 0.01, 1e-3) + (0, 0, 0.0085)
         spec, shape = spec_with(kind, (1, 0, 0) if grid is not None else SIZES["box"], grid=grid)
-        numbers = {"kn": 1e-3, "kt": 1e-3, "mu": 0.5, "kd": 0.0}
-        spec.add_contact("press", spec.add_points("line", 0, line, np.ones(count)), shape, **numbers)
-        axes = [np.tile(axis, (count, 1)) for axis in np.eye(3)]
-        spec.add_pad("pad", 0, line, *axes, shapes=[shape], **numbers)
+        numbers: dict[str, Any] = {"kn": 1e-3, "kt": 1e-3, "mu": 0.5, "kd": 0.0}
+        spec.add_contact(
+            _core.ContactDef(
+                name="press",
+                points=spec.add_points(_core.PointsDef(name="line", body=0, points=line)),
+                shape=shape,
+                **numbers,
+            )
+        )
+        spec.add_pad(_core.PadDef(name="pad", body=0, positions=line, shapes=[shape], **numbers))
         sim = Simulator(_core.Model(spec), threads=1)
         for name, work in (("step", lambda sim=sim: sim.step(np.zeros(0))), ("reading", sim.tactile)):
             times = []

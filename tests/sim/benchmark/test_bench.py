@@ -74,7 +74,7 @@ def test_every_timed_run_has_an_accuracy_check(everything: tuple[Path, str]) -> 
 def test_rolling_run_equals_the_published_run() -> None:
     """The end state equals that of a loop of single steps with the five forces, for every evaluation interval."""
     report = measure_rolling(ONCE, configs=[RollingConfig(5, every) for every in (1, 7, 20, 350, 0)])
-    sim = simulator((scene := rolling_scene(5)).describe_to, tolerance=TIMED["viscous"])
+    sim = simulator((scene := rolling_scene(5)).model_spec, tolerance=TIMED["viscous"])
     sim.q[:] = scene.q0
     largest = np.zeros(3)
     for step in range(350):
@@ -102,7 +102,7 @@ def test_mujoco_taxels_are_at_the_markers() -> None:
     """Each taxel gives its depth in the ball, and the ball rolls as in gelflow within the contact compliance."""
     scene = rolling_scene(40)
     run = rolling_run(scene, 5)
-    rival, sim = MujocoRolling(scene, run), simulator(scene.describe_to)
+    rival, sim = MujocoRolling(scene, run), simulator(scene.model_spec)
     rival.start()
     rival.execute()
     run.start(sim)
@@ -143,7 +143,7 @@ def test_gradients_equal_those_of_the_converged_reference() -> None:
 
 def test_environments_of_a_batch_differ_except_the_first() -> None:
     scene = load_scene("insertion")
-    sim = simulator(scene.describe_to, num_envs=4)
+    sim = simulator(scene.model_spec, num_envs=4)
     perturb_stiffness(sim)
     stiffness = sim.param("pad_left.kn")
     assert stiffness[0] == 8e3 and len(set(stiffness.tolist())) == 4
@@ -187,9 +187,9 @@ def test_inaccurate_run_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     """A loose Newton tolerance gives force errors above 1e-4."""
     scene = load_scene("insertion", friction="elastic")
     run = motion_run(scene, steps=60)
-    right, loose = (simulator(scene.describe_to, tolerance=tolerance) for tolerance in (1e-7, 0.3))
-    assert check_accuracy(run, right, scene.describe_to).violations("insertion") == []
-    lines = check_accuracy(run, loose, scene.describe_to).violations("insertion")
+    right, loose = (simulator(scene.model_spec, tolerance=tolerance) for tolerance in (1e-7, 0.3))
+    assert check_accuracy(run, right, scene.model_spec).violations("insertion") == []
+    lines = check_accuracy(run, loose, scene.model_spec).violations("insertion")
     assert len(lines) == 1 and lines[0].startswith("insertion: ")
     report = Report("scenes", "title", (), [], "note", [], lines)
     assert conclude([report], Output()) == 1

@@ -211,7 +211,7 @@ def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
 
 
 def test_iteration_limit_gives_a_failure_status(insertion: Scene) -> None:
-    spec = insertion.describe_to(_core.ModelSpec())
+    spec = insertion.model_spec()
     spec.max_step_iterations = 1
     sim = Simulator(_core.Model(spec))
     sim.q[:] = start = insertion.q0
@@ -278,8 +278,8 @@ def test_small_increments_accumulate_in_single_precision() -> None:
     """A step moves the body by 1e-9 m, 1/60 of the resolution of single precision at 0.5 m."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step = (0.0, 0.0, 0.0), 1e-6
-    body = spec.add_body("body", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-    spec.add_joint("body", body, "free", (0, 0, 0), (0, 0, 1))
+    body = spec.add_body(_core.BodyDef(name="body", mass=1.0, inertia=(1, 1, 1, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="body", body=body, type="free"))
     model = _core.Model(spec)
     stepped, rolled = Simulator(model, precision="single"), Simulator(model, precision="single")
     for sim in (stepped, rolled):

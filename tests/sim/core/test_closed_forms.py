@@ -14,16 +14,31 @@ RADIUS, DEPTH, STIFFNESS = 0.020, 1e-3, 1e8  # [m], [m], [N/m³]
 def pressed(side: int) -> float:
     """Sum of the normal forces of side × side markers on 16 × 16 mm, pressed by DEPTH onto a fixed sphere [N]."""
     spec = _core.ModelSpec()
-    body = spec.add_body("pad", -1, (0, 0, RADIUS - DEPTH), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
-    spec.add_joint("height", body, "slide", (0, 0, 0), (0, 0, 1))
-    sphere = spec.add_shape("sphere", -1, "sphere", (0, 0, 0), (1, 0, 0, 0), (RADIUS, 0, 0))
+    body = spec.add_body(
+        _core.BodyDef(name="pad", pos=(0, 0, RADIUS - DEPTH), mass=0.1, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0))
+    )
+    spec.add_joint(_core.JointDef(name="height", body=body, type="slide"))
+    sphere = spec.add_shape(_core.ShapeDef(name="sphere", kind="sphere", size=(RADIUS, 0, 0)))
     pitch = 0.016 / side
     line = (np.arange(side) - (side - 1) / 2) * pitch
     x, y = np.meshgrid(line, line)
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(side * side)])
     axes = [np.tile(axis, (len(points), 1)) for axis in ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0))]
     areas = np.full(len(points), pitch**2)
-    spec.add_pad("pad", body, points, *axes, shapes=[sphere], weights=areas, kn=STIFFNESS, kt=0.0, mu=0.0, kd=0.0)
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=points,
+            axes=np.stack(axes, axis=-1),
+            shapes=[sphere],
+            weights=areas,
+            kn=STIFFNESS,
+            kt=0.0,
+            mu=0.0,
+            kd=0.0,
+        )
+    )
     return float(Simulator(_core.Model(spec)).tactile()[0, :, 2].sum())
 
 
@@ -40,7 +55,7 @@ def test_force_of_a_sphere_on_a_pad_with_stiffness_per_area() -> None:
 def test_grasped_part_does_not_creep_and_markers_show_its_load_under_the_elastic_law(integrator: str) -> None:
     attempts = InsertionAttempts(1, scene=insertion_scene(friction="elastic"), randomization=NOMINAL)
     attempts.draw(np.random.default_rng(0))
-    spec = attempts.scene.describe_to(_core.ModelSpec())
+    spec = attempts.scene.model_spec()
     spec.integrator = integrator
     sim, u = Simulator(_core.Model(spec)), attempts._u
     for name in ("q", "params", "anchors", "anchored"):

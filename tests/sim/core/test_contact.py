@@ -27,8 +27,10 @@ CORNERS = HALF * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in 
 def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:
     """Add a free cube; returns its body."""
     inertia = mass * (2 * HALF) ** 2 / 6
-    body = int(spec.add_body(name, -1, pos, UPRIGHT, mass, ORIGIN, (inertia, inertia, inertia, 0, 0, 0)))
-    spec.add_joint(f"{name}_free", body, "free", ORIGIN, (0, 0, 1))
+    body = int(
+        spec.add_body(_core.BodyDef(name=name, pos=pos, mass=mass, inertia=(inertia, inertia, inertia, 0, 0, 0)))
+    )
+    spec.add_joint(_core.JointDef(name=f"{name}_free", body=body, type="free"))
     return body
 
 
@@ -38,12 +40,28 @@ def block_on_plane(law: str, *, slope: float = 0.0, damping: str = "depth", **nu
     spec.step, spec.tolerance = 2e-3, 1e-12
     spec.gravity = (G * np.sin(slope), 0.0, -G * np.cos(slope))
     body = block(spec, "block", (0, 0, HALF))
-    plane = spec.add_shape("plane", -1, "plane", ORIGIN, UPRIGHT, (1, 1, 1))
-    points = spec.add_points("corners", body, CORNERS, np.ones(8))
-    law_numbers = {"kn": 2e3, "kt": 20.0, "mu": 0.6, "kd": 2e4, "ks": 1e3 if law == "elastic" else 0.0} | numbers
-    spec.add_contact("contact", points, plane, law=law, damping=damping, **law_numbers)
-    axes = [np.tile(axis, (8, 1)) for axis in np.eye(3)]
-    spec.add_pad("pad", body, CORNERS, *axes, shapes=[plane], law=law, **law_numbers)
+    plane = spec.add_shape(_core.ShapeDef(name="plane", kind="plane", size=(1, 1, 1)))
+    points = spec.add_points(_core.PointsDef(name="corners", body=body, points=CORNERS))
+    law_numbers: dict[str, Any] = {
+        "kn": 2e3,
+        "kt": 20.0,
+        "mu": 0.6,
+        "kd": 2e4,
+        "ks": 1e3 if law == "elastic" else 0.0,
+    } | numbers
+    spec.add_contact(
+        _core.ContactDef(name="contact", points=points, shape=plane, law=law, damping=damping, **law_numbers)
+    )
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=CORNERS,
+            shapes=[plane],
+            law=law,
+            **law_numbers,
+        )
+    )
     return Simulator(_core.Model(spec))
 
 
@@ -135,9 +153,13 @@ def two_blocks(law: str) -> Simulator:
     spec.step, spec.tolerance, spec.gravity = 1e-3, 1e-13, ORIGIN
     first = block(spec, "first")
     second = block(spec, "second", (1.9 * HALF, 0.7 * HALF, 0.4 * HALF), mass=0.1)
-    shape = spec.add_shape("box", second, "box", ORIGIN, UPRIGHT, (HALF, HALF, HALF))
-    points = spec.add_points("corners", first, CORNERS, np.ones(8))
-    spec.add_contact("contact", points, shape, law=law, kn=300.0, kt=0.5, mu=0.7, kd=30.0, ks=100.0)
+    shape = spec.add_shape(_core.ShapeDef(name="box", body=second, kind="box", size=(HALF, HALF, HALF)))
+    points = spec.add_points(_core.PointsDef(name="corners", body=first, points=CORNERS))
+    spec.add_contact(
+        _core.ContactDef(
+            name="contact", points=points, shape=shape, law=law, kn=300.0, kt=0.5, mu=0.7, kd=30.0, ks=100.0
+        )
+    )
     sim = Simulator(_core.Model(spec))
     sim.v[0] = 0.3, 0.05, 0.0, 1.0, -2.0, 3.0, -0.2, 0.0, 0.1, 0.0, 1.0, -1.0
     return sim
@@ -187,11 +209,15 @@ def ball_on_plane(step: float = 1e-3) -> Simulator:
     spec.step, spec.tolerance = step, 1e-12
     radius, mass = 0.03, 0.2
     inertia = 0.4 * mass * radius**2
-    ball = spec.add_body("ball", -1, (0, 0, radius), UPRIGHT, mass, ORIGIN, (inertia, inertia, inertia, 0, 0, 0))
-    spec.add_joint("free", ball, "free", ORIGIN, (0, 0, 1))
-    plane = spec.add_shape("plane", -1, "plane", ORIGIN, UPRIGHT, (1, 1, 1))
-    points = spec.add_points("centre", ball, [ORIGIN], [1.0], radius=radius)
-    spec.add_contact("contact", points, plane, damping="plain", kn=5e4, kt=200.0, mu=0.3, kd=50.0)
+    ball = spec.add_body(
+        _core.BodyDef(name="ball", pos=(0, 0, radius), mass=mass, inertia=(inertia, inertia, inertia, 0, 0, 0))
+    )
+    spec.add_joint(_core.JointDef(name="free", body=ball, type="free"))
+    plane = spec.add_shape(_core.ShapeDef(name="plane", kind="plane", size=(1, 1, 1)))
+    points = spec.add_points(_core.PointsDef(name="centre", body=ball, points=[ORIGIN], radius=radius))
+    spec.add_contact(
+        _core.ContactDef(name="contact", points=points, shape=plane, damping="plain", kn=5e4, kt=200.0, mu=0.3, kd=50.0)
+    )
     return Simulator(_core.Model(spec))
 
 

@@ -69,9 +69,21 @@ def our_model(links: list[Link], gravity: Array, step: float = 5e-3, tolerance: 
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.tolerance = gravity, step, tolerance
     for i, link in enumerate(links):
-        spec.add_body(f"body{i}", link.parent, link.pos, link.quat, link.mass, link.com, link.inertia)
+        spec.add_body(
+            _core.BodyDef(
+                name=f"body{i}",
+                parent=link.parent,
+                pos=link.pos,
+                quat=link.quat,
+                mass=link.mass,
+                com=link.com,
+                inertia=link.inertia,
+            )
+        )
         for j, (kind, pos, axis, armature) in enumerate(link.joints):
-            spec.add_joint(f"joint{i}_{j}", i, kind, pos, axis, armature=armature)
+            spec.add_joint(
+                _core.JointDef(name=f"joint{i}_{j}", body=i, type=kind, pos=pos, axis=axis, armature=armature)
+            )
     return _core.Model(spec)
 
 
@@ -177,8 +189,8 @@ def free_bodies(
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -gravity), step, tolerance
     for i in range(count):
-        spec.add_body(f"body{i}", -1, (0.5 * i, 0.0, 1.0), UPRIGHT, 2.0, ORIGIN, inertia)
-        spec.add_joint(f"joint{i}", i, "free", ORIGIN, (0, 0, 1))
+        spec.add_body(_core.BodyDef(name=f"body{i}", pos=(0.5 * i, 0.0, 1.0), mass=2.0, inertia=inertia))
+        spec.add_joint(_core.JointDef(name=f"joint{i}", body=i, type="free"))
     return Simulator(_core.Model(spec))
 
 
@@ -238,10 +250,12 @@ def one_joint(
     """A body of 2 kg on a vertical slide or a horizontal hinge."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.tolerance = (0.0, 0.0, -GRAVITY), step, 1e-13
-    spec.add_body("body", -1, ORIGIN, UPRIGHT, 2.0, (0, 0, -com), (0.03, 0.03, 0.03, 0, 0, 0))
-    spec.add_joint("joint", 0, kind, ORIGIN, (0, 0, 1) if kind == "slide" else (1, 0, 0), **joint)
+    spec.add_body(_core.BodyDef(name="body", mass=2.0, com=(0, 0, -com), inertia=(0.03, 0.03, 0.03, 0, 0, 0)))
+    spec.add_joint(
+        _core.JointDef(name="joint", body=0, type=kind, axis=(0, 0, 1) if kind == "slide" else (1, 0, 0), **joint)
+    )
     if actuator is not None:
-        spec.add_actuator("servo", 0, "position", **actuator)
+        spec.add_actuator(_core.ActuatorDef(name="servo", joint=0, kind="position", **actuator))
     return Simulator(_core.Model(spec))
 
 

@@ -82,7 +82,7 @@ def test_friction_energy_of_a_slipping_block(integrator: str, step: float, withi
     BDF2 computes the slip of a step to first order."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
     throw = ThrownBody("box", "elastic", "depth", step, numbers, integrator=integrator, has_rotation=False)
-    sim, gauge = Simulator(_core.Model(throw.describe_to(_core.ModelSpec()))), EnergyGauge(throw)
+    sim, gauge = Simulator(_core.Model(throw.model_spec())), EnergyGauge(throw)
     points = 9  # of the lower face
     sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
     sim.q[0, 0], sim.v[0, 0] = -10, 1.0  # far from the slope
@@ -97,7 +97,7 @@ def test_energy_terms_equal_their_formulas() -> None:
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
     throw = ThrownBody("box", "elastic", "depth", 1e-3, numbers)
     sim, gauge = (
-        Simulator(_core.Model(throw.describe_to(_core.ModelSpec())), num_envs=2),
+        Simulator(_core.Model(throw.model_spec()), num_envs=2),
         EnergyGauge(throw, num_envs=2),
     )
     sim.q[:, 0], sim.q[:, 2] = -10, 0.6 * SIZE - np.array([1e-4, -1.0])

@@ -12,6 +12,7 @@ from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS, load_scene
 from gelflow.sim.scene.geometry.distance_grid import spline_grid
+from gelflow.sim.scene.model_spec import core_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import SHAPES, pressed_cloud
@@ -72,19 +73,28 @@ def arguments_of(kind: str) -> dict[str, Any]:
     line = np.linspace(-0.04, 0.04, 17)
     x, y, z = np.meshgrid(line, line, line, indexing="ij")
     grid = spline_grid(np.sqrt(x**2 + y**2 + z**2) - 0.02, np.full(3, line[0]), line[1] - line[0])
-    numbers = {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
-    return {"kind": kind, "size": (1, 0, 0), **numbers}
+    return {"kind": kind, "size": (1, 0, 0), "grid": core_grid(grid)}
 
 
 @pytest.mark.parametrize("kind", ["grid", "box", "cylinder"])
 def test_distance_grid_and_rounded_solid(kind: str) -> None:
     points = np.random.default_rng(2).uniform(-0.03, 0.03, (200, 3))
     spec = _core.ModelSpec()
-    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
-    shape = spec.add_shape("shape", -1, pos=(0, 0, 0), quat=(1, 0, 0, 0), **arguments_of(kind))
-    axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
-    spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.1, mu=0.5, kd=0.1)
+    body = spec.add_body(_core.BodyDef(name="probe", mass=1.0, inertia=(1, 1, 1, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="slide", body=body, type="slide", axis=(1, 0, 0)))
+    shape = spec.add_shape(_core.ShapeDef(name="shape", **arguments_of(kind)))
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=points,
+            shapes=[shape],
+            kn=1.0,
+            kt=0.1,
+            mu=0.5,
+            kd=0.1,
+        )
+    )
     model = _core.Model(spec)
     for values in model.distance("shape", points):
         assert np.isfinite(values).all()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gelflow.sim import _core
 from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, spline_grid
+from gelflow.sim.scene.model_spec import core_grid
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation import reference_meshes as mesh_solids
@@ -40,30 +41,30 @@ def bracket_grid(cells: int) -> DistanceGrid:
     return spline_grid(distances.reshape(nodes.shape[:3]), low - 3 * spacing, spacing)
 
 
-def arguments_of(grid: DistanceGrid | None) -> dict[str, Any]:
-    """Arguments of a grid for the core; empty without a grid."""
-    if grid is None:
-        return {}
-    return {"origin": grid.origin, "spacing": grid.spacing, "coefficients": grid.coefficients}
-
-
-def model_of(kind: str, size: Any, points: Array | None = None, *, rounding: float = 0.0, **grid: Any) -> Any:
+def model_of(
+    kind: str, size: Any, points: Array | None = None, *, rounding: float = 0.0, grid: DistanceGrid | None = None
+) -> _core.Model:
     """A fixed shape "shape" and fixed markers of 1 N/m."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
-    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
-    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), size, rounding=rounding, **grid)
+    body = spec.add_body(_core.BodyDef(name="probe", mass=1.0, inertia=(1, 1, 1, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="slide", body=body, type="slide", axis=(1, 0, 0)))
+    shape = spec.add_shape(
+        _core.ShapeDef(
+            name="shape", kind=kind, size=size, rounding=rounding, grid=core_grid(grid) if grid is not None else None
+        )
+    )
     if points is not None:
-        axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
-        spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.0, mu=0.0, kd=0.0)
+        spec.add_pad(
+            _core.PadDef(name="pad", body=body, positions=points, shapes=[shape], kn=1.0, kt=0.0, mu=0.0, kd=0.0)
+        )
     return _core.Model(spec)
 
 
 def shape_of(kind: str) -> Any:
     """A model with one shape: a sphere's grid, or a rounded solid."""
     if kind == "grid":
-        return model_of("grid", (1, 0, 0), **arguments_of(sphere_grid(16)))
+        return model_of("grid", (1, 0, 0), grid=sphere_grid(16))
     return model_of(kind, ROUNDED[kind], rounding=ROUNDING)
 
 
@@ -95,7 +96,7 @@ def test_normal_and_curvature_are_the_derivatives(kind: str) -> None:
 
 def test_second_derivatives_are_continuous_across_cells() -> None:
     grid = sphere_grid(16)
-    model = model_of("grid", (1, 0, 0), **arguments_of(grid))
+    model = model_of("grid", (1, 0, 0), grid=grid)
     rng = np.random.default_rng(1)
     border = grid.origin + grid.spacing * rng.integers(5, 18, (500, 3))  # cell corners, where all three indices change
     way = 1e-10 * rng.normal(size=(500, 3))
@@ -110,7 +111,7 @@ def test_grid_of_a_sphere_converges_at_fourth_order() -> None:
     length = np.linalg.norm(points, axis=1)
     errors = []
     for cells in (8, 16, 32):
-        d, n, hessian = model_of("grid", (1, 0, 0), **arguments_of(sphere_grid(cells))).distance("shape", points)
+        d, n, hessian = model_of("grid", (1, 0, 0), grid=sphere_grid(cells)).distance("shape", points)
         outwards = points / length[:, None]
         round_about = (np.eye(3) - outwards[:, :, None] * outwards[:, None]) / length[:, None, None]
         errors.append(
@@ -126,7 +127,7 @@ def test_grid_of_a_sphere_converges_at_fourth_order() -> None:
 def test_sign_of_a_bracket_is_correct_everywhere() -> None:
     grid = bracket_grid(32)
     points = np.random.default_rng(2).uniform(-0.03, 0.07, (20_000, 3))  # also far outside of the grid
-    d, _, _ = model_of("grid", (1, 0, 0), **arguments_of(grid)).distance("shape", points)
+    d, _, _ = model_of("grid", (1, 0, 0), grid=grid).distance("shape", points)
     exact = mesh_solids.bracket_distance(points, *BRACKET)
     clear = np.abs(exact) > 0.3 * grid.spacing  # sharp edges are rounded by a fraction of a cell
     assert ((d < 0) == (exact < 0))[clear].all()
@@ -137,7 +138,7 @@ def test_broad_phase_keeps_all_markers_in_contact() -> None:
     """Markers are tested in blocks; excluded blocks have no contact."""
     points = np.random.default_rng(3).uniform(-0.03, 0.07, (30_000, 3))
     for scale in (1.0, 0.7, 1.6):
-        model = model_of("grid", (scale, 0, 0), points, **arguments_of(bracket_grid(20)))
+        model = model_of("grid", (scale, 0, 0), points, grid=bracket_grid(20))
         d, n, _ = model.distance("shape", points)
         force = Simulator(model).tactile()[0] * [1, 1, -1]
         np.testing.assert_allclose(force, np.where(d < 0, -d, 0)[:, None] * n, atol=1e-15)
@@ -206,33 +207,59 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
     """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge of a grid."""
     spec = _core.ModelSpec()
     spec.tolerance = 1e-13
-    turret = spec.add_body("turret", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
-    spec.add_joint("turn", turret, "hinge", (0, 0, 0), (0.3, 0.2, 1), damping=1e-3)
-    hand = spec.add_body("hand", -1, (0, 0, 0), (1, 0, 0, 0), 0.02, (0, 0, 1e-3), (1e-5, 2e-5, 1e-5, 0, 0, 0))
+    turret = spec.add_body(_core.BodyDef(name="turret", mass=0.1, inertia=(1e-4, 1e-4, 1e-4, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="turn", body=turret, type="hinge", axis=(0.3, 0.2, 1), damping=1e-3))
+    hand = spec.add_body(_core.BodyDef(name="hand", mass=0.02, com=(0, 0, 1e-3), inertia=(1e-5, 2e-5, 1e-5, 0, 0, 0)))
     slides = [
-        spec.add_joint(name, hand, "slide", (0, 0, 0), axis, damping=0.5)
+        spec.add_joint(_core.JointDef(name=name, body=hand, type="slide", axis=axis, damping=0.5))
         for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
     ]
-    spec.add_joint("ball", hand, "ball", (0, 0, 0.002), (0, 0, 1), damping=1e-3)
+    spec.add_joint(_core.JointDef(name="ball", body=hand, type="ball", pos=(0, 0, 0.002), damping=1e-3))
     if kind in ROUNDED:
-        shape = spec.add_shape("shape", turret, kind, (1e-3, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=ROUNDING)
+        shape = spec.add_shape(
+            _core.ShapeDef(
+                name="shape", body=turret, kind=kind, pos=(1e-3, 0, 0), size=ROUNDED[kind], rounding=ROUNDING
+            )
+        )
     elif kind == "grid":
         shape = spec.add_shape(
-            "shape", turret, "grid", (1e-3, 0, 0), (1, 0, 0, 0), (1.2, 0, 0), **arguments_of(sphere_grid(10))
+            _core.ShapeDef(
+                name="shape",
+                body=turret,
+                kind="grid",
+                pos=(1e-3, 0, 0),
+                size=(1.2, 0, 0),
+                grid=core_grid(sphere_grid(10)),
+            )
         )
     else:
         shape = spec.add_shape(
-            "shape", turret, "grid", (-0.01, -0.006, -0.01), (1, 0, 0, 0), (1, 0, 0), **arguments_of(bracket_grid(16))
+            _core.ShapeDef(
+                name="shape",
+                body=turret,
+                kind="grid",
+                pos=(-0.01, -0.006, -0.01),
+                size=(1, 0, 0),
+                grid=core_grid(bracket_grid(16)),
+            )
         )
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
     numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.3, "kd": 20.0}
     numbers["ks"] = 100.0 if law == "elastic" else 0.0
-    spec.add_contact("press", spec.add_points("cloud", hand, cloud, np.ones(60)), shape, **numbers)
-    axes = [np.tile(axis, (60, 1)) for axis in np.eye(3)]
-    spec.add_pad("skin", hand, cloud * 1.01, *axes, shapes=[shape], **{**numbers, "kn": 50.0})
-    spec.add_actuator("x", slides[0], "position", kp=100.0, kd=1.0)
-    spec.add_actuator("z", slides[1], "position", kp=300.0, kd=1.0)
+    spec.add_contact(
+        _core.ContactDef(
+            name="press",
+            points=spec.add_points(_core.PointsDef(name="cloud", body=hand, points=cloud)),
+            shape=shape,
+            **numbers,
+        )
+    )
+    spec.add_pad(
+        _core.PadDef(name="skin", body=hand, positions=cloud * 1.01, shapes=[shape], **{**numbers, "kn": 50.0})
+    )
+    spec.add_actuator(_core.ActuatorDef(name="x", joint=slides[0], kind="position", kp=100.0, kd=1.0))
+    spec.add_actuator(_core.ActuatorDef(name="z", joint=slides[1], kind="position", kp=300.0, kd=1.0))
     sim = Simulator(_core.Model(spec), precision=precision)
     top = {"grid": 1.2 * RADIUS, "box": 0.01, "cylinder": 0.03, "edge": -1e-3}[kind]
     # Near the edge of a rounded solid: on its face and its rounding.
@@ -277,31 +304,37 @@ def test_single_precision_agrees_with_double(kind: str) -> None:
 
 def test_scaled_grid_equals_a_larger_shape() -> None:
     points = inside_points("grid", 1000)
-    grid = arguments_of(sphere_grid(12))
-    d, n, hessian = model_of("grid", (1, 0, 0), **grid).distance("shape", points)
-    larger = model_of("grid", (2, 0, 0), **grid).distance("shape", 2 * points)
+    grid = sphere_grid(12)
+    d, n, hessian = model_of("grid", (1, 0, 0), grid=grid).distance("shape", points)
+    larger = model_of("grid", (2, 0, 0), grid=grid).distance("shape", 2 * points)
     for ours, expected in zip(larger, (2 * d, n, hessian / 2), strict=True):
         np.testing.assert_allclose(ours, expected, rtol=1e-13, atol=1e-15)
 
 
-GRID_FAULTS: list[tuple[dict[str, Any], str]] = [
-    ({"coefficients": np.ones((6, 6), np.float32)}, "coefficients must have shape"),
-    ({"coefficients": np.ones((6, 6, 5), np.float32)}, "at least 3 cells"),
-    ({"coefficients": -np.ones((8, 8, 8), np.float32)}, "border of cells outside"),
-    ({"coefficients": np.full((8, 8, 8), np.nan, np.float32)}, "not finite"),
-    ({"coefficients": np.ones((8, 8, 8), np.float32), "spacing": 0.0}, "positive spacing"),
-    ({}, "a grid goes with the kind grid"),
-    ({"coefficients": np.ones((8, 8, 8), np.float32), "rounding": 0.1}, "only a box or a cylinder"),
+GRID_FAULTS: list[tuple[NDArray[np.float32], float, str]] = [
+    (np.ones((6, 6), np.float32), 0.1, "coefficients must have shape"),
+    (np.ones((6, 6, 5), np.float32), 0.1, "at least 3 cells"),
+    (-np.ones((8, 8, 8), np.float32), 0.1, "border of cells outside"),
+    (np.full((8, 8, 8), np.nan, np.float32), 0.1, "not finite"),
+    (np.ones((8, 8, 8), np.float32), 0.0, "positive spacing"),
 ]
 
 
-@pytest.mark.parametrize(("numbers", "message"), GRID_FAULTS, ids=[message for _, message in GRID_FAULTS])
-def test_invalid_grid_raises(numbers: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize(("coefficients", "spacing", "message"), GRID_FAULTS, ids=[fault[2] for fault in GRID_FAULTS])
+def test_invalid_grid_raises(coefficients: NDArray[np.float32], spacing: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        _core.ModelSpec().add_shape("s", -1, "grid", (0, 0, 0), (1, 0, 0, 0), (1, 0, 0), **{"spacing": 0.1, **numbers})
+        _core.DistanceGrid(origin=(0, 0, 0), spacing=spacing, coefficients=coefficients)
+
+
+def test_shape_with_an_invalid_grid_or_rounding_raises() -> None:
+    grid = _core.DistanceGrid(origin=(0, 0, 0), spacing=0.1, coefficients=np.ones((8, 8, 8), np.float32))
+    with pytest.raises(ValueError, match="a grid goes with the kind grid"):
+        _core.ModelSpec().add_shape(_core.ShapeDef(name="s", kind="grid", size=(1, 0, 0)))
+    with pytest.raises(ValueError, match="only a box or a cylinder"):
+        _core.ModelSpec().add_shape(_core.ShapeDef(name="s", kind="grid", size=(1, 0, 0), grid=grid, rounding=0.1))
 
 
 @pytest.mark.parametrize(("kind", "rounding"), list(itertools.product(ROUNDED, (-1e-3, 0.05, float("nan")))))
 def test_invalid_rounding_raises(kind: str, rounding: float) -> None:
     with pytest.raises(ValueError, match="rounding must"):
-        _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), ROUNDED[kind], rounding=rounding)
+        _core.ModelSpec().add_shape(_core.ShapeDef(name="s", kind=kind, size=ROUNDED[kind], rounding=rounding))

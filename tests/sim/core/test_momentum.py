@@ -1,10 +1,8 @@
 """Newton's third law: contact forces between moving bodies cancel, in every scene with such contacts.
 
-The scene's bodies are cut loose: each floats where the scene's motion had carried it, without gravity, motors and
-joints, and what touched still touches, with the scene's points, shapes and numbers.
+The bodies of a scene become free bodies at their poses in the middle of the scene's motion, without gravity, actuators
+and joints, with the contacts of the scene.
 """
-
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,46 +19,29 @@ TOLERANCE = 1e-11  # of Newton's method
 IN_TOUCH = {"rolling": 0.2, "pushing": 0.2, "insertion": 0.3, "grasp": 0.2, "dclaw": 0.3}  # time in contact [s]
 
 
-class Loose:
-    """Stands in for ModelSpec: makes every body free and drops everything that is not between two bodies.
+def free_bodies(spec: _core.ModelSpec, poses: Array, *, centred: bool) -> tuple[_core.ModelSpec, Array]:
+    """The bodies of `spec` as free bodies at `poses` (bodies, 7), the contacts between two of them, and their poses.
 
     `centred`: each body's frame is moved to its centre of mass.
     """
-
-    def __init__(self, poses: Array, step: float, centred: bool) -> None:
-        self.spec = _core.ModelSpec()
-        self.spec.gravity, self.spec.step, self.spec.tolerance = (0.0, 0.0, 0.0), step, TOLERANCE
-        self.poses = poses.copy()
-        self._centred = centred
-        self._shift: list[Array] = []  # shift of each body's frame, in that frame
-        self._on: list[int] = []  # the body of each shape
-        self._of: list[int] = []  # the body of each point set
-
-    def add_body(self, name: str, parent: int, pos: Any, quat: Any, mass: float, com: Any, inertia: Any) -> int:
-        pose, shift = self.poses[len(self._shift)], np.asarray(com, float) * self._centred
+    free, poses = _core.ModelSpec(), poses.copy()
+    shifts = [body.com * centred for body in spec.bodies]  # of each body's frame, in that frame
+    for body, pose, shift in zip(spec.bodies, poses, shifts, strict=True):
         pose[:3] += rotations(pose[None])[0] @ shift
-        self._shift.append(shift)
-        body = int(self.spec.add_body(name, -1, pose[:3], pose[3:], mass, np.asarray(com) - shift, inertia))
-        self.spec.add_joint(f"{name} floats", body, "free", (0, 0, 0), (0, 0, 1))
-        return body
-
-    def add_shape(self, name: str, body: int, kind: str, pos: Any, *args: Any, **more: Any) -> int:
-        self._on.append(body)
-        shift = self._shift[body] if body >= 0 else 0.0
-        return int(self.spec.add_shape(name, body, kind, np.asarray(pos) - shift, *args, **more))
-
-    def add_points(self, name: str, body: int, points: Array, *args: Any, **more: Any) -> int:
-        self._of.append(body)
-        return int(self.spec.add_points(name, body, points - self._shift[body], *args, **more))
-
-    def add_contact(self, name: str, points: int, shape: int, **numbers: Any) -> None:
-        if self._on[shape] >= 0 and self._of[points] >= 0:
-            self.spec.add_contact(name, points, shape, **numbers)
-
-    def add_joint(self, *args: Any, **more: Any) -> None:
-        pass
-
-    add_actuator = add_pad = add_joint
+        body.parent, body.pos, body.quat, body.com = -1, pose[:3], pose[3:], body.com - shift
+        index = free.add_body(body)
+        free.add_joint(_core.JointDef(name=f"{body.name} floats", body=index, type="free"))
+    shapes, points = spec.shapes, spec.points
+    for shape in shapes:
+        shape.pos = shape.pos - (shifts[shape.body] if shape.body >= 0 else 0.0)
+        free.add_shape(shape)
+    for point_set in points:
+        point_set.points = point_set.points - shifts[point_set.body]
+        free.add_points(point_set)
+    for contact in spec.contacts:
+        if shapes[contact.shape].body >= 0 and points[contact.points].body >= 0:
+            free.add_contact(contact)
+    return free, poses
 
 
 def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1", *, centred: bool = True) -> Simulator:
@@ -71,13 +52,12 @@ def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1",
     for u in moves.step_controls(scene.step)[: round(IN_TOUCH[name] / scene.step)]:
         sim.step(u)
     sim.check()
-    loose = Loose(sim.poses()[0], step, centred)
-    scene.describe_to(loose)
-    loose.spec.integrator, loose.spec.step = integrator, step
-    loose.spec.gravity, loose.spec.tolerance = (0.0, 0.0, 0.0), TOLERANCE
-    floating = Simulator(_core.Model(loose.spec))
+    spec, poses = free_bodies(scene.model_spec(), sim.poses()[0], centred=centred)
+    spec.integrator, spec.step = integrator, step
+    spec.gravity, spec.tolerance = (0.0, 0.0, 0.0), TOLERANCE
+    floating = Simulator(_core.Model(spec))
     assert len(floating.model.contact_names) > 0
-    floating.q[0] = loose.poses.ravel()
+    floating.q[0] = poses.ravel()
     floating.v[0] = 1e-2 * np.random.default_rng(0).normal(size=floating.model.nv)
     return floating
 

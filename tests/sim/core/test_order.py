@@ -18,7 +18,7 @@ TIME = 0.08  # [s]
 
 def rolling(step: float, integrator: str) -> Simulator:
     scene = load_scene("rolling", friction="viscous", overrides={"step": step, "integrator": integrator})
-    spec = scene.describe_to(_core.ModelSpec())
+    spec = scene.model_spec()
     spec.tolerance = 1e-13
     return Simulator(_core.Model(spec))
 
@@ -117,14 +117,24 @@ def test_elastic_law_resolves_the_start_of_contact_to_one_step() -> None:
     for step in (1.6e-3, 8e-4, 4e-4, 2e-4, 1e-4):
         spec = _core.ModelSpec()
         spec.gravity, spec.step, spec.integrator = (0.0, 0.0, 0.0), step, "bdf2"
-        body = spec.add_body("block", -1, (0, 0, height), (1, 0, 0, 0), 1e6, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-        for name, axis in zip(
-            "xz", ((1, 0, 0), (0, 0, 1)), strict=True
-        ):  # heavy, so that contact forces do not decelerate it
-            spec.add_joint(name, body, "slide", (0, 0, 0), axis)
-        plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (1, 1, 1))
-        axes = [[axis] for axis in np.eye(3)]
-        spec.add_pad("pad", body, [(0, 0, 0)], *axes, shapes=[plane], law="elastic", kn=1e3, kt=0, mu=1e6, kd=0, ks=1.0)
+        body = spec.add_body(_core.BodyDef(name="block", pos=(0, 0, height), mass=1e6, inertia=(1, 1, 1, 0, 0, 0)))
+        for name, axis in zip("xz", ((1, 0, 0), (0, 0, 1)), strict=True):  # too heavy to be decelerated
+            spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
+        plane = spec.add_shape(_core.ShapeDef(name="plane", kind="plane", size=(1, 1, 1)))
+        spec.add_pad(
+            _core.PadDef(
+                name="pad",
+                body=body,
+                positions=[(0, 0, 0)],
+                shapes=[plane],
+                law="elastic",
+                kn=1e3,
+                kt=0,
+                mu=1e6,
+                kd=0,
+                ks=1.0,
+            )
+        )
         sim = Simulator(_core.Model(spec))
         sim.v[0] = speed, -fall
         sim.step([], round(time / step))

@@ -27,7 +27,7 @@ def test_sliding_distance_of_a_block_is_v_squared_over_2_mu_g(law: str, integrat
     mu, speed, step = 0.3, 0.8, 1e-3
     numbers = {"kn": 2e3, "kt": 200.0 if law == "viscous" else 5.0, "mu": mu, "kd": 1e4, "ks": 1e4 * (law == "elastic")}
     throw = ThrownBody("box", law, "depth", step, numbers, integrator=integrator, has_rotation=False)
-    sim = Simulator(_core.Model(throw.describe_to(_core.ModelSpec())))
+    sim = Simulator(_core.Model(throw.model_spec()))
     sim.q[0, 0], sim.q[0, 2] = (
         -10,
         0.012 - MASS * GRAVITY / (9 * numbers["kn"]),
@@ -44,8 +44,8 @@ def test_sliding_distance_of_a_block_is_v_squared_over_2_mu_g(law: str, integrat
 def pendulum(step: float, integrator: str) -> Simulator:
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.tolerance, spec.integrator = (0.0, 0.0, -GRAVITY), step, 1e-12, integrator
-    spec.add_body("body", -1, ORIGIN, UPRIGHT, 2.0, (0, 0, -0.25), (0.03, 0.03, 0.03, 0, 0, 0))
-    spec.add_joint("hinge", 0, "hinge", ORIGIN, (1, 0, 0))
+    spec.add_body(_core.BodyDef(name="body", mass=2.0, com=(0, 0, -0.25), inertia=(0.03, 0.03, 0.03, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="hinge", body=0, type="hinge", axis=(1, 0, 0)))
     return Simulator(_core.Model(spec))
 
 
@@ -88,8 +88,8 @@ def test_top_tumbling_about_its_intermediate_axis(integrator: str, order: int) -
     for step in (1e-3, 5e-4, 2.5e-4, 1.25e-4):
         spec = _core.ModelSpec()
         spec.gravity, spec.step, spec.tolerance, spec.integrator = ORIGIN, step, 1e-11, integrator
-        spec.add_body("body", -1, ORIGIN, UPRIGHT, 1.0, ORIGIN, (*INERTIA, 0, 0, 0))
-        spec.add_joint("free", 0, "free", ORIGIN, (0, 0, 1))
+        spec.add_body(_core.BodyDef(name="body", mass=1.0, inertia=(*INERTIA, 0, 0, 0)))
+        spec.add_joint(_core.JointDef(name="free", body=0, type="free"))
         sim = Simulator(_core.Model(spec))
         sim.v[0, 3:] = SPIN
         sim.step(np.zeros(0), round(DURATION / step))
@@ -124,14 +124,16 @@ def thrown(free: bool, integrator: str, step: float, center: tuple[float, float,
     """A tumbling body on a free joint, or on three slides and a ball joint."""
     spec = _core.ModelSpec()
     spec.step, spec.tolerance, spec.integrator = step, 1e-10, integrator
-    body = spec.add_body("body", -1, ORIGIN, UPRIGHT, 0.3, center, (2e-4, 3e-4, 4e-4, 2e-5, -1e-5, 3e-5))
+    body = spec.add_body(
+        _core.BodyDef(name="body", mass=0.3, com=center, inertia=(2e-4, 3e-4, 4e-4, 2e-5, -1e-5, 3e-5))
+    )
     joints = (
         [("free", (0, 0, 1))]
         if free
         else [("slide", (1, 0, 0)), ("slide", (0, 1, 0)), ("slide", (0, 0, 1)), ("ball", (0, 0, 1))]
     )
     for i, (kind, axis) in enumerate(joints):
-        spec.add_joint(f"joint{i}", body, kind, ORIGIN, axis, damping=0.01)
+        spec.add_joint(_core.JointDef(name=f"joint{i}", body=body, type=kind, axis=axis, damping=0.01))
     sim = Simulator(_core.Model(spec))
     sim.q[0] = [0.1, -0.2, 0.3, *(np.array([1, 2, -1, 0.5]) / 2.5)]
     sim.v[0] = [0.5, -1.0, 2.0, 7.0, -3.0, 11.0]
@@ -170,8 +172,8 @@ def test_free_joint_off_the_centre_of_mass_agrees_at_the_order_of_the_integrator
 def test_a_hundred_bodies_have_the_same_free_fall() -> None:
     spec = _core.ModelSpec()
     for i in range(100):
-        body = spec.add_body(f"body{i}", -1, ORIGIN, UPRIGHT, 0.1 + i, ORIGIN, (1, 1, 1, 0, 0, 0))
-        spec.add_joint(f"slide{i}", body, "slide", ORIGIN, (0, 0, 1))
+        body = spec.add_body(_core.BodyDef(name=f"body{i}", mass=0.1 + i, inertia=(1, 1, 1, 0, 0, 0)))
+        spec.add_joint(_core.JointDef(name=f"slide{i}", body=body, type="slide"))
     sim = Simulator(_core.Model(spec))
     sim.step(np.zeros(0), 20)
     sim.check()

@@ -26,11 +26,21 @@ def depth_and_normal(kind: str, points: Array) -> tuple[Array, Array]:
     """Depth (n,) and outward normal (n, 3) at points of a fixed shape, from markers of 1 N/m."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
-    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 1.0, (0, 0, 0), (1, 1, 1, 0, 0, 0))
-    spec.add_joint("slide", body, "slide", (0, 0, 0), (1, 0, 0))
-    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), SIZES[kind])
-    axes = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
-    spec.add_pad("pad", body, points, *axes, shapes=[shape], kn=1.0, kt=0.0, mu=0.0, kd=0.0)
+    body = spec.add_body(_core.BodyDef(name="probe", mass=1.0, inertia=(1, 1, 1, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="slide", body=body, type="slide", axis=(1, 0, 0)))
+    shape = spec.add_shape(_core.ShapeDef(name="shape", kind=kind, size=SIZES[kind]))
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=points,
+            shapes=[shape],
+            kn=1.0,
+            kt=0.0,
+            mu=0.0,
+            kd=0.0,
+        )
+    )
     force = Simulator(_core.Model(spec)).tactile()[0] * [1, 1, -1]
     depth = np.linalg.norm(force, axis=1)
     return depth, force / np.maximum(depth, 1e-300)[:, None]
@@ -101,4 +111,4 @@ def test_forces_are_finite_where_the_distance_has_no_gradient(kind: str) -> None
 )
 def test_invalid_shape_raises(kind: str, size: tuple[float, float, float], message: str) -> None:
     with pytest.raises((UsageError, ValueError), match=message):
-        _core.ModelSpec().add_shape("s", -1, kind, (0, 0, 0), (1, 0, 0, 0), size)
+        _core.ModelSpec().add_shape(_core.ShapeDef(name="s", kind=kind, size=size))

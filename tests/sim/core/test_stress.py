@@ -96,8 +96,10 @@ def test_very_short_and_long_steps(step: float) -> None:
 
 
 def free_body(spec: _core.ModelSpec, name: str, mass: float, height: float, half: float = 0.01) -> int:
-    body: int = spec.add_body(name, -1, [0, 0, height], [1, 0, 0, 0], mass, [0, 0, 0], [mass * half**2] * 3 + [0] * 3)
-    spec.add_joint(name, body, "free", [0, 0, 0], [0, 0, 1])
+    body: int = spec.add_body(
+        _core.BodyDef(name=name, pos=[0, 0, height], mass=mass, inertia=[mass * half**2] * 3 + [0] * 3)
+    )
+    spec.add_joint(_core.JointDef(name=name, body=body, type="free"))
     return body
 
 
@@ -105,12 +107,24 @@ def test_heavy_block_on_a_light_one() -> None:
     """100 kg on 1 mg, a ratio of 1e8, with a deflection of 0.1 mm."""
     spec, half = _core.ModelSpec(), 0.01
     bodies = [free_body(spec, "light", 1e-6, half), free_body(spec, "heavy", 100.0, 3 * half)]
-    ground = spec.add_shape("ground", -1, "plane", [0, 0, 0], [1, 0, 0, 0], [0, 0, 0])
-    top = spec.add_shape("top", bodies[0], "plane", [0, 0, half], [1, 0, 0, 0], [0, 0, 0])
+    ground = spec.add_shape(_core.ShapeDef(name="ground", kind="plane"))
+    top = spec.add_shape(_core.ShapeDef(name="top", body=bodies[0], kind="plane", pos=[0, 0, half]))
     corners = np.array([[x, y, -half] for x in (-half, half) for y in (-half, half)])
     for name, body, below in (("light", 0, ground), ("heavy", 1, top)):
-        points = spec.add_points(f"{name} corners", bodies[body], corners, np.ones(4))
-        spec.add_contact(f"{name} contact", points, below, law="elastic", kn=2.5e6, kt=1e3, mu=0.5, kd=1e5, ks=1e6)
+        points = spec.add_points(_core.PointsDef(name=f"{name} corners", body=bodies[body], points=corners))
+        spec.add_contact(
+            _core.ContactDef(
+                name=f"{name} contact",
+                points=points,
+                shape=below,
+                law="elastic",
+                kn=2.5e6,
+                kt=1e3,
+                mu=0.5,
+                kd=1e5,
+                ks=1e6,
+            )
+        )
     sim = Simulator(_core.Model(spec))
     sim.step(np.zeros(0), 2_000)
     sim.check()

@@ -53,16 +53,25 @@ def test_forces_equal_the_formula_for_every_marker(
 ) -> None:
     """In the order of the markers, for any previous contents of the array."""
     spec = _core.ModelSpec()
-    body = spec.add_body("pad", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    body = spec.add_body(_core.BodyDef(name="pad", mass=0.1, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0)))
     for name, axis in zip("xyz", np.eye(3), strict=True):
-        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
+        spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
     shapes = [
-        spec.add_shape(f"ball{i}", -1, "sphere", center, (1, 0, 0, 0), (RADIUS, 0, 0))
+        spec.add_shape(_core.ShapeDef(name=f"ball{i}", kind="sphere", pos=center, size=(RADIUS, 0, 0)))
         for i, center in enumerate(CENTERS[:balls])
     ]
     places, axes, weights = pad_of(rows, cols, curved=curved)
-    numbers = {"kn": KN, "kt": KT, "mu": MU, "kd": KD, "weights": weights.tolist()}
-    spec.add_pad("pad", body, places, *np.moveaxis(axes, 1, 0).copy(), shapes=shapes, **numbers)
+    numbers: dict[str, Any] = {"kn": KN, "kt": KT, "mu": MU, "kd": KD, "weights": weights.tolist()}
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=places,
+            axes=np.swapaxes(axes, 1, 2),
+            shapes=shapes,
+            **numbers,
+        )
+    )
     sim = Simulator(_core.Model(spec), precision=precision)
     sim.v[:] = SPEED
     touching = []
@@ -105,7 +114,18 @@ def test_own_array_equals_a_new_array(side: int) -> None:
 @pytest.mark.parametrize("weight", [-1.0, np.nan, np.inf])
 def test_invalid_marker_weights_raise(weight: float) -> None:
     spec = _core.ModelSpec()
-    shape = spec.add_shape("ball", -1, "sphere", (0, 0, 0), (1, 0, 0, 0), (RADIUS, 0, 0))
-    axes = [[axis] for axis in np.eye(3)]
+    shape = spec.add_shape(_core.ShapeDef(name="ball", kind="sphere", size=(RADIUS, 0, 0)))
     with pytest.raises(ValueError, match="pad 'pad': weights must be finite and not negative"):
-        spec.add_pad("pad", -1, [(0, 0, 0)], *axes, shapes=[shape], weights=[weight], kn=1, kt=0, mu=0, kd=0)
+        spec.add_pad(
+            _core.PadDef(
+                name="pad",
+                body=-1,
+                positions=[(0, 0, 0)],
+                shapes=[shape],
+                weights=[weight],
+                kn=1,
+                kt=0,
+                mu=0,
+                kd=0,
+            )
+        )

@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -119,18 +118,27 @@ def test_unused_elements_do_not_change_results(added: str, tmp_path: Path) -> No
     assert run(more) == run(plain)
 
 
-class Recorder:
-    """Stands in for ModelSpec: records calls, so that a process without MuJoCo can repeat them."""
+LISTS = {"bodies": "body", "joints": "joint", "shapes": "shape", "points": "points", "contacts": "contact"}
+LISTS |= {"pads": "pad", "actuators": "actuator"}
 
-    def __init__(self) -> None:
-        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 
-    def __getattr__(self, name: str) -> Callable[..., int]:
-        def call(*args: Any, **numbers: Any) -> int:
-            self.calls.append((name, args, numbers))
-            return sum(known == name for known, *_ in self.calls) - 1
+def definitions_of(scene: Scene) -> tuple[dict[str, Any], list[tuple[str, str, dict[str, Any]]]]:
+    """A scene as plain data for a process without MuJoCo.
 
-        return call
+    Options, and for each definition the name of its add function, its class and its fields.
+    """
+    spec = scene.model_spec()
+    options = {name: getattr(spec, name) for name in ("gravity", "step", "integrator", "tolerance")}
+    definitions = [
+        (f"add_{kind}", type(definition).__name__, fields_of(definition))
+        for plural, kind in LISTS.items()
+        for definition in getattr(spec, plural)
+    ]
+    return options, definitions
+
+
+def fields_of(definition: object) -> dict[str, Any]:
+    return {name: getattr(definition, name) for name in dir(definition) if not name.startswith("_")}
 
 
 STEPPING = """
@@ -142,13 +150,12 @@ from gelflow.sim.simulator import Simulator
 
 with open(sys.argv[1], "rb") as file:
     scenes = pickle.load(file)
-for attributes, q, u in scenes:
+for (options, definitions), q, u in scenes:
     spec = _core.ModelSpec()
-    calls = attributes.pop("calls")
-    for name, value in attributes.items():
+    for name, value in options.items():
         setattr(spec, name, value)
-    for name, args, numbers in calls:
-        getattr(spec, name)(*args, **numbers)
+    for add, kind, fields in definitions:
+        getattr(spec, add)(getattr(_core, kind)(**fields))
     sim = Simulator(_core.Model(spec))
     sim.q[:] = q
     sim.step(u, int(sys.argv[2]))
@@ -161,12 +168,8 @@ for attributes, q, u in scenes:
 
 def instructions_per_step(scenes: list[Scene], folder: Path) -> list[float]:
     """Instructions per step after the first SHORT steps, without evaluation of marker forces."""
-    recorded = []
-    for scene in scenes:
-        recorder = Recorder()
-        scene.describe_to(recorder)
-        recorded.append((vars(recorder), scene.q0, PUSH))
-    (folder / "scenes.pickle").write_bytes(pickle.dumps(recorded))
+    data = [(definitions_of(scene), scene.q0, PUSH) for scene in scenes]
+    (folder / "scenes.pickle").write_bytes(pickle.dumps(data))
     out = folder / "callgrind"
     valgrind = ["valgrind", "-q", "--tool=callgrind", f"--callgrind-out-file={out}", "--dump-before=getppid"]
     steps = [str(SHORT), str(LONG - SHORT)]

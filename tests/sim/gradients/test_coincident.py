@@ -34,12 +34,19 @@ def marker(kind: str, at: tuple[float, float, float], law: str, precision: Any) 
     """One marker on three slides, at a position relative to a shape [UNIT]."""
     spec = _core.ModelSpec()
     spec.gravity = (0, 0, 0)
-    body = spec.add_body("hand", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-3, 1e-3, 1e-3, 0, 0, 0))
+    body = spec.add_body(_core.BodyDef(name="hand", mass=0.25, inertia=(1e-3, 1e-3, 1e-3, 0, 0, 0)))
     for axis, name in zip(np.eye(3), "xyz", strict=True):
-        spec.add_joint(name, body, "slide", (0, 0, 0), axis)
-    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), [UNIT * s for s in SIZES[kind]])
-    axes = [np.array([axis]) for axis in np.eye(3)]
-    spec.add_pad("pad", body, UNIT * np.array([at]), *axes, shapes=[shape], **law_of(law))
+        spec.add_joint(_core.JointDef(name=name, body=body, type="slide", axis=axis))
+    shape = spec.add_shape(_core.ShapeDef(name="shape", kind=kind, size=[UNIT * s for s in SIZES[kind]]))
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=body,
+            positions=UNIT * np.array([at]),
+            shapes=[shape],
+            **law_of(law),
+        )
+    )
     return Simulator(_core.Model(spec), precision=precision)
 
 
@@ -98,13 +105,15 @@ def fitted(
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.polish = gravity, 2.0**-9, 2
     inertia = 0.25 * (16 * UNIT) ** 2 / 6
-    cube = spec.add_body("cube", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (inertia, inertia, inertia, 0, 0, 0))
-    spec.add_joint("cube", cube, "free", (0, 0, 0), (0, 0, 1))
+    cube = spec.add_body(_core.BodyDef(name="cube", mass=0.25, inertia=(inertia, inertia, inertia, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="cube", body=cube, type="free"))
     surface = lattice(np.full(3, 8 * UNIT), (5, 5, 5))
-    points = spec.add_points("cube", cube, surface, np.ones(len(surface)))
+    points = spec.add_points(_core.PointsDef(name="cube", body=cube, points=surface))
     for name, (centre, half) in boxes.items():
-        shape = spec.add_shape(name, -1, "box", UNIT * np.array(centre), (1, 0, 0, 0), UNIT * np.array(half))
-        spec.add_contact(f"on {name}", points, shape, **law_of(law))
+        shape = spec.add_shape(
+            _core.ShapeDef(name=name, kind="box", pos=UNIT * np.array(centre), size=UNIT * np.array(half))
+        )
+        spec.add_contact(_core.ContactDef(name=f"on {name}", points=points, shape=shape, **law_of(law)))
     sim = Simulator(_core.Model(spec), precision=precision)
     sim.q[0, 3] = 1
     return sim
@@ -184,15 +193,27 @@ def hanging_over(law: str, precision: Any) -> Simulator:
     """A colliding pad of 8 × 8 markers, UNIT deep in a block below four of its rows; one row is on its edge."""
     spec = _core.ModelSpec()
     spec.gravity, spec.step, spec.polish = (0, 0, 0), 2.0**-14, 2
-    hand = spec.add_body("hand", -1, (0, 0, -UNIT), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-4, 1e-4, 1e-4, 0, 0, 0))
-    spec.add_joint("hand", hand, "free", (0, 0, 0), (0, 0, 1))
-    block = spec.add_body("block", -1, (-16 * UNIT, 0, -8 * UNIT), (1, 0, 0, 0), 0.5, (0, 0, 0), (1e-4,) * 3 + (0,) * 3)
-    spec.add_joint("block", block, "free", (0, 0, 0), (0, 0, 1))
-    shape = spec.add_shape("block", block, "box", (0, 0, 0), (1, 0, 0, 0), UNIT * np.array([16, 16, 8]))
+    hand = spec.add_body(_core.BodyDef(name="hand", pos=(0, 0, -UNIT), mass=0.25, inertia=(1e-4, 1e-4, 1e-4, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="hand", body=hand, type="free"))
+    block = spec.add_body(
+        _core.BodyDef(name="block", pos=(-16 * UNIT, 0, -8 * UNIT), mass=0.5, inertia=(1e-4,) * 3 + (0,) * 3)
+    )
+    spec.add_joint(_core.JointDef(name="block", body=block, type="free"))
+    shape = spec.add_shape(_core.ShapeDef(name="block", body=block, kind="box", size=UNIT * np.array([16, 16, 8])))
     along = 2 * UNIT * np.arange(-4, 4)  # along x: four rows above the block, one on its edge at x = 0, three outside
     places = np.array([(x, y + UNIT, 0) for x in along for y in along])
     axes = [np.tile(axis, (64, 1)) for axis in ((1, 0, 0), (0, -1, 0), (0, 0, -1))]
-    spec.add_pad("pad", hand, places, *axes, shapes=[shape], pushes=True, **law_of(law))
+    spec.add_pad(
+        _core.PadDef(
+            name="pad",
+            body=hand,
+            positions=places,
+            axes=np.stack(axes, axis=-1),
+            shapes=[shape],
+            collides=True,
+            **law_of(law),
+        )
+    )
     sim = Simulator(_core.Model(spec), precision=precision)
     poses = [[0, 0, -UNIT, 1, 0, 0, 0], [-16 * UNIT, 0, -8 * UNIT, 1, 0, 0, 0]]
     sim.q[0] = np.ravel(poses)

@@ -45,17 +45,23 @@ def probe(
     spec.tolerance = 1e-13
     spec.step = 2.0**-8
     spec.integrator = integrator
-    body = spec.add_body("probe", -1, (0, 0, 0), (1, 0, 0, 0), 0.25, (0, 0, 0), (1e-3, 1e-3, 1e-3, 0, 0, 0))
+    body = spec.add_body(_core.BodyDef(name="probe", mass=0.25, inertia=(1e-3, 1e-3, 1e-3, 0, 0, 0)))
     for axis in slides:
-        last = spec.add_joint(axis, body, "slide", (0, 0, 0), np.eye(3)["xyz".index(axis)], **(joint or {}))
-    shape = spec.add_shape("shape", -1, kind, (0, 0, 0), (1, 0, 0, 0), SIZES[kind])
+        last = spec.add_joint(
+            _core.JointDef(name=axis, body=body, type="slide", axis=np.eye(3)["xyz".index(axis)], **joint or {})
+        )
+    shape = spec.add_shape(_core.ShapeDef(name="shape", kind=kind, size=SIZES[kind]))
     all_numbers: dict[str, Any] = {**numbers, "law": law, "ks": 512.0 if law == "elastic" else 0.0}
     spec.add_contact(
-        "touch", spec.add_points("point", body, [at], [1.0], areas=[(0.25, 0.25, 0.5)]), shape, **all_numbers
+        _core.ContactDef(
+            name="touch",
+            points=spec.add_points(_core.PointsDef(name="point", body=body, points=[at], areas=[(0.25, 0.25, 0.5)])),
+            shape=shape,
+            **all_numbers,
+        )
     )
-    axes = [np.array([axis]) for axis in np.eye(3)]
-    spec.add_pad("pad", body, np.array([at]), *axes, shapes=[shape], **all_numbers)
-    spec.add_actuator("drive", last, **({"kind": "motor"} | (actuator or {})))
+    spec.add_pad(_core.PadDef(name="pad", body=body, positions=np.array([at]), shapes=[shape], **all_numbers))
+    spec.add_actuator(_core.ActuatorDef(name="drive", joint=last, **{"kind": "motor"} | (actuator or {})))
     return Simulator(_core.Model(spec))
 
 

@@ -36,22 +36,35 @@ def build(law: str, shape: str, points: str, markers: str) -> Simulator:
     """A cloud on slides and a ball joint above a box; each placed when built or by parameters."""
     spec = _core.ModelSpec()
     spec.tolerance = 1e-13
-    hand = spec.add_body("hand", -1, (0, 0, 0.02), (1, 0, 0, 0), 0.05, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
+    hand = spec.add_body(_core.BodyDef(name="hand", pos=(0, 0, 0.02), mass=0.05, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0)))
     for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1))):
-        spec.add_joint(name, hand, "slide", (0, 0, 0), axis, damping=0.5)
-    spec.add_joint("ball", hand, "ball", (0, 0, 0), (0, 0, 1), damping=1e-3)
+        spec.add_joint(_core.JointDef(name=name, body=hand, type="slide", axis=axis, damping=0.5))
+    spec.add_joint(_core.JointDef(name="ball", body=hand, type="ball", damping=1e-3))
     cloud = capsule(0.012, 0.0, count=80)[0]
     pos, frame = FRAME
-    at = {"pos": pos, "quat": quat(frame)}
+    at: dict[str, Any] = {"pos": pos, "quat": quat(frame)}
     turned = Rotation.from_rotvec(TURN)
-    box = (POS, quat(turned)) if shape == "moved" else (np.zeros(3), (1, 0, 0, 0))
-    top = spec.add_shape("box", -1, "box", *box, (0.03, 0.02, 0.01))
-    cloud_of_contact = spec.add_points("cloud", hand, moved(cloud, points, SCALE), np.ones(80), **at)
+    box = _core.ShapeDef(name="box", kind="box", size=(0.03, 0.02, 0.01))
+    if shape == "moved":
+        box.pos, box.quat = POS, quat(turned)
+    top = spec.add_shape(box)
+    cloud_of_contact = spec.add_points(
+        _core.PointsDef(name="cloud", body=hand, points=moved(cloud, points, SCALE), **at)
+    )
     numbers: dict[str, Any] = {**NUMBERS, "law": law, "ks": 100.0 if law == "elastic" else 0.0}
-    spec.add_contact("press", cloud_of_contact, top, **numbers)
+    spec.add_contact(_core.ContactDef(name="press", points=cloud_of_contact, shape=top, **numbers))
     axes = (frame * turned if markers == "moved" else frame).as_matrix()
-    columns = [np.tile(axis, (80, 1)) for axis in axes.T]
-    spec.add_pad("skin", hand, moved(cloud, markers, np.ones(3)), *columns, shapes=[top], **at, **numbers)
+    spec.add_pad(
+        _core.PadDef(
+            name="skin",
+            body=hand,
+            positions=moved(cloud, markers, np.ones(3)),
+            axes=np.tile(axes, (80, 1, 1)),
+            shapes=[top],
+            **at,
+            **numbers,
+        )
+    )
     sim = Simulator(_core.Model(spec))
     sim.q[0, 1] = 1e-3
     return sim
@@ -84,11 +97,11 @@ def test_placement_by_parameters_equals_placement_when_built(what: str, law: str
 def pressed_by(points: Array, areas: Array, depth: float) -> tuple[Simulator, Array]:
     """Points with stiffness per area on a plane, the lowest at `depth`."""
     spec = _core.ModelSpec()
-    body = spec.add_body("part", -1, (0, 0, 0), (1, 0, 0, 0), 0.1, (0, 0, 0), (1e-5, 1e-5, 1e-5, 0, 0, 0))
-    spec.add_joint("part", body, "free", (0, 0, 0), (0, 0, 1))
-    plane = spec.add_shape("plane", -1, "plane", (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
-    sampled = spec.add_points("part", body, points, areas.sum(1), areas=areas)
-    spec.add_contact("stand", sampled, plane, kn=1e6, kt=1.0, mu=0.5, kd=1.0)
+    body = spec.add_body(_core.BodyDef(name="part", mass=0.1, inertia=(1e-5, 1e-5, 1e-5, 0, 0, 0)))
+    spec.add_joint(_core.JointDef(name="part", body=body, type="free"))
+    plane = spec.add_shape(_core.ShapeDef(name="plane", kind="plane"))
+    sampled = spec.add_points(_core.PointsDef(name="part", body=body, points=points, weights=areas.sum(1), areas=areas))
+    spec.add_contact(_core.ContactDef(name="stand", points=sampled, shape=plane, kn=1e6, kt=1.0, mu=0.5, kd=1.0))
     sim = Simulator(_core.Model(spec))
     sim.q[0, 2] = -points[:, 2].min() - depth
     return sim, sim.wrenches()[0, 0].copy()

@@ -65,7 +65,7 @@ def test_tactile_forces_sum_to_the_contact_wrench(name: str, law: str) -> None:
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_gradients(law: str, integrator: str) -> None:
     scene = with_colliding_pads("rolling", law, integrator=integrator)
-    spec = scene.describe_to(_core.ModelSpec())
+    spec = scene.model_spec()
     spec.polish = 2
     sim = Simulator(_core.Model(spec))
     sim.step([0, 0, 0.2], 120)

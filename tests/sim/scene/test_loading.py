@@ -10,32 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.sim import _core
 from gelflow.sim.scene import Scene, load_scene, scene_names
 
 SHIPPED = ("dclaw", "grasp", "insertion", "pushing", "rolling")
-
-
-class RecordingSpec:
-    """A stand-in for the model builder of the core that records all calls."""
-
-    def __init__(self) -> None:
-        self.calls: dict[str, list[tuple[tuple[Any, ...], dict[str, Any]]]] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        if not name.startswith("add_"):
-            raise AttributeError(name)
-
-        def record(*args: Any, **kwargs: Any) -> int:
-            self.calls.setdefault(name, []).append((args, kwargs))
-            return len(self.calls[name]) - 1
-
-        return record
-
-
-def recorded(scene: Scene) -> RecordingSpec:
-    spec = RecordingSpec()
-    scene.describe_to(spec)
-    return spec
 
 
 def rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -50,27 +28,26 @@ def rotation_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float6
     return rotation(quat)
 
 
-def body_frames(spec: RecordingSpec, q: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Positions and rotations of the recorded bodies at q, by an independent implementation of the kinematics."""
+def body_frames(spec: _core.ModelSpec, q: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Positions and rotations of the bodies at q, by an independent implementation of the kinematics."""
     frames: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
     at = 0
-    for index, (args, _) in enumerate(spec.calls["add_body"]):
-        _, parent, pos, quat = args[:4]
-        base_pos, base_rot = frames[parent] if parent >= 0 else (np.zeros(3), np.eye(3))
-        x, r = base_pos + base_rot @ pos, base_rot @ rotation(quat)
-        for joint, _ in spec.calls["add_joint"]:
-            _, body, kind, anchor, axis = joint
-            if body != index:
+    joints = spec.joints
+    for index, body in enumerate(spec.bodies):
+        base_pos, base_rot = frames[body.parent] if body.parent >= 0 else (np.zeros(3), np.eye(3))
+        x, r = base_pos + base_rot @ body.pos, base_rot @ rotation(body.quat)
+        for joint in joints:
+            if joint.body != index:
                 continue
-            if kind == "free":
+            if joint.type == "free":
                 x, r = q[at : at + 3], rotation(q[at + 3 : at + 7])
                 at += 7
                 continue
-            if kind == "slide":
-                x = x + r @ axis * q[at]
+            if joint.type == "slide":
+                x = x + r @ joint.axis * q[at]
             else:
-                rotated = r @ rotation_about(axis, q[at])
-                x, r = x + r @ anchor - rotated @ anchor, rotated
+                rotated = r @ rotation_about(joint.axis, q[at])
+                x, r = x + r @ joint.pos - rotated @ joint.pos, rotated
             at += 1
         frames.append((x, r))
     return frames
@@ -88,7 +65,7 @@ def test_scene_names() -> None:
 @pytest.mark.parametrize("friction", ["viscous", "elastic"])
 def test_frames_agree_with_mujoco(name: str, friction: str) -> None:
     scene = load_scene(name, friction=friction)
-    spec, model = recorded(scene), reference(scene)
+    spec, model = scene.model_spec(), reference(scene)
     data = mujoco.MjData(model)
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -126,15 +103,13 @@ def test_mass_and_inertia_agree_with_mujoco_fusestatic(name: str, tmp_path: Path
     scene = load_scene(name)
     text = scene.path.with_suffix(".xml").read_text().replace("<compiler ", '<compiler fusestatic="true" ')
     merged = mujoco.MjModel.from_xml_string(text)
-    spec = recorded(scene)
-    for args, _ in spec.calls["add_body"]:
-        body, _, _, _, mass, com, packed = args
-        index = merged.body(body).id
-        assert mass == pytest.approx(merged.body_mass[index], rel=1e-12)
-        np.testing.assert_allclose(com, merged.body_ipos[index], atol=1e-12)
+    for body in scene.model_spec().bodies:
+        index = merged.body(body.name).id
+        assert body.mass == pytest.approx(merged.body_mass[index], rel=1e-12)
+        np.testing.assert_allclose(body.com, merged.body_ipos[index], atol=1e-12)
         axes = rotation(merged.body_iquat[index])
         expected = axes @ np.diag(merged.body_inertia[index]) @ axes.T
-        xx, yy, zz, xy, xz, yz = packed
+        xx, yy, zz, xy, xz, yz = body.inertia
         full = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         np.testing.assert_allclose(full, expected, atol=1e-9 * expected.max())
 
@@ -143,11 +118,10 @@ def test_merged_inertia_is_about_the_common_centre_of_mass(tmp_path: Path) -> No
     """Closed form for two unit cubes, 1 m apart, one of them on a body without a joint."""
     write(tmp_path, BLOCKS)
     scene = load_scene(tmp_path / "s.toml")
-    (args, _) = recorded(scene).calls["add_body"][0]
-    _, _, _, _, mass, com, packed = args
-    assert mass == pytest.approx(2)
-    np.testing.assert_allclose(com, [0, 0, 0.5])
-    np.testing.assert_allclose(packed, [1 / 3 + 0.5, 1 / 3 + 0.5, 1 / 3, 0, 0, 0], atol=1e-12)
+    body = scene.model_spec().bodies[0]
+    assert body.mass == pytest.approx(2)
+    np.testing.assert_allclose(body.com, [0, 0, 0.5])
+    np.testing.assert_allclose(body.inertia, [1 / 3 + 0.5, 1 / 3 + 0.5, 1 / 3, 0, 0, 0], atol=1e-12)
 
 
 def test_pad_frames_follow_the_observation_format() -> None:
@@ -181,7 +155,7 @@ def test_hole_matches_the_publication() -> None:
 def test_reference_pad_matches_the_published_markers() -> None:
     """First and last marker of the published data, which are ordered row by row."""
     scene = load_scene("pushing")
-    spec = recorded(scene)
+    spec = scene.model_spec()
     x, r = body_frames(spec, np.zeros(7))[scene.pads[0].body]
     markers = x + scene.pads[0].positions @ r.T
     np.testing.assert_allclose(markers[:, 0], 0.02 + 0.004 + 0.0015, atol=1e-12)
@@ -249,12 +223,10 @@ def test_area_weights_reach_the_model(tmp_path: Path) -> None:
         "rolling",
         overrides={"points.pad.stiffness": "per area", "pads.pad.stiffness": "per area", "pads.pad.rows": 200},
     )
-    spec = recorded(scene)
-    (args, _) = spec.calls["add_points"][0]
-    assert args[3].sum() == pytest.approx(2 * (0.05 * 0.05 + 2 * 0.05 * 0.01))
-    (_, kwargs) = spec.calls["add_pad"][0]
-    assert kwargs["weights"].sum() == pytest.approx(0.05 * 0.05)
-    assert recorded(load_scene("rolling")).calls["add_points"][0][0][3].sum() == 2168
+    spec = scene.model_spec()
+    assert sum(spec.points[0].weights or []) == pytest.approx(2 * (0.05 * 0.05 + 2 * 0.05 * 0.01))
+    assert sum(spec.pads[0].weights or []) == pytest.approx(0.05 * 0.05)
+    assert sum(load_scene("rolling").model_spec().points[0].weights or []) == 2168
 
 
 BLOCKS = {

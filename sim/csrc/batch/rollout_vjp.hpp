@@ -1,0 +1,79 @@
+// The reverse pass through a rollout (eqs. 19-23, adjoint.hpp).
+#pragma once
+
+#include "batch/param_gradient.hpp"
+#include "batch/trajectory.hpp"
+#include "solver/adjoint.hpp"
+
+namespace gelflow {
+
+// Adds the gradient through the markers that were read after `step` steps, to the state there and to the parameters.
+// `read` is the last read that is not yet done.
+template <class T>
+void readings_vjp(const Model& m, const T* params, int step, std::size_t e, const Trajectory<T>& r,
+                  const TrajectoryCotangent<T>& cotangent, double* by_params, StateGradient<T>& gradient, int& read,
+                  Workspace<T>& w) {
+  const StateView<T> now = r.state(m, step, e);
+  for (; read >= 0 && r.read_after[read] == step; --read) {
+    const T* by_reading = cotangent.tactile + r.reading(m, read, e);
+    tactile_vjp<T>(m, params, now, by_reading, gradient, w);
+    if (by_params == nullptr) continue;
+    const ParamState at{m.step, now.q, now.v, nullptr, nullptr, nullptr, now.anchors, now.anchored};
+    add_reading_param_gradient(m, params, at, by_reading, by_params);
+  }
+}
+
+// The substeps of the step from state `old` to state `now`. A step that was halved is taken again, which gives the start
+// and the anchors of each substep.
+template <class T>
+void record_substeps(const Model& m, const T* params, const T* u, const StateView<T>& old, const StateView<T>& now,
+                     bool halved, StepMemory<T>& memory, std::vector<SubstepRecord<T>>& records) {
+  records.clear();
+  if (!halved) {
+    const StepStart<T> from = step_start<T>(m, T(m.step), true, old, u, memory);
+    records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
+    return;
+  }
+  StateCopy<T> scratch(m, old);
+  gelflow::step<T>(
+      m, params, u, m.polish, scratch.view(), memory, false,
+      [&](const StepStart<T>& from, const StepMemory<T>& taken) { records.emplace_back(m, from, taken.v_new, false); });
+}
+
+// The reverse pass of environment e. Gradients by parameters need T = double.
+template <class T>
+void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajectory<T>& r,
+                 const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out, StepMemory<T>& memory) {
+  double* by_params = out.params == nullptr ? nullptr : out.params + e * m.param_names.size();
+  StateGradient<T> gradient(m);
+  std::copy_n(reinterpret_cast<const V3<T>*>(cotangent.anchors_end) + e * m.na, m.na, gradient.anchors.begin());
+  std::copy_n(cotangent.history_end + e * m.nh, m.nh, gradient.history.data());
+  std::vector<SubstepRecord<T>> records;
+  int read = r.reads - 1;
+  for (int t = r.steps; t >= 0; --t) {
+    const std::size_t row = r.row(t, e);
+    const StateView<T> now = r.state(m, t, e);
+    gradient.q += to_tangent<T>(m, now.q, cotangent.q + row * m.nq);
+    gradient.v += Eigen::Map<const VX<T>>(cotangent.v + row * m.nv, m.nv);
+    readings_vjp<T>(m, params, t, e, r, cotangent, by_params, gradient, read, memory.work);
+    if (t == 0) break;
+    const T* u = r.controls(m, t - 1, e);
+    T* by_u = out.u + (u - r.u);
+    record_substeps<T>(m, params, u, r.state(m, t - 1, e), now, r.halvings[r.row(t - 1, e)] != 0, memory, records);
+    for (auto it = records.rbegin(); it != records.rend(); ++it) {
+      substep_vjp<T>(m, params, u, *it, gradient, by_u, memory, [&](const VX<T>& c) {
+        if (by_params == nullptr) return;
+        const ParamState at{
+            it->h, it->q0.data(),      it->v_star.data(),  it->bdf2 ? it->history.data() : nullptr, it->v1.data(),
+            u,     it->anchors.data(), it->anchored.data()};
+        add_step_param_gradient(m, params, at, c.data(), gradient.anchors.data(), by_params);
+      });
+    }
+  }
+  add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, out.q + e * m.nq);
+  std::copy_n(gradient.v.data(), m.nv, out.v + e * m.nv);
+  std::copy_n(gradient.anchors.data(), m.na, reinterpret_cast<V3<T>*>(out.anchors) + e * m.na);
+  std::copy_n(gradient.history.data(), m.nh, out.history + e * m.nh);
+}
+
+}  // namespace gelflow

@@ -1,0 +1,53 @@
+// Named views of the arrays of a rollout and of its reverse pass. The caller owns the memory. Arrays are C-contiguous,
+// time first, then environment; N is the number of environments.
+#pragma once
+
+#include "solver/step.hpp"
+
+namespace gelflow {
+
+template <class T>
+struct Trajectory {
+  int steps, reads, environments;
+  const T* u;              // (steps, N, nu)
+  T *q, *v, *anchors;      // (steps + 1, N, ·); the first entry is the initial state
+  T* history;              // (steps + 1, N, nh)
+  std::uint8_t* anchored;  // (steps + 1, N, na)
+  std::int8_t* halvings;   // (steps, N)
+  std::int32_t* status;    // (N): a Status
+  const int* read_after;   // (reads): numbers of steps after which the markers are read, increasing
+  T* tactile;              // (reads, N, markers, 3)
+
+  // Row of an environment after `step` steps, in arrays with one row per step and environment.
+  std::size_t row(int step, std::size_t e) const { return static_cast<std::size_t>(step) * environments + e; }
+  StateView<T> state(const Model& m, int step, std::size_t e, T* q_rounding = nullptr) const {
+    const std::size_t i = row(step, e);
+    return {q + i * m.nq,        v + i * m.nv,       reinterpret_cast<V3<T>*>(anchors) + i * m.na,
+            anchored + i * m.na, history + i * m.nh, q_rounding};
+  }
+  // Controls of the step that starts after `step` steps.
+  const T* controls(const Model& m, int step, std::size_t e) const { return u + row(step, e) * m.actuators.size(); }
+  // Offset of an environment's markers in `tactile`.
+  std::size_t reading(const Model& m, int read, std::size_t e) const { return row(read, e) * m.markers * 3; }
+};
+
+// Gradient of a scalar by the results of a rollout: the input of the reverse pass.
+template <class T>
+struct TrajectoryCotangent {
+  const T *q, *v;        // shaped as in the trajectory; q by the quaternion's four numbers
+  const T* anchors_end;  // (N, na, 3)
+  const T* history_end;  // (N, nh)
+  const T* tactile;      // (reads, N, markers, 3)
+};
+
+// Gradient of the scalar by the inputs of a rollout: the output of the reverse pass.
+template <class T>
+struct TrajectoryGradient {
+  T* u;            // (steps, N, nu)
+  T *q, *v;        // of the initial state: (N, nq), (N, nv)
+  T* anchors;      // (N, na, 3)
+  T* history;      // (N, nh)
+  double* params;  // (N, parameters); null: not computed
+};
+
+}  // namespace gelflow

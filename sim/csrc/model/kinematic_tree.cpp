@@ -1,0 +1,121 @@
+// The parts of a model that follow from all its elements together: the dofs that move each body, which dofs move the
+// axes of others, and the dofs that change the relative motion of each contact pair.
+#include <algorithm>
+
+#include "model/definition_checks.hpp"
+#include "model/model_spec.hpp"
+
+namespace gelflow {
+
+namespace {
+
+void find_body_dofs(Model& m) {
+  for (Body& body : m.bodies) {  // parents come first, so their dofs are complete
+    if (body.joint_begin == body.joint_end) reject("body '" + body.name + "' has no joint: merge it into its parent");
+    if (body.parent != world) body.dofs = m.bodies[body.parent].dofs;
+    for (int j = body.joint_begin; j < body.joint_end; ++j) {
+      for (int i = 0; i < m.joints[j].dofs; ++i) body.dofs.push_back(m.joints[j].v + i);
+    }
+  }
+}
+
+void find_translations(Model& m) {
+  m.translation_only.assign(m.nv, 0);
+  for (Body& body : m.bodies) {
+    body.translation_only = true;
+    for (const int k : body.dofs) {  // root first
+      body.translation_only = body.translation_only && !m.angular[k];
+      m.translation_only[k] = body.translation_only;
+    }
+  }
+}
+
+void find_free_bodies(Model& m) {
+  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
+    const auto is_child = [&](const Body& other) { return other.parent == static_cast<int>(i); };
+    Body& body = m.bodies[i];
+    body.is_free = body.joint_end == body.joint_begin + 1 && m.joints[body.joint_begin].type == JointType::free &&
+                   std::none_of(m.bodies.begin(), m.bodies.end(), is_child);
+  }
+  for (int k = 0; k < m.nv; ++k) {
+    if (!m.bodies[m.dof_body[k]].is_free) m.articulated_dofs.push_back(k);
+  }
+}
+
+void find_ancestors(Model& m) {
+  m.ancestor_table.assign(static_cast<std::size_t>(m.nv) * m.nv, 0);
+  for (int k = 0; k < m.nv; ++k) {
+    for (const int j : m.bodies[m.dof_body[k]].dofs) {
+      if (j > k && m.group_begin[j] != m.group_begin[k]) continue;
+      m.ancestor_table[static_cast<std::size_t>(j) * m.nv + k] = 1;
+    }
+  }
+}
+
+// Packs of `width` neighbouring dofs that hold all dofs whose sign is not 0.
+PackedDofs pack_dofs(const Model& m, const std::vector<double>& signs, int width) {
+  PackedDofs packed;
+  for (int k = 0; k < m.nv; ++k) {
+    if (signs[k] == 0 || (!packed.start.empty() && k < packed.start.back() + width)) continue;
+    packed.start.push_back(k);
+  }
+  for (const int start : packed.start) {
+    for (int k = start; k < start + width; ++k) {
+      const double sign = k < m.nv ? signs[k] : 0.0;
+      packed.sign.push_back(sign);
+      packed.dof.push_back(sign != 0 ? k : -1);
+    }
+  }
+  for (const int row : packed.dof) {
+    packed.linear.push_back(row >= 0 && m.angular[row] == 0);
+    packed.has_coupling.push_back(0);
+    for (const int column : packed.dof) {
+      const bool both = row >= 0 && column >= 0;
+      const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && m.is_ancestor(column, row)
+                                                     : signs[row] > 0 || !m.is_ancestor(column, row));
+      packed.axis_coupling.push_back(counts ? 1.0 : 0.0);
+      if (counts) packed.has_coupling.back() = 1;
+    }
+  }
+  return packed;
+}
+
+PairDofs pair_dofs(Model& m, int first, int second) {
+  std::vector<double> signs(m.nv, 0.0);  // a dof that moves both bodies cancels
+  if (first != world) {
+    for (const int k : m.bodies[first].dofs) signs[k] += 1;
+  }
+  if (second != world) {
+    for (const int k : m.bodies[second].dofs) signs[k] -= 1;
+  }
+  const PairDofs pair{pack_dofs(m, signs, 1), pack_dofs(m, signs, 4), pack_dofs(m, signs, 8)};
+  for (const PackedDofs* packed : {&pair.single, &pair.four, &pair.eight}) {
+    m.jacobian_columns = std::max(m.jacobian_columns, static_cast<int>(packed->dof.size()));
+  }
+  return pair;
+}
+
+}  // namespace
+
+void build_kinematic_tree(Model& model) {
+  find_body_dofs(model);
+  find_translations(model);
+  find_free_bodies(model);
+  find_ancestors(model);
+}
+
+void build_contact_pairs(Model& model) {
+  for (Contact& contact : model.contacts) {
+    const PointSet& set = model.point_sets[contact.points];
+    const Shape& shape = model.shapes[contact.shape];
+    contact.pair = pair_dofs(model, set.mount.body, shape.body);
+    contact.uses_arc_correction = set.mount.body != world && model.bodies[set.mount.body].is_free &&
+                                  shape.body == world && shape.kind == ShapeKind::plane &&
+                                  (set.radius == 0 || set.cloud.extent > 0);
+  }
+  for (Pad& pad : model.pads) {
+    for (const int s : pad.shapes) pad.pairs.push_back(pair_dofs(model, pad.mount.body, model.shapes[s].body));
+  }
+}
+
+}  // namespace gelflow

@@ -1,0 +1,269 @@
+// Batch and BatchFloat, and the named arrays of rollouts.
+#include "batch/batch.hpp"
+
+#include <optional>
+
+#include "python/arrays.hpp"
+#include "python/bindings.hpp"
+
+namespace gelflow {
+
+namespace {
+
+// The arrays of a rollout. Trajectory<T> views them after checks of type and shape.
+struct TrajectoryArrays {
+  py::array u, q, v, anchors, anchored, history, tactile, read_after, halvings, status;
+};
+struct CotangentArrays {
+  py::array q, v, anchors_end, history_end, tactile;
+};
+struct GradientArrays {
+  py::array u, q, v, anchors, history, params;
+};
+
+template <class T>
+py::ssize_t actuators(const Batch<T>& b) {
+  return static_cast<py::ssize_t>(b.model->actuators.size());
+}
+
+template <class T>
+Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t) {
+  if (t.u.ndim() != 3) throw std::invalid_argument("u must have shape (steps, environments, actuators)");
+  const Model& m = *b.model;
+  const py::ssize_t steps = t.u.shape(0), n = b.n, reads = t.read_after.size();
+  const int* read_after = readable<int>(t.read_after, {reads}, "read_after");
+  for (py::ssize_t i = 0; i < reads; ++i) {
+    if (read_after[i] < 0 || read_after[i] > steps || (i > 0 && read_after[i] <= read_after[i - 1])) {
+      throw std::invalid_argument("read_after must increase and lie between 0 and the number of steps");
+    }
+  }
+  Trajectory<T> r{};
+  r.steps = static_cast<int>(steps);
+  r.reads = static_cast<int>(reads);
+  r.environments = b.n;
+  r.u = readable<T>(t.u, {steps, n, actuators(b)}, "u");
+  r.q = writable<T>(t.q, {steps + 1, n, m.nq}, "q");
+  r.v = writable<T>(t.v, {steps + 1, n, m.nv}, "v");
+  r.anchors = writable<T>(t.anchors, {steps + 1, n, m.na, 3}, "anchors");
+  r.anchored = writable<std::uint8_t>(t.anchored, {steps + 1, n, m.na}, "anchored");
+  r.history = writable<T>(t.history, {steps + 1, n, m.nh}, "history");
+  r.halvings = writable<std::int8_t>(t.halvings, {steps, n}, "halvings");
+  r.status = writable<std::int32_t>(t.status, {n}, "status");
+  r.read_after = read_after;
+  r.tactile = writable<T>(t.tactile, {reads, n, m.markers, 3}, "tactile");
+  return r;
+}
+
+template <class T>
+TrajectoryCotangent<T> checked(const Batch<T>& b, const Trajectory<T>& r, const CotangentArrays& c) {
+  const Model& m = *b.model;
+  const py::ssize_t n = b.n;
+  return {readable<T>(c.q, {r.steps + 1, n, m.nq}, "q"), readable<T>(c.v, {r.steps + 1, n, m.nv}, "v"),
+          readable<T>(c.anchors_end, {n, m.na, 3}, "anchors_end"), readable<T>(c.history_end, {n, m.nh}, "history_end"),
+          readable<T>(c.tactile, {r.reads, n, m.markers, 3}, "tactile")};
+}
+
+// Controls (N, nu), or (nu,) for all environments.
+template <class T>
+Controls<T> checked_controls(const Batch<T>& b, const Array<T>& u) {
+  const py::ssize_t nu = actuators(b);
+  const bool shared = u.ndim() == 1 && u.shape(0) == nu;
+  if (!shared && !(u.ndim() == 2 && u.shape(0) == b.n && u.shape(1) == nu)) {
+    throw std::invalid_argument("u must have shape " + shape_text({b.n, nu}) + " or (" + std::to_string(nu) +
+                                ",), got " + shape_text({u.shape(), u.shape() + u.ndim()}));
+  }
+  return {u.data(), shared};
+}
+
+void bind_trajectory(py::module_& module) {
+  using A = py::array;
+  py::class_<TrajectoryArrays>(module, "Trajectory")
+      .def(py::init([](A u, A q, A v, A anchors, A anchored, A history, A tactile, A read_after, A halvings, A status) {
+             return TrajectoryArrays{u, q, v, anchors, anchored, history, tactile, read_after, halvings, status};
+           }),
+           py::kw_only(), py::arg("u"), py::arg("q"), py::arg("v"), py::arg("anchors"), py::arg("anchored"),
+           py::arg("history"), py::arg("tactile"), py::arg("read_after"), py::arg("halvings"), py::arg("status"))
+      .def_readonly("u", &TrajectoryArrays::u)
+      .def_readonly("q", &TrajectoryArrays::q)
+      .def_readonly("v", &TrajectoryArrays::v)
+      .def_readonly("anchors", &TrajectoryArrays::anchors)
+      .def_readonly("anchored", &TrajectoryArrays::anchored)
+      .def_readonly("history", &TrajectoryArrays::history)
+      .def_readonly("tactile", &TrajectoryArrays::tactile)
+      .def_readonly("read_after", &TrajectoryArrays::read_after)
+      .def_readonly("halvings", &TrajectoryArrays::halvings)
+      .def_readonly("status", &TrajectoryArrays::status);
+  py::class_<CotangentArrays>(module, "TrajectoryCotangent")
+      .def(py::init([](A q, A v, A anchors_end, A history_end, A tactile) {
+             return CotangentArrays{q, v, anchors_end, history_end, tactile};
+           }),
+           py::kw_only(), py::arg("q"), py::arg("v"), py::arg("anchors_end"), py::arg("history_end"),
+           py::arg("tactile"))
+      .def_readonly("q", &CotangentArrays::q)
+      .def_readonly("v", &CotangentArrays::v)
+      .def_readonly("anchors_end", &CotangentArrays::anchors_end)
+      .def_readonly("history_end", &CotangentArrays::history_end)
+      .def_readonly("tactile", &CotangentArrays::tactile);
+  py::class_<GradientArrays>(module, "TrajectoryGradient")
+      .def_readonly("u", &GradientArrays::u)
+      .def_readonly("q", &GradientArrays::q)
+      .def_readonly("v", &GradientArrays::v)
+      .def_readonly("anchors", &GradientArrays::anchors)
+      .def_readonly("history", &GradientArrays::history)
+      .def_readonly("params", &GradientArrays::params);
+}
+
+template <class T>
+GradientArrays rollout_vjp(Batch<T>& b, TrajectoryArrays& trajectory, const CotangentArrays& cotangent, bool params) {
+  const Trajectory<T> r = checked<T>(b, trajectory);
+  const TrajectoryCotangent<T> c = checked<T>(b, r, cotangent);
+  const Model& m = *b.model;
+  const py::ssize_t n = b.n, np = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
+  py::array_t<T> u(Dimensions{r.steps, n, actuators(b)}), q(Dimensions{n, m.nq}), v(Dimensions{n, m.nv});
+  py::array_t<T> anchors(Dimensions{n, m.na, 3}), history(Dimensions{n, m.nh});
+  py::array_t<double> by_params(Dimensions{n, np});
+  const TrajectoryGradient<T> gradient{u.mutable_data(),       q.mutable_data(),
+                                       v.mutable_data(),       anchors.mutable_data(),
+                                       history.mutable_data(), params ? by_params.mutable_data() : nullptr};
+  {
+    const py::gil_scoped_release release;
+    b.rollout_vjp(r, c, gradient);
+  }
+  return {u, q, v, anchors, history, by_params};
+}
+
+template <class T>
+void bind_state(py::class_<Batch<T>>& type) {
+  using B = Batch<T>;
+  // An array of the batch's own memory.
+  const auto own = [&](const char* name, auto member, auto shape) {
+    type.def_property_readonly(name, [member, shape](const py::object& self) {
+      B& b = self.cast<B&>();
+      Dimensions dimensions = shape(*b.model);
+      dimensions.insert(dimensions.begin(), b.n);
+      return view((b.*member).data(), dimensions, self);
+    });
+  };
+  const auto none = [](const Model&) { return Dimensions{}; };
+  own("q", &B::q, [](const Model& m) { return Dimensions{m.nq}; });
+  own("v", &B::v, [](const Model& m) { return Dimensions{m.nv}; });
+  own("params", &B::params, [](const Model& m) { return Dimensions{static_cast<py::ssize_t>(m.param_names.size())}; });
+  own("anchored", &B::anchored, [](const Model& m) { return Dimensions{m.na}; });
+  own("history", &B::history, [](const Model& m) { return Dimensions{m.nh}; });
+  own("status", &B::status, none);
+  own("iterations", &B::iterations, none);
+  own("halved", &B::halved, none);
+  type.def_property_readonly("anchors",
+                             [](const py::object& self) {
+                               B& b = self.cast<B&>();
+                               return view(reinterpret_cast<T*>(b.anchors.data()), {b.n, b.model->na, 3}, self);
+                             })
+      .def_property_readonly("readings", [](const py::object& self) {
+        B& b = self.cast<B&>();
+        py::array readings = view(b.readings.data(), {b.n, b.model->markers, 3}, self);
+        readings.attr("flags").attr("writeable") = false;
+        return readings;
+      });
+}
+
+template <class T>
+void bind_steps(py::class_<Batch<T>>& type) {
+  using B = Batch<T>;
+  type.def(
+          "reset",
+          [](B& b, const std::optional<Array<std::uint8_t>>& which) {
+            if (which) check_shape(*which, {b.n}, "which");
+            b.reset(which ? which->data() : nullptr);
+          },
+          py::arg("which") = py::none())
+      .def(
+          "step",
+          [](B& b, const Array<T>& u, int steps) {
+            const Controls<T> controls = checked_controls<T>(b, u);
+            const py::gil_scoped_release release;
+            b.step(controls, steps);
+          },
+          py::arg("u"), py::arg("steps") = 1)
+      .def(
+          "error_estimate",
+          [](B& b, const Array<T>& u) {
+            const Controls<T> controls = checked_controls<T>(b, u);
+            py::array_t<T> out(Dimensions{b.n, b.model->nv});
+            py::array_t<std::int32_t> status(static_cast<py::ssize_t>(b.n));
+            b.error_estimate(controls, out.mutable_data(), status.mutable_data());
+            return py::make_tuple(out, status);
+          },
+          py::arg("u"))
+      .def(
+          "rollout",
+          [](B& b, TrajectoryArrays& trajectory) {
+            const Trajectory<T> r = checked<T>(b, trajectory);
+            const py::gil_scoped_release release;
+            b.rollout(r);
+          },
+          py::arg("trajectory"))
+      .def(
+          "contact_modes",
+          [](B& b, TrajectoryArrays& trajectory) {
+            const Trajectory<T> r = checked<T>(b, trajectory);
+            py::array_t<std::uint64_t> out(Dimensions{r.steps, b.n});
+            b.contact_modes(r, out.mutable_data());
+            return out;
+          },
+          py::arg("trajectory"))
+      .def("rollout_vjp", &rollout_vjp<T>, py::arg("trajectory"), py::arg("cotangent"), py::arg("params") = false);
+}
+
+template <class T>
+void bind_outputs(py::class_<Batch<T>>& type) {
+  using B = Batch<T>;
+  // A member function that writes an array of the caller.
+  const auto writes = [&](const char* name, void (B::*function)(T*), auto shape) {
+    type.def(
+        name,
+        [function, shape](B& b, py::array out) {
+          Dimensions dimensions = shape(*b.model);
+          dimensions.insert(dimensions.begin(), b.n);
+          (b.*function)(writable<T>(out, dimensions, "out"));
+        },
+        py::arg("out"));
+  };
+  writes("wrenches", &B::wrenches,
+         [](const Model& m) { return Dimensions{static_cast<py::ssize_t>(m.contacts.size()), 6}; });
+  writes("contact_forces", &B::contact_forces, [](const Model& m) { return Dimensions{m.nv}; });
+  writes("poses", &B::poses, [](const Model& m) { return Dimensions{static_cast<py::ssize_t>(m.bodies.size()), 7}; });
+  writes("mass_matrix", &B::mass_matrix, [](const Model& m) { return Dimensions{m.nv, m.nv}; });
+  writes("bias", &B::bias, [](const Model& m) { return Dimensions{m.nv}; });
+  type.def(
+          "tactile",
+          [](B& b, py::array out) {
+            T* data = writable<T>(out, {b.n, b.model->markers, 3}, "out");
+            const py::gil_scoped_release release;
+            b.tactile(data);
+          },
+          py::arg("out"))
+      .def("update_readings", &B::update_readings, py::call_guard<py::gil_scoped_release>());
+}
+
+template <class T>
+void bind_batch(py::module_& module, const char* name) {
+  using B = Batch<T>;
+  py::class_<B> type(module, name);
+  type.def(py::init<std::shared_ptr<const Model>, int, int>(), py::arg("model"), py::arg("environments"),
+           py::arg("threads"))
+      .def_readonly("environments", &B::n)
+      .def_property_readonly("threads", &B::threads);
+  bind_state(type);
+  bind_steps(type);
+  bind_outputs(type);
+}
+
+}  // namespace
+
+void bind_batches(py::module_& module) {
+  bind_trajectory(module);
+  bind_batch<double>(module, "Batch");
+  bind_batch<float>(module, "BatchFloat");
+}
+
+}  // namespace gelflow
