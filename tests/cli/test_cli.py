@@ -2,6 +2,7 @@
 
 import json
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -100,6 +101,20 @@ def test_json_of_recover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     path.write_bytes(path.read_bytes()[:-10])
     report = printed_json(capsys, "recover", str(path), "--out", str(target))
     assert report["path"] == str(target) and report["messages"] == 2
+
+
+def test_json_of_mock(tmp_path: Path) -> None:
+    """With --attached and a closed standard input the mock robot starts, prints its addresses and ends."""
+    lab = tmp_path / "lab.toml"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    arguments = ["mock", "--attached", "--json", "--egm-port", port, "--out", str(lab)]
+    done = subprocess.run([*MAIN, *arguments], stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed["arm"] == f"127.0.0.1:{port}" and len(printed["cameras"]) == 2
+    assert printed["lab_file"] == str(lab) and lab.exists()
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])

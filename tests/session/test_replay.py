@@ -1,6 +1,7 @@
 """Replay: the same images in the same order give the same decisions; every difference is detected."""
 
 import dataclasses
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -275,6 +276,13 @@ def test_the_command_reports_identical_decisions(
     assert "all 3 decisions identical" in out and "note:" not in out
     drawn = cv2.imread(str(picture))
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
+
+
+def test_the_command_prints_json(real_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(real_session), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["identical"] and printed["notes"] == [] and printed["picture"] is None
+    assert [decision["action_difference"] for decision in printed["decisions"]] == [0, 0, 0]
 
 
 def test_the_command_detects_another_policy(
