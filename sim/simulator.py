@@ -215,14 +215,14 @@ class Simulator:
             values = np.asarray(values, self.dtype)
         if values.ndim < 2 or tuple(values.shape[-2:]) != (self.model.markers, 3):
             raise UsageError(f"forces must have shape (…, {self.model.markers}, 3), got {tuple(values.shape)}")
-        displacements = [pad.gel.displacement(values[..., self.pad(pad.name), :]) for pad in pads]
+        displacements = [pad.gel.displacement(values[..., self.marker_slice(pad.name), :]) for pad in pads]
         if isinstance(values, np.ndarray):
             return np.concatenate(displacements, axis=-2)
         import torch  # deferred: only tensors need torch
 
         return torch.cat(displacements, dim=-2)
 
-    def pad(self, name: str) -> slice:
+    def marker_slice(self, name: str) -> slice:
         """Slice of the marker axis that belongs to one pad."""
         names = list(self.model.pad_names)
         if name not in names:

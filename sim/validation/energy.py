@@ -79,7 +79,7 @@ class EnergyGauge:
         probe.anchored[:] = 0
         for name, start in _anchor_starts(sim).items():
             if start >= 0:
-                own = probe.pad(name)
+                own = probe.marker_slice(name)
                 theirs = slice(start, start + own.stop - own.start)
                 probe.anchors[:, own] = sim.anchors[:, theirs]
                 probe.anchored[:, own] = sim.anchored[:, theirs]
@@ -94,7 +94,7 @@ class EnergyGauge:
         contact, friction = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
         anchor_starts = _anchor_starts(sim)
         for name, weights in self._weights.items():
-            own = self._probe.pad(name)
+            own = self._probe.marker_slice(name)
             contact += 0.5 * _number(sim, name, "kn") * (depth[:, own] ** 2 @ weights)
             if anchor_starts[name] >= 0:
                 friction += 0.5 * _number(sim, name, "ks") * ((strain[:, own] ** 2).sum(2) @ weights)

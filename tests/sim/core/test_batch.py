@@ -162,7 +162,7 @@ def test_wrong_shapes_and_types_raise(insertion: Scene) -> None:
     with pytest.raises(UsageError, match="precision must be 'double' or 'single', got 'half'"):
         Simulator(insertion, precision="half")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="no pad 'middle'; there are left, right"):
-        sim.pad("middle")
+        sim.marker_slice("middle")
 
 
 def test_zero_steps_do_nothing_and_negative_steps_raise(insertion: Scene) -> None:

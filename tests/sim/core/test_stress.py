@@ -37,17 +37,17 @@ def test_results_are_finite(scene: str, law: str, integrator: str, precision: Pr
 @pytest.mark.parametrize("precision", BOTH)
 @pytest.mark.parametrize("scene", SCENES)
 def test_no_step_of_the_normal_range_fails(scene: str, precision: Precision) -> None:
-    extremes = StressTest(envs=24, steps=20, threads=1, seed=4)
+    stress = StressTest(envs=24, steps=20, threads=1, seed=4)
     for law in FRICTION_LAWS:
         for integrator in INTEGRATORS:
-            statistics = extremes.run(StressBatch(scene, law, integrator, "normal", precision))
+            statistics = stress.run(StressBatch(scene, law, integrator, "normal", precision))
             assert statistics.failed == 0 and statistics.steps == 24 * 20
 
 
 def test_failures_are_rare_and_iterations_limited() -> None:
-    extremes, total = StressTest(envs=24, steps=20, threads=1, seed=5), StepStatistics()
+    stress, total = StressTest(envs=24, steps=20, threads=1, seed=5), StepStatistics()
     for draw in stress_batches(3):
-        total.add(extremes.run(draw))
+        total.add(stress.run(draw))
     assert total.steps > 28_000 and total.failed <= 0.01 * total.steps
     assert total.most_iterations <= _core.ModelSpec().max_step_iterations
 

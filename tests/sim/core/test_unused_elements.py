@@ -106,7 +106,7 @@ def run(scene: Scene) -> bytes:
         sim.step(PUSH)
         parts += [sim.q.tobytes(), sim.v.tobytes()]
     sim.check()
-    readings = sim.tactile()[0, sim.pad("pad")]
+    readings = sim.tactile()[0, sim.marker_slice("pad")]
     assert readings.any()  # the pad is on the ball
     return b"".join([*parts, readings.tobytes()])
 
