@@ -1,4 +1,4 @@
-// Everything one environment's step writes besides its state; allocated once, reused by every step.
+// Memory for the intermediate results of one environment's step; allocated once, reused by each step.
 #pragma once
 
 #include <utility>
