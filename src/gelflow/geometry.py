@@ -60,12 +60,6 @@ def rotation_columns(q: Sequence[float] | Array) -> Columns:
     )
 
 
-def rotation_matrix(quaternion: Array) -> Array:
-    """Rotation matrices (…, 3, 3) of unit quaternions w x y z (…, 4)."""
-    columns = rotation_columns(np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0))
-    return np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
-
-
 def columns_quaternion(columns: Columns) -> Quaternion:
     """The unit quaternion with w ≥ 0 of a rotation matrix, given by columns.
 

@@ -14,7 +14,7 @@ from gelflow.geometry import (
     compose,
     invert,
     rotation_columns,
-    rotation_matrix,
+    rotation_matrices,
     yaw_quaternion,
 )
 
@@ -53,7 +53,7 @@ def test_plain_floats_and_arrays_agree(seed: int) -> None:
     position, turn = invert(one)
     assert position == pytest.approx(a.inverse().position) and turn == pytest.approx(a.inverse().quaternion)
     both = np.stack([a.quaternion, b.quaternion])
-    np.testing.assert_allclose(rotation_matrix(both), [rotation(a).as_matrix(), rotation(b).as_matrix()], atol=1e-14)
+    np.testing.assert_allclose(rotation_matrices(both), [rotation(a).as_matrix(), rotation(b).as_matrix()], atol=1e-14)
     np.testing.assert_allclose(a.apply(b.position[None]), [a.position + rotation(a).apply(b.position)], atol=1e-14)
     assert angle_between(columns_quaternion(rotation_columns(a.quaternion.tolist())), a.quaternion) < 1e-7
     assert angles_between(both[0], both[1]) == pytest.approx(angle_between(both[0], both[1]))

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import rotation_matrices
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS
 from gelflow.sim.simulator import Simulator
@@ -130,21 +131,10 @@ def test_marker_forces_at_contact_points_add_up_to_the_contact_force(law: str, s
     sim.v[0, 3:] = 0.1, 0.2, 0.5
     sim.step(np.zeros(0), 60)
     quat = sim.poses()[0, 0, 3:]
-    force = (sim.tactile()[0] * [1, 1, -1]).sum(0) @ matrix(quat).T
+    force = (sim.tactile()[0] * [1, 1, -1]).sum(0) @ rotation_matrices(quat).T
     # Wrench and marker forces use the present state and anchors.
     np.testing.assert_allclose(force, sim.wrenches()[0, 0, 3:], rtol=0, atol=1e-13)
     assert sim.tactile()[0, :, :2].any()
-
-
-def matrix(quat: Array) -> Array:
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def two_blocks(law: str) -> Simulator:
@@ -183,7 +173,10 @@ def test_contact_forces_on_two_bodies_are_equal_and_opposite(law: str) -> None:
         np.testing.assert_allclose(MASS * gain[:3], wrench[3:], atol=1e-9)
         np.testing.assert_allclose(0.1 * gain[6:9], -wrench[3:], atol=1e-9)
         for mass, joint, sign in ((MASS, 0, 1), (0.1, 1, -1)):
-            position, turn = sim.q[0, 7 * joint : 7 * joint + 3], matrix(sim.q[0, 7 * joint + 3 : 7 * joint + 7])
+            position, turn = (
+                sim.q[0, 7 * joint : 7 * joint + 3],
+                rotation_matrices(sim.q[0, 7 * joint + 3 : 7 * joint + 7]),
+            )
             moment = wrench[:3] - np.cross(position, wrench[3:])  # about the body's centre
             torque = mass * (2 * HALF) ** 2 / 6 * turn @ gain[6 * joint + 3 : 6 * joint + 6]
             np.testing.assert_allclose(torque, sign * moment, atol=1e-10)
@@ -240,7 +233,7 @@ def test_sliding_ball_ends_rolling_at_five_sevenths_of_its_speed() -> None:
     settle(sim, sliding)
     # The ground's reaction acts at the ground, `depth` above the sphere's lowest point.
     assert sim.v[0, 0] == pytest.approx(5 / 7, rel=5 * depth / 0.03)
-    spin = matrix(sim.q[0, 3:]) @ sim.v[0, 3:]
+    spin = rotation_matrices(sim.q[0, 3:]) @ sim.v[0, 3:]
     assert spin[1] * 0.03 == pytest.approx(sim.v[0, 0], rel=1e-6)
     before = sim.v[0, 0]
     settle(sim, 0.5)

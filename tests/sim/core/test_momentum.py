@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from gelflow.geometry import rotation_matrices
 from gelflow.sim import _core
 from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
@@ -27,7 +28,7 @@ def free_bodies(spec: _core.ModelSpec, poses: Array, *, centred: bool) -> tuple[
     free, poses = _core.ModelSpec(), poses.copy()
     shifts = [body.com * centred for body in spec.bodies]  # of each body's frame, in that frame
     for body, pose, shift in zip(spec.bodies, poses, shifts, strict=True):
-        pose[:3] += rotations(pose[None])[0] @ shift
+        pose[:3] += rotation_matrices(pose[3:]) @ shift
         body.parent, body.pos, body.quat, body.com = -1, pose[:3], pose[3:], body.com - shift
         index = free.add_body(body)
         free.add_joint(_core.JointDef(name=f"{body.name} floats", body=index, type="free"))
@@ -62,20 +63,12 @@ def cut_loose(name: str, law: str, step: float = 1e-3, integrator: str = "bdf1",
     return floating
 
 
-def rotations(poses: Array) -> Array:
-    w, x, y, z = poses[:, 3:].T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
 def in_world(sim: Simulator, of_joints: Array) -> Array:
     """Generalized forces (or momenta) of free bodies as (moment about the world origin, force), (bodies, 6)."""
     poses, parts = sim.poses()[0], of_joints.reshape(-1, 6)
-    moment = np.einsum("bij,bj->bi", rotations(poses), parts[:, 3:]) + np.cross(poses[:, :3], parts[:, :3])
+    moment = np.einsum("bij,bj->bi", rotation_matrices(poses[:, 3:]), parts[:, 3:]) + np.cross(
+        poses[:, :3], parts[:, :3]
+    )
     return np.hstack([moment, parts[:, :3]])
 
 
