@@ -13,7 +13,7 @@ from gelflow.errors import UsageError
 
 _level = os.environ.get("GELFLOW_CORE") or ("v3" if runs_v3() else "base")
 if _level not in ("base", "v3", "sanitize"):
-    raise UsageError(f"GELFLOW_CORE must be base, v3 or sanitize, got {_level!r}")
+    raise UsageError(f"GELFLOW_CORE must be base or v3, or sanitize after `make sanitize`, got {_level!r}")
 if _level == "v3" and not runs_v3():
     raise UsageError("GELFLOW_CORE=v3 needs a processor with AVX2; unset GELFLOW_CORE to choose a build automatically")
 _build = importlib.import_module(f"gelflow.sim._core_{_level}")
