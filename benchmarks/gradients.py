@@ -14,7 +14,7 @@ from gelflow.sim._core import LEVEL
 from gelflow.sim.validation.studies.gradient_survey import (
     DIFFERENCE_LIMIT,
     DUAL_LIMIT,
-    LEFT_OUT_LIMIT,
+    SKIPPED_LIMIT,
     STATES,
     count,
     survey,
@@ -37,7 +37,7 @@ def main() -> int:
         **script.header(),
         "core": LEVEL,
         "seconds": round(seconds),
-        "limits": {"dual": DUAL_LIMIT, "difference": DIFFERENCE_LIMIT, "left_out": LEFT_OUT_LIMIT},
+        "limits": {"dual": DUAL_LIMIT, "difference": DIFFERENCE_LIMIT, "skipped": SKIPPED_LIMIT},
         "results": [asdict(result) for result in results],
     }
     summary = f"{len(violations)} of {len(results)} combinations outside the limits, {seconds:.0f} s"

@@ -11,7 +11,7 @@ FILES_PER_FOLDER, LINES_PER_FILE, LINES_PER_FUNCTION = 15, 400, 60
 CODE = (".py", ".pyi", ".cpp", ".hpp")
 
 # Exceptions, each with its reason.
-LARGE_FILES: dict[str, str] = {}
+LARGE_FILES = {"sim/_core.pyi": "the types of one compiled module"}
 LONG_FUNCTIONS: dict[str, str] = {}
 
 

@@ -65,8 +65,8 @@ class EchoPolicy:
         self.last = np.zeros(3)
 
     def act(self, observation: FlowMap) -> NDArray[np.float64]:
-        felt = observation.image.reshape(-1)[:3] * self.gain + observation.divisor
-        self.last = 0.5 * self.last + felt
+        value = observation.image.reshape(-1)[:3] * self.gain + observation.divisor
+        self.last = 0.5 * self.last + value
         return self.last.copy()
 
 

@@ -57,7 +57,7 @@ struct Composite {
   V3<T> momentum;  // linear momentum p
 };
 
-// What the candidate points in a workspace belong to: possibly another environment; an earlier step of the same
+// State to which the candidate points in a workspace belong: possibly another environment; an earlier step of the same
 // environment; the present step.
 enum class CacheState : std::uint8_t { stale, warm, current };
 

@@ -4,7 +4,7 @@ Each state has a scalar of positions, velocities or marker forces, in turn. Erro
 
 dual        largest difference to dual numbers, which run the same code
 difference  largest difference to five-point central differences
-left out    share of gradient entries without a stencil on one smooth piece of the dynamics
+skipped    share of gradient entries without a stencil on one smooth piece of the dynamics
 where       input with the largest error; parameters in groups of one kind: "kn", "pos", "scale", …
 """
 
@@ -22,7 +22,7 @@ from gelflow.sim.validation.reference_motions import PUBLISHED_ROLLING_FORCES, S
 
 OUTPUTS: tuple[Output, ...] = ("q", "v", "tactile")
 ROLLING_RUN = "rolling run"
-DUAL_LIMIT, DIFFERENCE_LIMIT, LEFT_OUT_LIMIT = 1e-10, 1e-6, 0.05
+DUAL_LIMIT, DIFFERENCE_LIMIT, SKIPPED_LIMIT = 1e-10, 1e-6, 0.05
 STATES = 12  # per combination
 
 
@@ -39,12 +39,12 @@ class GradientErrors:
     dual_worst: str = ""
     difference: float | None = None
     difference_worst: str = ""
-    left_out: float | None = None
+    skipped: float | None = None
 
     @property
     def within_limits(self) -> bool:
         smooth = self.difference is None or (
-            self.difference < DIFFERENCE_LIMIT and (self.left_out or 0.0) <= LEFT_OUT_LIMIT
+            self.difference < DIFFERENCE_LIMIT and (self.skipped or 0.0) <= SKIPPED_LIMIT
         )
         return self.dual < DUAL_LIMIT and smooth
 
@@ -86,9 +86,9 @@ def _check_state(result: GradientErrors, seed: int) -> None:
         result.dual, result.dual_worst = dual.error, dual.worst
     if result.difference is None or difference.error >= result.difference:
         result.difference, result.difference_worst = difference.error, difference.worst
-    left_out = (result.left_out or 0.0) * result.entries + difference.skipped * difference.entries
+    skipped = (result.skipped or 0.0) * result.entries + difference.skipped * difference.entries
     result.states, result.entries = result.states + 1, result.entries + difference.entries
-    result.left_out = left_out / result.entries
+    result.skipped = skipped / result.entries
 
 
 def _check_rolling_run(result: GradientErrors) -> None:
@@ -107,13 +107,13 @@ def _check_rolling_run(result: GradientErrors) -> None:
 def table(results: Sequence[GradientErrors]) -> Table:
     """Errors of all combinations; those outside the limits are red."""
     out = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in ("case", "law", "steps", "dual", "where", "difference", "where", "left out"):
-        out.add_column(column, justify="right" if column == "left out" else "left", no_wrap=True)
+    for column in ("case", "law", "steps", "dual", "where", "difference", "where", "skipped"):
+        out.add_column(column, justify="right" if column == "skipped" else "left", no_wrap=True)
     for r in results:
         out.add_row(
             *(r.name, r.law, r.integrator, f"{r.dual:.0e}", r.dual_worst),
             *("" if r.difference is None else f"{r.difference:.0e}", r.difference_worst),
-            "" if r.left_out is None else f"{r.left_out:.1%}",
+            "" if r.skipped is None else f"{r.skipped:.1%}",
             style=None if r.within_limits else "red",
         )
     return out

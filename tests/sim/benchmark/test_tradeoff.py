@@ -42,7 +42,7 @@ def test_quick_measurement_prints_its_results(capsys: pytest.CaptureFixture[str]
     errors = [measurements[f"BDF2 {step} ms 1e-3"]["errors"] for step in ("10", "2.5", "0.625")]
     for figure in ("position", "rotation", "markers", "gradient"):
         assert errors[0][figure] > errors[1][figure] > errors[2][figure] > 3 * found["changes"]["scene"][figure]
-    # What is printed for people, from the same numbers.
+    # The table is printed from the same numbers.
     rows = tuple(
         Measurement(**{**p, "setting": Setting(**p["setting"]), "errors": Errors(**p["errors"])})
         for p in found["measurements"]

@@ -203,6 +203,20 @@ def test_edges_without_rounding_are_sharp(kind: str) -> None:
     np.testing.assert_array_equal(little[1][inside], sharp[1][inside])
 
 
+def shape_def(kind: str, body: int) -> _core.ShapeDef:
+    """A rounded solid, a sphere as a grid, or the bracket's sharp edge ("edge")."""
+    if kind in ROUNDED:
+        return _core.ShapeDef(
+            name="shape", body=body, kind=kind, pos=(1e-3, 0, 0), size=ROUNDED[kind], rounding=ROUNDING
+        )
+    pos, size, grid = (
+        ((1e-3, 0, 0), (1.2, 0, 0), sphere_grid(10))
+        if kind == "grid"
+        else ((-0.01, -0.006, -0.01), (1, 0, 0), bracket_grid(16))
+    )
+    return _core.ShapeDef(name="shape", body=body, kind="grid", pos=pos, size=size, grid=core_grid(grid))
+
+
 def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "double") -> tuple[Simulator, Array]:
     """A cloud of points on a ball joint, pressed onto a shape on a hinge; "edge": a sharp edge of a grid."""
     spec = _core.ModelSpec()
@@ -215,34 +229,7 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
         for name, axis in (("x", (1, 0, 0)), ("z", (0, 0, 1)))
     ]
     spec.add_joint(_core.JointDef(name="ball", body=hand, type="ball", pos=(0, 0, 0.002), damping=1e-3))
-    if kind in ROUNDED:
-        shape = spec.add_shape(
-            _core.ShapeDef(
-                name="shape", body=turret, kind=kind, pos=(1e-3, 0, 0), size=ROUNDED[kind], rounding=ROUNDING
-            )
-        )
-    elif kind == "grid":
-        shape = spec.add_shape(
-            _core.ShapeDef(
-                name="shape",
-                body=turret,
-                kind="grid",
-                pos=(1e-3, 0, 0),
-                size=(1.2, 0, 0),
-                grid=core_grid(sphere_grid(10)),
-            )
-        )
-    else:
-        shape = spec.add_shape(
-            _core.ShapeDef(
-                name="shape",
-                body=turret,
-                kind="grid",
-                pos=(-0.01, -0.006, -0.01),
-                size=(1, 0, 0),
-                grid=core_grid(bracket_grid(16)),
-            )
-        )
+    shape = spec.add_shape(shape_def(kind, turret))
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]
     numbers: dict[str, Any] = {"law": law, "kn": 200.0, "kt": 2.0, "mu": 0.3, "kd": 20.0}
@@ -276,7 +263,7 @@ def pressed(kind: str, law: str, rng: np.random.Generator, precision: Any = "dou
 @pytest.mark.parametrize("kind", [*KINDS, "edge"])
 def test_gradients_of_points_pressed_onto_a_shape(kind: str, law: str) -> None:
     """With respect to controls, state and parameters, including the scale of a grid and the rounding of a solid."""
-    left_out = []
+    skipped = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
         sim, u = pressed(kind, law, rng)
@@ -289,9 +276,9 @@ def test_gradients_of_points_pressed_onto_a_shape(kind: str, law: str) -> None:
             # a kink that is not in the contact mode signature. Positions and velocities have no such kink.
             case = gradient_check.RolloutLoss.random(sim, u, OUTPUTS[seed % 2], rng)
         agreement = gradient_check.compare_to_differences(case)
-        left_out.append(agreement.skipped)
+        skipped.append(agreement.skipped)
         assert agreement.error < 1e-6
-    assert np.mean(left_out) <= 0.1
+    assert np.mean(skipped) <= 0.1
 
 
 @pytest.mark.parametrize("kind", ["grid", "box"])

@@ -185,7 +185,7 @@ def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_
 
 
 def _not_modelled(d: "Description") -> Tree:
-    root = Tree("[bold]left out, and why[/bold]")
+    root = Tree("[bold]not modelled, and why[/bold]")
     for line in d.not_modelled:
         root.add(escape(line))
     return root
