@@ -6,7 +6,8 @@ from pathlib import Path
 
 import script
 
-from gelflow.sim.validation.studies.mesh_distance import BAND, draw, error_table, measure, time_table
+from gelflow.sim.validation.studies.mesh_distance import BAND, error_table, measure, time_table
+from gelflow.sim.validation.studies.mesh_distance_picture import draw
 
 
 def main() -> int:

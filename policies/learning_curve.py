@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gelflow.figures import BLUE, VERMILION, save
 from gelflow.policies.evaluation import EvaluationResult
 
 
@@ -38,24 +39,27 @@ def write_table(path: Path, points: Sequence[LearningCurvePoint]) -> None:
 
 def draw(path: Path, points: Sequence[LearningCurvePoint]) -> None:
     """Draws success rate and reward over attempts."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # imported on use: slow
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # imported on use: slow
 
     figure = Figure(figsize=(8, 6), layout="constrained")
-    FigureCanvasAgg(figure)
     top, bottom = figure.subplots(2, 1, sharex=True)
     updates = [p for p in points if p.evaluation is None]
-    evaluated = [(p.attempts, p.evaluation) for p in points if p.evaluation is not None]
-    x = np.array([p.attempts for p in updates]) / 1000
-    top.plot(x, [100 * p.success for p in updates], color="0.55", label="training, with exploration")
-    x_evaluated = [attempts / 1000 for attempts, _ in evaluated]
+    evaluated = [(p.attempts / 1000, p.evaluation) for p in points if p.evaluation is not None]
+    x = [p.attempts / 1000 for p in updates]
+    top.plot(x, [100 * p.success for p in updates], "--", color="0.45", label="training, with exploration")
+    x_evaluated = [attempts for attempts, _ in evaluated]
     low, high = np.array([e.confidence_interval() for _, e in evaluated]).reshape(-1, 2).T * 100
-    top.plot(x_evaluated, [100 * e.success for _, e in evaluated], "o-", color="#0072b2", label="evaluation, 95 %")
-    top.fill_between(x_evaluated, low, high, color="#0072b2", alpha=0.2, linewidth=0)
-    top.set(ylabel="parts inserted [%]", ylim=(0, 100), title="Insertion policy, simulation")
+    label = "evaluation, 95 % confidence interval"
+    top.plot(x_evaluated, [100 * e.success for _, e in evaluated], "o-", color=BLUE, label=label)
+    top.fill_between(x_evaluated, low, high, color=BLUE, alpha=0.2, linewidth=0)
+    title = "Insertion policy in simulation"
+    if evaluated:
+        attempts, last = evaluated[-1]
+        title += f": {100 * last.success:.0f} % of the parts inserted after {attempts:.0f} thousand attempts"
+    top.set(ylabel="parts inserted [%]", ylim=(0, 100), title=title)
     top.legend(loc="lower right")
-    bottom.plot(x, [p.reward for p in updates], color="#d55e00")
+    bottom.plot(x, [p.reward for p in updates], color=VERMILION)
     bottom.set(xlabel="attempts [thousands]", ylabel="mean reward per attempt [-]")
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)

@@ -1,12 +1,11 @@
-"""The curves of `gelflow bench tracking --picture FILE`: errors against image degradation, time against size."""
+"""Curves of `gelflow bench tracking --out FOLDER`: errors over image degradation, and time over size."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from gelflow.figures import SERIES, save, set_log_axis
 from gelflow.measurement.timing import BenchmarkOptions, Report
 from gelflow.perception.benchmark.baselines import TRACKERS
 from gelflow.perception.benchmark.image_classes import LARGE, ImageClass
@@ -18,7 +17,6 @@ from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 _SEQUENCE: dict[str, Any] = {"frames": 20, "period": 32}  # from rest to the peak
 _QUICK_SEQUENCE: dict[str, Any] = {"frames": 6, "period": 4}
 _TIMED_FRAMES = 8
-_STYLES = (("o-", "#0072b2"), ("s-", "#d55e00"), ("^-", "#555555"))  # marker and colour of each tracker
 
 
 @dataclass(frozen=True)
@@ -33,9 +31,14 @@ class Curve:
 
 ERRORS = (
     Curve("noise", "noise [grey levels]", (0.5, 1, 1.5, 2, 3, 4, 6, 8), lambda value: ({"noise": value}, {})),
-    Curve("motion", "largest motion [spacings]", (0.1, 0.2, 0.4, 0.6, 0.8, 1.0), lambda value: ({}, {"peak": value})),
     Curve(
-        "missing", "missing dots [fraction]", (0, 0.02, 0.05, 0.1, 0.15, 0.2), lambda value: ({"missing": value}, {})
+        "motion",
+        "largest motion [spacings]",
+        (0.1, 0.2, 0.4, 0.6, 0.8, 1.0),
+        lambda value: ({}, {"peak": value}),
+    ),
+    Curve(
+        "missing", "share of missing dots [-]", (0, 0.02, 0.05, 0.1, 0.15, 0.2), lambda value: ({"missing": value}, {})
     ),
     Curve("occlusion", "number of occluders", (0, 1, 2, 3, 4), lambda value: ({"occluders": int(value)}, {})),
 )
@@ -91,33 +94,55 @@ def _measure_times(options: BenchmarkOptions, rows: list[tuple[str, ...]], resul
         results.append({"curve": name, "value": value} | {name: asdict(timing) for name, timing in timings.items()})
 
 
-def draw(curves: Report, file: Path) -> None:
-    """Draws six panels: median and 95th percentile of the errors over four parameters, and two of times."""
-    from matplotlib.figure import Figure  # imported on use: slow
+def draw(results: Sequence[Mapping[str, Any]], file: Path) -> None:
+    """Draw the results of `measure_curves`: errors over four parameters, and times over markers and image width."""
+    from matplotlib.figure import Figure  # deferred: slow to import
 
-    figure = Figure(figsize=(11, 6.6), layout="constrained")
+    figure = Figure(figsize=(11, 7), layout="constrained")
     panels = [(curve.name, curve.label) for curve in ERRORS]
-    panels += [("markers", f"markers on {LARGE[0]} × {LARGE[1]} px"), ("width", "image width [px]")]
+    panels += [("markers", f"number of markers on {LARGE[0]} × {LARGE[1]} px"), ("width", "image width [px]")]
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, panels, strict=True):
-        points = [result for result in curves.results if result["curve"] == name]
-        _draw_panel(axes, points)
-        axes.set_yscale("log")
+        points = [result for result in results if result["curve"] == name]
         axes.set_xlabel(label)
+        set_log_axis(axes, "y")
         axes.grid(True, which="major", alpha=0.3)
+        if name in ("markers", "width"):
+            _draw_times(axes, points)
+        else:
+            _draw_errors(axes, points)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), title="median; dashed: 95 %")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=90)
+    legend = "solid: median; dashed: 95th percentile; cross: the grid is not found"
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), title=legend)
+    figure.suptitle(_title(results))
+    save(figure, file, dpi=90)
 
 
-def _draw_panel(axes: Any, points: list[dict[str, Any]]) -> None:
-    x = [point["value"] for point in points]
-    timed = "frame" in points[0][next(iter(TRACKERS))]
-    axes.set_ylabel("time per image [ms]" if timed else "error [px]")
-    for name, (line, colour) in zip(TRACKERS, _STYLES, strict=True):
-        if timed:
-            axes.plot(x, [point[name]["frame"] for point in points], line, color=colour, label=name, ms=3)
-            continue
-        for metric, style, label in (("median", line, name), ("percentile_95", "--", None)):
-            values = [np.nan if (value := point[name][metric]) is None else value for point in points]
-            axes.plot(x, values, style, color=colour, label=label, ms=3)
+def _title(results: Sequence[Mapping[str, Any]]) -> str:
+    """Range of the median errors and times of the other trackers relative to those of gelflow."""
+    own, *others = TRACKERS
+    parts = []
+    for other in others:
+        ratios = []
+        for metric in ("median", "frame"):
+            pairs = [(r[own][metric], r[other][metric]) for r in results if metric in r[own]]
+            ratio = [theirs / ours for ours, theirs in pairs if ours is not None and theirs is not None]
+            ratios.append(f"{min(ratio):.1f} to {max(ratio):.1f}")
+        parts.append(f"{other}: {ratios[0]} times the median error and {ratios[1]} times the time of {own}")
+    return "\n".join(parts)
+
+
+def _draw_errors(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
+    axes.set_ylabel("position error [px]")
+    for name, (color, marker) in zip(TRACKERS, SERIES, strict=False):
+        for metric, style, fill, label in (("median", "-", color, name), ("percentile_95", "--", "white", None)):
+            measured = [(p["value"], p[name][metric]) for p in points if p[name][metric] is not None]
+            axes.plot(*zip(*measured, strict=True), marker + style, color=color, mfc=fill, label=label, ms=4)
+        failed = [p["value"] for p in points if p[name]["median"] is None]
+        axes.plot(failed, [0.04] * len(failed), "x", color=color, ms=8, mew=2, transform=axes.get_xaxis_transform())
+
+
+def _draw_times(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
+    axes.set_ylabel("time per image [ms]")
+    for name, (color, marker) in zip(TRACKERS, SERIES, strict=False):
+        times = [(p["value"], p[name]["frame"]) for p in points]
+        axes.plot(*zip(*times, strict=True), marker + "-", color=color, ms=4)

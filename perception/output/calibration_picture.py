@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import UsageError
+from gelflow.figures import VERMILION, save
 from gelflow.perception.calibration import Calibration
 
 _MAGNIFICATION = 20  # of the residuals
@@ -28,13 +28,13 @@ def draw_calibration(
     left, right = figure.subplots(1, 2)
     left.imshow(image[..., ::-1])
     for line in _grid_lines(fit):
-        left.plot(*fit.to_pixels(line).T, color="tab:cyan", linewidth=0.8)
+        left.plot(*fit.to_pixels(line).T, color="#56B4E9", linewidth=0.8)
     position = rest[measured]
     residual = position - fit.to_pixels(fit.marker_positions_mm())[measured]
     left.quiver(
         *position.T,
         *(_MAGNIFICATION * residual.T),
-        color="red",
+        color=VERMILION,
         angles="xy",
         scale_units="xy",
         scale=1,
@@ -43,15 +43,16 @@ def draw_calibration(
     )
     left.set(xlim=(-0.5, fit.width - 0.5), ylim=(fit.height - 0.5, -0.5), xticks=[], yticks=[])
     left.set_title(
-        f"fitted grid; red: residuals × {_MAGNIFICATION}, {fit.residual_px:.2f} px (root mean square)", fontsize=10
+        f"residual of the fitted grid: {fit.residual_px:.2f} px rms; arrows: residuals × {_MAGNIFICATION}", fontsize=10
     )
     right.imshow(fit.rectify(image)[..., ::-1], extent=_extent(fit))
-    right.set(xlabel="x (right) [mm]", ylabel="y (down) [mm]", title="rectified: rows and columns straight and even")
+    right.set(
+        xlabel="x (right) [mm]",
+        ylabel="y (down) [mm]",
+        title="rectified image: straight, equally spaced rows and columns",
+    )
     right.title.set_fontsize(10)
-    try:
-        figure.savefig(path, dpi=110)
-    except OSError as error:
-        raise UsageError(f"cannot write the picture {path}: {error.strerror}") from error
+    save(figure, path, dpi=110)
 
 
 def _grid_lines(fit: Calibration) -> list[Floats]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gelflow.errors import UsageError
+from gelflow.figures import draw_flow_map, save
 
 if TYPE_CHECKING:
     from gelflow.perception.frames import CameraMount
@@ -29,7 +29,10 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
     if not attempts:
         return
     figure = Figure(figsize=(11.5, 3.1 * len(attempts) + 0.7), layout="constrained")
-    figure.suptitle(f"Part {insertion.number + 1}: {insertion.outcome} after {len(insertion.attempts)} attempts")
+    count = len(insertion.attempts)
+    figure.suptitle(
+        f"Part {insertion.number + 1}: {insertion.outcome} after {count} attempt{'s' if count > 1 else ''}", fontsize=13
+    )
     axes = figure.subplots(len(attempts), 5, squeeze=False, width_ratios=(1, 1, 1, 1, 1.1))
     for line, made in zip(axes, attempts, strict=True):
         for sensor in (0, 1):
@@ -38,10 +41,12 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
         line[0].set_ylabel(f"attempt {made.number + 1}", fontsize=10)
         line[4].axis("off")
         line[4].text(0.0, 0.5, _text(made), transform=line[4].transAxes, fontsize=9, va="center")
-    try:
-        figure.savefig(path, dpi=90)
-    except OSError as error:
-        raise UsageError(f"cannot write the picture {path}: {error.strerror}") from error
+    figure.supxlabel(
+        f"Gel images at the largest depth, marker displacements × {_MAGNIFICATION}. "
+        "Flow maps: longest arrow = 1, fingertip down.",
+        fontsize=9,
+    )
+    save(figure, path, dpi=90)
 
 
 def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
@@ -68,25 +73,19 @@ def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
         width=0.006,
     )
     axis.set(xticks=[], yticks=[])
-    axis.set_title(f"{_SIDES[sensor]} camera, motion × {_MAGNIFICATION}", fontsize=8)
+    axis.set_title(f"{_SIDES[sensor]} camera, displacements × {_MAGNIFICATION}", fontsize=8)
 
 
 def _flow(axis: Any, made: "Attempt", sensor: int, task: "InsertionTask") -> None:
-    """The flow map of one pad, seen from outside, fingertip down."""
-    axis.set(aspect="equal", xticks=[], yticks=[])
+    """The flow map of one pad at the last frame of the decision."""
     axis.set_title(f"{_SIDES[sensor]} pad, flow map", fontsize=8)
     if made.observation is None:
-        axis.text(0.5, 0.5, "no decision", transform=axis.transAxes, ha="center", va="center", fontsize=9, color="gray")
+        axis.axis("off")
+        axis.text(0.5, 0.5, "no correction", transform=axis.transAxes, ha="center", va="center", fontsize=9)
         return
-    positions = task.grid.positions()
     last = len(task.frame_depths) - 1
-    down, right = made.observation.image.reshape(-1, task.sensors, 2, task.grid.rows * task.grid.cols)[last, sensor]
-    axis.quiver(
-        positions[:, 1], positions[:, 0], right * task.grid.pitch * 1.5, down * task.grid.pitch * 1.5,
-        np.hypot(down, right), angles="xy", scale_units="xy", scale=1, cmap="viridis", clim=(0, 1), width=0.008,
-    )  # fmt: skip
-    axis.invert_yaxis()
-    axis.margins(0.15)
+    maps = made.observation.image.reshape(-1, task.sensors, 2, task.grid.rows * task.grid.cols)
+    draw_flow_map(axis, task.grid, maps[last, sensor])
 
 
 def _text(made: "Attempt") -> str:
@@ -101,7 +100,7 @@ def _text(made: "Attempt") -> str:
         dx, dy, turn = made.action * (1e3, 1e3, 180 / np.pi)
         lines += [
             "stopped by contact" if made.stopped_by_contact else "not in the hole",
-            f"longest arrow {made.observation.divisor:.3f} {made.observation.unit}",
+            f"longest flow vector {made.observation.divisor:.3f} {made.observation.unit}",
             "",
             "correction of the policy:",
             f"x {dx:+.2f} mm, y {dy:+.2f} mm",

@@ -58,8 +58,13 @@ class SweepResult:
 
 def exponent(sizes: Sequence[int], seconds: Sequence[float]) -> float:
     """Slope of log time over log size for the largest sizes (at least 2): 1 for time proportional to size."""
-    count = max(2, round(UPPER * len(sizes)))
-    return float(np.polyfit(np.log(sizes[-count:]), np.log(seconds[-count:]), 1)[0])
+    fitted = fitted_sizes(len(sizes))
+    return float(np.polyfit(np.log(sizes[fitted]), np.log(seconds[fitted]), 1)[0])
+
+
+def fitted_sizes(count: int) -> slice:
+    """The sizes among `count` ascending ones to which the exponent is fitted: the larger ones, at least 2."""
+    return slice(-max(2, round(UPPER * count)), None)
 
 
 def balls(count: int) -> SpecFactory:
@@ -194,8 +199,8 @@ def measure_sweep(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
     return SweepResult(sweep, sizes, times, checks, exponent(sizes, [t.median for t in times]))
 
 
-def measure_growth(options: BenchmarkOptions) -> tuple[Report, list[SweepResult]]:
-    """Time all sweeps; returns the report, and the data of `growth_picture.draw`."""
+def measure_growth(options: BenchmarkOptions) -> Report:
+    """Time all sweeps. `growth_picture.draw` draws the results of the report."""
     sweeps = [measure_sweep(sweep, options) for sweep in SWEEPS]
     rows, records, violations = [], [], []
     for result in sweeps:
@@ -220,7 +225,7 @@ def measure_growth(options: BenchmarkOptions) -> tuple[Report, list[SweepResult]
         )
         for size, accuracy in zip(sizes, result.checks, strict=True):
             violations += accuracy.violations(f"growth, {size} {name}")
-    report = Report(
+    return Report(
         name="growth",
         title="Growth: steps per second",
         columns=("number of", "from - to", "first", "middle", "last", "time ~ n^"),
@@ -231,4 +236,3 @@ def measure_growth(options: BenchmarkOptions) -> tuple[Report, list[SweepResult]
         results=records,
         violations=violations,
     )
-    return report, sweeps

@@ -1,37 +1,54 @@
-"""Picture of the scaling measurement (`gelflow bench growth --picture FILE`)."""
+"""Picture of the scaling measurement (`gelflow bench growth --out FOLDER`)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from gelflow.sim.benchmark.speed.growth import UPPER, SweepResult
+from gelflow.figures import SERIES, save
+from gelflow.sim.benchmark.speed.growth import fitted_sizes
 
-PANELS = (("bodies", "chain"), ("contacts",), ("markers",), ("environments",))
+# Title and label of the horizontal axis, and the sweeps with their names in the legend.
+_PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
+    ("Bodies", "number of bodies", {"bodies": "independent", "chain": "in a chain"}),
+    ("Contact points", "number of contact points", {"contacts": ""}),
+    ("Markers", "number of markers", {"markers": ""}),
+    ("Environments", "number of environments", {"environments": ""}),
+)
 
 
-def draw(found: Sequence[SweepResult], file: Path) -> None:
-    """Draw steps per second over size, with fitted power laws; one panel per quantity. Writes `file`."""
-    by_name = {result.sweep.name: result for result in found}
+def draw(records: Sequence[Mapping[str, Any]], file: Path) -> None:
+    """Draw step rates over size, with fitted power laws; one panel per quantity. Writes `file`.
+
+    `records` are the results of the report of `measure_growth`.
+    """
+    from matplotlib.figure import Figure  # deferred: slow to import
+
+    by_name = {record["of"]: record for record in records}
     figure = Figure(figsize=(10, 7.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    for axes, names in zip(figure.subplots(2, 2).flat, PANELS, strict=True):
-        for k, name in enumerate(names):
-            result = by_name[name]
-            color = f"C{k}"
-            axes.loglog(result.sizes, result.rates, "o", color=color)
-            x = np.array(result.sizes[-max(2, round(UPPER * len(result.sizes))) :], float)
-            y = np.array(result.rates[-len(x) :])
-            level = np.exp(np.mean(np.log(y) + result.exponent * np.log(x)))
-            axes.loglog(x, level * x**-result.exponent, color=color, label=f"{name}: time ~ n^{result.exponent:.2f}")
-        axes.set_xlabel(by_name[names[0]].sweep.unit if len(names) == 1 else "bodies")
-        axes.set_ylabel("steps per second" + (" of the batch" if names == ("environments",) else ""))
-        axes.set_title(by_name[names[0]].sweep.threads, fontsize="medium")
+    for axes, (title, label, sweeps) in zip(figure.subplots(2, 2).flat, _PANELS, strict=True):
+        exponents = []
+        for name, style in zip(sweeps, SERIES, strict=False):
+            _draw_sweep(axes, by_name[name], sweeps[name], *style)
+            exponents.append(f"n$^{{{by_name[name]['exponent']:.2f}}}$ {sweeps[name]}".rstrip())
+        threads = by_name[next(iter(sweeps))]["threads"]
+        unit = "steps of the whole batch per second" if "environments" in sweeps else "steps per second"
+        axes.set_title(f"{title}: step time ∝ {', '.join(exponents)}")
+        axes.set(xlabel=f"{label} n", ylabel=f"{unit} [1/s], {threads}")
         axes.grid(True, which="major", alpha=0.3)
-        decades = np.log10(np.concatenate([by_name[name].rates for name in names]))
-        axes.set_ylim(10 ** np.floor(decades.min()), 10 ** np.ceil(decades.max()))
-        axes.legend(loc="lower left")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=90)
+        rates = [size["per_second"] for name in sweeps for size in by_name[name]["sizes"]]
+        axes.set_ylim(10 ** np.floor(np.log10(min(rates))), 10 ** np.ceil(np.log10(max(rates))))
+        if len(sweeps) > 1:
+            axes.legend(loc="lower left")
+    save(figure, file, dpi=90)
+
+
+def _draw_sweep(axes: Any, record: Mapping[str, Any], label: str, color: str, marker: str) -> None:
+    """Measured rates, and the power law over the sizes to which it was fitted."""
+    sizes = np.array([size["size"] for size in record["sizes"]], float)
+    rates = np.array([size["per_second"] for size in record["sizes"]])
+    axes.loglog(sizes, rates, marker, color=color, label=label)
+    n, fitted = sizes[fitted_sizes(len(sizes))], rates[fitted_sizes(len(sizes))]
+    level = np.exp(np.mean(np.log(fitted) + record["exponent"] * np.log(n)))
+    axes.loglog(n, level * n ** -record["exponent"], color=color)

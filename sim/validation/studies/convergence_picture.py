@@ -2,39 +2,65 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from gelflow.figures import BLUE, SERIES, VERMILION, save
 from gelflow.sim.validation.studies.convergence import Convergence
 from gelflow.sim.validation.studies.schemes import Scheme
 
-COLORS = {"viscous": "tab:blue", "elastic": "tab:orange"}
+_COLORS = {"viscous": BLUE, "elastic": VERMILION}
+_LINES = {"bdf1": "o--", "bdf2": "s-"}
+_QUANTITIES = {"q": "q", "tactile": "marker forces"}
 
 
 def draw(
-    found: Sequence[Convergence], ball: Sequence[Scheme], scenes: Mapping[str, Sequence[Scheme]], path: Path
+    scenes: Sequence[Convergence], ball: Sequence[Scheme], schemes: Mapping[str, Sequence[Scheme]], path: Path
 ) -> None:
     """Draw convergence of the scenes, and errors over cost of the schemes on the ball and on scenes. Writes `path`."""
     from matplotlib.figure import Figure  # deferred: slow to import
 
-    names = list(dict.fromkeys(r.scene for r in found))
-    figure = Figure(figsize=(12, 7.5), layout="constrained")
-    axes = figure.subplots(2, 3)
-    for axis, name in zip(axes[0], names, strict=True):
-        for r in (r for r in found if r.scene == name):
-            style = {"bdf1": "o--", "bdf2": "s-"}[r.integrator]
-            for quantity, alpha in (("q", 1.0), ("tactile", 0.35)):
-                label = f"{r.integrator.upper()}, {r.law}, {quantity}"
-                axis.loglog(r.steps, r.errors(quantity), style, color=COLORS[r.law], alpha=alpha, ms=3, label=label)
-        steps = max((r.steps for r in found if r.scene == name), key=len)
-        axis.loglog(steps, [s / steps[0] for s in steps], "k:", lw=0.8, label="slope 1")
-        axis.set(title=name, xlabel="time step [s]", ylabel="mean relative error")
-        axis.grid(alpha=0.3)
-    axes[0][0].legend(fontsize=6)
-    panels = {"ball on a plane": ball, **scenes}
-    for axis, (title, schemes) in zip(axes[1], panels.items(), strict=False):
-        for scheme in schemes:
-            axis.loglog(scheme.solves, scheme.errors, "o-", ms=3, label=scheme.name)
-        axis.set(title=title, xlabel="Newton iterations", ylabel="relative error at the end")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    figure = Figure(figsize=(12.5, 9), layout="constrained")
+    figure.suptitle(_title(scenes))
+    top, bottom = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    names = list(dict.fromkeys(r.scene for r in scenes))
+    for axes, name in zip(top.subplots(1, 3, sharey=True), names, strict=True):
+        _draw_scene(axes, name, [r for r in scenes if r.scene == name])
+    top.axes[0].set_ylabel("mean relative error [-]")
+    handles, labels = top.axes[0].get_legend_handles_labels()
+    top.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=9)
+    panels = {"ball on a plane, viscous": ball, **schemes}
+    styles = {scheme.name: style for scheme, style in zip(ball, SERIES, strict=False)}
+    for axes, (title, curves) in zip(bottom.subplots(1, 3, sharey=True), panels.items(), strict=False):
+        for scheme in curves:
+            color, marker = styles[scheme.name]
+            axes.loglog(scheme.solves, scheme.errors, marker + "-", color=color, ms=4, label=scheme.name)
+        axes.set(title=title, xlabel="cost: number of Newton iterations")
+        axes.grid(alpha=0.3)
+    bottom.axes[0].set_ylabel("relative error of q at the end [-]")
+    handles, labels = bottom.axes[0].get_legend_handles_labels()
+    bottom.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=9)
+    save(figure, path, dpi=100)
+
+
+def _title(scenes: Sequence[Convergence]) -> str:
+    """Ranges of the orders of convergence of q over the finest steps."""
+    parts = []
+    for integrator in _LINES:
+        orders = [r.slope("q") for r in scenes if r.integrator == integrator]
+        parts.append(f"{integrator.upper()} {min(orders):.2f} to {max(orders):.2f}")
+    return f"Order of convergence of q over the finest steps: {', '.join(parts)}"
+
+
+def _draw_scene(axes: Any, name: str, curves: Sequence[Convergence]) -> None:
+    """Errors of one scene over the step; filled markers for q and open ones for the marker forces."""
+    for r in curves:
+        for quantity, words in _QUANTITIES.items():
+            color, fill = _COLORS[r.law], _COLORS[r.law] if quantity == "q" else "white"
+            label = f"{r.integrator.upper()}, {r.law}, {words}"
+            axes.loglog(r.steps, r.errors(quantity), _LINES[r.integrator], color=color, mfc=fill, ms=4, label=label)
+    steps = max((r.steps for r in curves), key=len)
+    axes.loglog(steps, [s / steps[0] for s in steps], "k:", lw=1, label="slope 1")
+    halved = [s for s in steps if s > 1e-5]
+    axes.loglog(halved, [(s / steps[0]) ** 2 for s in halved], "k-.", lw=1, label="slope 2")
+    axes.set(title=name, xlabel="time step [s]")
+    axes.grid(alpha=0.3)

@@ -12,7 +12,6 @@ rounded by 3 mm:
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -247,30 +246,6 @@ def error_table(results: Sequence[Result]) -> Table:
         if r.resolution == max(RESOLUTIONS):
             out.add_row()
     return out
-
-
-def draw(results: Sequence[Result], file: Path) -> None:
-    """Draw errors over resolution. Writes `file`."""
-    from matplotlib.figure import Figure  # deferred: slow to import
-
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    panels = figure.subplots(1, 3)
-    lines = (
-        ("distance [µm]", "distance_rms", 1e6),
-        ("normal", "normal_rms", 1.0),
-        ("contact force [%], median", "force_median", 100),
-    )
-    for panel, (title, field, scale) in zip(panels, lines, strict=True):
-        for name in dict.fromkeys(r.solid for r in results):
-            chosen = [r for r in results if r.solid == name]
-            panel.loglog([r.resolution for r in chosen], [getattr(r, field) * scale for r in chosen], "o-", label=name)
-        panel.set_xticks(RESOLUTIONS, [str(n) for n in RESOLUTIONS])
-        panel.minorticks_off()
-        panel.set(title=f"error of the {title}", xlabel="cells along the longest side")
-        panel.grid(alpha=0.3)
-    panels[0].legend(fontsize="small")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=110)
 
 
 def measure(

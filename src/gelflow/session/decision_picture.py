@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gelflow.errors import UsageError
+from gelflow.figures import draw_flow_map, save
 from gelflow.observation import Grid
 from gelflow.session.records import SENSORS, Decision
 
@@ -23,28 +23,17 @@ def draw_decisions(decisions: Sequence[Decision], grid: Grid, path: str | Path) 
     shown = list(decisions[:MAX_DECISIONS])
     columns = shown[0].flow.shape[0] // 2
     sensors = len(shown[0].tracked)
-    positions = grid.positions()
     figure = Figure(figsize=(2.1 * columns + 1.6, 2.6 * len(shown)), layout="constrained")
     axes = figure.subplots(len(shown), columns, squeeze=False)
     for line, decision in zip(axes, shown, strict=True):
         flow = decision.flow.reshape(columns, 2, -1)
         dx, dy, turn = decision.action * (1e3, 1e3, 180 / np.pi)
         for column, axis in enumerate(line):
-            down, right = flow[column] * grid.pitch * 1.4
-            longest = np.hypot(*flow[column])
-            axis.quiver(
-                positions[:, 1], positions[:, 0], right, down, longest,
-                angles="xy", scale_units="xy", scale=1, cmap="viridis", clim=(0, 1), width=0.008,
-            )  # fmt: skip
-            axis.set(aspect="equal", xticks=[], yticks=[])
-            axis.invert_yaxis()
-            axis.margins(0.18)
+            draw_flow_map(axis, grid, flow[column])
             axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=8)
         line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=8)
         scale = f"longest arrow\n{decision.divisor:.3g} {decision.unit}"
         text = f"{scale}\n\ncorrection\nx {dx:+.2f} mm\ny {dy:+.2f} mm\nyaw {turn:+.1f}°"
         line[-1].text(1.06, 0.5, text, transform=line[-1].transAxes, fontsize=8, va="center")
-    try:
-        figure.savefig(path, dpi=100)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot write the picture {path}: {error}; name a .png in a writable folder") from error
+    figure.supxlabel("flow maps at the frames of a decision, longest arrow = 1; fingertip down", fontsize=8)
+    save(figure, path, make_folder=False)

@@ -118,11 +118,11 @@ def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -
 def _measure_growth(options: "BenchmarkOptions", folder: Path | None) -> "Report":
     from gelflow.sim.benchmark.speed.growth import measure_growth
 
-    report, series = measure_growth(options)
+    report = measure_growth(options)
     if folder is not None:
         from gelflow.sim.benchmark.speed.growth_picture import draw
 
-        draw(series, folder / "growth.png")
+        draw(report.results, folder / "growth.png")
     return report
 
 
@@ -134,7 +134,7 @@ def _measure_tracking(options: "BenchmarkOptions", folder: Path | None) -> "list
         from gelflow.perception.benchmark.curves import draw, measure_curves
 
         curves = measure_curves(options)
-        draw(curves, folder / "tracking.png")
+        draw(curves.results, folder / "tracking.png")
         reports.append(curves)
     return reports
 
