@@ -126,7 +126,7 @@ def _title(results: Sequence[Mapping[str, Any]]) -> str:
         for metric in ("median", "frame"):
             pairs = [(r[own][metric], r[other][metric]) for r in results if metric in r[own]]
             ratio = [theirs / ours for ours, theirs in pairs if ours is not None and theirs is not None]
-            ratios.append(f"{min(ratio):.1f} to {max(ratio):.1f}")
+            ratios.append(f"{min(ratio):.2g} to {max(ratio):.2g}")
         parts.append(f"{other}: {ratios[0]} times the median error and {ratios[1]} times the time of {own}")
     return "\n".join(parts)
 

@@ -33,9 +33,9 @@ def draw(records: Sequence[Mapping[str, Any]], file: Path) -> None:
             _draw_sweep(axes, by_name[name], sweeps[name], *style)
             exponents.append(f"n$^{{{by_name[name]['exponent']:.2f}}}$ {sweeps[name]}".rstrip())
         threads = by_name[next(iter(sweeps))]["threads"]
-        unit = "steps of the whole batch per second" if "environments" in sweeps else "steps per second"
-        axes.set_title(f"{title}: step time ∝ {', '.join(exponents)}")
-        axes.set(xlabel=f"{label} n", ylabel=f"{unit} [1/s], {threads}")
+        unit = "steps of the batch" if "environments" in sweeps else "steps"
+        axes.set_title(f"{title}: step time ∝ {', '.join(exponents)}", fontsize=11)
+        axes.set(xlabel=f"{label} n", ylabel=f"{unit} per second [1/s], {threads}")
         axes.grid(True, which="major", alpha=0.3)
         rates = [size["per_second"] for name in sweeps for size in by_name[name]["sizes"]]
         axes.set_ylim(10 ** np.floor(np.log10(min(rates))), 10 ** np.ceil(np.log10(max(rates))))

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 _PANELS = {  # error → label, factor to its unit
     "position": ("largest position error [mm]", 1e3),
     "markers": ("relative error of the marker forces [%]", 100),
-    "flow": ("mean error of the flow vectors [% of the longest]", 100),
+    "flow": ("mean flow vector error [% of the longest]", 100),
     "gradient": ("relative error of the gradient [%]", 100),
 }
 _GROUPS = {  # group → label, colour, marker
@@ -35,7 +35,7 @@ def draw(tradeoff: "Tradeoff", path: Path) -> None:
     from matplotlib.figure import Figure  # deferred: slow to import
 
     figure = Figure(figsize=(11, 8.5), layout="constrained")
-    figure.suptitle(_title(tradeoff), fontsize=12)
+    figure.suptitle(_title(tradeoff), fontsize=11)
     for axes, (name, (label, factor)) in zip(figure.subplots(2, 2).flat, _PANELS.items(), strict=True):
         axes.set(xlabel="computing time per simulated second [ms]", ylabel=label)
         set_log_axis(axes, "x")
@@ -49,18 +49,16 @@ def draw(tradeoff: "Tradeoff", path: Path) -> None:
 
 def _title(tradeoff: "Tradeoff") -> str:
     """Computing time and error of the marker forces of each preset."""
-    presets = sorted((preset, m) for m in tradeoff.measurements for preset in m.presets)
+    title = f"{tradeoff.scene}: error against computing time per simulated second"
+    presets = [(preset, m) for m in tradeoff.measurements for preset in m.presets]
     presets.sort(key=lambda pair: -pair[1].errors.markers)
-    figures = [f"{preset} {1e3 * m.seconds:.2g} ms, {100 * m.errors.markers:.2g} %" for preset, m in presets]
-    return "\n".join(
-        [
-            f"{tradeoff.scene}: error against computing time",
-            f"Computing time and error of the marker forces of the presets: {'; '.join(figures)}",
-        ][: 2 if figures else 1]
-    )
+    results = [f"{preset} {100 * m.errors.markers:.2g} % in {1e3 * m.seconds:.2g} ms" for preset, m in presets]
+    return f"{title}\nError of the marker forces with the presets: {'; '.join(results)}" if results else title
 
 
 def _draw_panel(axes: Any, tradeoff: "Tradeoff", name: str, factor: float) -> None:
+    from matplotlib.patheffects import withStroke  # deferred: slow to import
+
     points = [(1e3 * m.seconds, factor * max(getattr(m.errors, name), _LEAST)) for m in tradeoff.measurements]
     groups = [m.setting.group for m in tradeoff.measurements]
     for group, (label, color, marker) in _GROUPS.items():
@@ -69,14 +67,15 @@ def _draw_panel(axes: Any, tradeoff: "Tradeoff", name: str, factor: float) -> No
             axes.plot(*zip(*chosen, strict=True), marker, color=color, ms=5, alpha=0.75, label=label, ls="")
     comparable = [point for point, of in zip(points, groups, strict=True) if of not in _SEPARATE]
     axes.plot(*zip(*front(comparable), strict=True), "k-", lw=0.8, alpha=0.6, label="Pareto front")
-    axes.margins(0.1)
+    axes.margins(0.14, 0.1)
     named = [(p, point) for m, point in zip(tradeoff.measurements, points, strict=True) for p in m.presets]
     for at, (preset, point) in enumerate(named):
         axes.plot(*point, "o", mfc="none", mec=VERMILION, mew=2, ms=12, label="preset" if at == 0 else None)
-        axes.annotate(
-            preset, point, xytext=(0, 9), textcoords="offset points", ha="center", color="#A04000", weight="bold",
-            bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
+        text = axes.annotate(
+            preset, point, xytext=(-6, -6), textcoords="offset points", ha="right", va="top", color="#A04000",
+            weight="bold",
         )  # fmt: skip
+        text.set_path_effects([withStroke(linewidth=2, foreground="white")])
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:

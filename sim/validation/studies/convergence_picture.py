@@ -21,7 +21,8 @@ def draw(
 
     figure = Figure(figsize=(12.5, 9), layout="constrained")
     figure.suptitle(_title(scenes))
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    halves: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))  # an array: two rows
+    top, bottom = halves
     names = list(dict.fromkeys(r.scene for r in scenes))
     for axes, name in zip(top.subplots(1, 3, sharey=True), names, strict=True):
         _draw_scene(axes, name, [r for r in scenes if r.scene == name])

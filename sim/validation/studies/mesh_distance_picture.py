@@ -8,7 +8,7 @@ from gelflow.sim.validation.studies.mesh_distance import RESOLUTIONS, Result
 
 _PANELS = (  # title, label, field of the result, factor to the unit of the label
     ("distance", "rms error of the distance [µm]", "distance_rms", 1e6),
-    ("unit normal", "rms error of the normal [-]", "normal_rms", 1.0),
+    ("normal", "rms error of the normal [-]", "normal_rms", 1.0),
     ("contact force", "median error of the contact force [%]", "force_median", 100),
 )
 _NAMES = {"rounded": "rounded box"}  # solids whose label differs from the name
@@ -30,7 +30,7 @@ def draw(results: Sequence[Result], file: Path) -> None:
         set_log_axis(axes, "y", subs=(1,))
         axes.set_xticks(RESOLUTIONS, [str(n) for n in RESOLUTIONS])
         axes.xaxis.minorticks_off()
-        axes.set(title=title, xlabel="cells along the longest side", ylabel=label)
+        axes.set(title=title, xlabel="number of cells along the longest side", ylabel=label)
         axes.grid(alpha=0.3)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))

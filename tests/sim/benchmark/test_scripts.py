@@ -41,6 +41,13 @@ def test_script_writes_a_record(
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_pictures_are_drawn_from_the_committed_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("growth", "tracking", "mesh_distance", "order", "tradeoff_pushing")
+    assert run("pictures", *names, "--out", str(tmp_path), monkeypatch=monkeypatch) == 0
+    assert {path.stem for path in tmp_path.iterdir()} == set(names)
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in tmp_path.iterdir())
+
+
 def test_missing_file_gives_status_2(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("compare_pushing", "missing.npz", monkeypatch=monkeypatch) == 2
     assert capsys.readouterr().err == "missing.npz: no such file\n"
