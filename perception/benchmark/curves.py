@@ -113,7 +113,7 @@ def draw(results: Sequence[Mapping[str, Any]], file: Path) -> None:
     handles, labels = figure.axes[0].get_legend_handles_labels()
     legend = "solid: median; dashed: 95th percentile; cross: the grid is not found"
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), title=legend)
-    figure.suptitle(_title(results))
+    figure.suptitle(_title(results), fontsize=11)
     save(figure, file, dpi=90)
 
 
@@ -122,13 +122,13 @@ def _title(results: Sequence[Mapping[str, Any]]) -> str:
     own, *others = TRACKERS
     parts = []
     for other in others:
-        ratios = []
+        ranges = []
         for metric in ("median", "frame"):
             pairs = [(r[own][metric], r[other][metric]) for r in results if metric in r[own]]
-            ratio = [theirs / ours for ours, theirs in pairs if ours is not None and theirs is not None]
-            ratios.append(f"{min(ratio):.2g} to {max(ratio):.2g}")
-        parts.append(f"{other}: {ratios[0]} times the median error and {ratios[1]} times the time of {own}")
-    return "\n".join(parts)
+            ratios = [theirs / ours for ours, theirs in pairs if ours is not None and theirs is not None]
+            ranges.append(" to ".join(f"{end:.{0 if end >= 10 else 1}f}" for end in (min(ratios), max(ratios))))
+        parts.append(f"{other}: {ranges[0]} × the median error, {ranges[1]} × the time")
+    return "\n".join((f"Relative to {own}, where it finds the grid", *parts))
 
 
 def _draw_errors(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
