@@ -8,8 +8,8 @@ from gelflow.figures import BLUE, SERIES, VERMILION, save
 from gelflow.sim.validation.studies.convergence import Convergence
 from gelflow.sim.validation.studies.schemes import Scheme
 
-_COLORS = {"viscous": BLUE, "elastic": VERMILION}
-_LINES = {"bdf1": "o--", "bdf2": "s-"}
+_LAWS = {"viscous": (BLUE, "o"), "elastic": (VERMILION, "^")}  # colour, marker
+_LINES = {"bdf1": "--", "bdf2": "-"}
 _QUANTITIES = {"q": "q", "tactile": "marker forces"}
 
 
@@ -56,9 +56,11 @@ def _draw_scene(axes: Any, name: str, curves: Sequence[Convergence]) -> None:
     """Errors of one scene over the step; filled markers for q and open ones for the marker forces."""
     for r in curves:
         for quantity, words in _QUANTITIES.items():
-            color, fill = _COLORS[r.law], _COLORS[r.law] if quantity == "q" else "white"
+            color, marker = _LAWS[r.law]
+            fill = color if quantity == "q" else "white"
             label = f"{r.integrator.upper()}, {r.law}, {words}"
-            axes.loglog(r.steps, r.errors(quantity), _LINES[r.integrator], color=color, mfc=fill, ms=4, label=label)
+            line = marker + _LINES[r.integrator]
+            axes.loglog(r.steps, r.errors(quantity), line, color=color, mfc=fill, ms=4.5, label=label)
     steps = max((r.steps for r in curves), key=len)
     axes.loglog(steps, [s / steps[0] for s in steps], "k:", lw=1, label="slope 1")
     halved = [s for s in steps if s > 1e-5]
