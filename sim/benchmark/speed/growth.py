@@ -33,7 +33,7 @@ class Sweep:
     """A quantity that is varied."""
 
     name: str
-    unit: str  # label of the horizontal axis
+    unit: str  # name of the counted quantity
     sizes: tuple[int, ...]
     quick: tuple[int, ...]
     prepare: Callable[[int], tuple[Workload, AccuracyCheck]]
