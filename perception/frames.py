@@ -1,4 +1,7 @@
-"""Camera images to tactile frames: decoding, the mounting of a camera, and conversion to the pad frame."""
+"""Camera images to tactile frames: decoding, the mounting of a camera, and conversion to the pad frame.
+
+`gelflow.observation.flow_map` computes the observation of a policy from these frames.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +37,7 @@ class CameraMount:
     rotation: Literal[0, 90, 180, 270] = 0  # of the image, clockwise [deg]
     mirrored: bool = True  # the camera views the gel from behind
     pixels_per_mm: float | None = None  # uniform scale
-    calibration: Calibration | None = None  # position-dependent scale; with neither of both, frames are in px
+    calibration: Calibration | None = None  # position-dependent scale; with neither, frames are in px
 
     def __post_init__(self) -> None:
         if self.rotation not in (0, 90, 180, 270):

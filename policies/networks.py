@@ -34,7 +34,9 @@ class Architecture:
     degree: int = 1  # of the polynomials in row and column
     history: int = 5  # attempts in the input, including the latest
     hidden: tuple[int, ...] = (64, 64)  # units of each hidden layer (tanh)
-    reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)  # correction of output ±1 [m, m, rad]
+    # Correction for an output of ±1 [m, m, rad]. The actions of the Gymnasium environments have their own scale,
+    # `InsertionTask.action_scale`.
+    reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)
 
     def __post_init__(self) -> None:
         if self.kind != KIND:

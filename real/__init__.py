@@ -2,6 +2,7 @@
 
 To add a device, write a class that fits `Gripper`, `Arm` or `Camera` of `gelflow.protocols`; `real/wsg/driver.py`,
 `real/egm/driver.py` and `real/camera/driver.py` are the examples.
+`real/runner/cell.py` creates the drivers of a run; see "Adding another gripper" in docs/guide/gripper.md.
 """
 
 import lazy_loader as _lazy

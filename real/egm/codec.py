@@ -1,6 +1,12 @@
 """EGM messages: bytes ↔ frozen dataclasses. Units on the wire are mm, degrees and ms; here m, rad and s. No I/O.
 
-The schema is that of the ABBRobotEGM package. protobuf rejects a second copy of a schema in one process, so no other
+Fields of the messages (protobuf; the schema is ABB's egm.proto in the package ABBRobotEGM):
+
+- EgmRobot, from the controller: header (seqno, tm, mtype = data), feedBack and planned (joints; cartesian: pos, orient,
+  euler), motorState, mciState, rapidExecState, mciConvergenceMet. Of planned, nothing is read.
+- EgmSensor, to the controller: header (seqno, tm, mtype = correction), planned.cartesian (pos, orient).
+
+protobuf rejects a second copy of a schema in one process, so no other
 EGM package (such as abb_robot_client) may be imported.
 """
 
@@ -24,7 +30,7 @@ except TypeError as error:  # raised by protobuf for a second schema
 
 _DATA = egm_pb2.EgmHeader.MSGTYPE_DATA
 _CORRECTION = egm_pb2.EgmHeader.MSGTYPE_CORRECTION
-_COUNTER = 0xFFFFFFFF  # seqno and tm are unsigned 32-bit
+_UINT32 = 0xFFFFFFFF  # seqno and tm are unsigned 32-bit
 _MOTORS = ("undefined", "on", "off")
 _MCI = ("undefined", "error", "stopped", "running")
 _RAPID = ("undefined", "stopped", "running")
@@ -62,7 +68,7 @@ class EgmReference:
     """Reference pose for the robot (EgmSensor, type 3)."""
 
     sequence: int
-    time: float  # this computer's robot time [s], rounded to milliseconds
+    time: float  # robot time [s], rounded to milliseconds
     position: Vector  # [m]
     quaternion: Quaternion  # w x y z
 
@@ -77,7 +83,7 @@ def encode_robot(feedback: EgmFeedback) -> bytes:
     """An EgmRobot message with equal measured and planned values, and Euler angles as sent by a controller."""
     message = egm_pb2.EgmRobot()
     header = message.header
-    header.seqno, header.tm, header.mtype = feedback.sequence & _COUNTER, _milliseconds(feedback.time), _DATA
+    header.seqno, header.tm, header.mtype = feedback.sequence & _UINT32, _milliseconds(feedback.time), _DATA
     degrees = [math.degrees(angle) for angle in feedback.joints]
     roll, pitch, yaw = (math.degrees(angle) for angle in _to_euler(feedback.quaternion))
     for part in (message.feedBack, message.planned):
@@ -120,9 +126,9 @@ def decode_robot(data: bytes) -> EgmFeedback:
         position=position,
         quaternion=quaternion,
         joints=joints,
-        motors=_word(_MOTORS, message.motorState.state),
-        mci=_word(_MCI, message.mciState.state),
-        rapid=_word(_RAPID, message.rapidExecState.state),
+        motors=_state_name(_MOTORS, message.motorState.state),
+        mci=_state_name(_MCI, message.mciState.state),
+        rapid=_state_name(_RAPID, message.rapidExecState.state),
         converged=message.mciConvergenceMet,
     )
 
@@ -131,7 +137,7 @@ def encode_sensor(reference: EgmReference) -> bytes:
     """An EgmSensor message with a reference pose."""
     message = egm_pb2.EgmSensor()
     header = message.header
-    header.seqno, header.tm, header.mtype = reference.sequence & _COUNTER, _milliseconds(reference.time), _CORRECTION
+    header.seqno, header.tm, header.mtype = reference.sequence & _UINT32, _milliseconds(reference.time), _CORRECTION
     _fill_pose(message.planned.cartesian, reference.position, reference.quaternion)
     return message.SerializeToString()  # type: ignore[no-any-return]
 
@@ -190,8 +196,8 @@ def _from_euler(euler: Any) -> Quaternion:
 
 
 def _milliseconds(time: float) -> int:
-    return round(time * 1e3) & _COUNTER
+    return round(time * 1e3) & _UINT32
 
 
-def _word(words: tuple[str, ...], number: int) -> str:
-    return words[number] if 0 <= number < len(words) else "undefined"
+def _state_name(names: tuple[str, ...], number: int) -> str:
+    return names[number] if 0 <= number < len(names) else "undefined"

@@ -68,7 +68,7 @@ class EgmLoop:
         now = self._clock.now()
         if kind == "target":
             position, quaternion, expires, speed, turn_speed = values
-            self._generator.post(Target(tuple(position), tuple(quaternion), expires, speed, turn_speed), now)
+            self._generator.set_target(Target(tuple(position), tuple(quaternion), expires, speed, turn_speed), now)
         elif kind == "hold":
             self._generator.hold(now, values[0])
         elif kind == "stop":

@@ -1,8 +1,8 @@
 """Generates the reference pose of every EGM cycle: a state machine without I/O.
 
 Waiting: the reference equals the feedback, so that nothing moves when the controller starts to follow. Following: the
-reference moves in a straight line to the newest target with bounded steps, and is frozen without a target. Latched:
-nothing is sent until `reset`.
+reference moves in a straight line to the newest target with bounded steps; it is frozen without a target, and while the
+robot lags behind it. Latched: nothing is sent until `reset`.
 """
 
 import math
@@ -16,7 +16,7 @@ from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.target import Target, check_target, tool_frame
 
 # UDP may reorder messages by a few; a larger step back means that the controller restarted its counter.
-_REORDERED = 10
+_MAX_REORDERING = 10
 
 
 class EgmFlag(IntFlag):
@@ -26,7 +26,7 @@ class EgmFlag(IntFlag):
     FOLLOWING = 2  # the controller follows references
     CONVERGED = 4  # the controller's convergence condition is met
     HOLD = 8  # no target: the reference is frozen
-    WAITING = 16  # the reference waits for the robot to catch up
+    LAGGING = 16  # the robot lags behind: the reference is frozen until it catches up
     LOST = 32  # messages before this one are missing
     UNANSWERED = 64  # a newer message had arrived and was answered instead
     LATCHED = 128  # stopped: nothing is sent
@@ -71,7 +71,7 @@ class ReferenceGenerator:
         flags = EgmFlag(0)
         if last is not None:
             behind = last.sequence - feedback.sequence
-            if behind == 0 or (0 < behind <= _REORDERED and feedback.time < last.time):
+            if behind == 0 or (0 < behind <= _MAX_REORDERING and feedback.time < last.time):
                 return False
             if behind > 0:
                 self._restarted(last, feedback, now)
@@ -108,11 +108,11 @@ class ReferenceGenerator:
             return self._reference, self._flags | EgmFlag.HOLD
         if self._too_far_ahead():
             self._rate = 0.0
-            return self._reference, self._flags | EgmFlag.WAITING
+            return self._reference, self._flags | EgmFlag.LAGGING
         self._reference = self._step(self._reference, self._target)
         return self._reference, self._flags
 
-    def post(self, target: Target, now: float) -> None:
+    def set_target(self, target: Target, now: float) -> None:
         """Follow `target` from now on; an invalid target is refused and the arm holds."""
         if self.latched:
             return
@@ -183,14 +183,15 @@ class ReferenceGenerator:
     def _step(self, reference: PoseTuple, target: Target) -> PoseTuple:
         """One cycle along the straight line and the shorter rotation, both ending together, with ramps at both ends."""
         move, turn = _difference(reference, target)
-        duration = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
+        # Times at the speeds of the target [s]: to the target, and of this cycle.
+        remaining = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
         # Accelerate from rest to full rate in ramp_time; decelerate equally to rest at the target.
         ramp = self._config.ramp_time
-        self._rate = min(1.0, self._rate + self._config.cycle / ramp, math.sqrt(2 * duration / ramp))
-        distance = self._rate * self._config.cycle
-        if distance >= duration:
+        self._rate = min(1.0, self._rate + self._config.cycle / ramp, math.sqrt(2 * remaining / ramp))
+        advance = self._rate * self._config.cycle
+        if advance >= remaining:
             return target.position, target.quaternion
-        share = distance / duration
+        share = advance / remaining
         (x, y, z), quaternion = reference
         position = (x + share * move[0], y + share * move[1], z + share * move[2])
         return position, _turned(quaternion, turn, share)

@@ -74,8 +74,8 @@ def _open_camera(
     )
 
 
-def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run: bool) -> WsgGripper:
-    """The gripper of the lab file, not yet connected. The driver of another gripper is created here."""
+def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run: bool) -> Gripper:
+    """The gripper of the lab file, not yet connected. Another driver is created here, with the same two callbacks."""
     return WsgGripper(
         transport_for(lab.gripper.address, clock=clock),
         clock=clock,

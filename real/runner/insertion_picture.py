@@ -42,7 +42,7 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
         line[4].axis("off")
         line[4].text(0.0, 0.5, _text(made), transform=line[4].transAxes, fontsize=9, va="center")
     figure.supxlabel(
-        f"Gel images at the largest depth, marker displacements × {_MAGNIFICATION}. "
+        f"Gel images at the end of the descent, marker displacements × {_MAGNIFICATION}. "
         "Flow maps: longest arrow = 1, fingertip down.",
         fontsize=9,
     )
@@ -50,14 +50,14 @@ def draw_insertion(insertion: "Insertion", mounts: Sequence["CameraMount"], task
 
 
 def _gel(axis: Any, made: "Attempt", sensor: int, mount: "CameraMount") -> None:
-    """The deepest image with the marker displacements since the reference."""
+    """The last image of the descent with the marker displacements since the reference."""
     from gelflow.perception.frames import decode_image
     from gelflow.perception.tracker import MarkerTracker
 
-    assert made.reference is not None and made.deepest is not None
+    assert made.reference is not None and made.last is not None
     tracker = MarkerTracker(mount.tracker_config())
     tracker.start(decode_image(made.reference.images[sensor].data))
-    image = decode_image(made.deepest.images[sensor].data)
+    image = decode_image(made.last.images[sensor].data)
     tracked = tracker.track(image)
     axis.imshow(image[:, :, ::-1])
     (x, y), (right, down) = tracked.position[tracked.valid].T, tracked.displacement[tracked.valid].T
@@ -96,8 +96,8 @@ def _text(made: "Attempt") -> str:
     ]
     if made.inserted:
         lines += ["", "no contact: in the hole"]
-    elif made.action is not None and made.observation is not None:
-        dx, dy, turn = made.action * (1e3, 1e3, 180 / np.pi)
+    elif made.correction is not None and made.observation is not None:
+        dx, dy, turn = made.correction * (1e3, 1e3, 180 / np.pi)
         lines += [
             "stopped by contact" if made.stopped_by_contact else "not in the hole",
             f"longest flow vector {made.observation.divisor:.3f} {made.observation.unit}",

@@ -25,7 +25,7 @@ from gelflow.task import InsertionTask
 from gelflow.time_sync import RUNNER
 
 PlanarPose = tuple[float, float, float]  # of the gripper relative to the taught hole: x, y [m], yaw [rad]
-_REST = 0.1  # from a hold until the arm and the newest images are at rest [s]
+_REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
 _AT_DEPTH = 0.02e-3  # distance from its end at which a descent is complete [m]
 
 
@@ -48,15 +48,15 @@ class Attempt:
     number: int
     planar_pose: PlanarPose  # during the descent
     depth: float  # reached below the start [m]
-    shear: float  # mean shear along the finger at the deepest reading [mm]
+    shear: float  # mean shear along the finger at the last reading [mm]
     contact: bool  # the shear exceeded contact_shear_mm
     stopped_by_contact: bool  # the shear exceeded stop_shear_mm and stopped the descent
-    inserted: bool  # as decided from pose and shear
+    inserted: bool  # lower face below the success height without contact, then lowered into the hole without contact
     duration: float  # [s]
     observation: FlowMap | None = None  # None when the policy was not evaluated
-    action: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
+    correction: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
     reference: TactileReading | None = None
-    deepest: TactileReading | None = None
+    last: TactileReading | None = None  # the newest reading of the descent
 
 
 @dataclass(frozen=True)
@@ -115,16 +115,16 @@ class InsertionRunner:
                     outcome = "inserted"
                     break
                 planar_pose = self._next_pose(planar_pose, attempt)
-            self._finish(number, planar_pose, inserted=outcome == "inserted")
+            self._release_part(number, planar_pose, inserted=outcome == "inserted")
         except PartLost:
             outcome = "part lost"
-            self._give_up(planar_pose)
+            self._retreat(planar_pose)
         except NotGrasped as error:
             outcome = str(error)
-            self._give_up(planar_pose)
+            self._retreat(planar_pose)
         except MarkersUnreadable as error:
             outcome = str(error)
-            self._finish(number, planar_pose, inserted=False)
+            self._release_part(number, planar_pose, inserted=False)
         result = Insertion(number, outcome, planar_pose, self._clock.now() - start, tuple(attempts))
         tries = len(attempts)
         self._recorder.event("insertion ended", {"number": number, "outcome": outcome, "attempts": tries})
@@ -190,18 +190,18 @@ class InsertionRunner:
         reference = observer.start(self._clock.now())
         stopped = self._descend(planar_pose, observer, begun)
         frames = observer.chosen(self._task.frame_depths)
-        deepest = observer.readings[-1]
-        contact = deepest.shear > self._lab.descent.contact_shear_mm
-        reached = self._task.start_height - deepest.depth < self._task.success_height
+        last = observer.readings[-1]
+        contact = last.shear > self._lab.descent.contact_shear_mm
+        reached = self._task.start_height - last.depth < self._task.success_height
         inserted = reached and not contact and not stopped and self._lower(planar_pose, observer)
-        observation, action = None, None
+        observation, correction = None, None
         if not inserted:
             observation = observer.observe(frames, self._task)
-            action = np.asarray(self._policy.act(observation), dtype=float)
-            self._record_decision(number, attempt, planar_pose, observer, frames, observation, action)
+            correction = np.asarray(self._policy.act(observation), dtype=float)
+            self._record_decision(number, attempt, planar_pose, observer, frames, observation, correction)
         result = Attempt(
-            attempt, planar_pose, deepest.depth, deepest.shear, contact, stopped, inserted,
-            self._clock.now() - begun, observation, action, reference, deepest,
+            attempt, planar_pose, last.depth, last.shear, contact, stopped, inserted,
+            self._clock.now() - begun, observation, correction, reference, last,
         )  # fmt: skip
         self._recorder.attempt_end(_summary(number, result))
         return result
@@ -224,7 +224,7 @@ class InsertionRunner:
                 self._motion.hold()
                 raise PeerTimeout(f"an attempt took more than {lab.limits.attempt_time:g} s; does the arm follow?")
             if reading is not None:
-                depth = self._keep(observer, reading, start)
+                depth = self._add_reading(observer, reading, start)
                 if reading.shear > lab.descent.stop_shear_mm:
                     self._recorder.event("stopped by contact", {"shear_mm": reading.shear, "depth": depth})
                     self._read_at_rest(observer, start)
@@ -240,12 +240,12 @@ class InsertionRunner:
 
     def _read_at_rest(self, observer: TactileObserver, start: float) -> None:
         """Add a reading at rest after contact: the cameras are not synchronized, so pads in motion are inconsistent."""
-        self._motion.wait(_REST)
+        self._motion.wait(_REST_TIME)
         reading = observer.read(observer.images(self._clock.now()))
         if reading is not None:
-            self._keep(observer, reading, start)
+            self._add_reading(observer, reading, start)
 
-    def _keep(self, observer: TactileObserver, reading: TactileReading, start: float) -> float:
+    def _add_reading(self, observer: TactileObserver, reading: TactileReading, start: float) -> float:
         """Add a reading to those of the attempt; returns its depth below `start` [m]."""
         depth = start - self._motion.height_at(reading.frame.stamp)
         observer.keep(replace(reading, depth=depth))
@@ -277,10 +277,10 @@ class InsertionRunner:
         observer: TactileObserver,
         frames: list[TactileReading],
         observation: FlowMap,
-        action: NDArray[np.float64],
+        correction: NDArray[np.float64],
     ) -> None:
         assert observer.reference is not None
-        target = self.pose(self._corrected(planar_pose, action), self._task.start_height)
+        target = self.pose(self._corrected(planar_pose, correction), self._task.start_height)
         decision = Decision.of(
             observation,
             insertion=number,
@@ -288,29 +288,31 @@ class InsertionRunner:
             tracked=tuple(map(tuple, observer.tracked)),
             reference=observer.reference.sequences,
             frames=tuple(reading.sequences for reading in frames),
-            action=action,
+            # Keys of the file format: `action` is the correction, `correction` the corrected pose (see `Decision`).
+            action=correction,
             correction=np.array([target.position[0], target.position[1], target.yaw]),
             depths=(observer.reference.depth, *(reading.depth for reading in frames)),
         )
         self._recorder.decision(decision.to_json())
 
     def _next_pose(self, planar_pose: PlanarPose, attempt: Attempt) -> PlanarPose:
-        assert attempt.action is not None
+        assert attempt.correction is not None
         self._motion.move(self.pose(planar_pose, self._task.start_height))
-        return self._corrected(planar_pose, attempt.action)
+        return self._corrected(planar_pose, attempt.correction)
 
-    def _corrected(self, planar_pose: PlanarPose, action: NDArray[np.float64]) -> PlanarPose:
+    def _corrected(self, planar_pose: PlanarPose, correction: NDArray[np.float64]) -> PlanarPose:
         """The planar pose after a correction, limited to the task's workspace as in the simulated environment.
 
-        This limit is part of the definition of an action; the supervisor then checks the resulting target, which it
+        This limit is part of the definition of a correction; the supervisor then checks the resulting target, which it
         refuses and never clamps. Raises SafetyError when the policy's output is not three finite numbers.
         """
-        if action.shape != (3,) or not np.isfinite(action).all():
-            raise SafetyError(f"correction refused: the policy gave {action.tolist()}, expected three finite numbers")
-        x, y, yaw = (float(v) for v in self._task.corrected(np.array(planar_pose), action))
+        if correction.shape != (3,) or not np.isfinite(correction).all():
+            given = correction.tolist()
+            raise SafetyError(f"correction refused: the policy gave {given}, expected three finite numbers")
+        x, y, yaw = (float(v) for v in self._task.corrected(np.array(planar_pose), correction))
         return x, y, yaw
 
-    def _finish(self, number: int, planar_pose: PlanarPose, *, inserted: bool) -> None:
+    def _release_part(self, number: int, planar_pose: PlanarPose, *, inserted: bool) -> None:
         """Release the part: in the hole, or above it to the operator."""
         part, lab = self._lab.part, self._lab.gripper
         if not inserted:
@@ -322,7 +324,7 @@ class InsertionRunner:
         if inserted:
             self._motion.move(self.pose(planar_pose, part.load_height))
 
-    def _give_up(self, planar_pose: PlanarPose) -> None:
+    def _retreat(self, planar_pose: PlanarPose) -> None:
         """Without a held part: move up, with the fingers unchanged."""
         self._motion.expect_part(False)
         self._motion.move(self.pose(planar_pose, self._lab.part.load_height))

@@ -59,7 +59,7 @@ class DryRun:
     items: list[PreflightItem]
     targets: list[str]  # the first targets, after the supervisor's check
     observation: FlowMap  # from two pairs of images at rest, without contact
-    action: NDArray[np.float64]  # the policy's action for this observation
+    correction: NDArray[np.float64]  # of the policy for this observation: dx, dy [m], dyaw [rad] in the gripper frame
 
 
 def run_insertions(plan: RunPlan) -> list[Insertion]:
@@ -96,8 +96,8 @@ def dry_run(plan: RunPlan) -> DryRun:
         assert observer.reference is not None
         observation = flow_map([reading.frame], observer.reference.frame, grid=plan.task.grid)
         plan.policy.reset()
-        action = np.asarray(plan.policy.act(observation), dtype=float)
-        return DryRun(items, runner.check_plan(supervisor), observation, action)
+        correction = np.asarray(plan.policy.act(observation), dtype=float)
+        return DryRun(items, runner.check_plan(supervisor), observation, correction)
 
 
 def create_motion(cell: Cell) -> tuple[Supervisor, MotionExecutor]:

@@ -18,8 +18,9 @@ from gelflow.errors import UsageError
 
 Unit = Literal["N", "mm", "px"]
 
-# Lower limit of the divisor by unit, about three times the noise of the sources with that unit. It keeps the flow map
-# of a frame without contact near zero instead of amplifying the noise.
+# Lower limit of the divisor by unit, about three times the noise of the sources with that unit: for N the largest
+# marker noise of `Randomization` (1 mN), for mm and px the rest jitter that `gelflow track` reports. It keeps the flow
+# map of a frame without contact near zero instead of amplifying the noise.
 MIN_DIVISORS: Mapping[str, float] = MappingProxyType({"N": 3e-3, "mm": 0.02, "px": 0.3})
 
 
@@ -47,7 +48,7 @@ class Grid:
 class TactileFrame:
     """Marker vectors of all tactile sensors at one time."""
 
-    shear: NDArray[np.float32]  # in `unit`, shape (sensors, markers, 2): x, y on the pad
+    shear: NDArray[np.float32]  # in `unit`, shape (sensors, markers, 2): x, y on the pad; NaN where `valid` is False
     valid: NDArray[np.bool_]  # shape (sensors, markers); False for markers that were not measured
     positions: NDArray[np.float32]  # marker positions on the pad at rest [mm], shape (markers, 2)
     stamp: float  # [s]

@@ -5,7 +5,8 @@ Every method has its own time limit and raises `gelflow.errors.PeerError` (or a 
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from types import TracebackType
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,22 @@ class Arm(Protocol):
 
 @runtime_checkable
 class Gripper(Protocol):
-    """A parallel gripper with force-limited grasping. Widths [m], speeds [m/s], forces [N]."""
+    """A parallel gripper with force-limited grasping. Widths [m], speeds [m/s], forces [N].
+
+    A driver does no I/O before `with`, which connects at its start and calls `close` at its end. For the recording of a
+    session (`real/runner/cell.py`) its constructor also takes two callbacks: `on_command(name, values)`, called before
+    a command is sent, and `on_measurement(state)`, called for every new measured state.
+    """
+
+    def __enter__(self) -> Self:
+        """Connect. Raises PeerError when the gripper cannot be reached."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close, after any error too."""
+        ...
 
     def state(self) -> GripperState:
         """The newest measured state."""
@@ -137,5 +153,5 @@ class Policy(Protocol):
         ...
 
     def act(self, observation: FlowMap) -> NDArray[np.float64]:
-        """The correction (dx [m], dy [m], dtheta [rad]) of the gripper in its own frame, shape (3,)."""
+        """The correction (dx [m], dy [m], dyaw [rad]) of the gripper in its own frame, shape (3,)."""
         ...

@@ -1,6 +1,8 @@
 """Description of the insertion task, shared by the simulated environment and the robot's runner.
 
 Every checkpoint contains the description of its task; a policy cannot be loaded for another description.
+Equation numbers are those of Xu et al., Efficient Tactile Simulation with Differentiability for Robotic Manipulation,
+CoRL 2022.
 """
 
 import dataclasses
@@ -32,9 +34,14 @@ class InsertionTask:
     descent: float = 1.1e-3  # of the gripper in an attempt, unless the part meets the hole's floor
     start_height: float = 25.5e-3  # height of the part's lower face above the hole's floor at the start of an attempt
     rim_height: float = 25.0e-3  # height of the hole's rim above its floor
-    success_height: float = 24.7e-3  # the part is inserted when its lower face is below this height
+    # Necessary for success: the part's lower face is below this height. The simulation also requires the face inside
+    # the hole and no stop by contact (`sim/tasks/insertion.py`); the robot requires a descent without contact, then
+    # lowers the part into the hole without contact (`real/runner/insertion_runner.py`).
+    success_height: float = 24.7e-3
     attempts: int = 15
-    action_scale: tuple[float, float, float] = (20e-3, 20e-3, np.pi / 18)  # correction for action ±1: x, y, yaw
+    # Correction in x, y, yaw for an action of ±1 of the Gymnasium environments. The output ±1 of a trained network has
+    # its own scale, `Architecture.reach` in `policies/networks.py`.
+    action_scale: tuple[float, float, float] = (20e-3, 20e-3, np.pi / 18)
     workspace: tuple[float, float, float] = (15e-3, 15e-3, np.pi / 12)  # largest |x|, |y|, |yaw| of the gripper
     misalignment: tuple[float, float, float] = (6e-3, 6e-3, np.pi / 18)  # at the start: uniform within ± these
 
@@ -67,7 +74,10 @@ class InsertionTask:
         return (len(self.frame_depths) * self.sensors * 2, self.grid.rows, self.grid.cols)
 
     def correction(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The correction (dx [m], dy [m], dyaw [rad]) in the gripper's frame for an action, which is clipped to ±1."""
+        """The correction (dx [m], dy [m], dyaw [rad]) in the gripper's frame for an environment's action in ±1.
+
+        The action is clipped to ±1 and scaled by `action_scale`.
+        """
         return np.asarray(np.clip(np.asarray(action, dtype=float), -1, 1) * np.asarray(self.action_scale))
 
     def corrected(self, pose: NDArray[np.float64], correction: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -59,7 +59,7 @@ def insertion_to_json(result: "Insertion") -> dict[str, Any]:
                 "depth": attempt.depth,
                 "shear_mm": attempt.shear,
                 "outcome": attempt_outcome(attempt),
-                "correction": attempt.action,
+                "correction": attempt.correction,
             }
             for attempt in result.attempts
         ],

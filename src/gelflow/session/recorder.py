@@ -89,7 +89,10 @@ class SessionRecorder:
         self._put(f"/{name}/image", message.SerializeToString(), stamp=image.stamp, sequence=image.sequence)
 
     def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
-        """Record the markers of the image with that stamp; `values` are the properties of `gelflow.Markers`."""
+        """Record the markers of the image with that stamp; `values` follow the JSON schema `gelflow.Markers`.
+
+        The schema is in `session/channels.py`.
+        """
         name = _name(sensor)
         self._json(f"/{name}/markers", {"stamp": stamp, **values}, stamp=stamp)
         drawn = annotate(values, nanoseconds(stamp))  # for viewers

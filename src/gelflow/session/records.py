@@ -94,6 +94,9 @@ class Decision:
 
     For each sensor a new tracker starts on the first image of `tracked` and then tracks the others in order;
     `reference` and `frames` select the tactile frames of the observation.
+
+    Two names are keys of the file format and differ from the terms elsewhere: `action` is the correction of the policy,
+    and `correction` is the pose that results from it.
     """
 
     insertion: int  # counts insertions from 0; the policy is reset when it changes
@@ -104,8 +107,8 @@ class Decision:
     flow: NDArray[np.float32]  # the flow map, shape (frames * sensors * 2, rows, cols)
     divisor: float  # of the flow map, in `unit`
     unit: str
-    action: NDArray[np.float64]  # output of the policy: dx [m], dy [m], dtheta [rad] in the gripper's frame
-    correction: NDArray[np.float64]  # resulting target of the arm: x [m], y [m], yaw [rad], base frame
+    action: NDArray[np.float64]  # the policy's correction: dx [m], dy [m], dyaw [rad] in the gripper's frame
+    correction: NDArray[np.float64]  # the corrected gripper pose: x [m], y [m], yaw [rad] in the base frame
     depths: tuple[float, ...] = ()  # depth of the reference and of each frame below the attempt's start [m]
 
     def __post_init__(self) -> None:

@@ -90,7 +90,7 @@ def test_target_is_reached_exactly_within_the_bounds_of_speed_and_ramp() -> None
     robot.step()
     turned = (0.0, math.sin(0.05), math.cos(0.05), 0.0)  # 0.1 rad about the tool's z
     goal = dataclasses.replace(target((0.408, 0.004, 0.296)), quaternion=turned)
-    robot.generator.post(goal, robot.now)
+    robot.generator.set_target(goal, robot.now)
     robot.step(400)
     assert robot.sent[-1] == (goal.position, goal.quaternion)
     positions = np.array([p for p, _ in robot.sent])
@@ -112,7 +112,7 @@ def test_slow_target_moves_at_its_speed() -> None:
     """The descent at 0.5 mm/s advances 2 µm per cycle."""
     robot = Robot()
     robot.step()
-    robot.generator.post(target((0.40, 0.0, 0.299), speed=0.5e-3), robot.now)
+    robot.generator.set_target(target((0.40, 0.0, 0.299), speed=0.5e-3), robot.now)
     robot.step(150)
     heights = [p[2] for p, _ in robot.sent]
     assert np.diff(heights)[-100:] == pytest.approx(np.full(100, -2e-6), rel=1e-6)
@@ -122,11 +122,11 @@ def test_renewed_target_keeps_the_speed_and_reversed_target_starts_from_rest() -
     robot = Robot()
     robot.step()
     for _ in range(20):
-        robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
+        robot.generator.set_target(target((0.44, 0.0, 0.30)), robot.now)
         robot.step(5)
     x = np.array([p[0] for p, _ in robot.sent])
     assert np.diff(x)[-1] == pytest.approx(CONFIG.max_speed * CYCLE)
-    robot.generator.post(target((0.38, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.38, 0.0, 0.30)), robot.now)
     robot.step()
     back = robot.sent[-1][0][0] - robot.sent[-2][0][0]
     assert -CONFIG.max_speed * CYCLE * CYCLE / CONFIG.ramp_time * 1.01 <= back < 0
@@ -135,7 +135,7 @@ def test_renewed_target_keeps_the_speed_and_reversed_target_starts_from_rest() -
 def test_expired_target_freezes_the_reference() -> None:
     robot = Robot()
     robot.step()
-    robot.generator.post(target((0.44, 0.0, 0.30), expires=robot.now + 0.1), robot.now)
+    robot.generator.set_target(target((0.44, 0.0, 0.30), expires=robot.now + 0.1), robot.now)
     robot.step(25)
     frozen = robot.sent[-1]
     assert frozen[0][0] > START[0]
@@ -149,9 +149,9 @@ def test_expired_target_freezes_the_reference() -> None:
 def test_reference_waits_for_a_robot_that_does_not_follow() -> None:
     robot = Robot(lag=10**6)  # does not move
     robot.step()
-    robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.44, 0.0, 0.30)), robot.now)
     flags = robot.step(500)
-    assert EgmFlag.WAITING in flags
+    assert EgmFlag.LAGGING in flags
     assert robot.sent[-1][0][0] - START[0] <= CONFIG.max_lead + CONFIG.max_speed * CYCLE
 
 
@@ -162,7 +162,7 @@ def test_reference_waits_for_a_robot_that_does_not_follow() -> None:
 def test_stopped_controller_latches_until_reset(field: str, value: str, reason: str) -> None:
     robot = Robot()
     robot.step(5)
-    robot.generator.post(target((0.42, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.42, 0.0, 0.30)), robot.now)
     robot.step(5)
     count = len(robot.sent)
     robot.step(1, **{field: value})
@@ -170,7 +170,7 @@ def test_stopped_controller_latches_until_reset(field: str, value: str, reason: 
     # The controller is ready again and new targets arrive: still nothing is sent.
     for _ in range(20):
         robot.step()
-        robot.generator.post(target((0.42, 0.0, 0.30)), robot.now)
+        robot.generator.set_target(target((0.42, 0.0, 0.30)), robot.now)
     assert len(robot.sent) == count
     robot.generator.reset(robot.now)
     here = robot.sent[-robot.lag]
@@ -210,7 +210,7 @@ def test_duplicates_and_late_messages_are_not_answered_and_a_gap_is_flagged() ->
 def test_stale_feedback_holds_then_stops() -> None:
     robot = Robot()
     robot.step(3)
-    robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.44, 0.0, 0.30)), robot.now)
     robot.step(3)
     robot.generator.check_age(robot.now + 0.019)
     assert robot.generator.target is not None
@@ -256,17 +256,17 @@ WRONG = [
 def test_invalid_target_is_refused_and_the_arm_holds(wrong: Target, text: str) -> None:
     robot = Robot()
     robot.step()
-    robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.44, 0.0, 0.30)), robot.now)
     robot.step(30)
     before = robot.sent[-1]
-    robot.generator.post(wrong, robot.now)
+    robot.generator.set_target(wrong, robot.now)
     robot.step(30)
     assert robot.sent[-1] == before
     refusals = [event for event in robot.events() if event.startswith("refused: target refused: ")]
     assert len(refusals) == 1
     assert text in refusals[0]
     # Not latched: a valid target is followed.
-    robot.generator.post(target((0.44, 0.0, 0.30)), robot.now)
+    robot.generator.set_target(target((0.44, 0.0, 0.30)), robot.now)
     robot.step(30)
     assert robot.sent[-1] != before
 
@@ -360,7 +360,7 @@ def test_references_stay_within_workspace_and_speed_limits_for_arbitrary_targets
     for (dx, dy, dz), turn, speed, cycles in posts:
         quaternion = (0.0, math.sin(turn / 2), math.cos(turn / 2), 0.0)
         goal = Target((0.4 + dx, dy, 0.3 + dz), quaternion, robot.now + 0.1, speed, CONFIG.max_turn_speed)
-        robot.generator.post(goal, robot.now)
+        robot.generator.set_target(goal, robot.now)
         robot.step(cycles)
     for (a, qa), (b, qb) in itertools.pairwise(robot.sent):
         assert math.dist(a, b) <= CONFIG.max_speed * CYCLE * (1 + 1e-9)

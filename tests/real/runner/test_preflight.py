@@ -32,7 +32,7 @@ def test_dry_run_sends_no_motion(robot: MockRobot, tmp_path: Path) -> None:
     finally:
         relay.close()
     assert [item.good for item in result.items] == [True] * 5 and len(result.targets) == 4
-    assert np.isfinite(result.action).all()
+    assert np.isfinite(result.correction).all()
     packets = Decoder(plausible=plausible_request).feed(relay.sent)
     assert packets and all(isinstance(packet, Packet) for packet in packets)
     asked = [packet.id for packet in packets]

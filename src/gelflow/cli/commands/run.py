@@ -79,7 +79,7 @@ def _dry_run(output: Output, plan: "RunPlan") -> int:
     output.console.print(preflight_table(made.items))
     output.text("checked targets of a run: " + "; ".join(made.targets))
     flow = f"divisor of the flow map at rest: {made.observation.divisor:.3f} {made.observation.unit}"
-    output.text(f"{flow}; correction of the policy: {made.action.round(5).tolist()} [m, m, rad]")
+    output.text(f"{flow}; correction of the policy: {made.correction.round(5).tolist()} [m, m, rad]")
     output.text("dry run: nothing was moved.")
     output.result(
         {
@@ -88,7 +88,7 @@ def _dry_run(output: Output, plan: "RunPlan") -> int:
             "targets": made.targets,
             "divisor": made.observation.divisor,
             "unit": made.observation.unit,
-            "correction": made.action,
+            "correction": made.correction,
         }
     )
     return SUCCESS
