@@ -1,7 +1,7 @@
 """Accuracy and speed of all settings and presets of the scenes: `python benchmarks/tradeoff.py [SCENE …]`.
 
 For each scene the measurements (`gelflow.sim.benchmark.tradeoff`) are written to benchmarks/results/tradeoff_SCENE.json
-and docs/pictures/tradeoff_SCENE.png, and the error bounds of its presets to the table of docs/guide/tradeoff.md. Times
+and docs/pictures/tradeoff_SCENE.png, and the error bounds of its presets to the table of docs/guide/presets.md. Times
 require an idle machine; errors do not depend on the machine.
 """
 
@@ -20,7 +20,7 @@ from gelflow.sim.benchmark.tradeoff.preset_bounds import bounds, preset_errors
 from gelflow.sim.benchmark.tradeoff.sweep import measure
 from gelflow.sim.scene import scene_names
 
-PAGE = script.ROOT / "docs" / "guide" / "tradeoff.md"
+PAGE = script.ROOT / "docs" / "guide" / "presets.md"
 DESCRIPTION = "Measure accuracy and speed of scene settings. Quick run: 3 repeats, 2 samples, no page or picture."
 HALVINGS = 8  # of a frame, for the references of the sampled physics
 

@@ -1,4 +1,4 @@
-"""The table of presets in docs/guide/tradeoff.md: rows from measurements, and their replacement in the page."""
+"""The table of presets in docs/guide/presets.md: rows from measurements, and their replacement in the page."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

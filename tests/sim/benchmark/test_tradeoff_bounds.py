@@ -1,4 +1,4 @@
-"""The error bounds in docs/guide/tradeoff.md hold for other samples of the physics."""
+"""The error bounds in docs/guide/presets.md hold for other samples of the physics."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from gelflow.sim.benchmark.tradeoff.preset_bounds import SCENE_DEFAULT, preset_e
 from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.scene import PRESET_NAMES, load_scene, scene_names
 
-PAGE = Path(__file__).parents[3] / "docs" / "guide" / "tradeoff.md"
+PAGE = Path(__file__).parents[3] / "docs" / "guide" / "presets.md"
 SEEDS = (1001, 1002, 1003)  # the page's draws have seeds from 0 on
 HALVINGS = 8
 
