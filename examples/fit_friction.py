@@ -22,11 +22,10 @@ with torch.no_grad():
     recorded = motion(torch.tensor(0.5, dtype=torch.float64))  # stands for a measurement
 
 mu = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-optimizer = torch.optim.SGD([mu], lr=2e-3)
-for iteration in range(16):
+optimizer = torch.optim.SGD([mu], lr=3e-3)
+for iteration in range(7):
     optimizer.zero_grad()
     loss = (motion(mu) - recorded).square().mean()  # [mm²]
     loss.backward()
-    if iteration % 5 == 0:
-        print(f"iteration {iteration:2d}: mu = {mu.item():.4f}, loss {loss.item():.2g} mm²")
+    print(f"iteration {iteration}: mu = {mu.item():.4f}, loss {loss.item():.2g} mm²", flush=True)
     optimizer.step()

@@ -27,7 +27,7 @@ class TrackerConfig:
 
     rows: int | None = None  # rows of markers in the image; None: detected
     cols: int | None = None  # markers in a row; None: detected
-    either_way: bool = True  # rows and cols may be transposed in the image
+    either_way: bool = True  # also accept the transposed shape, rows and cols exchanged in the image
     polarity: Polarity = "auto"  # dots are "dark" or "bright" relative to the gel
 
 

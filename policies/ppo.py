@@ -46,13 +46,15 @@ class PPOSettings:
     epochs: int = 10  # per update
     learning_rate: float = 2e-3  # decreases linearly to a tenth
     discount: float = 0.5
-    gae: float = 0.95  # λ of the generalized advantage estimate
+    gae: float = 0.95  # λ of the generalized advantage estimation (GAE), 0 to 1
     clip: float = 0.2  # clip range of the policy ratio
     value: float = 0.5  # coefficient of the value loss
     entropy: float = 0.0  # coefficient of the entropy loss
     gradient_norm: float = 0.5  # largest norm of the gradient
-    spread: float = 0.4  # initial standard deviation of the actions
-    calibration: int = 2_000  # random attempts that determine the scale of the features
+    spread: float = 0.4  # initial standard deviation of the actions, whose range is ±1
+    calibration: int = (
+        2_000  # random attempts that determine the scale of the features (`feature_scale`), not camera calibration
+    )
     evaluate_every: int = 20_000  # attempts
     evaluate_episodes: int = 512
 
@@ -93,7 +95,7 @@ class HistoryVecEnv(VecEnv):
         self._seed = seed
         self._actions: Array = np.zeros((env.count, 3))
         self._signs: Array = np.ones((env.count, 3))
-        self.rewards: list[float] = []
+        self.pose_rewards: list[float] = []  # mean `InsertionTask.reward` of the poses after each step
         self.successes: deque[bool] = deque(maxlen=512)
 
     def reset(self) -> NDArray[np.float32]:
@@ -106,7 +108,7 @@ class HistoryVecEnv(VecEnv):
     def step_wait(self) -> VecEnvStepReturn:
         self._history.record(self._actions)
         result = self._env.step(self._actions)
-        self.rewards.append(float(result.reward.mean()))
+        self.pose_rewards.append(float(result.reward.mean()))
         self.successes.extend(bool(value) for value in result.success[result.done])
         self._history.reset(result.done)
         # The number of attempts is part of the observation, so the last attempt is a regular end of the episode.
@@ -278,9 +280,9 @@ class _TrainingCallback(BaseCallback):
     def _add_point(self, evaluation: EvaluationResult | None) -> None:
         env = self._run.env
         spread = float(torch.as_tensor(self.model.policy.log_std).detach().exp().mean())
-        reward = float(np.mean(env.rewards)) if env.rewards else float("nan")
+        reward = float(np.mean(env.pose_rewards)) if env.pose_rewards else float("nan")
         success = float(np.mean(env.successes)) if env.successes else float("nan")
-        env.rewards.clear()
+        env.pose_rewards.clear()
         point = LearningCurvePoint(self.num_timesteps, self._minutes(), reward, success, spread, evaluation)
         self._points.append(point)
         if self._run.report:

@@ -27,7 +27,10 @@ class Buildable(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A recorded rollout. The first axis is time, the second the environment."""
+    """A recorded rollout of N environments. The first axis is time, the second the environment.
+
+    Sizes: nq positions, nv velocities, nu controls, na friction anchors, nh values of the BDF2 history.
+    """
 
     q: NDArray[Any]  # (steps + 1, N, nq)
     v: NDArray[Any]  # (steps + 1, N, nv)
@@ -35,8 +38,8 @@ class Trajectory:
     anchored: NDArray[np.uint8]  # (steps + 1, N, na), 1 where the anchor is set
     history: NDArray[Any]  # (steps + 1, N, nh): previous step of BDF2, see `Simulator`
     u: NDArray[Any]  # (steps, N, nu)
-    tactile: NDArray[Any]  # (reads, N, markers, 3): shear x, shear y, normal [N]
-    read_after: NDArray[np.int32]  # (reads): number of steps taken before each evaluation of `tactile`
+    tactile: NDArray[Any]  # (readings, N, markers, 3): shear x, shear y, normal [N]
+    read_after: NDArray[np.int32]  # (readings): number of steps taken before each reading of `tactile`
     halvings: NDArray[np.int8]  # (steps, N): the step was split into 2^halvings substeps
     status: NDArray[np.int32]  # (N): 0, or the reason of failure (`STATUS_MESSAGES`)
 
@@ -67,9 +70,9 @@ class Simulator:
     ----------
     q, v: positions (N, nq) and velocities (N, nv); writable views of the simulator's memory, like all state arrays
     params: physical parameters (N, parameters), writable; see `param`
-    anchors, anchored: state of the elastic friction law, (N, na, 3) [m] and (N, na)
-    history: state of BDF2, (N, nh): displacement of the previous step (nv), velocity before it (nv), and 1 if a
-        previous step exists; nh = 0 for BDF1
+    anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
+    history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
+        1 if a previous step exists; nh = 0 for BDF1
     status: (N), 0 or the reason of failure, see `STATUS_MESSAGES`
     iterations, halved: (N), Newton iterations and steps that were split into substeps, since the last reset
 
@@ -80,7 +83,7 @@ class Simulator:
 
     def __init__(
         self,
-        scene: Any,
+        scene: Buildable | _core.Model,
         *,
         num_envs: int = 1,
         threads: int | None = None,
@@ -92,7 +95,7 @@ class Simulator:
             precision = getattr(scene, "precision", "double")
         if precision not in ("double", "single"):
             raise UsageError(f"precision must be 'double' or 'single', got {precision!r}")
-        self.scene = scene
+        self.scene: Any = scene  # attributes of a `Scene` are used where present
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
         available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -291,7 +294,7 @@ class Simulator:
     ) -> Trajectory:
         """Record steps with controls u (steps, N, nu), from the given or the present state; the state is not changed.
 
-        Marker forces are evaluated after the numbers of steps in `read_after` (0 is the start). `out` is an earlier
+        Marker forces are read after the numbers of steps in `read_after` (0 is the start). `out` is an earlier
         trajectory of the same shape whose arrays are overwritten, which saves the allocation of large arrays. Raises
         UsageError for wrong shapes and for values that are not finite.
         """
@@ -301,7 +304,7 @@ class Simulator:
         steps, n = controls.shape[0], self.num_envs
         if out is not None and (out.u.shape != controls.shape or len(out.read_after) != len(read_after)):
             raise UsageError(
-                f"out must be a trajectory with u of shape {controls.shape} and {len(read_after)} tactile evaluations, "
+                f"out must be a trajectory with u of shape {controls.shape} and {len(read_after)} tactile readings, "
                 f"got {out.u.shape} and {len(out.read_after)}"
             )
 
@@ -314,8 +317,8 @@ class Simulator:
             array[0] = present if start is None else start
             return array
 
-        reads = np.asarray(read_after, dtype=np.int32)
-        readings = (len(reads), n, self.model.markers, 3)
+        read_steps = np.asarray(read_after, dtype=np.int32)
+        tactile_shape = (len(read_steps), n, self.model.markers, 3)
         result = Trajectory(
             q=along_time("q", q),
             v=along_time("v", v),
@@ -323,8 +326,8 @@ class Simulator:
             anchored=along_time("anchored", anchored),
             history=along_time("history", history),
             u=controls,
-            tactile=np.empty(readings, self.dtype) if out is None else out.tactile,
-            read_after=reads,
+            tactile=np.empty(tactile_shape, self.dtype) if out is None else out.tactile,
+            read_after=read_steps,
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),
         )
@@ -341,7 +344,7 @@ class Simulator:
         """Contact mode signature of each step (contact, slip and clipping of every point and actuator), (steps, N).
 
         Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
-        at which they were evaluated.
+        after which they were read.
         """
         return self._batch.contact_modes(_arrays(trajectory))
 

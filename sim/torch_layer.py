@@ -1,8 +1,10 @@
-"""Differentiable PyTorch functions for a step and for a rollout, with exact gradients (eq. 18).
+"""Differentiable PyTorch functions for a step and for a rollout, with exact gradients (eq. 18 of the paper).
 
 Tensors are on the CPU and have the simulator's precision. The state is an explicit argument; the simulator's own state
 is not changed. The gradient of a quaternion is its tangent gradient, mapped to four components. Physical parameters can
 be passed by name as tensors; their gradient is computed only when a tensor requires it.
+
+Paper: Xu et al., Efficient Tactile Simulation with Differentiability for Robotic Manipulation, CoRL 2022.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,7 +38,7 @@ class TorchRollout:
 
     q: torch.Tensor  # (steps + 1, N, nq)
     v: torch.Tensor  # (steps + 1, N, nv)
-    tactile: torch.Tensor  # (reads, N, markers, 3) [N]
+    tactile: torch.Tensor  # (readings, N, markers, 3) [N]
     end: TorchState
     ok: torch.Tensor
 

@@ -52,7 +52,7 @@ class ContactDef:
     points: str
     shape: str
     law: str  # friction law: "viscous" or "elastic"
-    damping: str  # "depth" (scaled by penetration depth, eq. 8) or "plain"
+    damping: str  # "depth" (scaled by penetration depth, eq. 8 of Xu et al., CoRL 2022) or "plain"
     params: Mapping[str, float]  # kn, kt, mu, kd, ks
 
 

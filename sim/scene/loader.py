@@ -21,6 +21,7 @@ INTEGRATORS = ("bdf1", "bdf2")
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
+# Tables of named elements: each key is the name of an element, for example [pads.left].
 _ELEMENT_TABLES = ("joints", "shapes", "points", "contacts", "pads")
 _KEYS = ("format", "model", *_SOLVER_KEYS, "friction", *_ELEMENT_TABLES, "presets")
 

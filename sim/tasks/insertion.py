@@ -22,11 +22,13 @@ from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
 
-DESCENT_TIME = 0.225  # [s] of an attempt, as published: 45 steps of 5 ms, about ten times faster than the robot
+DESCENT_TIME = (
+    0.225  # [s] of an attempt, as in Xu et al. (CoRL 2022): 45 steps of 5 ms, about ten times faster than the robot
+)
 SETTLE_TIME = 0.120  # [s] until the part is at rest in the closed gripper
-ARMS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
+ARM_JOINTS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 PADS = ("left", "right")
-_CLEAR = 0.1  # [m] height of the part while the gripper closes, clear of the hole
+_CLEAR_HEIGHT = 0.1  # [m] height of the part while the gripper closes, clear of the hole
 _OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
 
 
@@ -37,7 +39,9 @@ class AttemptResult:
     image: NDArray[np.float32]  # flow maps, shape (N, frames * sensors * 2, rows, cols)
     divisor: Array  # [N], shape (N,): normalization of the flow maps
     height: Array  # [m], shape (N,): highest corner of the part's lower face above the hole's floor
-    inserted: NDArray[np.bool_]  # shape (N,): the lower face is inside the hole, below the task's success height
+    # Shape (N,): the lower face is inside the hole and below the task's success height, contact did not stop the
+    # descent, and no step failed.
+    inserted: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # shape (N,): a simulation step failed
 
 
@@ -97,8 +101,8 @@ class InsertionAttempts:
         self._frames = [self._step_at(depth) for depth in task.frame_depths]
         self._reference_at = self._step_at(task.reference_depth)
         self._part_q = self.scene.q("part").start
-        self._arm_q = [self.scene.q(name).start for name in ARMS]
-        self._arm_u = [self.scene.u(name) for name in ARMS]
+        self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
+        self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
         shapes = {shape.name: shape for shape in self.scene.shapes}
         half = shapes["part"].size
         self._corners = half * np.array([[x, y, -1.0] for x in (-1, 1) for y in (-1, 1)])
@@ -106,7 +110,7 @@ class InsertionAttempts:
         right, back = shapes["wall_right"], shapes["wall_back"]
         self._outline = np.array([right.pose.position[0] - right.size[0], back.pose.position[1] - back.size[1]])
         self.pose: Array = np.zeros((num_envs, 3))
-        self._noise: Array = np.zeros(num_envs)
+        self._noise: Array = np.zeros(num_envs)  # standard deviation of a marker force [N]
         self._stop_shear: Array = np.full(num_envs, np.inf)
         # The grasp at rest: controls, state and shear forces.
         self._u: Array = np.zeros((num_envs, self.scene.nu))
@@ -145,9 +149,9 @@ class InsertionAttempts:
         sim, scene = self.sim, self.scene
         sim.reset()
         sim.q[:] = scene.q0
-        sim.q[:, self._part_q + 2] = _CLEAR
-        sim.q[:, self._arm_q[2]] = _CLEAR + height
-        # Finger positions at force equilibrium; half of a disc's points are on the face in contact.
+        sim.q[:, self._part_q + 2] = _CLEAR_HEIGHT
+        sim.q[:, self._arm_q[2]] = _CLEAR_HEIGHT + height
+        # Finger positions at force equilibrium; a pad is a disc; half of its points are on the face in contact.
         touching = {p.name: p.weights.sum() / 2 for p in scene.points}
         for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
             sim.q[:, scene.q(finger)] += (force / (sim.param(f"{pad}.kn") * touching[pad]))[:, None]

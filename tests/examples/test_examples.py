@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"
 LAST_LINE = {
-    "fit_friction.py": r"iteration 15: mu = 0\.500\d, loss .* mm²",
-    "gymnasium_loop.py": r"attempt \d+: reward -?\d+\.\d+",
+    "fit_friction.py": r"iteration 6: mu = 0\.500\d, loss .* mm²",
+    "gymnasium_loop.py": r"attempt \d+: reward -?\d+\.\d+, inserted (True|False)",
     "mock_gripper.py": r"width 25\.0 mm, force 20\.0 N, holding",
     "own_scene.py": r" \[  0\.    0\.    0\.    0\.    0\.    0\.    0\. \]\]",
     "randomize_parameters.py": r"mu 0\.3\d, mass .* g: the box moved .* mm",
