@@ -374,7 +374,10 @@ class Simulator:
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:
                 return np.zeros(like.shape, self.dtype)
-            return np.ascontiguousarray(np.broadcast_to(np.asarray(value, self.dtype), like.shape))
+            array = np.asarray(value, self.dtype)
+            if array.shape != like.shape:  # broadcast_to is slow
+                array = np.broadcast_to(array, like.shape)
+            return np.ascontiguousarray(array)
 
         cotangent = _core.TrajectoryCotangent(
             q=shaped(q, trajectory.q),

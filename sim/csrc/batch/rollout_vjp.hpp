@@ -1,4 +1,4 @@
-// The reverse pass through a rollout (eqs. 19-23, adjoint.hpp).
+// The reverse pass through a rollout (adjoint.hpp).
 #pragma once
 
 #include "batch/param_gradient.hpp"

@@ -1,4 +1,5 @@
-// Update of the anchors of one cloud, the memory of elastic friction, and its vector-Jacobian product.
+// Update of the anchors of one point cloud against one shape (contact_anchors.hpp: of all contacts of the model), and
+// its vector-Jacobian product.
 #pragma once
 
 #include "contact/contact_points.hpp"

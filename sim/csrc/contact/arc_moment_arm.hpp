@@ -1,5 +1,5 @@
-// Correction of the moment arm of a rotating body: the mean over a step less the one at the step's end
-// (arc_correction.hpp).
+// Correction N = Jr(θ) − 1 of the moment arm of a rotating body: the mean over a step less the arm at the step's end
+// (arc_correction.hpp applies it to contact springs, free_body.hpp to the weight).
 #pragma once
 
 #include "math/spatial.hpp"

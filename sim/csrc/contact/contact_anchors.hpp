@@ -1,4 +1,5 @@
-// Update of the contacts' anchors at the end of a step, and its vector-Jacobian products.
+// Update of the anchors of all contacts of the model at the end of a step (anchors.hpp: of one point cloud), and its
+// vector-Jacobian products.
 #pragma once
 
 #include "contact/anchors.hpp"

@@ -1,8 +1,11 @@
 // Contact law: the force of a shape on one point (eq. 8), its derivatives (eqs. 11-16), and the anchor of elastic
 // friction.
 //
-// In the shape's frame, x the point, v its velocity relative to the shape, d, n, H the distance there (d < 0 inside),
-// ḋ = n·v, v_t = v − ḋ n:
+// Equation numbers are those of the appendix of Xu et al., "Efficient Tactile Simulation with Differentiability for
+// Robotic Manipulation", CoRL 2022.
+//
+// In the shape's frame, x the point, X its anchor, e = x − X (0 at a new contact point), v its velocity relative to the
+// shape, d, n, H the distance there (d < 0 inside) with its gradient and Hessian, ḋ = n·v, v_t = v − ḋ n:
 //     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8 has no max and can pull)
 //                 N = max(−k_n d − r k_d ḋ, 0)          plain damping, for grounds; r = min(−d / 1 µm, 1), since a
 //                                                       light body that arrives fast has no solution without the ramp
@@ -11,11 +14,10 @@
 //     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch, without division; under the
 //                                                       elastic law with a tolerance of rounding size, see force_terms
 //     force       f = N n + f_t
-// Under the elastic law e = x − X with the anchor X in the shape's frame; a new contact point has e = 0. The rolling
-// point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
+// The rolling point of a sphere on a plane is not a material point and has no anchor: it follows the viscous law.
 //
-// Spring and damper act in parallel, in series with the slider. After a step of length h that ended in slip, the rate
-// w = (s − s_before)/h of the strain satisfies f_t = −k_s s − k_t w: friction dissipates the work of the motion that the
+// Spring and damper act in parallel, in series with the slider. After a step of length h that ended in slip, the strain
+// rate ṡ = (s − s_before)/h satisfies f_t = −k_s s − k_t ṡ: friction dissipates the work of the motion that the
 // spring does not store. With s_before = s* − h v_t, s* the strain in f* (exact under BDF1, to second order under BDF2),
 //     −k_s s = k_t v_t + q f_t + (1 − q) f*,     q = h k_s / (h k_s + k_t)
 // which is −k_s s* in stick, where f_t = f* and the anchor stays. A new contact point stores nothing.
@@ -25,7 +27,7 @@
 
 namespace gelflow {
 
-// Coefficients of a pack of points (simd_pack.hpp), times the points' weights: the force at weight 0 is 0.
+// Coefficients of several points, times their weights: the force at weight 0 is 0. P is a pack type (simd_pack.hpp).
 template <class P>
 struct PointLaw {
   P kn, kt, mu, kd, ks;
@@ -113,7 +115,8 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
     const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
     Vec3<P> normal_by_x = p.normal_by_d * n;
     const Vec3<P> force_by_normal = n + law.mu * direction;  // ∂f/∂N
-    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ); t·n = 0 unless n is not of unit length (field form).
+    // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ); t·n = 0 unless n is the gradient of a grid and not of
+    // unit length, see HessianForm::field.
     Mat3<P> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
     if (at.form == HessianForm::field) [[unlikely]] {
       project += p.ratio * dot(direction, n) * outer(direction, n);

@@ -1,4 +1,5 @@
-// A SIMD pack of contact points, and the evaluation of their kinematics and contact-law coefficients.
+// One SIMD pack of contact points (contact_points.hpp: the loops over packs), and the evaluation of their kinematics and
+// contact-law coefficients.
 #pragma once
 
 #include <bit>

@@ -1,5 +1,5 @@
-// Loops over the contact points of a pair, one SIMD pack at a time: over all points of a cloud in its order, or over the
-// candidates of a step.
+// Loops over the contact points of a pair, one SIMD pack (contact_pack.hpp) at a time: over all points of a cloud in its
+// order, or over the candidates of a step.
 #pragma once
 
 #include "contact/candidate_points.hpp"

@@ -14,7 +14,7 @@ struct ContactSettings {
   const V3<T>* anchors;          // of this cloud against this shape
   const std::uint8_t* anchored;  // both unused under the viscous law
   double continuation = 1;       // factor of k_t and k_s (newton.hpp)
-  T h = T(0);                    // length of the step, where one is taken
+  T h = T(0);                    // step length, where a step is taken [s]
 };
 
 template <class T>

@@ -3,6 +3,9 @@
 //
 // With f the force on the pad at a marker, in the pad's frame, and x, y, z the marker's axes:
 //     (shear_x, shear_y, normal) = (f·x, f·y, −f·z)
+//
+// Equation numbers are those of the appendix of Xu et al., "Efficient Tactile Simulation with Differentiability for
+// Robotic Manipulation", CoRL 2022.
 #pragma once
 
 #include "contact/anchors.hpp"
@@ -33,7 +36,7 @@ GELFLOW_INLINE void read_pad(const Pad& pad, std::size_t s, const PairFrame<T>& 
     const unsigned active = bits(t.active);
     tracker.add(pad, t, active);
     if (!pad.flat) [[unlikely]] {
-      const Vec3<P> in_shape = force.force;  // the call needs its address
+      const Vec3<P> in_shape = force.force;  // a copy: taking the address of `force.force` would keep it in memory
       return add_to_curved_pad<T>(pad, frame, t.first, active, in_shape, readings);
     }
     Vec3<P> reading = transposed_times(axes, force.force);
@@ -111,7 +114,7 @@ GELFLOW_INLINE void read_pad_vjp(const Pad& pad, const PairFrame<T>& frame, cons
     if (pad.flat) [[likely]] {
       by_force = axes * by_force;
     } else {
-      const Vec3<P> by_marker_force = by_force;  // the call needs its address
+      const Vec3<P> by_marker_force = by_force;  // a copy: taking the address of `by_force` would keep it in memory
       const Vec3<P> in_shape = from_curved_pad<T>(pad, frame, t.first, active, by_marker_force);
       for (int a = 0; a < 3; ++a) by_force[a] = in_shape[a];
     }

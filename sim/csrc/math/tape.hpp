@@ -52,6 +52,7 @@ struct Taped {
   Taped(double value, int i, double di, int j = -1, double dj = 0) : a(value) {
     if (i >= 0 || j >= 0) entry = Tape::current().add(i, di, j, dj);
   }
+  // An independent variable: the backward pass computes the gradient with respect to it.
   static Taped watched(double value) {
     Taped x(value);
     x.entry = Tape::current().add(-1, 0, -1, 0);

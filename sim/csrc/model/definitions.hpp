@@ -64,7 +64,7 @@ struct ContactDef {
   std::string name;
   int points = 0, shape = 0;
   std::string law = "viscous";    // friction: viscous or elastic
-  std::string damping = "depth";  // depth (k_d scaled by depth, eq. 8) or plain
+  std::string damping = "depth";  // depth (k_d scaled by depth) or plain
   ContactParams<double> params{0, 0, 0, 0, 0};
 };
 

@@ -27,7 +27,7 @@ enum class ShapeKind : std::uint8_t {
   grid
 };
 enum class FrictionLaw : std::uint8_t { viscous, elastic };
-enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth (eq. 8), or not
+enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth, or not (contact_law.hpp)
 enum class ActuatorKind : std::uint8_t { motor, position, velocity, general };
 
 struct Body {

@@ -77,7 +77,7 @@ struct RoundingParams {
 };
 
 // Penalty contact: normal stiffness, tangential (viscous) coefficient, friction coefficient, damping, tangential
-// stiffness of the elastic law (eq. 8).
+// stiffness of the elastic law (contact_law.hpp).
 template <class T>
 struct ContactParams {
   static constexpr std::array names{"kn", "kt", "mu", "kd", "ks"};

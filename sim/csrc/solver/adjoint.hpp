@@ -1,11 +1,14 @@
 // The reverse pass of one step (eqs. 19-23).
 //
-// With b the gradient with respect to v_t, directly and through the increment β h v_t + γ δ, and A = ∂g/∂v_t at the
-// accepted state:
+// Equation numbers are those of the appendix of Xu et al., "Efficient Tactile Simulation with Differentiability for
+// Robotic Manipulation", CoRL 2022.
+//
+// The position increment of this step is β h v_t + γ δ. With b the gradient with respect to v_t, directly and through
+// the increment, A = ∂g/∂v_t at the accepted state, and c the multiplier of the residual g:
 //     Aᵀ c = b,   ∂L/∂u −= cᵀ ∂g/∂u,   ∂L/∂v* = Mᵀ c,
 //     ∂L/∂q_{t-1} = (∂q_t/∂q_{t-1})ᵀ (∂L/∂q_t − (∂g/∂q_t)ᵀ c),   ∂L/∂X_{t-1} −= cᵀ ∂g/∂X_{t-1}.
 // The anchors after the step depend on the state at its end: their gradient is added to ∂L/∂q_t and ∂L/∂v_t first. Under
-// BDF2 the increment is δ of the next step, and v_{t-1} its v_{t-2}.
+// BDF2 the position increment of this step is δ of the next step, and v_{t-1} its v_{t-2}.
 #pragma once
 
 #include "solver/step.hpp"

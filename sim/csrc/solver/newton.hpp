@@ -77,14 +77,14 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 // from the best iterate. If the line search gets stuck at a kink, the next direction uses the Jacobian just past it.
 //
 // Jacobian reuse. After an update that decreased the residual strongly, the factorized Jacobian serves one more update,
-// which costs a quarter. Such an update converges linearly and ends nearer to the tolerance, so double precision
-// tightens the tolerance by a safety factor; single precision has no room for one. Tight tolerances disable Jacobian
-// reuse.
+// which costs a quarter of an update that evaluates and factorizes the Jacobian. Such an update converges linearly and
+// ends nearer to the tolerance, so double precision tightens the tolerance by a safety factor; single precision has no
+// room for one. Tight tolerances disable Jacobian reuse.
 //
-// Unchecked final update. Where the residual is within the tolerance, or is expected to be within a tenth of it after an
-// update with the reused Jacobian, one more update is applied without evaluating its residual, unless the residual is
-// far below the tolerance already or anchors depend on the result. It is cheap and removes an error that would otherwise
-// accumulate over many steps.
+// Unverified last iteration. Where the residual is within the tolerance, or is expected to be within a tenth of it
+// after an update with the reused Jacobian, one more update is applied without evaluating its residual, unless the
+// residual is far below the tolerance already or anchors depend on the result. It is cheap and removes an error that
+// would otherwise accumulate over many steps.
 template <class T>
 class NewtonSolver {
  public:
@@ -135,7 +135,8 @@ class NewtonSolver {
     double residual;  // relative to the impulses at this iterate
   };
 
-  // At least 1000 (double) or 100 (single precision) rounding units; loose while the continuation factor is below 1.
+  // The tolerance is at least 1000 (double) or 100 (single precision) rounding units, and loose while the
+  // continuation factor is below 1.
   static double tolerance_of(const Model& m, const StepStart<T>& from) {
     constexpr double units = single_precision ? 100 : 1000;
     const double tolerance =
@@ -253,7 +254,7 @@ class NewtonSolver {
   int& iterations_;
   Workspace<T>& w_;
   const double tolerance_;
-  const bool inexact_;  // Jacobian reuse and the unchecked final update are allowed
+  const bool inexact_;  // Jacobian reuse and the unverified last iteration are allowed
   int polish_;
 
   double norm_ = 0, previous_norm_ = 0;    // of the residual at v, and before the last step

@@ -2,7 +2,8 @@
 //
 //     g(v_t) = β h · (inverse dynamics of (q_t, v_t, (v_t − v*)/(β h)) − f),    q_t = q_{t-1} ⊕ (β h v_t + γ δ)
 //
-// In the code h stands for β h.
+// with h the step length. In the code `h` is β h here and in what the residual calls; contact_law.hpp takes the step
+// length itself.
 #pragma once
 
 #include "contact/contact_forces.hpp"

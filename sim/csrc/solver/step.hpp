@@ -6,6 +6,9 @@
 //
 // solved for v_t (residual.hpp, newton.hpp). If the solver fails, the step is divided into substeps. BDF2 starts with one
 // step of BDF1, whose local error is of the order of BDF2's, and restarts after a step that was divided.
+//
+// Equation numbers are those of the appendix of Xu et al., "Efficient Tactile Simulation with Differentiability for
+// Robotic Manipulation", CoRL 2022.
 #pragma once
 
 #include <algorithm>
