@@ -372,7 +372,7 @@ def test_results_are_written_to_given_arrays(insertion: Scene) -> None:
         np.testing.assert_array_equal(own, results())
     with pytest.raises(
         UsageError,
-        match=re.escape("out must be a trajectory with u of shape (12, 5, 8) and 1 tactile evaluations, got"),
+        match=re.escape("out must be a trajectory with u of shape (12, 5, 8) and 1 tactile readings, got"),
     ):
         sim.rollout(u, read_after=(3,), out=other)
 
