@@ -12,7 +12,7 @@
 //     BDF2: ω* = 4/3 ω_{t-1} − 1/3 ω_{t-2}, where ω_{t-2} refers to the axes before δ: z = 1/3 (1 − exp(−[δ]×)) (ω_{t-2} × c)
 // Under BDF1 the weight acts along the arc of the centre of mass (arc_correction.hpp): the moment gains (N c) × (−m Rᵀ g).
 //
-// Derivatives, besides M by v_t:
+// Derivatives, in addition to M (by v_t):
 //     F by φ       −m R [y]×              moment   m [c]× [Rᵀ a]× − m [N c]× [Rᵀ g]×
 //     F by θ       −m/h R [u]× Jr(θ)      moment   m/h (−[c]× [u]× Jr(θ)) − m Σ_j (∂N/∂θ_j c) × Rᵀ g e_jᵀ
 //     moment by ω  [ω]× J − [J ω]×
