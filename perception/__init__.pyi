@@ -7,6 +7,7 @@ from .frames import CameraMount as CameraMount
 from .frames import decode_image as decode_image
 from .frames import tactile_frame as tactile_frame
 from .overlay import draw_overlay as draw_overlay
+from .scale import check_scale as check_scale
 from .sources import ImageSource as ImageSource
 from .sources import SourceImage as SourceImage
 from .sources import image_source as image_source
@@ -23,6 +24,7 @@ __all__ = [
     "TrackerConfig",
     "TrackerInitError",
     "TrackingResult",
+    "check_scale",
     "decode_image",
     "draw_overlay",
     "fit_calibration",

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 from gelflow.errors import GelflowError, PeerError, SafetyError
 from gelflow.perception.frames import CameraMount, decode_image
+from gelflow.perception.scale import check_scale
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 
 _VISIBLE_FRACTION = 0.8  # of the markers, at rest
+_COMPARED_IMAGES = 3  # consecutive images of each camera
 _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
 
 
@@ -52,6 +54,8 @@ def _result(name: str, check: Callable[[], str]) -> PreflightItem:
 
 
 def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
+    if sensor > 0:
+        _check_distinct(cell)
     image = cell.cameras[sensor].latest()
     picture = decode_image(image.data)
     if mount.calibration is not None:
@@ -60,8 +64,25 @@ def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     visible, total = int(tracked.valid.sum()), mount.rows * mount.cols
     if visible < _VISIBLE_FRACTION * total:
         raise PeerError(f"{visible} of {total} markers are visible; check the gel, its light and the camera")
+    check_scale(mount, tracked)
     age = cell.clock.now() - image.stamp
     return f"{visible} of {total} markers, {mount.rows} × {mount.cols}; newest image {1e3 * age:.0f} ms old"
+
+
+def _check_distinct(cell: Cell) -> None:
+    """Raise PeerError when both cameras deliver an identical image: sensor noise makes those of two cameras differ."""
+    newest = [-1, -1]
+    seen: tuple[set[bytes], set[bytes]] = set(), set()
+    for _ in range(_COMPARED_IMAGES):
+        for sensor, camera in enumerate(cell.cameras):
+            image = camera.next(newest[sensor], camera.timeout)
+            newest[sensor] = image.sequence
+            seen[sensor].add(image.data)
+    if seen[0] & seen[1]:
+        raise PeerError(
+            "it delivers the same images as the left camera: correct the sources in the lab file, each finger has its "
+            "own camera"
+        )
 
 
 def _arm(cell: Cell) -> str:

@@ -102,3 +102,23 @@ def test_run_command_refuses_invalid_files_in_one_line(tmp_path: Path, capsys: p
         assert main(["run", "insertion", *arguments]) == 2
         output = capsys.readouterr()
         assert expected in output.err and output.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("scale", [157.0, 1e12])
+def test_a_scale_that_does_not_fit_the_markers_is_refused(robot: MockRobot, tmp_path: Path, scale: float) -> None:
+    lab = lab_for(robot)
+    left, right = (replace(camera, pixels_per_mm=scale) for camera in (lab.cameras.left, lab.cameras.right))
+    lab = replace(lab, cameras=replace(lab.cameras, left=left, right=right))
+    with pytest.raises(SafetyError, match=r"left camera: .* pixels_per_mm = 15\.7\d* would fit; right camera: .*"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
+    assert robot.arm.report.largest_step < 1e-9
+
+
+def test_the_same_images_from_both_cameras_are_refused(robot: MockRobot, tmp_path: Path) -> None:
+    lab = lab_for(robot)
+    # Another spelling of the address of the left camera, so that the sources differ.
+    same = replace(lab.cameras.left, source=lab.cameras.left.source.replace("127.0.0.1", "localhost"))
+    lab = replace(lab, cameras=replace(lab.cameras, right=same))
+    with pytest.raises(SafetyError, match="right camera: it delivers the same images as the left camera"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
+    assert robot.arm.report.largest_step < 1e-9
