@@ -1,7 +1,7 @@
 """A fast renderer of undamaged gels for streaming mock cameras.
 
-Illumination, print and several sensor noise images are drawn once per appearance. An image then costs one small
-sprite per dot at a sub-pixel position, one multiplication and the JPEG encoder.
+Illumination, print and a field of sensor noise are drawn once per appearance. An image then costs one crop of the noise
+field, one small sprite per dot at a sub-pixel position, one multiplication and the JPEG encoder.
 """
 
 import cv2
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.appearance import GelAppearance
 
-_NOISE_IMAGES = 8  # precomputed images of the gel with sensor noise
+_NOISE_SHIFTS = 64  # crops of the noise field per axis [px]
 _PHASES = 64  # sprites per pixel and axis: dot positions are rounded to 1/128 px
 
 Image = NDArray[np.uint8]
@@ -29,10 +29,9 @@ class FastGelRenderer:
         printed[rng.permutation(markers)[: round(appearance.missing * markers)]] = False
         sign = 1.0 if appearance.bright else -1.0
         self._density = (sign * appearance.contrast * rng.normal(1.0, 0.04, markers).clip(0.8, 1.2)).astype(np.float32)
-        self._gels = [
-            (light + rng.normal(0, appearance.noise, light.shape)).clip(0, 255).astype(np.float32)
-            for _ in range(_NOISE_IMAGES)
-        ]
+        self._light = light
+        field = (appearance.height + _NOISE_SHIFTS, appearance.width + _NOISE_SHIFTS, 3)
+        self._noise = rng.normal(0, appearance.noise, field).astype(np.float32)
         self._rest = appearance.positions_mm()
         sprites, self._reach = _sprites(appearance)
         used = (sprites > 0).any(axis=0)  # drops the empty corners of the square
@@ -51,8 +50,8 @@ class FastGelRenderer:
     def render(self, displacement_mm: ArrayLike, *, sequence: int = 0) -> Image:
         """The image (B G R, uint8, shape (height, width, 3)) of the gel with displaced markers.
 
-        `displacement_mm` [mm], shape (rows * cols, 2), is along the pad's x and y axes; `sequence` selects the noise
-        image. Raises UsageError for a wrong shape or values that are not finite.
+        `displacement_mm` [mm], shape (rows * cols, 2), is along the pad's x and y axes; `sequence` selects the
+        noise, which repeats after 4096 images. Raises UsageError for a wrong shape or values that are not finite.
         """
         displacement = np.asarray(displacement_mm, dtype=float)
         if displacement.shape != self._rest.shape:
@@ -60,8 +59,10 @@ class FastGelRenderer:
         if not np.isfinite(displacement).all():
             raise UsageError("displacement of the markers must be finite")
         factor = self._draw_dots(self.appearance.to_pixels(self._rest + displacement))
-        # Knuth's multiplicative hash avoids a visible cycle of the noise images.
-        gel = self._gels[(sequence * 2654435761 % 2**32) * _NOISE_IMAGES >> 32]
+        # The odd factor visits every crop once before it repeats one, in an order without a visible motion.
+        down, right = divmod(sequence * 2531 % _NOISE_SHIFTS**2, _NOISE_SHIFTS)
+        noise = self._noise[down : down + self.appearance.height, right : right + self.appearance.width]
+        gel = cv2.add(self._light, noise)
         return np.asarray(cv2.multiply(gel, cv2.merge([factor] * 3), dtype=cv2.CV_8U), dtype=np.uint8)
 
     def encode(self, image: Image) -> bytes:

@@ -9,6 +9,7 @@ from typing import Self
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import CameraImage
+from gelflow.real.camera.liveness import RepeatFilter
 from gelflow.time_sync import MIN_WAIT
 
 OnImage = Callable[[CameraImage], None]
@@ -16,6 +17,9 @@ OnImage = Callable[[CameraImage], None]
 
 class StreamCamera(ABC):
     """A `gelflow.protocols.Camera` whose images a thread receives; only the newest image is kept.
+
+    An image that repeats a recent one is passed to `on_image` but is not new: `latest` and `next` do not return it, so
+    that a frozen camera ends in their time-outs as a silent one does. `repeated` counts such images.
 
     `on_image` is called with every image in the reader thread, before the image is available to callers: a recording
     therefore holds each image before any decision based on it. An exception of `on_image` ends the stream and is
@@ -34,6 +38,9 @@ class StreamCamera(ABC):
         self._on_image = on_image
         self._changed = threading.Condition()
         self._newest: CameraImage | None = None
+        self.repeated = 0  # number of received images that repeat a recent one
+        self._repeated_since = 0  # of these, since the newest image
+        self._repeats = RepeatFilter()  # continues after a reconnect, which does not revive a frozen server
         self._count = 0  # continues after a reconnect, so that a sequence number is unique within a session
         self._failure: GelflowError | None = None
         self._thread: threading.Thread | None = None
@@ -53,6 +60,7 @@ class StreamCamera(ABC):
         with self._changed:
             self._failure = None
             self._newest = None
+            self._repeated_since = 0
         self._thread = threading.Thread(
             target=self._receive, args=(self._closing,), name=f"camera {self.name}", daemon=True
         )
@@ -85,7 +93,7 @@ class StreamCamera(ABC):
     def latest(self) -> CameraImage:
         """The newest image, at most `timeout` old; directly after opening, waits up to `timeout` for the first image.
 
-        Raises PeerTimeout when there is none, PeerError when the stream has ended.
+        Raises PeerTimeout when there is none or the camera repeats an image, PeerError when the stream has ended.
         """
         with self._changed:
             self._raise_unopened()
@@ -152,10 +160,16 @@ class StreamCamera(ABC):
 
     def _accept(self, image: CameraImage) -> None:
         self._count += 1
+        repeat = self._repeats.is_repeat(image.data)
         if self._on_image is not None:
             self._on_image(image)
         with self._changed:
+            if repeat:
+                self.repeated += 1
+                self._repeated_since += 1
+                return
             self._newest = image
+            self._repeated_since = 0
             self._changed.notify_all()
 
     def _raise_failure(self) -> None:
@@ -171,6 +185,9 @@ class StreamCamera(ABC):
         last = "none so far"
         if self._newest is not None:
             last = f"the last {self._clock.now() - self._newest.stamp:.2f} s ago"
+        if self._repeated_since:
+            reason = f"repeats the same image ({self._repeated_since} times) from {self.source}; new images: {last}"
+            return PeerTimeout(f"camera {self.name}: {reason}; the camera or its server is frozen")
         damaged = f", {self.damaged} damaged" if self.damaged else ""
         reason = f"no new image from {self.source} within {waited:g} s ({last}{damaged})"
         return PeerTimeout(f"camera {self.name}: {reason}; check the camera")
