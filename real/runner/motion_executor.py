@@ -22,6 +22,8 @@ from gelflow.session.recorder import SessionRecorder
 RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
 _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
 _ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
+_PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of _ARRIVED
+_BLOCKED_AFTER = 3.0  # without progress [s]
 
 
 class PartLost(PeerError):
@@ -118,21 +120,18 @@ class MotionExecutor:
         return self.pose().is_near(goal, within, _ARRIVED[1])
 
     def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
-        """Move to `target` and wait for the arrival. Raises PeerTimeout after twice the expected time plus 3 s."""
-        start = self.pose()
+        """Move to `target` and wait for the arrival. Raises PeerTimeout when the arm comes no closer for 3 s."""
         self.go(target, speed=speed)
-        linear = float(np.linalg.norm(target.position - start.position)) / self._speeds[0]
-        angular = angle_between(start.quaternion, target.quaternion) / self._speeds[1]
-        limit = 2 * max(linear, angular) + 3.0
-        end = self._clock.now() + limit
+        progress = self.progress(target)
         while not self.arrived():
             if while_moving is not None:
                 while_moving()
-            if self._clock.now() > end:
-                self.hold()
-                off = float(np.linalg.norm(self.pose().position - target.position))
-                raise PeerTimeout(f"the arm is {1e3 * off:.2f} mm from its target after {limit:.1f} s; is it blocked?")
+            progress.check()
             self.wait(0.02)
+
+    def progress(self, target: Pose) -> "Progress":
+        """Monitors from now on whether the arm comes closer to `target`."""
+        return Progress(self, target, self._clock)
 
     def wait(self, seconds: float) -> None:
         """Wait for `seconds` of robot time. Raises the failure of the thread, or PartLost."""
@@ -252,3 +251,31 @@ class MotionExecutor:
     def _raise_failure(self) -> None:
         if self.failure is not None:
             raise type(self.failure)(*self.failure.args) from self.failure
+
+
+class Progress:
+    """Monitors that the arm comes closer to a target.
+
+    The controller may follow more slowly than the reference may move (MaxSpeedDeviation), so the duration of a motion
+    does not show whether the arm is blocked.
+    """
+
+    def __init__(self, motion: MotionExecutor, target: Pose, clock: Clock) -> None:
+        self._motion, self._target, self._clock = motion, target, clock
+        self._best, self._since = math.inf, clock.now()
+
+    def check(self) -> None:
+        """Hold and raise PeerTimeout when the arm came no closer for 3 s [robot time]."""
+        pose = self._motion.pose()
+        distance = float(np.linalg.norm(pose.position - self._target.position)) / _ARRIVED[0]
+        turn = angle_between(pose.quaternion, self._target.quaternion) / _ARRIVED[1]
+        remaining = max(distance, turn)  # 1 at the arrival
+        if remaining < self._best - _PROGRESS:
+            self._best, self._since = remaining, self._clock.now()
+        elif self._clock.now() - self._since > _BLOCKED_AFTER:
+            self._motion.hold()
+            millimetres, degrees = 1e3 * distance * _ARRIVED[0], math.degrees(turn * _ARRIVED[1])
+            raise PeerTimeout(
+                f"the arm is {millimetres:.2f} mm and {degrees:.2f}° from its target and came no closer for "
+                f"{_BLOCKED_AFTER:g} s; is it blocked, or slower than its MaxSpeedDeviation?"
+            )
