@@ -13,6 +13,8 @@ from .simulated_cell.cell import SimulatedCell as SimulatedCell
 from .simulated_cell.cell import SimulatedCellConfig as SimulatedCellConfig
 from .simulated_cell.cell import preset_config as preset_config
 from .simulated_cell.process import SimulatedCellProcess as SimulatedCellProcess
+from .simulated_cell.world import World as World
+from .simulated_cell.world import load_world as load_world
 from .wsg.device import MockWsgGripper as MockWsgGripper
 from .wsg.finger_controller import MockWsgConfig as MockWsgConfig
 
@@ -33,5 +35,7 @@ __all__ = [
     "SimulatedCell",
     "SimulatedCellConfig",
     "SimulatedCellProcess",
+    "World",
+    "load_world",
     "preset_config",
 ]

@@ -7,9 +7,13 @@ import tempfile
 import threading
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
@@ -21,6 +25,7 @@ from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
+from gelflow.perception.synthetic.lens import Lens
 from gelflow.real.kinematics import Joints
 from gelflow.time_sync import LEFT_CAMERA, RIGHT_CAMERA, TimeSync
 
@@ -39,9 +44,21 @@ class MockRobotConfig:
     egm_port: int = 6510  # UDP port to which the arm sends its feedback
     tcp_port: int = 0  # of the gripper, in addition to its pty; 0 takes a free port
     truth_port: int = 0  # of the HTTP server of the ground truth; 0 takes a free port
-    camera_rate: float = 12.5  # images per second: one every 80 ms, as in the real cell
-    look: GelAppearance = field(default_factory=GelAppearance)
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
+
+    def view(self, finger: int) -> tuple[GelAppearance, Lens]:
+        """Appearance of a gel in its camera's ideal image, and the camera's lens; finger 0 is the left one."""
+        world, rotation = self.cell.world, self.rotations[finger]
+        camera = world.cameras[finger]
+        look = camera.appearance(world.markers, seed=finger)
+        turned = (look.height, look.width) if rotation in (90, 270) else (look.width, look.height)
+        return replace(look, rotation=rotation, width=turned[0], height=turned[1]), camera.lens
+
+    def print_error(self, finger: int) -> NDArray[np.float64]:
+        """Positions of the printed markers relative to the regular grid [mm], shape (markers, 2)."""
+        markers = self.cell.world.markers
+        rng = np.random.default_rng((finger, 0x9F1))
+        return rng.normal(0.0, markers.jitter_mm, (markers.rows * markers.cols, 2))
 
 
 class MockRobot:
@@ -60,14 +77,15 @@ class MockRobot:
         self.cell = SimulatedCellProcess(clock, config.cell)
         # CommTimeout is 0.4 s in wall time, because the computer's jitter does not scale with the clock.
         timeout = 0.4 * max(1.0, clock.factor)
-        controller = MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR, comm_timeout=timeout)
+        lag = config.cell.world.arm.lag
+        controller = MockEgmConfig(host=config.host, port=config.egm_port, near=_NEAR, comm_timeout=timeout, lag=lag)
         self.arm = MockEgmArm(self.cell, clock=clock, config=controller)
         self.gripper = MockWsgGripper(self.cell, clock=clock, tcp_port=config.tcp_port, host=config.host)
         self.cameras = tuple(
             MockMjpegCamera(
-                _Gel(self.cell, finger, _look(config, finger)),
+                _Gel(self.cell, finger, config),
                 clock,
-                rate=config.camera_rate,
+                rate=config.cell.world.cameras[finger].rate,
                 host=config.host,
                 slot=slot,
             )
@@ -75,6 +93,11 @@ class MockRobot:
         )
         self._truth = _TruthServer((config.host, config.truth_port), self.cell)
         self._stack = contextlib.ExitStack()
+
+    @property
+    def folder(self) -> Path:
+        """A folder that is removed when the robot stops."""
+        return Path(self._folder.name)
 
     @property
     def truth_url(self) -> str:
@@ -109,26 +132,20 @@ class MockRobot:
         self.stop()
 
 
-def _look(config: MockRobotConfig, finger: int) -> GelAppearance:
-    rotation = config.rotations[finger]
-    width, height = config.look.width, config.look.height
-    turned = (height, width) if rotation in (90, 270) else (width, height)
-    look = replace(config.look, grid=config.cell.grid, seed=config.look.seed + finger)
-    return replace(look, rotation=rotation, width=turned[0], height=turned[1])
-
-
 class _Gel:
     """Image source of one camera."""
 
-    def __init__(self, cell: SimulatedCellProcess, finger: int, look: GelAppearance) -> None:
+    def __init__(self, cell: SimulatedCellProcess, finger: int, config: MockRobotConfig) -> None:
         self._cell, self._finger = cell, finger
-        self._renderer = FastGelRenderer(look)
+        appearance, lens = config.view(finger)
+        self._renderer = FastGelRenderer(appearance, lens=lens)
+        self._printed = config.print_error(finger)
         self._count = 0
 
     def __call__(self) -> bytes:
         self._count += 1
-        image = self._renderer.render(self._cell.marker_displacement(self._finger), sequence=self._count)
-        return self._renderer.encode(image)
+        displacement = self._printed + self._cell.marker_displacement(self._finger)
+        return self._renderer.encode(self._renderer.render(displacement, sequence=self._count))
 
 
 class _TruthServer(ThreadingHTTPServer):

@@ -15,6 +15,7 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.time_sync import MAX_LEAD
 
 BOUNDARY = "boundarydonotcross"
+CLOCK_OFFSET = 1.7e9  # of the camera's own clock from robot time [s]: a client cannot compare the two
 Corruption = Literal["truncated", "garbage", "length"]
 CORRUPTIONS: tuple[Corruption, ...] = ("truncated", "garbage", "length")
 
@@ -48,6 +49,7 @@ class MockMjpegCamera:
         self._threads: list[threading.Thread] = []
         self._changed = threading.Condition()
         self._image = b""
+        self._stamp = 0.0  # of the image, on the camera's own clock [s]
         self._number = 0  # of images created
         self._watchers = 0
         self._closing = False
@@ -155,7 +157,7 @@ class MockMjpegCamera:
                     self._changed.notify_all()
                 return
             with self._changed:
-                self._image = image
+                self._image, self._stamp = image, self._clock.now() + CLOCK_OFFSET
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
@@ -173,8 +175,8 @@ class MockMjpegCamera:
             self._changed.notify_all()
             return self._epoch
 
-    def _next(self, after: int, epoch: int) -> tuple[int, bytes, Corruption | None] | None:
-        """The newest image with a number above `after`; None when the stream ends."""
+    def _next(self, after: int, epoch: int) -> tuple[int, bytes, float, Corruption | None] | None:
+        """Number, image and stamp of the newest image with a number above `after`; None when the stream ends."""
 
         def ended() -> bool:
             return self._closing or self._failure is not None or self._epoch != epoch
@@ -184,7 +186,7 @@ class MockMjpegCamera:
             if ended():
                 return None
             corruption = self._corrupt.pop(0) if self._corrupt else None
-            return self._number, self._image, corruption
+            return self._number, self._image, self._stamp, corruption
 
     def _newest(self) -> int:
         with self._changed:
@@ -231,8 +233,8 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self.wfile.write(f"--{BOUNDARY}\r\n".encode())
             while (step := camera._next(number, epoch)) is not None:
-                number, image, corruption = step
-                self.wfile.write(_part(image, corruption))
+                number, image, stamp, corruption = step
+                self.wfile.write(_part(image, stamp, corruption))
         except OSError:
             return  # the client has disconnected
         finally:
@@ -256,8 +258,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(step[1])
 
 
-def _part(image: bytes, corruption: Corruption | None) -> bytes:
-    """One part of the stream and the boundary behind it, in the order of mjpg-streamer."""
+def _part(image: bytes, stamp: float, corruption: Corruption | None) -> bytes:
+    """One part of the stream and the boundary behind it, with the headers and in the order of mjpg-streamer."""
     length, body = len(image), image
     if corruption == "truncated":
         body = image[: len(image) // 2]
@@ -267,5 +269,5 @@ def _part(image: bytes, corruption: Corruption | None) -> bytes:
         length = len(body)
     elif corruption == "length":
         length = 10 * len(image)
-    head = f"Content-Type: image/jpeg\r\nContent-Length: {length}\r\n\r\n".encode()
+    head = f"Content-Type: image/jpeg\r\nContent-Length: {length}\r\nX-Timestamp: {stamp:.6f}\r\n\r\n".encode()
     return head + body + f"\r\n--{BOUNDARY}\r\n".encode()

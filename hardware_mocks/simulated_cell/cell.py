@@ -8,7 +8,7 @@ one by a random misalignment for every part; `truth` returns it, the devices do 
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
+from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside, lower_face_corners
+from gelflow.hardware_mocks.simulated_cell.world import PART_SIZE, World
 from gelflow.observation import Grid, resampling_weights
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -26,10 +29,7 @@ from gelflow.time_sync import MAX_LEAD, MIN_WAIT, SIMULATED_CELL
 
 Array = NDArray[np.float64]
 _PARKED_POSE = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # of a part that is not in use [m], w x y z
-_HALF_HEIGHT = 0.030  # of the part [m]
-_PART_WIDTH = 0.035  # between the pads [m]
-_HOLE = (0.01975, 0.02725)  # half its opening [m]
-_INTO_WALL = 0.3e-3  # largest penetration of an inserted part into a wall of the hole [m]
+_TRUTH_PERIOD = 0.016  # of measurements of a gripped part's slip [s]
 _AT_REST = (2e-5, math.radians(0.02))  # largest motion of a tool at rest [m, rad]
 
 
@@ -37,15 +37,13 @@ _AT_REST = (2e-5, math.radians(0.02))  # largest motion of a tool at rest [m, ra
 class SimulatedCellConfig:
     """Parameters of the simulated cell. Lengths in metres, angles in radians, times in robot time."""
 
+    world: World = field(default_factory=World)
     hole: Pose = field(default_factory=lambda: Pose(np.array([0.374, 0.05, 0.05]), yaw_quaternion(0.0)))
     tool: Pose = field(default_factory=lambda: Pose(np.array([0.0, 0.0, 0.18]), np.array([0.0, 1.0, 0.0, 0.0])))
-    grid: Grid = Grid(rows=18, cols=14, pitch=1.4, center=(2.0, 0.0))  # markers printed on the gels [mm]
     grasp_height: float = 0.030  # of the pad centres above the part's lower face [m]
     load_height: float = 0.032  # of the lower face above the hole's floor when the operator presents a part [m]
     height_error: float = 0.2e-3  # largest height error of a presented part [m]
     step: float = 4e-3  # time step of the simulation [s]; must divide EGM's 4 ms
-    arm_stiffness: float = 1e5  # [N/m]
-    yaw_stiffness: float = 500.0  # [N m/rad]
     start_width: float = 0.060  # between the fingers [m]
     seed: int = 0  # of the first part; incremented for each further part
     preset: str | None = None  # of the insertion scene, except for its step: see `preset_config`
@@ -54,37 +52,33 @@ class SimulatedCellConfig:
         if not 0 < self.step <= 4e-3 or abs(4e-3 / self.step - round(4e-3 / self.step)) > 1e-9:
             raise UsageError(f"the time step of the simulated cell must divide 4 ms, got {self.step} s")
 
+    @property
+    def grid(self) -> Grid:
+        """The grid of the markers printed on the gels [mm]."""
+        return self.world.markers.grid
+
+    @property
+    def taught_hole(self) -> Pose:
+        """The taught pose of the hole in the base frame; `hole` is the true one."""
+        return self.hole @ self.world.taught_error.pose
+
     def start_tool(self) -> tuple[Array, Array]:
         """Initial tool pose, with the gripper ready to be loaded: position [m] and quaternion w x y z."""
-        taught = Pose(np.array([0.0, 0.0, self.load_height + self.grasp_height]), yaw_quaternion(0.0))
-        pose = self.hole @ taught @ self.tool.inverse()
+        above = Pose(np.array([0.0, 0.0, self.load_height + self.grasp_height]), yaw_quaternion(0.0))
+        pose = self.taught_hole @ above @ self.tool.inverse()
         return pose.position, pose.quaternion
 
 
-def preset_config(preset: str | None, *, seed: int) -> SimulatedCellConfig:
+def preset_config(preset: str | None, *, seed: int, world: World | None = None) -> SimulatedCellConfig:
     """The cell with a preset of the insertion scene; its step is the longest that divides 4 ms and is not longer.
 
     Raises UsageError when there is no such preset.
     """
+    config = SimulatedCellConfig(seed=seed, world=world or World())
     if preset is None:
-        return SimulatedCellConfig(seed=seed)
+        return config
     step = load_scene("insertion", preset=preset).step
-    return SimulatedCellConfig(seed=seed, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
-
-
-@dataclass
-class PartTruth:
-    """Ground truth of one part."""
-
-    seed: int
-    misalignment: tuple[float, float, float]  # of the gripper at the taught pose, in the hole's frame [m, m, rad]
-    phase: str = "presented"  # presented, gripped, released
-    height: float = 0.0  # of the lower face's highest corner above the hole's floor, when last held [m]
-    x: float = 0.0  # of the part in the hole frame [m]
-    y: float = 0.0
-    yaw: float = 0.0  # [rad]
-    slip: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the part relative to the gripper frame [m, m, rad]
-    inserted: bool = False  # in the hole when last held
+    return replace(config, preset=preset, step=4e-3 / math.ceil(4e-3 / step - 1e-9))
 
 
 class SimulatedCell:
@@ -97,9 +91,7 @@ class SimulatedCell:
         self._clock, self._task = clock, task
         scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
         self._sim = sim = Simulator(scene, threads=1)
-        for name in ("arm_x", "arm_y", "arm_z"):
-            self._servo(name, config.arm_stiffness, 1000.0)
-        self._servo("arm_yaw", config.yaw_stiffness, 200.0)
+        self._physics = CellPhysics(sim, config.world)
         self._arm = [sim.joint_q(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         self._part = sim.joint_q("part")
         self._part_v = sim.joint_v("part")
@@ -109,7 +101,7 @@ class SimulatedCell:
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         sim.reset()
         sim.q[0] = scene.q0
-        self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=_PART_WIDTH)
+        self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=PART_SIZE[0])
         self._lock = threading.Lock()
         self._time = clock.now()
         self._still_since = self._time
@@ -119,6 +111,10 @@ class SimulatedCell:
         self._held_pose: Array | None = _PARKED_POSE
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
+        self._slip: SlipMonitor | None = None  # while a part is gripped
+        self._truth_due = 0.0  # time of its next measurement [s]
+        contacts = enumerate(sim.model.contact_names)
+        self._hole_contacts = [i for i, name in contacts if name.startswith(("part_hole", "part_floor"))]
         self._tool = self._rest = self._start = Pose(*config.start_tool())
         self._reset_arm()
         self._hold_part()
@@ -189,7 +185,9 @@ class SimulatedCell:
         """Displacement of the printed markers on both pads [mm], shape (2, markers, 2)."""
         with self._lock:
             moved = 1e3 * self._sim.displacement()[0]
-        return np.stack([weights @ moved[pad, :2] for weights, pad in zip(self._weights, self._pads, strict=True)])
+            compliance = self._physics.gel_compliance
+        pads = zip(self._weights, self._pads, compliance, strict=True)
+        return np.stack([weights @ (soft * moved[pad, :2]) for weights, pad, soft in pads])
 
     # Ground truth, not available to the devices
 
@@ -211,10 +209,6 @@ class SimulatedCell:
             }
 
     # Internal; the caller holds the lock
-
-    def _servo(self, name: str, stiffness: float, force: float) -> None:
-        for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
-            self._sim.param(f"{name}.{key}")[:] = value
 
     def _in_scene(self) -> Array:
         """Positions of the arm's four joints in the scene for the present tool pose: x, y, z [m], yaw [rad]."""
@@ -251,16 +245,20 @@ class SimulatedCell:
         elif part.phase == "presented":
             if self._gripper.locked:
                 self._held_pose, part.phase = None, "gripped"
+                self._slip = SlipMonitor(part, gripper=self._gripper_pose(), part=self._part_pose())
         elif part.phase == "gripped":
             if not self._gripper.locked:
                 self._measure(part)
-                part.phase = "released"
+                part.phase, self._slip = "released", None
+            elif self._time >= self._truth_due:
+                self._truth_due = self._time + _TRUTH_PERIOD - 1e-9
+                self._monitor_slip()
         elif self._ready_to_load():
             self._held_pose, self._current = _PARKED_POSE, None
 
     def _ready_to_load(self) -> bool:
         """Whether the fingers are open and the arm is at rest at the hand-over pose."""
-        open_wide = self._gripper.width() > _PART_WIDTH + 0.005
+        open_wide = self._gripper.width() > PART_SIZE[0] + 0.005
         there = self._tool.is_near(self._start, 1e-3, math.radians(1.0))
         return open_wide and there and self._time - self._still_since > 0.3
 
@@ -268,14 +266,17 @@ class SimulatedCell:
         """Sample the misalignment of the next part and hold the part between the fingers."""
         rng = np.random.default_rng((self._next_seed, 0x6E1))
         x, y, yaw = self._task.draw_misalignment(rng, 1)[0]
-        self._to_scene = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)) @ self._hole_to_base
+        misaligned = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw))
+        self._to_scene = misaligned @ self._hole_to_base
         self._reset_arm()
         gx, gy, gz, turn = self._in_scene()
-        z = gz - self.config.grasp_height + _HALF_HEIGHT + rng.uniform(-1, 1) * self.config.height_error
+        z = gz - self.config.grasp_height + PART_SIZE[2] / 2 + rng.uniform(-1, 1) * self.config.height_error
         self._held_pose = np.array([gx, gy, z, *yaw_quaternion(turn)])
         self._hold_part()
         self._sim.clear_history()
-        self._current = PartTruth(self._next_seed, (float(x), float(y), float(yaw)))
+        taught = misaligned @ self.config.world.taught_error.pose
+        where = (float(taught.position[0]), float(taught.position[1]), taught.yaw)
+        self._current = PartTruth(self._next_seed, where)
         self.parts.append(self._current)
         self._next_seed += 1
 
@@ -283,22 +284,26 @@ class SimulatedCell:
         q = self._sim.q[0, self._part : self._part + 7]
         return Pose(q[:3].copy(), q[3:].copy())
 
-    def _lower_face(self, pose: Pose) -> Array:
-        """Corners of the part's lower face in the hole frame [m], shape (4, 3)."""
-        half = (_PART_WIDTH / 2, 0.025, -_HALF_HEIGHT)
-        corners = [np.array([i * half[0], j * half[1], half[2]]) for i in (-1, 1) for j in (-1, 1)]
-        return pose.apply(np.array(corners))
+    def _gripper_pose(self) -> Pose:
+        x, y, z, yaw = (float(v) for v in self._sim.q[0, self._arm])
+        return Pose(np.array([x, y, z]), yaw_quaternion(yaw))
+
+    def _monitor_slip(self) -> None:
+        assert self._slip is not None
+        force = np.linalg.norm(self._sim.wrenches()[0, self._hole_contacts, 3:].sum(axis=0))
+        self._slip.update(
+            self._time, tool=self._tool, gripper=self._gripper_pose(), part=self._part_pose(), force=float(force)
+        )
 
     def _measure(self, part: PartTruth) -> None:
         """Update the ground truth of a part until its release, so that it describes the pose reached by the robot."""
         if part.phase == "released":
             return
         pose = self._part_pose()
-        corners = self._lower_face(pose)
+        corners = lower_face_corners(pose)
         part.x, part.y = float(pose.position[0]), float(pose.position[1])
         part.yaw, part.height = pose.yaw, float(corners[:, 2].max())
-        x, y, z, yaw = (float(v) for v in self._sim.q[0, self._arm])
-        slip = Pose(np.array([x, y, z]), yaw_quaternion(yaw)).inverse() @ pose
+        slip = self._gripper_pose().inverse() @ pose
         part.slip = float(slip.position[0]), float(slip.position[1]), slip.yaw
-        inside = bool((np.abs(corners[:, :2]) < np.array(_HOLE) + _INTO_WALL).all())
+        inside = is_inside(corners, self.config.world.hole.half_opening)
         part.inserted = part.phase == "gripped" and inside and part.height < self._task.success_height

@@ -24,7 +24,7 @@ from gelflow.session.records import from_plain, to_plain
 Array = NDArray[np.float64]
 _START_LIMIT = 30.0  # [s, wall]
 _ANSWER_LIMIT = 5.0  # [s, wall]
-_GEL_PERIOD = 0.02  # period of marker readings, several per camera image [s]
+_GEL_PERIOD = 0.008  # period of marker readings, several per camera image [s]
 
 
 class _SharedBlock:

@@ -10,18 +10,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.lens import Lens
 
 _NOISE_SHIFTS = 64  # crops of the noise field per axis [px]
 _PHASES = 64  # sprites per pixel and axis: dot positions are rounded to 1/128 px
 
 Image = NDArray[np.uint8]
+Map = NDArray[np.float32]
 
 
 class FastGelRenderer:
-    """Renders one gel. Equal appearance, displacement and sequence number give bit-identical images."""
+    """Renders one gel. Equal appearance, displacement and sequence number give bit-identical images.
 
-    def __init__(self, appearance: GelAppearance | None = None) -> None:
+    `lens` moves and deforms the dots. Illumination and sensor noise belong to the image and are not distorted.
+    """
+
+    def __init__(self, appearance: GelAppearance | None = None, *, lens: Lens | None = None) -> None:
         self.appearance = appearance = GelAppearance() if appearance is None else appearance
+        self._pad, self._sources = 0, None  # border of the ideal image that the lens moves into view [px]
+        if lens is not None and not lens.ideal:
+            self._pad, self._sources = _padded(lens.sources(appearance))
         rng = np.random.default_rng(appearance.seed)
         light = illumination(appearance, rng)
         markers = appearance.grid.rows * appearance.grid.cols
@@ -36,7 +44,7 @@ class FastGelRenderer:
         sprites, self._reach = _sprites(appearance)
         used = (sprites > 0).any(axis=0)  # drops the empty corners of the square
         self._sprites = np.ascontiguousarray(sprites[:, used])
-        self._margin = 2 * self._reach + 2
+        self._margin = 2 * self._reach + 2 + self._pad
         self._ink = np.ones(
             (appearance.height + 2 * self._margin, appearance.width + 2 * self._margin), dtype=np.float32
         )
@@ -59,6 +67,8 @@ class FastGelRenderer:
         if not np.isfinite(displacement).all():
             raise UsageError("displacement of the markers must be finite")
         factor = self._draw_dots(self.appearance.to_pixels(self._rest + displacement))
+        if self._sources is not None:
+            factor = np.asarray(cv2.remap(factor, *self._sources, cv2.INTER_LINEAR), dtype=np.float32)
         # The odd factor visits every crop once before it repeats one, in an order without a visible motion.
         down, right = divmod(sequence * 2531 % _NOISE_SHIFTS**2, _NOISE_SHIFTS)
         noise = self._noise[down : down + self.appearance.height, right : right + self.appearance.width]
@@ -73,13 +83,13 @@ class FastGelRenderer:
         return data.tobytes()
 
     def _draw_dots(self, centers: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Brightness factor of the dots at each pixel, shape (height, width)."""
-        appearance, margin = self.appearance, self._margin
+        """Brightness factor of the dots at each pixel, shape (height + 2 pad, width + 2 pad)."""
+        appearance, margin, pad = self.appearance, self._margin, self._pad
         self._ink[:] = 1
         flat, stride = self._ink.reshape(-1), self._ink.shape[1]
         # Dots far outside the image are moved to just outside, which keeps their index in the padded image valid.
-        limit = np.array([appearance.width, appearance.height]) + self._reach
-        centers = np.clip(centers, -self._reach - 1.0, limit)
+        limit = np.array([appearance.width, appearance.height]) + self._reach + pad
+        centers = np.clip(centers, -self._reach - 1.0 - pad, limit)
         fine = np.round(centers * _PHASES).astype(np.intp)
         whole, phase = fine // _PHASES, fine % _PHASES
         first = (whole[:, 1] + margin) * stride + whole[:, 0] + margin
@@ -88,7 +98,17 @@ class FastGelRenderer:
         for markers in self._classes:
             pixels = first[markers, None] + self._steps
             flat[pixels] = keep(flat[pixels], 1 + self._density[markers, None] * self._sprites[sprite[markers]])
-        return self._ink[margin : margin + appearance.height, margin : margin + appearance.width]
+        first_pixel = margin - pad
+        return self._ink[first_pixel : margin + appearance.height + pad, first_pixel : margin + appearance.width + pad]
+
+
+def _padded(sources: tuple[Map, Map]) -> tuple[int, tuple[Map, Map]]:
+    """The border that contains all source positions [px], and the positions relative to its corner."""
+    height, width = sources[0].shape
+    right, down = sources
+    outside = max(-right.min(), right.max() - (width - 1), -down.min(), down.max() - (height - 1), 0.0)
+    pad = int(np.ceil(outside)) + 1
+    return pad, (right + np.float32(pad), down + np.float32(pad))
 
 
 def _sprites(appearance: GelAppearance) -> tuple[NDArray[np.float32], int]:

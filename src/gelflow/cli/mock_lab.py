@@ -1,8 +1,13 @@
 """The lab file's content for a running mock robot."""
 
 import math
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
+
+from gelflow.perception.calibration import fit_calibration, save_calibration
+from gelflow.perception.frames import CameraMount
 from gelflow.real.runner import lab
 
 if TYPE_CHECKING:
@@ -16,6 +21,7 @@ _TIMEOUT_SCALE = 12
 def lab_for(robot: "MockRobot") -> lab.Lab:
     """Addresses, calibration, taught poses and time limits of `robot`."""
     cell = robot.config.cell
+    taught = cell.taught_hole
     factor, time_sync = robot.clock.settings
     return lab.Lab(
         gripper=lab.GripperSettings(
@@ -35,7 +41,7 @@ def lab_for(robot: "MockRobot") -> lab.Lab:
             cast("lab.Vector", tuple(cell.tool.position.tolist())),
             cast("tuple[float, float, float, float]", tuple(cell.tool.quaternion.tolist())),
         ),
-        hole=lab.HoleSettings(cast("lab.Vector", tuple(cell.hole.position.tolist())), math.degrees(cell.hole.yaw)),
+        hole=lab.HoleSettings(cast("lab.Vector", tuple(taught.position.tolist())), math.degrees(taught.yaw)),
         part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
@@ -46,17 +52,39 @@ def lab_for(robot: "MockRobot") -> lab.Lab:
 
 
 def _camera(robot: "MockRobot", finger: int) -> lab.CameraSettings:
-    grid, look = robot.config.cell.grid, robot.config.look
+    grid, view = robot.config.cell.grid, robot.config.cell.world.cameras[finger]
+    scale: dict[str, Any] = {"pixels_per_mm": view.pixels_per_mm}
+    if view.calibrated and not view.lens.ideal:
+        scale = {"calibration": str(_write_calibration(robot, finger))}
     return lab.CameraSettings(
         source=robot.cameras[finger].url,
         rows=grid.rows,
         cols=grid.cols,
         pitch_mm=grid.pitch,
-        pixels_per_mm=look.pixels_per_mm,
         center_mm=grid.center,
         rotation_deg=robot.config.rotations[finger],
-        mirrored=look.mirrored,
+        mirrored=True,
+        **scale,
     )
+
+
+def _write_calibration(robot: "MockRobot", finger: int) -> Path:
+    """Calibrate a camera from its marker positions at rest, as `gelflow calibrate-camera` does from an image."""
+    config = robot.config
+    grid = config.cell.grid
+    appearance, lens = config.view(finger)
+    mount = CameraMount(grid.rows, grid.cols, grid.pitch, grid.center, config.rotations[finger])
+    on_pad = lens.apply(appearance.to_pixels(grid.positions() + config.print_error(finger)), appearance)
+    in_image = np.empty_like(on_pad)
+    in_image[mount.marker_order()] = on_pad
+    size = (appearance.width, appearance.height)
+    inside = np.all((in_image >= 0) & (in_image <= np.array(size) - 1), axis=1)
+    rows, cols = mount.image_grid
+    fit = fit_calibration(in_image, inside, rows=rows, cols=cols, spacing_mm=grid.pitch, size=size)
+    path = robot.folder / f"camera_{finger}.json"
+    path.unlink(missing_ok=True)
+    save_calibration(fit, path)
+    return path
 
 
 def _limits(scale: float) -> lab.LimitsSettings:

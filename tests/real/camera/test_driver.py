@@ -6,6 +6,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, UsageError
-from gelflow.hardware_mocks.camera.device import Corruption, MockMjpegCamera
+from gelflow.hardware_mocks.camera.device import CLOCK_OFFSET, Corruption, MockMjpegCamera
 from gelflow.protocols import Camera, CameraImage
 from gelflow.real.camera.driver import MjpegCamera, UvcCamera, open_camera
 
@@ -305,3 +306,16 @@ def test_jpeg_bytes_of_a_device_are_passed_on() -> None:
     assert camera._encode(buffer) == (jpeg, "jpeg")
     with pytest.raises(PeerError, match="not a JPEG"):
         camera._encode(np.zeros((1, 50), np.uint8))
+
+
+def test_mock_camera_stamps_each_image_with_its_own_clock() -> None:
+    with served(rate=50.0) as (server, _), socket.create_connection(("127.0.0.1", server.port), 5.0) as link:
+        link.sendall(b"GET /?action=stream HTTP/1.0\r\n\r\n")
+        data = b""
+        while data.count(b"X-Timestamp: ") < 6:
+            data += link.recv(65536)
+    heads = [head.split(b"\r\n\r\n")[0] for head in data.split(b"--boundarydonotcross\r\n")[1:6]]
+    stamps = [float(head.split(b"X-Timestamp: ")[1]) for head in heads]
+    assert all(head.startswith(b"Content-Type: image/jpeg\r\nContent-Length: ") for head in heads)
+    assert all(b - a > 0.01 for a, b in pairwise(stamps))
+    assert stamps[-1] - stamps[0] < 1.0 and stamps[0] > CLOCK_OFFSET

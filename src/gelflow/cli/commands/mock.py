@@ -29,6 +29,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for side in ("left", "right"):
         text = f"clockwise rotation of the {side} camera's image: 0, 90, 180 or 270 (default 0)"
         parser.add_argument(f"--turn-{side}", type=int, choices=(0, 90, 180, 270), default=0, metavar="DEG", help=text)
+    parser.add_argument(
+        "--world",
+        type=Path,
+        metavar="FILE",
+        help="TOML file of a world that differs from training (docs/guide/mock.md)",
+    )
     parser.add_argument("--attached", action="store_true", help="end when standard input is closed")
     add_seed(parser)
     add_preset(parser)
@@ -41,11 +47,13 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.cli.mock_lab import lab_for
     from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
     from gelflow.hardware_mocks.simulated_cell.cell import preset_config
+    from gelflow.hardware_mocks.simulated_cell.world import World, load_world
     from gelflow.real.runner.lab_file import save_lab
 
     check_at_least(args, seed=0)
+    world = load_world(args.world) if args.world is not None else World()
     config = MockRobotConfig(
-        cell=preset_config(args.preset, seed=args.seed),
+        cell=preset_config(args.preset, seed=args.seed, world=world),
         egm_port=args.egm_port,
         tcp_port=args.tcp_port,
         truth_port=args.truth_port,

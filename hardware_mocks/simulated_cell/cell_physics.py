@@ -1,0 +1,60 @@
+"""Applies a world to the parameters of the insertion scene; may be applied again while the simulation runs."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.hardware_mocks.simulated_cell.world import World
+from gelflow.sim.simulator import Simulator
+
+_SIDES = ("left", "right")
+_STIFFNESSES = ("kn", "ks", "kt", "kd")  # contact parameters that are proportional to the stiffness of a surface
+_WALLS = {"wall_left": ("x", -1), "wall_right": ("x", 1), "wall_front": ("y", -1), "wall_back": ("y", 1)}
+_INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+class CellPhysics:
+    """The physical parameters of one simulator. The caller holds the cell's lock."""
+
+    def __init__(self, sim: Simulator, world: World) -> None:
+        self._sim = sim
+        self._nominal: dict[str, float] = {}  # values of the scene file, by parameter
+        self.gel_compliance: NDArray[np.float64] = np.ones(2)  # of the left and right gel, relative to the scene's
+        self.world = world
+        self.apply(world)
+
+    def apply(self, world: World) -> None:
+        """Set all parameters for `world`."""
+        self.world = world
+        for side, stiffness in zip(_SIDES, (world.gels.left, world.gels.right), strict=True):
+            for surface in (f"pad_{side}", side):
+                self._scale_contact(surface, stiffness, world.friction.pads)
+        self.gel_compliance = 1 / np.array([world.gels.left, world.gels.right])
+        opening = dict(zip("xy", world.hole.half_opening, strict=True))
+        for wall, (axis, sign) in _WALLS.items():
+            half = float(self._sim.param(f"{wall}.size.{axis}")[0])
+            self._set(f"{wall}.shape.pos.{axis}", sign * (half + opening[axis]))
+            self._scale_contact(f"part_hole/{wall}", world.hole.stiffness, world.friction.hole)
+        self._scale_contact("part_floor", world.hole.stiffness, world.friction.floor)
+        for name in ("part.mass", *(f"part.inertia.{axes}" for axes in _INERTIA)):
+            self._scale(name, world.part.mass / self._scene_value("part.mass"))
+        for name in ("arm_x", "arm_y", "arm_z"):
+            self._servo(name, world.arm.stiffness, 1000.0)
+        self._servo("arm_yaw", world.arm.yaw_stiffness, 200.0)
+
+    def _scale_contact(self, contact: str, stiffness: float, friction: float) -> None:
+        for key in _STIFFNESSES:
+            self._scale(f"{contact}.{key}", stiffness)
+        self._set(f"{contact}.mu", friction)
+
+    def _servo(self, name: str, stiffness: float, force: float) -> None:
+        for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):
+            self._set(f"{name}.{key}", value)
+
+    def _scene_value(self, name: str) -> float:
+        return self._nominal.setdefault(name, float(self._sim.param(name)[0]))
+
+    def _scale(self, name: str, factor: float) -> None:
+        self._set(name, self._scene_value(name) * factor)
+
+    def _set(self, name: str, value: float) -> None:
+        self._sim.param(name)[:] = value

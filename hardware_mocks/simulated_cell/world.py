@@ -1,0 +1,229 @@
+"""The world of the mock robot: physics, gels, cameras, arm and taught pose, by default as the policy was trained.
+
+A TOML file changes any of them, to test the runner in a cell that differs from training. SI units, unless the name of
+a key ends in `_mm`, `_px` or `_deg`.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import UsageError
+from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.observation import Grid
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.lens import Lens
+from gelflow.toml_tables import TomlTable, read_toml
+
+FORMAT = 1
+PART_SIZE = (0.035, 0.050, 0.060)  # of the part: between the pads, along them, height [m]
+_LARGEST_OPENING = 0.070  # of the hole: the walls of the scene must still support a part beside it [m]
+
+
+def _check(table: object, limits: dict[str, tuple[float, float]]) -> None:
+    for name, (low, high) in limits.items():
+        value = getattr(table, name)
+        if not low <= value <= high:
+            raise UsageError(f"{name} must be within {low:g} to {high:g}, got {value}")
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction coefficients of the part."""
+
+    pads: float = 1.5  # against the gels
+    hole: float = 1.5  # against the walls and the rim of the hole
+    floor: float = 0.8  # against the floor of the hole
+
+    def __post_init__(self) -> None:
+        _check(self, {"pads": (0.01, 5), "hole": (0, 5), "floor": (0, 5)})
+
+
+@dataclass(frozen=True)
+class Gels:
+    """Stiffness of each gel relative to that of the scene: 5 moves the markers a fifth as far under equal force."""
+
+    left: float = 1.0
+    right: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check(self, {"left": (0.02, 50), "right": (0.02, 50)})
+
+
+@dataclass(frozen=True)
+class Hole:
+    """Size and stiffness of the hole."""
+
+    clearance: tuple[float, float] = (4.5e-3, 4.5e-3)  # opening minus part, along x and y [m]
+    stiffness: float = 1.0  # of walls, rim and floor, relative to the scene's
+
+    def __post_init__(self) -> None:
+        _check(self, {"stiffness": (0.02, 50)})
+        if not all(c > 0 and size + c <= _LARGEST_OPENING for c, size in zip(self.clearance, PART_SIZE, strict=False)):
+            raise UsageError(f"clearance must be above 0 and a few millimetres, got {self.clearance} m")
+
+    @property
+    def half_opening(self) -> tuple[float, float]:
+        """Half the opening along x and y [m]."""
+        return (PART_SIZE[0] + self.clearance[0]) / 2, (PART_SIZE[1] + self.clearance[1]) / 2
+
+
+@dataclass(frozen=True)
+class TaughtError:
+    """Error of the taught pose of the hole: the lab file's pose relative to the true one, in the hole frame."""
+
+    x: float = 0.0  # [m]
+    y: float = 0.0  # [m]
+    z: float = 0.0  # negative: the hole is taught too low [m]
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check(self, dict.fromkeys("xyz", (-0.05, 0.05)) | {"yaw_deg": (-45, 45)})
+
+    @property
+    def pose(self) -> Pose:
+        """The taught hole frame in the true one."""
+        return Pose(np.array([self.x, self.y, self.z]), yaw_quaternion(math.radians(self.yaw_deg)))
+
+
+@dataclass(frozen=True)
+class MarkerPrint:
+    """Markers printed on both gels, rows from the base to the tip of the finger."""
+
+    rows: int = 18
+    cols: int = 14
+    pitch_mm: float = 1.4
+    center_mm: tuple[float, float] = (2.0, 0.0)  # of the grid on the pad, x towards the fingertip
+    jitter_mm: float = 0.0  # standard deviation of a marker's position from the regular grid
+    missing: float = 0.0  # fraction of the markers that are not printed
+
+    def __post_init__(self) -> None:
+        _check(self, {"rows": (2, 60), "cols": (2, 60), "pitch_mm": (0.3, 10), "jitter_mm": (0, 2), "missing": (0, 1)})
+
+    @property
+    def grid(self) -> Grid:
+        """The regular grid on the pad."""
+        return Grid(self.rows, self.cols, self.pitch_mm, self.center_mm)
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """Image of one camera."""
+
+    rate: float = 30.0  # images per second
+    pixels_per_mm: float = 15.7  # scale at the image centre
+    dot_radius_px: float = 4.4
+    contrast: float = 0.62  # of the dots, 0 to 1
+    light: float = 125.0  # mean brightness of the gel [grey levels]
+    blur_px: float = 1.0  # standard deviation
+    noise: float = 1.2  # standard deviation of the sensor noise [grey levels]
+    tilt_deg: tuple[float, float] = (0.0, 0.0)  # about the image's right and down axes
+    distance_mm: float = 40.0  # of the camera from the gel; a shorter distance increases the effect of a tilt
+    barrel: float = 0.0  # relative inward shift of the image corners; negative: pincushion
+    calibrated: bool = True  # the lab file has a calibration file for a tilted or distorted image; false: only a scale
+
+    def __post_init__(self) -> None:
+        _check(self, {"rate": (1, 200)})
+        self.appearance(MarkerPrint())
+        _ = self.lens
+
+    def appearance(self, printed: MarkerPrint, *, seed: int = 0) -> GelAppearance:
+        """The appearance of a gel with the markers `printed`."""
+        return GelAppearance(
+            grid=printed.grid,
+            pixels_per_mm=self.pixels_per_mm,
+            radius=self.dot_radius_px,
+            contrast=self.contrast,
+            light=self.light,
+            blur=self.blur_px,
+            noise=self.noise,
+            missing=printed.missing,
+            seed=seed,
+        )
+
+    @property
+    def lens(self) -> Lens:
+        """Tilt and distortion."""
+        return Lens(self.tilt_deg, self.distance_mm, self.barrel)
+
+
+@dataclass(frozen=True)
+class ArmDynamics:
+    """Dynamics of the arm."""
+
+    lag: float = 0.010  # time constant of the controller's filter [s]
+    stiffness: float = 1e5  # of the tool against a force [N/m]
+    yaw_stiffness: float = 500.0  # [N m/rad]
+
+    def __post_init__(self) -> None:
+        _check(self, {"lag": (1e-3, 0.5), "stiffness": (100, 1e7), "yaw_stiffness": (1, 1e5)})
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part."""
+
+    mass: float = 0.063  # [kg]
+
+    def __post_init__(self) -> None:
+        _check(self, {"mass": (1e-3, 5)})
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything in which a cell can differ from training. Equal to training by default."""
+
+    friction: Friction = field(default_factory=Friction)
+    gels: Gels = field(default_factory=Gels)
+    hole: Hole = field(default_factory=Hole)
+    taught_error: TaughtError = field(default_factory=TaughtError)
+    markers: MarkerPrint = field(default_factory=MarkerPrint)
+    left_camera: CameraView = field(default_factory=CameraView)
+    right_camera: CameraView = field(default_factory=CameraView)
+    arm: ArmDynamics = field(default_factory=ArmDynamics)
+    part: Part = field(default_factory=Part)
+
+    @property
+    def cameras(self) -> tuple[CameraView, CameraView]:
+        """Views of the left and of the right camera."""
+        return self.left_camera, self.right_camera
+
+
+def load_world(path: Path) -> World:
+    """Read a world from TOML. Raises UsageError on unknown keys and values out of range, naming the known ones."""
+    return world_from_tables(read_toml(path), str(path))
+
+
+def world_from_tables(tables: dict[str, Any], location: str) -> World:
+    """A world from the tables of a TOML file at `location`; the table `cameras` holds for both cameras."""
+    if tables.get("format", FORMAT) != FORMAT:
+        raise UsageError(f"{location}: format must be {FORMAT}, got {tables['format']!r}")
+    merged = {key: value for key, value in tables.items() if key not in ("format", "cameras")}
+    known = [item.name for item in dataclasses.fields(World)]
+    TomlTable(tables, location).check_keys([*known, "cameras", "format"])
+    both = TomlTable(tables, location).table("cameras").data
+    for name in ("left_camera", "right_camera"):
+        merged[name] = {**both, **TomlTable(tables, location).table(name).data}
+    return TomlTable(merged, location).as_dataclass(World)
+
+
+def plain_world(world: World) -> dict[str, Any]:
+    """The values of `world` that differ from the default, as tables that `world_from_tables` reads."""
+
+    def changed(value: Any, default: Any) -> dict[str, Any]:
+        tables = {}
+        for item in dataclasses.fields(value):
+            mine, theirs = getattr(value, item.name), getattr(default, item.name)
+            if mine != theirs:
+                tables[item.name] = changed(mine, theirs) if dataclasses.is_dataclass(mine) else _plain(mine)
+        return tables
+
+    return {"format": FORMAT, **changed(world, World())}
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
