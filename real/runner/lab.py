@@ -5,8 +5,11 @@ SI units, unless the name of a key ends in `_deg` or `_mm`. `gelflow.real.runner
 
 import dataclasses
 import math
+import os
+import re
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +19,7 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.calibration import load_calibration
 from gelflow.perception.frames import CameraMount
-from gelflow.real.limits import LIMITS
+from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range
 
 FORMAT = 1
 Vector = tuple[float, float, float]
@@ -27,10 +30,22 @@ def _require(condition: bool, message: str) -> None:
         raise UsageError(message)
 
 
-def _positive(table: object, *names: str) -> None:
-    for name in names:
-        value = getattr(table, name)
-        _require(value > 0, f"{name} must be above 0, got {value}")
+def _check_ranges(table: Any, path: str, *, skip: str = "") -> None:
+    """Raise UsageError when a number of `table`, whose keys start with `path`, is outside `LAB_RANGES`, or NaN.
+
+    Time limits are not checked here, because their range depends on the whole lab file.
+    """
+    for field_ in dataclasses.fields(table):
+        allowed = LAB_RANGES.get(path + field_.name)
+        if allowed is not None and not allowed.time_limit and field_.name != skip:
+            _check_range(field_.name, getattr(table, field_.name), allowed)
+
+
+def _check_range(name: str, value: Any, allowed: Range) -> None:
+    numbers = value if isinstance(value, tuple) else (value,)
+    # The comparison is false for NaN.
+    valid = all(allowed.low <= number <= allowed.high * (1 + 1e-9) for number in numbers)
+    _require(valid, f"{name} must be {allowed}, got {list(value) if isinstance(value, tuple) else value}")
 
 
 @dataclass(frozen=True)
@@ -47,14 +62,9 @@ class GripperSettings:
     def __post_init__(self) -> None:
         known = self.address.startswith(("serial:", "tcp:"))
         _require(known, f"address must be serial:DEVICE or tcp:HOST:PORT, got {self.address!r}")
-        low, high = LIMITS.gripper_force
-        _require(low <= self.grasp_force <= high, f"grasp_force must be {low:g} to {high:g} N, got {self.grasp_force}")
-        low, high = LIMITS.gripper_speed
-        _require(low <= self.speed <= high, f"speed must be {low:g} to {high:g} m/s, got {self.speed}")
-        widest = LIMITS.gripper_width[1]
-        widths = 0 < self.part_width < self.open_width <= widest
-        text = f"0 < part_width < open_width ≤ {widest:g} m must hold, got {self.part_width}, {self.open_width}"
-        _require(widths, text)
+        _check_ranges(self, "gripper.")
+        text = f"part_width must be below open_width, got {self.part_width} and {self.open_width} m"
+        _require(self.part_width < self.open_width, text)
 
 
 @dataclass(frozen=True)
@@ -64,20 +74,20 @@ class ArmSettings:
     egm_port: int = 6510  # UDP port on which this computer listens
     max_speed: float = LIMITS.tool_speed  # of the tool, in moves between attempts [m/s]
     max_turn_speed_deg: float = LIMITS.tool_turn_speed_deg  # angular speed of the tool [°/s]
+    joint_speed_deg: float = LIMITS.joint_speed_deg  # of each joint [°/s]: MaxSpeedDeviation of the RAPID program
     connect_timeout: float = 5.0  # for the first message of the robot [s]
     host: str = "0.0.0.0"  # address of this computer to listen on; 0.0.0.0: all
     robot: str = ""  # IP address of the controller; empty: the first sender
 
     def __post_init__(self) -> None:
-        _require(0 < self.egm_port < 65536, f"egm_port must be 1 to 65535, got {self.egm_port}")
-        _positive(self, "max_speed", "max_turn_speed_deg", "connect_timeout")
+        _check_ranges(self, "arm.")
 
 
 @dataclass(frozen=True)
 class CameraSettings:
     """One GelSlim sensor: source of its images and geometry of its view."""
 
-    source: str  # "http://HOST:PORT/path" of an MJPEG stream, or "uvc:INDEX"
+    source: str  # "http://HOST:PORT/path" of an MJPEG stream, "uvc:INDEX" or "uvc:/dev/videoN"
     rows: int  # markers from the finger's base to its tip
     cols: int  # markers across the finger
     pitch_mm: float  # distance between neighbouring markers on the gel [mm]
@@ -88,16 +98,15 @@ class CameraSettings:
     mirrored: bool = True  # the camera views the gel from behind
 
     def __post_init__(self) -> None:
-        known = self.source.startswith(("http://", "uvc:"))
-        _require(known, f"source must be http://HOST:PORT/… or uvc:INDEX, got {self.source!r}")
-        if self.source.startswith("uvc:"):
-            _require(self.source[4:].isdigit(), f"source must be uvc:INDEX with a whole number, got {self.source!r}")
+        known = self.source.startswith("http://") or re.fullmatch(r"uvc:(\d{1,4}|/dev/.+)", self.source)
+        text = f"source must be http://HOST:PORT/…, uvc:INDEX or uvc:/dev/videoN, got {self.source!r}"
+        _require(bool(known), text)
         turned = self.rotation_deg in (0, 90, 180, 270)
         _require(turned, f"rotation_deg must be 0, 90, 180 or 270, got {self.rotation_deg}")
         _require(self.rows >= 3 and self.cols >= 3, f"rows and cols must be at least 3, got {self.rows}, {self.cols}")
-        _positive(self, "pitch_mm")
-        one = bool(self.calibration) != bool(self.pixels_per_mm) and self.pixels_per_mm >= 0
-        _require(one, "give either calibration, a file of gelflow calibrate-camera, or pixels_per_mm above 0")
+        one = bool(self.calibration) != bool(self.pixels_per_mm)
+        _require(one, "give either calibration, a file of gelflow calibrate-camera, or pixels_per_mm")
+        _check_ranges(self, "cameras.", skip="pixels_per_mm" if self.calibration else "")
 
     @property
     def mount(self) -> CameraMount:
@@ -122,6 +131,23 @@ class CamerasSettings:
     left: CameraSettings
     right: CameraSettings
 
+    def __post_init__(self) -> None:
+        same = _camera_identity(self.left.source) == _camera_identity(self.right.source)
+        _require(not same, f"left and right must be two cameras, got the same source {self.right.source!r} for both")
+
+
+def _camera_identity(source: str) -> str:
+    """A text that is equal for two sources of the same camera."""
+    if not source.startswith("uvc:"):
+        url = urlsplit(source)
+        try:
+            return f"{url.hostname}:{url.port or 80}{url.path or '/'}?{url.query}"
+        except ValueError:  # an invalid port, which the driver refuses
+            return source
+    device = source.removeprefix("uvc:")
+    # Links such as those in /dev/v4l/by-id name a device that has another name too.
+    return os.path.realpath(f"/dev/video{int(device)}" if device.isdigit() else device)
+
 
 @dataclass(frozen=True)
 class ToolSettings:
@@ -135,6 +161,7 @@ class ToolSettings:
     quaternion: tuple[float, float, float, float]  # w x y z
 
     def __post_init__(self) -> None:
+        _check_ranges(self, "tool.")
         length = math.sqrt(sum(c * c for c in self.quaternion))
         _require(abs(length - 1) < 1e-3, f"quaternion must have length 1, got {length:.4f}")
 
@@ -150,6 +177,9 @@ class HoleSettings:
 
     position: Vector  # centre of the hole's floor in the robot's base frame [m]
     yaw_deg: float  # of the gripper about the base's z axis, when the part fits [°]
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, "hole.")
 
     @property
     def pose(self) -> Pose:
@@ -172,8 +202,7 @@ class PartSettings:
             self.presentation in ("prompt", "wait"),
             f'presentation must be "prompt" or "wait", got {self.presentation!r}',
         )
-        _positive(self, "grasp_height", "load_height", "insert_to")
-        _require(self.load_wait >= 0, f"load_wait must be at least 0, got {self.load_wait}")
+        _check_ranges(self, "part.")
 
 
 @dataclass(frozen=True)
@@ -190,7 +219,7 @@ class WorkspaceSettings:
     max_turn_deg: float = LIMITS.target_turn_deg  # largest rotation from the arm to a target [°]
 
     def __post_init__(self) -> None:
-        _positive(self, "x", "y", "yaw_deg", "tilt_deg", "max_step", "max_turn_deg")
+        _check_ranges(self, "workspace.")
         _require(self.height_min < self.height_max, "height_min must be below height_max")
 
 
@@ -206,7 +235,7 @@ class DescentSettings:
     max_depth: float = LIMITS.descent_depth  # largest depth below the start of an attempt [m]
 
     def __post_init__(self) -> None:
-        _positive(self, "speed", "settle", "contact_shear_mm", "max_depth")
+        _check_ranges(self, "descent.")
         _require(self.stop_shear_mm > self.contact_shear_mm, "stop_shear_mm must be above contact_shear_mm")
 
 
@@ -221,12 +250,11 @@ class LimitsSettings:
     gripper_reply: float = LIMITS.gripper_reply_time  # for the first reply of the gripper to a command
     gripper_motion: float = LIMITS.gripper_motion_time  # for the end of a gripper motion
     attempt_time: float = 60.0  # for one attempt
+    recording_delay: float = LIMITS.recording_delay  # a record that is not stored after this time ends the run
     retries: int = 1  # repetitions of an attempt whose images could not be tracked
 
     def __post_init__(self) -> None:
-        _positive(self, "stale_pose", "stale_frame", "stale_gripper", "target_lifetime")
-        _positive(self, "gripper_reply", "gripper_motion", "attempt_time")
-        _require(self.retries >= 0, f"retries must be at least 0, got {self.retries}")
+        _check_ranges(self, "limits.")
 
 
 @dataclass(frozen=True)
@@ -245,6 +273,17 @@ class Lab:
     clock_factor: float = 1.0  # robot time over wall time: 1 for a robot, larger only for a mock robot
     time_sync: str = ""  # time-sync file of a mock robot; empty for a robot
     format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        _check_ranges(self, "")
+        real_time = self.clock_factor == 1 or bool(self.time_sync)
+        text = f"clock_factor must be 1 without time_sync (a robot runs in real time), got {self.clock_factor}"
+        _require(real_time, text)
+        scale = MOCK_TIME_SCALE * self.clock_factor if self.time_sync else 1.0
+        for key, allowed in LAB_RANGES.items():
+            if allowed.time_limit:
+                value = getattr(self.limits, key.removeprefix("limits."))
+                _check_range(key, value, allowed._replace(high=scale * allowed.high))
 
     @property
     def clock(self) -> ScaledClock:

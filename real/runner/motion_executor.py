@@ -185,6 +185,7 @@ class MotionExecutor:
         state = self._arm.state()
         self.supervisor.watch(state)
         self._check_age("pose", state, self._lab.limits.stale_pose)
+        self._recorder.check()
         for camera in self._cameras:
             camera.latest()
         gripper = self._gripper.state()

@@ -37,6 +37,7 @@ class RunPlan:
     on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
     on_insertion: Callable[[Insertion], None] = lambda insertion: None
     before_insertion: Callable[[int], None] = lambda number: None
+    on_motion: Callable[[MotionExecutor], None] = lambda motion: None  # before anything moves
 
 
 class WaitingOperator:
@@ -67,6 +68,7 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
     results = []
     with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
         supervisor, motion = create_motion(cell)
+        plan.on_motion(motion)
         plan.on_preflight(run_preflight(cell, supervisor))
         operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
         with motion:
@@ -127,6 +129,7 @@ def _recording(plan: RunPlan, *, dry_run: bool) -> Iterator[SessionRecorder]:
         clock_factor=plan.lab.clock_factor,
         dry_run=dry_run,
     )
-    with SessionRecorder(plan.session, plan.lab.clock).open() as recorder:
+    max_delay = plan.lab.limits.recording_delay
+    with SessionRecorder(plan.session, plan.lab.clock, max_delay=max_delay).open() as recorder:
         recorder.metadata(description)
         yield recorder

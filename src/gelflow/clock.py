@@ -44,8 +44,9 @@ class ScaledClock:
     _sync: TimeSync | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if not 0.01 <= self.factor <= 1000:
-            raise UsageError(f"clock factor {self.factor} is outside 0.01 to 1000 (1 is real time)")
+        # Slower than real time, the shortest wall-clock waits of the drivers would last longer than their time-outs.
+        if not 1 <= self.factor <= 1000:
+            raise UsageError(f"clock factor {self.factor:g} is outside 1 to 1000 (1 is real time)")
         if self.time_sync:
             object.__setattr__(self, "_sync", TimeSync(self.time_sync))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import gelflow.real
 from gelflow.real.egm.config import EgmConfig
-from gelflow.real.limits import LIMITS
+from gelflow.real.limits import LAB_RANGES, LIMITS
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.real.wsg.config import WsgConfig
 
@@ -39,3 +39,16 @@ def test_documentation_shows_the_same_numbers() -> None:
             assert shown == [bound for low, high in value for bound in ((high,) if -low == high else (low, high))]
         else:
             assert shown == list(value if isinstance(value, tuple) else (value,))
+
+
+def test_documentation_shows_the_ranges_of_the_lab_file() -> None:
+    page = (ROOT / "docs" / "guide" / "robot.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w.]+)` \| ([^|]+) \| ?(yes)? ?\|$", page, flags=re.M)
+    shown = {key: (text, time_limit == "yes") for key, text, time_limit in rows}
+    assert shown == {key: (str(allowed), allowed.time_limit) for key, allowed in LAB_RANGES.items()}
+
+
+def test_defaults_are_within_the_ranges() -> None:
+    assert LAB_RANGES["arm.max_speed"].low < LIMITS.tool_speed < LAB_RANGES["arm.max_speed"].high
+    assert LAB_RANGES["limits.stale_frame"].low < LIMITS.image_age < LAB_RANGES["limits.stale_frame"].high
+    assert LAB_RANGES["limits.target_lifetime"].high == LIMITS.longest_target_lifetime

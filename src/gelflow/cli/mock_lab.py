@@ -8,14 +8,11 @@ import numpy as np
 
 from gelflow.perception.calibration import fit_calibration, save_calibration
 from gelflow.perception.frames import CameraMount
+from gelflow.real.limits import MOCK_TIME_SCALE
 from gelflow.real.runner import lab
 
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
-
-# Mock robot and runner share one computer, whose scheduling jitter does not shrink when the clock is scaled. In wall
-# time the limits are therefore this many times those of a robot.
-_TIMEOUT_SCALE = 12
 
 
 def lab_for(robot: "MockRobot") -> lab.Lab:
@@ -45,7 +42,7 @@ def lab_for(robot: "MockRobot") -> lab.Lab:
         part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
-        limits=_limits(_TIMEOUT_SCALE * max(1.0, factor)),
+        limits=_limits(MOCK_TIME_SCALE * factor),
         clock_factor=factor,
         time_sync=time_sync,
     )
@@ -96,4 +93,5 @@ def _limits(scale: float) -> lab.LimitsSettings:
         gripper_reply=1.0 * scale,
         gripper_motion=6.0 * scale,
         attempt_time=60.0 * scale,
+        recording_delay=1.0 * scale,
     )

@@ -1,10 +1,12 @@
 """Recorder of sessions as MCAP files. It never drops a record silently; a crash loses at most half a second."""
 
+import contextlib
 import fcntl
 import os
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -32,7 +34,10 @@ CHUNK_BYTES = 64 * 1024  # with the default of 1 MB a killed recorder loses many
 FLUSH_PERIOD = 0.25  # half of the largest loss by a crash [s, robot time]
 DISK_TIMEOUT = 10.0  # for the disk to store everything [s, wall]
 
+MAX_DELAY = 1.0  # of the oldest record that is not stored yet [s, robot time]
+
 _Item = tuple[str, int, int, int, bytes]  # topic, log time [ns], publish time [ns], sequence, data
+_Queued = tuple[float, _Item | threading.Event]  # time at which it was queued [s, wall], item
 
 
 def nanoseconds(seconds: float) -> int:
@@ -46,12 +51,19 @@ class SessionRecorder:
     Every method may be called from any thread. Methods return without waiting for the disk, except `attempt_end` and
     `close`, which return when all records are stored. When a record cannot be queued or written, the call and every
     later one raise PeerError, and the caller must stop the attempt. `gelflow recover` recovers the unfinished file.
+    A program that moves a robot calls `check` regularly: it raises when the disk is more than `max_delay` [s, robot
+    time] behind.
     """
 
-    def __init__(self, path: str | Path, clock: Clock, *, queue_size: int = 4096) -> None:
+    def __init__(self, path: str | Path, clock: Clock, *, queue_size: int = 4096, max_delay: float = MAX_DELAY) -> None:
         self.path = Path(path)
         self._clock = clock
-        self._queue: queue.Queue[_Item | threading.Event | None] = queue.Queue(queue_size)
+        self._max_delay = max_delay
+        self._queue: queue.Queue[_Queued | None] = queue.Queue(queue_size)
+        # Times at which the oldest record of each batch was queued [s, wall]: of the batches that wait for fsync, then
+        # of the batch that is being written (None: it is empty).
+        self._syncing: deque[float] = deque()
+        self._writing: float | None = None
         self._failure: str | None = None
         self._thread: threading.Thread | None = None
         self._described = False
@@ -164,9 +176,26 @@ class SessionRecorder:
         self._enqueue(done)
         deadline = time.monotonic() + DISK_TIMEOUT
         while not done.wait(0.05):
-            self._check()
+            self.check()
             if time.monotonic() > deadline:
                 raise PeerTimeout(f"{self.path}: not stored after {DISK_TIMEOUT:g} s; is the disk full or slow?")
+
+    @property
+    def delay(self) -> float:
+        """Age of the oldest record that is not stored on the disk yet [s, wall]; 0 when all are stored."""
+        with self._queue.mutex:
+            first = self._queue.queue[0] if self._queue.queue else None
+        oldest = next(iter(tuple(self._syncing)), self._writing)
+        if oldest is None:
+            oldest = None if first is None else first[0]
+        return 0.0 if oldest is None else time.monotonic() - oldest
+
+    def check(self) -> None:
+        """Raise PeerError when the recording has failed, PeerTimeout when the disk is more than `max_delay` behind."""
+        self._check()
+        if (delay := self.delay) > self._clock.wall(self._max_delay):
+            allowed = f"at most {self._clock.wall(self._max_delay):g} s is allowed"
+            raise PeerTimeout(f"recording {self.path} is {delay:.1f} s behind, {allowed}; is the disk full or slow?")
 
     def close(self) -> None:
         """Write the index, store all records and close. Raises PeerError when the file cannot be finished."""
@@ -215,7 +244,7 @@ class SessionRecorder:
         if self._thread is None:
             raise UsageError(f"{self.path}: the recorder is not open")
         try:
-            self._queue.put_nowait(item)
+            self._queue.put_nowait((time.monotonic(), item))
         except queue.Full:
             self._fail(f"{self._queue.maxsize} records wait for the disk, which is too slow or full")
             self._check()
@@ -241,7 +270,7 @@ class SessionRecorder:
         writer.add_metadata("gelflow", {"format": str(FORMAT), "version": __version__})
         channels = _register(writer)
         writer.flush()  # type: ignore[no-untyped-call]
-        with _Syncer(stream.fileno(), self._fail) as syncer:
+        with _Syncer(stream.fileno(), self._fail, self._syncing) as syncer:
             finished = self._write_queue(writer, channels, syncer)
         if finished and self._failure is None:
             writer.finish()  # type: ignore[no-untyped-call]
@@ -252,25 +281,23 @@ class SessionRecorder:
     def _write_queue(self, writer: Writer, channels: Mapping[str, int], syncer: "_Syncer") -> bool:
         """Write the queue until the recorder is closed (True) or fails (False)."""
         due = self._clock.now() + FLUSH_PERIOD
-        dirty = False
         while self._failure is None:
-            item: _Item | threading.Event | None
-            try:
-                item = self._queue.get(timeout=max(0.0, self._clock.wall(due - self._clock.now())))
-            except queue.Empty:
-                item = None
-            else:
-                if item is None:
+            item: _Item | threading.Event | None = None
+            with contextlib.suppress(queue.Empty):
+                queued = self._queue.get(timeout=max(0.0, self._clock.wall(due - self._clock.now())))
+                if queued is None:
                     return True
+                stamp, item = queued
+                self._writing = stamp if self._writing is None else self._writing
             if isinstance(item, tuple):
                 topic, logged, published, sequence, data = item
                 writer.add_message(channels[topic], logged, data, published, sequence)
-                dirty = True
             if isinstance(item, threading.Event) or self._clock.now() >= due:
-                if dirty or isinstance(item, threading.Event):
+                if self._writing is not None:
                     writer.flush()  # type: ignore[no-untyped-call]
+                    self._syncing.append(self._writing)
+                    self._writing = None
                     syncer.request(item if isinstance(item, threading.Event) else None)
-                    dirty = False
                 due = self._clock.now() + FLUSH_PERIOD
         return False
 
@@ -281,9 +308,10 @@ class _Syncer:
     Written records survive a crash of this program; stored ones also survive a crash of the computer.
     """
 
-    def __init__(self, descriptor: int, fail: Callable[[str], None]) -> None:
+    def __init__(self, descriptor: int, fail: Callable[[str], None], batches: deque[float]) -> None:
         self._descriptor = descriptor
         self._fail = fail
+        self._batches = batches  # one per request; removed from the left when it is stored
         self._requests: queue.Queue[threading.Event | None] = queue.Queue()
         self._ending = False
         self._thread = threading.Thread(target=self._run, name="recorder sync", daemon=True)
@@ -312,6 +340,8 @@ class _Syncer:
                 self._fail(error.strerror or "the disk failed")
                 return
             for done in waiting:
+                if self._batches:
+                    self._batches.popleft()
                 if done is not None:
                     done.set()
 

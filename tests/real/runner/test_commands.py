@@ -84,7 +84,7 @@ def test_demo_reports_a_mock_that_does_not_start() -> None:
     [
         (["demo", "--insertions", "0"], "--insertions must be at least 1"),
         (["demo", "--checkpoint", "/nowhere/policy.safetensors"], "no checkpoint at /nowhere/policy.safetensors"),
-        (["mock", "--factor", "0"], "clock factor 0.0 is outside 0.01 to 1000"),
+        (["mock", "--factor", "0.5"], "clock factor 0.5 is outside 1 to 1000"),
     ],
 )
 def test_invalid_options_give_a_one_line_error(

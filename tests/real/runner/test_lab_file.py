@@ -1,5 +1,6 @@
 """Lab files: errors name file, table, key and the nearest valid keys in one line."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import gelflow.real
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.calibration import Calibration, save_calibration
+from gelflow.real.limits import LAB_RANGES
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
+from gelflow.time_sync import TimeSync
 
 EXAMPLE = Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml"
 
@@ -73,7 +76,7 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
         ),
         ("grasp_force = 12.0", "grasp_force = nan", "grasp_force must be a finite number"),
         ("grasp_force = 12.0", "grasp_force = 300", "lab.toml, gripper: grasp_force must be 5 to 80 N, got 300"),
-        ("open_width = 0.060", "open_width = 0.030", "0 < part_width < open_width"),
+        ("open_width = 0.060", "open_width = 0.030", "part_width must be below open_width, got 0.035 and 0.03 m"),
         ("serial:/dev/ttyUSB0", "/dev/ttyUSB0", "address must be serial:DEVICE or tcp:HOST:PORT"),
         ("rows = 18", "rows = 18.5", "rows must be an integer, got"),
         ("rows = 18", "rows = true", "rows must be an integer, got"),
@@ -88,13 +91,103 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
         ("# stop_shear_mm = 0.12", "stop_shear_mm = 0.01", "stop_shear_mm must be above contact_shear_mm"),
         ("pixels_per_mm = 15.7", "pixels_per_mm = 0.0", "lab.toml, cameras.left: give either calibration"),
         ("pixels_per_mm = 15.7", 'calibration = "none.json"', "lab.toml, cameras.left: cannot read"),
-        ("# stale_pose = 0.020", "stale_pose = 0", "stale_pose must be above 0"),
+        ("# stale_pose = 0.020", "stale_pose = 0", "lab.toml: limits.stale_pose must be 0.008 to 0.1 s, got 0"),
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
     ],
 )
 def test_errors_name_the_key(tmp_path: Path, example: str, old: str, new: str, expected: str) -> None:
     assert old in example
     assert expected in refused(tmp_path, example.replace(old, new, 1))
+
+
+def with_value(text: str, key: str, value: str) -> str:
+    """A lab file with every key, with another value of the dotted `key`; `cameras.` means the left camera."""
+    *table, name = key.replace("cameras.", "cameras.left.").split(".")
+    head = rf"\[{re.escape('.'.join(table))}\]\n" if table else ""
+    changed, count = re.subn(rf"({head}(?:(?!\[).*\n)*?{name} = ).*", rf"\g<1>{value}", text, count=1)
+    assert count == 1
+    return changed
+
+
+def as_toml(before: object, number: float) -> str:
+    return f"[{', '.join([str(number)] * len(before))}]" if isinstance(before, tuple) else str(number)
+
+
+@pytest.mark.parametrize("key", LAB_RANGES)
+def test_numbers_outside_their_range_are_refused_with_key_range_and_value(tmp_path: Path, key: str) -> None:
+    saved = tmp_path / "saved.toml"
+    lab = load_lab(EXAMPLE)
+    save_lab(lab, saved, title="all keys")
+    owner = lab
+    for name in key.replace("cameras.", "cameras.left.").split(".")[:-1]:
+        owner = getattr(owner, name)
+    before, name, allowed = getattr(owner, key.split(".")[-1]), key.split(".")[-1], LAB_RANGES[key]
+    step = 1 if isinstance(before, int) else 1e-3 * (allowed.high - allowed.low)
+    wrong = [allowed.low - step, allowed.high + step, 10**9 if isinstance(before, int) else 1e9]
+    for number in wrong:
+        message = refused(tmp_path, with_value(saved.read_text(), key, as_toml(before, number)))
+        assert f"{name} must be {allowed}, got " in message
+        assert as_toml(before, number) in message
+    if isinstance(before, float):
+        for text in ("nan", "inf", "-inf"):
+            assert name in refused(tmp_path, with_value(saved.read_text(), key, text))
+
+
+def test_every_number_of_a_lab_file_has_a_range() -> None:
+    def numbers(table: object, path: str) -> set[str]:
+        found = set()
+        for field in dataclasses.fields(table):  # type: ignore[arg-type]
+            value = getattr(table, field.name)
+            if dataclasses.is_dataclass(value):
+                # Both cameras have the same ranges.
+                found |= numbers(value, path if field.name in ("left", "right") else f"{path}{field.name}.")
+            elif not isinstance(value, str | bool):
+                found.add(path + field.name)
+        return found
+
+    # These have their own checks.
+    own = {"format", "cameras.rows", "cameras.cols", "cameras.rotation_deg", "tool.quaternion"}
+    assert numbers(load_lab(EXAMPLE), "") - own == set(LAB_RANGES)
+
+
+def test_time_limits_of_a_mock_robot_may_be_longer_in_proportion_to_its_clock(tmp_path: Path, example: str) -> None:
+    TimeSync.create(sync := str(tmp_path / "time_sync"))
+    scaled = example.replace("format = 1", f'format = 1\nclock_factor = 4.0\ntime_sync = "{sync}"')
+    path = tmp_path / "lab.toml"
+    path.write_text(scaled.replace("# stale_frame = 0.250", "stale_frame = 48.0"))
+    assert load_lab(path).limits.stale_frame == 48.0
+    message = refused(tmp_path, scaled.replace("# stale_frame = 0.250", "stale_frame = 48.1"))
+    assert "limits.stale_frame must be 0.05 to 48 s, got 48.1" in message
+
+
+@pytest.mark.parametrize("factor", ["0.01", "0.5", "4.0"])
+def test_another_clock_than_real_time_needs_a_mock_robot(tmp_path: Path, example: str, factor: str) -> None:
+    message = refused(tmp_path, example.replace("# clock_factor = 1.0", f"clock_factor = {factor}"))
+    assert "clock_factor must be 1" in message and f"got {factor}" in message
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("http://192.168.1.31:8080/?action=stream", "http://192.168.1.31:8080/?action=stream"),
+        ("http://Gel.local/stream", "http://gel.local:80/stream"),
+        ("uvc:0", "uvc:/dev/video0"),
+    ],
+)
+def test_one_camera_for_both_fingers_is_refused(tmp_path: Path, example: str, left: str, right: str) -> None:
+    text = example.replace("http://192.168.1.30:8080/?action=stream", left)
+    text = text.replace("http://192.168.1.31:8080/?action=stream", right)
+    assert "lab.toml, cameras: left and right must be two cameras" in refused(tmp_path, text)
+
+
+def test_uvc_devices_are_named_by_index_or_path(tmp_path: Path, example: str) -> None:
+    text = example.replace("http://192.168.1.30:8080/?action=stream", "uvc:/dev/video2")
+    path = tmp_path / "lab.toml"
+    path.write_text(text.replace("http://192.168.1.31:8080/?action=stream", "uvc:0"))
+    lab = load_lab(path)
+    assert (lab.cameras.left.source, lab.cameras.right.source) == ("uvc:/dev/video2", "uvc:0")
+    message = refused(tmp_path, text.replace("uvc:/dev/video2", "uvc:video2"))
+    assert "source must be http://HOST:PORT/…, uvc:INDEX or uvc:/dev/videoN, got 'uvc:video2'" in message
 
 
 def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: str) -> None:
