@@ -1,0 +1,60 @@
+"""A disk that is slower than the recording: the recorder knows how far it is behind."""
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.writer import Writer
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerTimeout
+from gelflow.session.reader import SessionReader
+from gelflow.session.recorder import SessionRecorder
+
+CLOCK = ScaledClock()
+
+
+@pytest.mark.parametrize("slow", ["fsync", "write"])
+def test_a_slow_disk_is_noticed_within_the_allowed_delay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: str
+) -> None:
+    """The disk stores nothing until it is released; all records are stored after that."""
+    released = threading.Event()
+    where, name = {"fsync": (os, "fsync"), "write": (Writer, "flush")}[slow]
+    stored = getattr(where, name)
+
+    def wait_for_disk(target: Any) -> None:
+        released.wait(20)
+        stored(target)
+
+    with SessionRecorder(tmp_path / "a.mcap", CLOCK, max_delay=0.4) as recorder:
+        recorder.event("first")
+        recorder.attempt_end()
+        recorder.check()
+        monkeypatch.setattr(where, name, wait_for_disk)
+        end = time.monotonic() + 20
+        with pytest.raises(
+            PeerTimeout, match=r"is 0\.\d s behind, at most 0\.4 s is allowed; is the disk full or slow"
+        ):
+            while time.monotonic() < end:
+                recorder.event("tick")
+                recorder.check()
+                time.sleep(0.01)
+        with pytest.raises(PeerTimeout, match="behind"):
+            recorder.attempt_end()
+        released.set()
+    with SessionReader(tmp_path / "a.mcap") as reader:
+        assert reader.counts()["/event"] > 10
+
+
+def test_delay_is_zero_when_all_records_are_stored(tmp_path: Path) -> None:
+    with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
+        recorder.event("tick")
+        recorder.attempt_end()
+        end = time.monotonic() + 20
+        while recorder.delay > 0 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert recorder.delay == 0
