@@ -13,6 +13,7 @@ from gelflow.errors import PeerError, PeerRefused
 MAX_HEAD = 16 * 1024  # bytes of an HTTP head or of a part's headers
 MAX_PART = 16 * 1024 * 1024  # bytes of one image
 _BLANK_LINE = re.compile(rb"\r?\n\r?\n")
+_TIMESTAMP = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
 _START, _END = b"\xff\xd8", b"\xff\xd9"  # first and last marker of every JPEG
 
 
@@ -68,6 +69,14 @@ def parse_head(data: bytes) -> tuple[Head, bytes] | None:
     return Head(int(status[1]), (status[2] or "").strip(), _headers(lines)), data[blank.end() :]
 
 
+@dataclass(frozen=True)
+class Part:
+    """One JPEG image of a multipart stream."""
+
+    data: bytes
+    camera_time: float | None = None  # X-Timestamp: time of the image on the camera's own clock [s]
+
+
 class MultipartParser:
     """Extracts the JPEG images of a multipart body, independently of how the data is split.
 
@@ -82,18 +91,19 @@ class MultipartParser:
         self._scanned = 0  # no delimiter starts before this offset
         self._state = self._seek
         self._length: int | None = None
+        self._camera_time: float | None = None
 
-    def feed(self, data: bytes) -> list[bytes]:
+    def feed(self, data: bytes) -> list[Part]:
         """Add received bytes; returns the images that they complete, in order."""
         self._buffer += data
-        images: list[bytes] = []
+        images: list[Part] = []
         while self._state(images):
             pass
         return images
 
     # Each state returns False when it needs more bytes.
 
-    def _seek(self, images: list[bytes]) -> bool:
+    def _seek(self, images: list[Part]) -> bool:
         """Between parts: skip to the next delimiter."""
         position = self._find(len(self._buffer))
         if position < 0:
@@ -103,7 +113,7 @@ class MultipartParser:
         self._begin(position)
         return True
 
-    def _read_headers(self, images: list[bytes]) -> bool:
+    def _read_headers(self, images: list[Part]) -> bool:
         """After a delimiter: the rest of its line, then headers, then a blank line."""
         blank = _BLANK_LINE.search(self._buffer, 0, MAX_HEAD)
         again = self._find(blank.start() if blank else min(len(self._buffer), MAX_HEAD))
@@ -121,11 +131,12 @@ class MultipartParser:
         self._length = int(length) if length.isascii() and length.isdigit() and len(length) < 10 else None
         if self._length is not None and not 0 < self._length <= MAX_PART:
             self._length = None
+        self._camera_time = parse_timestamp(headers.get("x-timestamp", ""))
         self._advance(blank.end())
         self._state = self._read_body
         return True
 
-    def _read_body(self, images: list[bytes]) -> bool:
+    def _read_body(self, images: list[Part]) -> bool:
         limit = MAX_PART + len(self._delimiter) if self._length is None else self._length
         position = self._find(min(len(self._buffer), limit))
         if position >= 0:
@@ -168,14 +179,23 @@ class MultipartParser:
         self._advance(count)
         self._state = self._seek
 
-    def _emit(self, body: bytes, images: list[bytes]) -> bool:
+    def _emit(self, body: bytes, images: list[Part]) -> bool:
         # Some cameras pad the image with zeros.
         whole = body.startswith(_START) and body.rstrip(b"\0\r\n").endswith(_END)
         if whole:
-            images.append(body)
+            images.append(Part(body, self._camera_time))
         else:
             self.damaged += 1
         return whole
+
+
+def parse_timestamp(text: str) -> float | None:
+    """The time in mjpg-streamer's header "X-Timestamp: SEC.USEC" [s]; None for a missing, malformed or zero one.
+
+    Some input plugins of mjpg-streamer send zero because they have no time.
+    """
+    seconds = float(text) if _TIMESTAMP.fullmatch(text) else 0.0
+    return seconds if seconds > 0 else None
 
 
 def _headers(lines: list[str]) -> dict[str, str]:

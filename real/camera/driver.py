@@ -12,23 +12,29 @@ from urllib.parse import urlsplit
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.real.camera import codec
-from gelflow.real.camera.stream import OnImage, StreamCamera
+from gelflow.real.camera.stream import OnImage, ReceivedImage, StreamCamera
 from gelflow.real.limits import LIMITS
 
 
 def open_camera(
-    source: str, name: str, clock: Clock, *, timeout: float = LIMITS.image_age, on_image: OnImage | None = None
+    source: str,
+    name: str,
+    clock: Clock,
+    *,
+    timeout: float = LIMITS.image_age,
+    latency: float = 0.0,
+    on_image: OnImage | None = None,
 ) -> StreamCamera:
     """Open the camera at `source`: "http://HOST:PORT/?action=stream", "uvc:INDEX" or "uvc:/dev/videoN".
 
     Raises UsageError for any other source, and PeerError when the camera cannot be opened.
     """
     if source.startswith("http://"):
-        return MjpegCamera(source, name, clock, timeout=timeout, on_image=on_image).open()
+        return MjpegCamera(source, name, clock, timeout=timeout, latency=latency, on_image=on_image).open()
     if source.startswith("uvc:"):
         device = source.removeprefix("uvc:")
         chosen = int(device) if device.isdigit() else device
-        return UvcCamera(chosen, name, clock, timeout=timeout, on_image=on_image).open()
+        return UvcCamera(chosen, name, clock, timeout=timeout, latency=latency, on_image=on_image).open()
     raise UsageError(f"camera {name}: expected http://HOST:PORT/… or uvc:INDEX, got {source!r}")
 
 
@@ -46,10 +52,11 @@ class MjpegCamera(StreamCamera):
         clock: Clock,
         *,
         timeout: float = LIMITS.image_age,
+        latency: float = 0.0,
         connect_timeout: float = 3.0,
         on_image: OnImage | None = None,
     ) -> None:
-        super().__init__(url, name, clock, timeout=timeout, on_image=on_image)
+        super().__init__(url, name, clock, timeout=timeout, latency=latency, on_image=on_image)
         parts = urlsplit(url)
         try:
             port = parts.port or 80
@@ -122,13 +129,13 @@ class MjpegCamera(StreamCamera):
                 link.shutdown(socket.SHUT_RDWR)
             link.close()
 
-    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+    def _images(self, closing: threading.Event) -> Iterator[ReceivedImage]:
         link, parser = self._socket, self._parser
         assert link is not None and parser is not None
         data = self._early
         while True:
-            for image in parser.feed(data):
-                yield image, "jpeg"
+            for part in parser.feed(data):
+                yield ReceivedImage(part.data, camera_time=part.camera_time)
             data = b""
             try:
                 data = link.recv(65536)
@@ -158,10 +165,11 @@ class UvcCamera(StreamCamera):
         clock: Clock,
         *,
         timeout: float = LIMITS.image_age,
+        latency: float = 0.0,
         size: tuple[int, int] | None = None,
         on_image: OnImage | None = None,
     ) -> None:
-        super().__init__(f"video device {device}", name, clock, timeout=timeout, on_image=on_image)
+        super().__init__(f"video device {device}", name, clock, timeout=timeout, latency=latency, on_image=on_image)
         if isinstance(device, int) and device < 0:
             raise UsageError(f"camera {name}: a device index is 0 or more, got {device}")
         self._device = device if isinstance(device, int) else str(device)
@@ -187,14 +195,14 @@ class UvcCamera(StreamCamera):
     def _disconnect(self) -> None:
         """No effect: OpenCV's read cannot be interrupted, and the reader thread releases the device."""
 
-    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
+    def _images(self, closing: threading.Event) -> Iterator[ReceivedImage]:
         capture, self._capture = self._capture, None
         try:
             while not closing.is_set():
                 read, pixels = capture.read()
                 if not read:
                     raise PeerError(f"camera {self.name}: {self.source} sent no image; is it plugged in? reconnect")
-                yield self._encode(pixels)
+                yield ReceivedImage(*self._encode(pixels))
         finally:
             capture.release()
 

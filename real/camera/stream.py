@@ -1,25 +1,42 @@
 """Base class of streaming cameras: reader thread, newest image, waiting with time-outs, persistent errors."""
 
+import math
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import CameraImage
-from gelflow.real.camera.liveness import RepeatFilter
+from gelflow.real.camera.liveness import CameraClock, RepeatFilter
 from gelflow.time_sync import MIN_WAIT
 
 OnImage = Callable[[CameraImage], None]
 
 
+@dataclass(frozen=True)
+class ReceivedImage:
+    """An image as a camera class receives it."""
+
+    data: bytes
+    encoding: str = "jpeg"
+    camera_time: float | None = None  # on the camera's own clock [s]
+
+
 class StreamCamera(ABC):
     """A `gelflow.protocols.Camera` whose images a thread receives; only the newest image is kept.
 
-    An image that repeats a recent one is passed to `on_image` but is not new: `latest` and `next` do not return it, so
-    that a frozen camera ends in their time-outs as a silent one does. `repeated` counts such images.
+    An image that repeats a recent one, that carries no later time of the camera's own clock than its predecessor, or
+    that is older than `timeout` at its reception is passed to `on_image` but is not new: `latest` and `next` do not
+    return it, so that a frozen camera ends in their time-outs as a silent one does. `repeated`, `unclocked` and `late`
+    count such images.
+
+    The stamp of an image is the robot time of its reception, less `latency` and less its delay in addition to the
+    shortest one by the camera's own clock (if the camera sends its time). `latency` [s] is the constant time from the
+    exposure to the reception, which no clock shows; `gelflow.real.camera.estimate_latency` measures it.
 
     `on_image` is called with every image in the reader thread, before the image is available to callers: a recording
     therefore holds each image before any decision based on it. An exception of `on_image` ends the stream and is
@@ -27,20 +44,33 @@ class StreamCamera(ABC):
     """
 
     def __init__(
-        self, source: str, name: str, clock: Clock, *, timeout: float, on_image: OnImage | None = None
+        self,
+        source: str,
+        name: str,
+        clock: Clock,
+        *,
+        timeout: float,
+        latency: float = 0.0,
+        on_image: OnImage | None = None,
     ) -> None:
         if not timeout > 0:
             raise UsageError(f"camera {name}: timeout must be above 0 s, got {timeout}")
+        if not 0 <= latency < timeout:
+            raise UsageError(f"camera {name}: latency must be at least 0 s and below {timeout:g} s, got {latency}")
         self.source = source  # for messages
         self.name = name
         self.timeout = timeout  # largest age of the image that `latest` returns [s, robot time]
+        self.latency = latency
         self._clock = clock
         self._on_image = on_image
         self._changed = threading.Condition()
         self._newest: CameraImage | None = None
-        self.repeated = 0  # number of received images that repeat a recent one
-        self._repeated_since = 0  # of these, since the newest image
+        self.repeated = self.unclocked = self.late = 0
+        self._rejected = 0  # images since the newest one
+        self._rejection = ("", "")  # of the last of them: what the camera does, and the likely cause
         self._repeats = RepeatFilter()  # continues after a reconnect, which does not revive a frozen server
+        self._camera_clock = CameraClock()
+        self._stamp = -math.inf  # of the last image [s]
         self._count = 0  # continues after a reconnect, so that a sequence number is unique within a session
         self._failure: GelflowError | None = None
         self._thread: threading.Thread | None = None
@@ -60,7 +90,8 @@ class StreamCamera(ABC):
         with self._changed:
             self._failure = None
             self._newest = None
-            self._repeated_since = 0
+            self._rejected = 0
+        self._camera_clock = CameraClock()
         self._thread = threading.Thread(
             target=self._receive, args=(self._closing,), name=f"camera {self.name}", daemon=True
         )
@@ -93,7 +124,8 @@ class StreamCamera(ABC):
     def latest(self) -> CameraImage:
         """The newest image, at most `timeout` old; directly after opening, waits up to `timeout` for the first image.
 
-        Raises PeerTimeout when there is none or the camera repeats an image, PeerError when the stream has ended.
+        Raises PeerTimeout when there is none, with the reason if images arrive but are not new, and PeerError when the
+        stream has ended.
         """
         with self._changed:
             self._raise_unopened()
@@ -134,8 +166,8 @@ class StreamCamera(ABC):
         """Disconnect and wake the reader thread. May be called twice, from any thread."""
 
     @abstractmethod
-    def _images(self, closing: threading.Event) -> Iterator[tuple[bytes, str]]:
-        """Images (bytes, encoding) until `closing` is set or the stream ends. Raises GelflowError when it fails."""
+    def _images(self, closing: threading.Event) -> Iterator[ReceivedImage]:
+        """Images until `closing` is set or the stream ends. Raises GelflowError when it fails."""
 
     # Reader thread
 
@@ -144,10 +176,10 @@ class StreamCamera(ABC):
             f"camera {self.name}: {self.source} closed the stream; check it and reconnect"
         )
         try:
-            for data, encoding in self._images(closing):
+            for received in self._images(closing):
                 if closing.is_set():
                     break
-                self._accept(CameraImage(data, self._clock.now(), self._count, encoding))
+                self._accept(received, self._clock.now())
         except GelflowError as error:
             failure = error
         except Exception as error:  # noqa: BLE001 - a thread has no caller: raised by the next call of `latest` or `next`
@@ -158,19 +190,34 @@ class StreamCamera(ABC):
                 self._changed.notify_all()
             self._disconnect()
 
-    def _accept(self, image: CameraImage) -> None:
+    def _accept(self, received: ReceivedImage, now: float) -> None:
+        """Stamp, record and publish an image that was received at the robot time `now` [s]."""
+        delay = 0.0 if received.camera_time is None else self._camera_clock.delay(now, received.camera_time)
+        age = self.latency + (delay or 0.0)
+        self._stamp = max(self._stamp, now - age)  # the measured delays shrink while the shortest one is not yet known
+        image = CameraImage(received.data, self._stamp, self._count, received.encoding, received.camera_time)
         self._count += 1
-        repeat = self._repeats.is_repeat(image.data)
+        repeat = self._repeats.is_repeat(received.data)
         if self._on_image is not None:
             self._on_image(image)
         with self._changed:
             if repeat:
                 self.repeated += 1
-                self._repeated_since += 1
-                return
-            self._newest = image
-            self._repeated_since = 0
-            self._changed.notify_all()
+                self._reject("repeats the same image", "the camera or its server is frozen")
+            elif delay is None:
+                self.unclocked += 1
+                self._reject("sends images whose X-Timestamp does not advance", "the camera or its server is frozen")
+            elif age > self.timeout:
+                self.late += 1
+                self._reject(f"sends images {age:.2f} s late by its own clock", "its server or network buffers images")
+            else:
+                self._newest = image
+                self._rejected = 0
+                self._changed.notify_all()
+
+    def _reject(self, what: str, cause: str) -> None:
+        self._rejected += 1
+        self._rejection = what, cause
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
@@ -185,9 +232,10 @@ class StreamCamera(ABC):
         last = "none so far"
         if self._newest is not None:
             last = f"the last {self._clock.now() - self._newest.stamp:.2f} s ago"
-        if self._repeated_since:
-            reason = f"repeats the same image ({self._repeated_since} times) from {self.source}; new images: {last}"
-            return PeerTimeout(f"camera {self.name}: {reason}; the camera or its server is frozen")
+        if self._rejected:
+            what, cause = self._rejection
+            reason = f"{what} ({self._rejected} times) from {self.source}; new images: {last}; {cause}"
+            return PeerTimeout(f"camera {self.name}: {reason}")
         damaged = f", {self.damaged} damaged" if self.damaged else ""
         reason = f"no new image from {self.source} within {waited:g} s ({last}{damaged})"
         return PeerTimeout(f"camera {self.name}: {reason}; check the camera")

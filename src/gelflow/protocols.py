@@ -19,9 +19,10 @@ class CameraImage:
     """A camera image as received. The compressed bytes are recorded; decoding them is deterministic."""
 
     data: bytes  # JPEG or PNG
-    stamp: float  # robot time of reception [s]
+    stamp: float  # robot time of reception, less the known part of the transmission's delay [s]
     sequence: int  # counts the images received from this camera
     encoding: str = "jpeg"
+    camera_time: float | None = None  # on the camera's own clock, if the camera sends it [s]
 
 
 @dataclass(frozen=True)

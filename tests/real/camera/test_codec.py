@@ -29,7 +29,7 @@ def parse(data: bytes, cuts: list[int] | None = None) -> tuple[list[bytes], int]
     images = []
     edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts or []), len(data)]
     for start, end in itertools.pairwise(edges):
-        images += parser.feed(data[start:end])
+        images += [part.data for part in parser.feed(data[start:end])]
     return images, parser.damaged
 
 
@@ -78,7 +78,29 @@ def test_image_with_a_length_is_complete_with_its_last_byte() -> None:
     parser = codec.MultipartParser(BOUNDARY)
     data = part(jpeg(1), length=44)
     assert parser.feed(data[:-3]) == []
-    assert parser.feed(data[-3:-2]) == [jpeg(1)]
+    assert parser.feed(data[-3:-2]) == [codec.Part(jpeg(1))]
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        (b"X-Timestamp: 1700000000.000025", 1700000000.000025),
+        (b"x-timestamp:12.500", 12.5),
+        (b"X-Timestamp: 7", 7.0),
+        (b"X-Timestamp: 0.000000", None),  # of an input plugin without a clock
+        (b"X-Timestamp: -1.5", None),
+        (b"X-Timestamp: nan", None),
+        (b"X-Timestamp: 1e300", None),
+        (b"X-Timestamp: 12:30:05", None),
+        (b"X-Timestamp:", None),
+        (b"X-Framerate: 30", None),
+    ],
+)
+def test_time_of_the_camera_is_read_from_the_header_of_its_part(header: bytes, expected: float | None) -> None:
+    opening = b"--" + BOUNDARY + b"\r\nContent-Type: image/jpeg\r\nContent-Length: 44\r\n"
+    first = opening + header + b"\r\n\r\n" + jpeg(1) + b"\r\n"
+    parts = codec.MultipartParser(BOUNDARY).feed(first + part(jpeg(2), length=44))
+    assert parts == [codec.Part(jpeg(1), expected), codec.Part(jpeg(2), None)]
 
 
 def test_truncated_part_costs_one_image() -> None:
@@ -118,7 +140,7 @@ def test_endless_garbage_needs_bounded_memory_and_time() -> None:
         for _ in range(40):
             assert parser.feed(b"\0" * 1_000_000) == []
         assert len(parser._buffer) <= codec.MAX_PART + 1_000_000
-        assert parser.feed(part(jpeg(1), length=44) + part(jpeg(2), length=44))[-1] == jpeg(2)
+        assert parser.feed(part(jpeg(1), length=44) + part(jpeg(2), length=44))[-1] == codec.Part(jpeg(2))
         assert time.monotonic() - started < 20  # a quadratic search takes hours
 
 

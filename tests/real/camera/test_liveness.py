@@ -1,22 +1,25 @@
 """Sign of life of cameras: a frozen or looping stream ends in a time-out and never returns an old image as new."""
 
 import itertools
+import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import PeerTimeout
+from gelflow.errors import PeerTimeout, UsageError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.protocols import CameraImage
 from gelflow.real.camera.driver import MjpegCamera, UvcCamera
-from gelflow.real.camera.liveness import HISTORY, RepeatFilter, picture_digest
+from gelflow.real.camera.liveness import HISTORY, CameraClock, RepeatFilter, picture_digest
 
 CLOCK = ScaledClock(1.0)
 PATIENT = 10.0  # time-out that only a failing test reaches [s]
@@ -37,6 +40,61 @@ class Server:
     def __call__(self) -> bytes:
         self.made += 1
         return self.loop[self.made % len(self.loop)] if self.loop else jpeg(self.made)
+
+
+class ManualClock:
+    """Robot time that the test sets."""
+
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += seconds
+
+    def wall(self, seconds: float) -> float:
+        return seconds
+
+
+class TimedStream:
+    """An MJPEG server on a socket that sends X-Timestamp, and a camera on it; each `send` waits for the reception."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.clock = ManualClock()
+        self.seen: list[CameraImage] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/?action=stream"
+        self.camera = MjpegCamera(url, "left", self.clock, on_image=self.seen.append, **settings)
+
+    def __enter__(self) -> "TimedStream":
+        head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=xyz\r\n\r\n--xyz\r\n"
+        opening = threading.Thread(target=self.camera.open)
+        opening.start()
+        self._link = self._listener.accept()[0]
+        self._link.recv(4096)
+        self._link.sendall(head)
+        opening.join(PATIENT)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.camera.close()
+        self._link.close()
+        self._listener.close()
+
+    def send(self, received: float, camera_time: float) -> CameraImage:
+        """Send a new image that is received at the robot time `received` [s]; returns the recorded image."""
+        self.clock.time = received
+        rejected, count, image = self._rejected(), len(self.seen), jpeg(len(self.seen))
+        header = f"Content-Type: image/jpeg\r\nContent-Length: {len(image)}\r\nX-Timestamp: {camera_time:.6f}\r\n\r\n"
+        self._link.sendall(header.encode() + image + b"\r\n--xyz\r\n")
+        wait(lambda: len(self.seen) > count)
+        wait(lambda: self.camera._newest is self.seen[-1] or self._rejected() > rejected)
+        return self.seen[-1]
+
+    def _rejected(self) -> int:
+        return self.camera.repeated + self.camera.unclocked + self.camera.late
 
 
 def segment(marker: int, content: bytes) -> bytes:
@@ -130,6 +188,80 @@ def test_digest_ignores_what_does_not_affect_pixels() -> None:
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe0\xff\xff", b"\xff\xd8\xff\xfe\0\0\xff\xfe\0\0"])
 def test_digest_of_malformed_data_does_not_fail(data: bytes) -> None:
     assert len(picture_digest(data)) == 16
+
+
+def test_growing_delay_of_a_server_is_a_timeout() -> None:
+    """The images arrive at the full rate and differ, but each is taken ever longer before its reception."""
+    with TimedStream(timeout=0.25) as stream:
+        sent, number = 100.0, 0
+        while stream.camera.late == 0:
+            taken = 5000.0 + 0.08 * number
+            sent = 100.0 + 0.08 * number + (0.0 if number < 5 else 0.02 * (number - 5))
+            image = stream.send(sent, taken)
+            if stream.camera.late == 0:
+                assert stream.camera.latest() is image
+            assert image.stamp == pytest.approx(100.0 + 0.08 * number, abs=2e-3)  # the time of the exposure
+            number += 1
+            assert number < 30
+        assert 0.25 < sent - image.stamp < 0.29
+        stream.clock.time = sent + 0.2
+        with pytest.raises(PeerTimeout, match=r"camera left: sends images 0\.2\d s late by its own clock .*buffers"):
+            stream.camera.latest()
+        image = stream.send(sent + 0.5, 5000.0 + 0.5 + sent - 100.0)  # the server has caught up
+        assert stream.camera.latest() is image
+
+
+def test_image_in_order_of_arrival_but_not_of_the_camera_is_not_new() -> None:
+    with TimedStream(timeout=0.25) as stream:
+        stream.send(100.0, 50.0)
+        newest = stream.send(100.08, 50.08)
+        stream.send(100.10, 50.0)  # duplicated or reordered by the server
+        assert stream.camera.latest() is newest and stream.camera.unclocked == 1
+        assert stream.camera.latest() is newest
+        newest = stream.send(100.16, 50.16)
+        assert stream.camera.latest() is newest
+
+
+def test_camera_whose_clock_stands_still_is_a_timeout() -> None:
+    with TimedStream(timeout=0.25) as stream:
+        for number in range(5):
+            stream.send(100.0 + 0.08 * number, 50.0)
+        with pytest.raises(PeerTimeout, match=r"X-Timestamp does not advance \(4 times\)"):
+            stream.camera.latest()
+
+
+def test_camera_clock_that_is_set_costs_at_most_one_image() -> None:
+    with TimedStream(timeout=0.25) as stream:
+        for number, shift in enumerate([0.0, 0.0, 3600.0, 3600.0, -7200.0, -7200.0, 0.0, 0.0]):
+            image = stream.send(100.0 + 0.08 * number, 9000.0 + 0.08 * number + shift)
+            assert image.stamp == pytest.approx(100.0 + 0.08 * number)
+        assert stream.camera.latest() is image and stream.camera.unclocked == 1 and stream.camera.late == 0
+
+
+def test_latency_is_subtracted_from_the_stamps() -> None:
+    with TimedStream(timeout=0.25, latency=0.05) as stream:
+        assert stream.send(100.0, 50.0).stamp == pytest.approx(99.95)
+        assert stream.send(100.11, 50.08).stamp == pytest.approx(100.03, abs=1e-4)  # 30 ms late
+        stream.clock.time = 100.27
+        stream.camera.latest()
+        stream.clock.time = 100.29  # 0.26 s after the exposure
+        with pytest.raises(PeerTimeout, match=r"the last 0\.26 s ago"):
+            stream.camera.latest()
+
+
+@pytest.mark.parametrize("latency", [-0.01, 0.25, float("nan")])
+def test_latency_outside_the_time_limit_is_refused(latency: float) -> None:
+    with pytest.raises(UsageError, match="camera left: latency"):
+        MjpegCamera("http://127.0.0.1:1/", "left", CLOCK, timeout=0.25, latency=latency)
+
+
+def test_drift_of_the_camera_clock_is_not_a_delay() -> None:
+    for drift in (-300e-6, 300e-6):
+        clock, rng = CameraClock(), np.random.default_rng(1)
+        for number in range(30 * 3600):  # one hour
+            received = number / 30 + rng.uniform(0, 0.01)
+            delay = clock.delay(received, 1e9 + number / 30 * (1 + drift))
+            assert delay is not None and delay < 0.02
 
 
 def test_memory_is_bounded() -> None:
