@@ -88,6 +88,7 @@ LAB_RANGES = {
     "cameras.pitch_mm": Range(0.2, 10, "mm"),
     "cameras.pixels_per_mm": Range(1, 200, "px/mm"),
     "cameras.center_mm": Range(-30, 30, "mm"),
+    "cameras.latency": Range(0, 0.2, "s"),
     "tool.position": Range(-0.5, 0.5, "m"),
     "hole.position": Range(-1, 1, "m"),
     "hole.yaw_deg": Range(-180, 180, "°"),

@@ -19,7 +19,7 @@ from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.limits import LIMITS
-from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.lab import CameraSettings, Lab
 from gelflow.real.transport import transport_for
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.driver import WsgGripper
@@ -65,11 +65,13 @@ def _open_camera(
     lab: Lab, clock: ScaledClock, name: Literal["left", "right"], sensor: int, recorder: SessionRecorder
 ) -> StreamCamera:
     """A connected camera that records every image."""
+    settings: CameraSettings = getattr(lab.cameras, name)
     return open_camera(
-        getattr(lab.cameras, name).source,
+        settings.source,
         name,
         clock,
         timeout=lab.limits.stale_frame,
+        latency=settings.latency,
         on_image=lambda image: recorder.image(sensor, image),
     )
 

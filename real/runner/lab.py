@@ -96,6 +96,7 @@ class CameraSettings:
     center_mm: tuple[float, float] = (0.0, 0.0)  # centre of the marker grid on the pad, x towards the fingertip [mm]
     rotation_deg: int = 0  # of the image, clockwise; at 0 the fingertip is at the bottom [°]: 0, 90, 180 or 270
     mirrored: bool = True  # the camera views the gel from behind
+    latency: float = 0.0  # constant time from the exposure to the reception of an image [s], 0 to 0.2
 
     def __post_init__(self) -> None:
         known = self.source.startswith("http://") or re.fullmatch(r"uvc:(\d{1,4}|/dev/.+)", self.source)
