@@ -92,7 +92,7 @@ class McapWriter:
     def __init__(self, path: Path, sensor: str, description: Mapping[str, Any]) -> None:
         self._clock = _StampClock()
         self._sensor = SENSORS.index(sensor)
-        self._recorder = SessionRecorder(path, self._clock).open()
+        self._recorder = SessionRecorder(path, self._clock, epoch=0.0).open()  # the images have no date
         self._recorder.metadata(description)
 
     def add(self, step: TrackedImage) -> None:

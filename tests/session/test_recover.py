@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
 from gelflow.protocols import CameraImage
+from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.recovery import recover
@@ -95,6 +97,41 @@ def test_damage_in_a_finished_file_is_reported_and_the_rest_recovered(tmp_path: 
         assert len(list(reader.records())) == report.messages
 
 
+def test_a_reader_goes_on_past_damaged_chunks_and_counts_them(tmp_path: Path) -> None:
+    path = make(tmp_path / "session.mcap")
+    data = bytearray(path.read_bytes())
+    for place in (len(data) // 3, 2 * len(data) // 3):
+        data[place] ^= 0xFF
+    path.write_bytes(data)
+    damage = Damage()
+    with SessionReader(path) as reader:
+        images = [record.value.sequence for record in reader.records(["/left/image"], damage=damage)]
+        everything = Damage()
+        assert len(list(reader.records(damage=everything))) == len(images) + 1
+    lost = sorted(set(range(40)) - set(images))
+    assert damage.chunks == 2 and damage.records == len(lost) == everything.records
+    assert images == sorted(images) and len(lost) <= 2 * 8 and lost[0] > 5 and lost[-1] < 35
+
+
+def test_records_that_cannot_be_decoded_are_passed_over_and_counted(tmp_path: Path) -> None:
+    with (tmp_path / "odd.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("gelflow", {"format": "1", "version": "1"})
+        for topic, contents in [("/event", [b"{}", b"{broken", b"{}"]), ("/decision", [b'{"insertion": 0}'])]:
+            schema = writer.register_schema(topic, "jsonschema", b"{}")
+            channel = writer.register_channel(topic, "json", schema)
+            for data in contents:
+                writer.add_message(channel, 5, data, 5, 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    damage = Damage()
+    with SessionReader(tmp_path / "odd.mcap") as reader:
+        assert [record.topic for record in reader.records(damage=damage)] == ["/event", "/event"]
+        with pytest.raises(PeerError, match="is damaged"):
+            list(reader.records())
+    assert (damage.chunks, damage.records) == (0, 2)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_random_damage_raises_gelflow_errors_only(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -105,6 +142,7 @@ def test_random_damage_raises_gelflow_errors_only(tmp_path: Path, seed: int) -> 
     path.write_bytes(data[: len(data) if seed % 2 else rng.integers(9, len(data))])
     try:
         with SessionReader(path) as reader:
+            list(reader.records(damage=Damage()))
             list(reader.records())
     except (PeerError, UsageError):
         pass

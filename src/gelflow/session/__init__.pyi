@@ -3,6 +3,7 @@ from .decision_replay import Comparison as Comparison
 from .decision_replay import ImageTracker as ImageTracker
 from .decision_replay import PerceptionPipeline as PerceptionPipeline
 from .decision_replay import replay as replay
+from .messages import Damage as Damage
 from .reader import Record as Record
 from .reader import SessionReader as SessionReader
 from .recorder import SessionRecorder as SessionRecorder
@@ -15,6 +16,7 @@ from .recovery import recover as recover
 __all__ = [
     "SENSORS",
     "Comparison",
+    "Damage",
     "Decision",
     "ImageTracker",
     "PerceptionPipeline",

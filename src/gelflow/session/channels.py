@@ -63,7 +63,9 @@ PROTOBUF: dict[str, Any] = {
 }
 
 JSON: dict[str, JsonChannel] = {
-    "/session": JsonChannel("gelflow.Session", {"format": INTEGER, "task": TABLE, "versions": TABLE}, ("format",)),
+    "/session": JsonChannel(
+        "gelflow.Session", {"format": INTEGER, "epoch": NUMBER, "task": TABLE, "versions": TABLE}, ("format",)
+    ),
     **{
         f"/{sensor}/markers": JsonChannel(
             "gelflow.Markers",
@@ -80,6 +82,14 @@ JSON: dict[str, JsonChannel] = {
                 "quality": NUMBERS,
             },
             ("stamp", "rows", "cols", "spacing_px", "position_px", "displacement_px", "valid", "inferred", "quality"),
+        )
+        for sensor in SENSORS
+    },
+    **{
+        f"/{sensor}/timing": JsonChannel(
+            "gelflow.ImageTiming",
+            {"stamp": NUMBER, "sequence": INTEGER, "camera_time": NUMBER},
+            ("stamp", "sequence", "camera_time"),
         )
         for sensor in SENSORS
     },

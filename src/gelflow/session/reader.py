@@ -1,9 +1,8 @@
 """Reader of finished session files: records in the order of recording."""
 
+import dataclasses
 import fcntl
 import json
-import struct
-import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
-import zstandard
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from google.protobuf.message import DecodeError
-from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Message
 from mcap.writer import MCAP0_MAGIC
@@ -23,22 +19,8 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.geometry import Pose
 from gelflow.protocols import CameraImage
 from gelflow.session.channels import JSON, PROTOBUF
+from gelflow.session.messages import DECODE_ERRORS, Damage, expected_records, ordered_messages
 from gelflow.session.records import FORMAT, SENSORS, Decision
-
-# Exceptions of the libraries that decode a damaged file.
-DECODE_ERRORS = (
-    McapError,
-    DecodeError,
-    struct.error,
-    zlib.error,
-    zstandard.ZstdError,
-    ValueError,
-    KeyError,
-    IndexError,
-    EOFError,
-    MemoryError,
-    OverflowError,
-)
 
 
 @dataclass(frozen=True)
@@ -46,7 +28,8 @@ class Record:
     """One record.
 
     The type of `value` depends on the topic: `CameraImage`, `Pose` in the robot's base frame, `Decision`, joint angles
-    [rad] by name (dict), an object (dict) of a JSON topic, or the protobuf message of another standard schema.
+    [rad] by name (dict), an object (dict) of a JSON topic, or the protobuf message of another standard schema, whose
+    timestamp is a date (`SessionReader.epoch` later than robot time).
     """
 
     topic: str
@@ -60,6 +43,8 @@ class SessionReader:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
+        self.epoch = 0.0  # date of the robot time 0 as seconds since 1970; 0 in files that contain no dates
+        self._epoch = 0  # the same [ns]
         self._stream: BinaryIO | None = None
         self._reader: SeekingReader | None = None
 
@@ -111,29 +96,58 @@ class SessionReader:
         counts = summary.statistics.channel_message_counts
         return {channel.topic: counts[key] for key, channel in summary.channels.items() if counts.get(key)}
 
-    def records(self, topics: Collection[str] | None = None) -> Iterator[Record]:
+    def records(self, topics: Collection[str] | None = None, *, damage: Damage | None = None) -> Iterator[Record]:
         """All records, or those of `topics`, in the order of recording.
 
-        Raises UsageError for an unknown topic and PeerError where the file is damaged.
+        Raises UsageError for an unknown topic, and PeerError where the file is damaged. With `damage`, the reader goes
+        on behind damaged records and adds their number to it.
         """
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])
             raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; the topics of a session are {known}")
-        messages = self._opened().iter_messages(topics)
+        summary = self._opened().get_summary()
+        if summary is None or not summary.chunk_indexes:
+            return  # the recorder has written no message
+        read = _with_timing(topics)
+        assert self._stream is not None
+        messages = ordered_messages(self._stream, summary, read, damage)
+        camera_times: dict[str, tuple[int, float]] = {}  # per sensor, of the image that follows
+        good = 0
         while True:
             try:
-                _, channel, message = next(messages)
-                value = _decode(channel.topic, message)
+                channel, message = next(messages)
             except StopIteration:
-                return
+                break
             except DECODE_ERRORS as error:
                 raise self._damaged(error) from error
-            yield Record(channel.topic, message.log_time / 1e9, message.publish_time / 1e9, value)
+            try:
+                record = self._record(channel.topic, message, camera_times)
+            except (*DECODE_ERRORS, PeerError) as error:
+                if damage is None:
+                    raise self._damaged(error) from error
+                continue
+            good += 1
+            if topics is None or record.topic in topics:
+                yield record
+        if damage is not None:
+            damage.records += expected_records(summary, read) - good
 
     def decisions(self) -> Iterator[Decision]:
-        """All decisions, in order."""
+        """All decisions, in order. Raises PeerError where the file is damaged."""
         for record in self.records(["/decision"]):
             yield record.value
+
+    def _record(self, topic: str, message: Message, camera_times: dict[str, tuple[int, float]]) -> Record:
+        """A message as a record; joins the times of the cameras' own clocks with their images."""
+        stamp = (message.publish_time - self._epoch) / 1e9
+        value = _decode(topic, message, stamp)
+        sensor = topic.removeprefix("/").partition("/")[0]
+        if topic == f"/{sensor}/timing":
+            camera_times[sensor] = value["sequence"], float(value["camera_time"])
+        elif isinstance(value, CameraImage) and sensor in camera_times:
+            sequence, camera_time = camera_times.pop(sensor)
+            value = dataclasses.replace(value, camera_time=camera_time) if sequence == value.sequence else value
+        return Record(topic, (message.log_time - self._epoch) / 1e9, stamp, value)
 
     def _opened(self) -> SeekingReader:
         if self._reader is None:
@@ -148,6 +162,8 @@ class SessionReader:
                     raise UsageError(
                         f"{self.path} has session format {written}; this gelflow reads format {FORMAT}: update gelflow"
                     )
+                self._epoch = int(metadata.metadata.get("epoch_ns", "0"))
+                self.epoch = self._epoch / 1e9
                 return
         raise UsageError(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
 
@@ -193,7 +209,14 @@ def is_being_recorded(stream: BinaryIO) -> bool:
     return False
 
 
-def _decode(topic: str, message: Message) -> Any:
+def _with_timing(topics: Collection[str] | None) -> Collection[str] | None:
+    """`topics` and the topics that their records are joined with."""
+    if topics is None:
+        return None
+    return {*topics, *(f"/{sensor}/timing" for sensor in SENSORS if f"/{sensor}/image" in topics)}
+
+
+def _decode(topic: str, message: Message, stamp: float) -> Any:
     if topic == "/decision":
         return Decision.from_json(json.loads(message.data))
     if topic in JSON:
@@ -202,7 +225,7 @@ def _decode(topic: str, message: Message) -> Any:
         return message.data
     decoded = PROTOBUF[topic].FromString(message.data)
     if topic in [f"/{sensor}/image" for sensor in SENSORS]:
-        return CameraImage(decoded.data, message.publish_time / 1e9, message.sequence, decoded.format)
+        return CameraImage(decoded.data, stamp, message.sequence, decoded.format)
     if topic == "/arm/joints":
         return {joint.name: joint.position for joint in decoded.joints}
     if isinstance(decoded, PoseInFrame):

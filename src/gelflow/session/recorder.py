@@ -41,8 +41,8 @@ _Queued = tuple[float, _Item | threading.Event]  # time at which it was queued [
 
 
 def nanoseconds(seconds: float) -> int:
-    """A stamp [s] as MCAP's integer nanoseconds."""
-    return max(0, round(float(seconds) * 1e9))
+    """A time [s] in integer nanoseconds."""
+    return round(float(seconds) * 1e9)
 
 
 class SessionRecorder:
@@ -53,12 +53,24 @@ class SessionRecorder:
     later one raise PeerError, and the caller must stop the attempt. `gelflow recover` recovers the unfinished file.
     A program that moves a robot calls `check` regularly: it raises when the disk is more than `max_delay` [s, robot
     time] behind.
+
+    All arguments are in robot time. Messages of the file have dates: `epoch` [s] is the date of the robot time 0 as
+    seconds since 1970, by default the present date less the present robot time; 0 writes robot time as it is.
     """
 
-    def __init__(self, path: str | Path, clock: Clock, *, queue_size: int = 4096, max_delay: float = MAX_DELAY) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        clock: Clock,
+        *,
+        queue_size: int = 4096,
+        max_delay: float = MAX_DELAY,
+        epoch: float | None = None,
+    ) -> None:
         self.path = Path(path)
         self._clock = clock
         self._max_delay = max_delay
+        self._epoch = nanoseconds(time.time() - clock.now() if epoch is None else epoch)
         self._queue: queue.Queue[_Queued | None] = queue.Queue(queue_size)
         # Times at which the oldest record of each batch was queued [s, wall]: of the batches that wait for fsync, then
         # of the batch that is being written (None: it is empty).
@@ -91,13 +103,16 @@ class SessionRecorder:
         if self._described:
             raise UsageError("the session already has a description; call metadata once")
         self._described = True
-        self._json("/session", {"format": FORMAT, **to_plain(description)})
+        self._json("/session", {"format": FORMAT, "epoch": self._epoch / 1e9, **to_plain(description)})
 
     def image(self, sensor: int, image: CameraImage) -> None:
         """Record a camera image as received. `sensor` 0 is the left finger."""
         name = _name(sensor)
+        if image.camera_time is not None:  # before the image: the reader joins both
+            timing = {"stamp": image.stamp, "sequence": image.sequence, "camera_time": image.camera_time}
+            self._json(f"/{name}/timing", timing, stamp=image.stamp)
         message = CompressedImage(frame_id=f"{name}_gel", data=image.data, format=image.encoding)
-        message.timestamp.FromNanoseconds(nanoseconds(image.stamp))
+        message.timestamp.FromNanoseconds(self._date(image.stamp))
         self._put(f"/{name}/image", message.SerializeToString(), stamp=image.stamp, sequence=image.sequence)
 
     def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
@@ -107,19 +122,19 @@ class SessionRecorder:
         """
         name = _name(sensor)
         self._json(f"/{name}/markers", {"stamp": stamp, **values}, stamp=stamp)
-        drawn = annotate(values, nanoseconds(stamp))  # for viewers
+        drawn = annotate(values, self._date(stamp))  # for viewers
         self._put(f"/{name}/annotations", drawn.SerializeToString(), stamp=stamp)
 
     def arm_state(self, state: ArmState) -> None:
         """Record the measured pose, joints and status of the arm."""
         self._pose("/arm/pose", state.stamp, state.position, state.quaternion)
         transform = FrameTransform(parent_frame_id=BASE_FRAME, child_frame_id=TOOL_FRAME)
-        transform.timestamp.FromNanoseconds(nanoseconds(state.stamp))
+        transform.timestamp.FromNanoseconds(self._date(state.stamp))
         _fill(transform.translation, "xyz", state.position)
         _fill(transform.rotation, "wxyz", state.quaternion)
         self._put("/tf", transform.SerializeToString(), stamp=state.stamp)
         joints = JointStates()
-        joints.timestamp.FromNanoseconds(nanoseconds(state.stamp))
+        joints.timestamp.FromNanoseconds(self._date(state.stamp))
         for number, angle in enumerate(state.joints, start=1):
             joints.joints.add(name=f"joint_{number}", position=float(angle))
         self._put("/arm/joints", joints.SerializeToString(), stamp=state.stamp)
@@ -157,7 +172,7 @@ class SessionRecorder:
         message = RawImage(
             width=channels * cols, height=rows, encoding="32FC1", step=4 * channels * cols, data=picture.tobytes()
         )
-        message.timestamp.FromNanoseconds(nanoseconds(stamp))
+        message.timestamp.FromNanoseconds(self._date(stamp))
         self._put("/flow_map", message.SerializeToString(), stamp=stamp)
 
     def event(self, name: str, values: Mapping[str, Any] | None = None) -> None:
@@ -230,14 +245,18 @@ class SessionRecorder:
 
     def _pose(self, topic: str, stamp: float, position: ArrayLike, quaternion: ArrayLike) -> None:
         message = PoseInFrame(frame_id=BASE_FRAME)
-        message.timestamp.FromNanoseconds(nanoseconds(stamp))
+        message.timestamp.FromNanoseconds(self._date(stamp))
         _fill(message.pose.position, "xyz", position)
         _fill(message.pose.orientation, "wxyz", quaternion)
         self._put(topic, message.SerializeToString(), stamp=stamp)
 
     def _put(self, topic: str, data: bytes, *, stamp: float | None = None, sequence: int = 0) -> None:
-        now = nanoseconds(self._clock.now())
-        self._enqueue((topic, now, now if stamp is None else nanoseconds(stamp), sequence, data))
+        now = self._date(self._clock.now())
+        self._enqueue((topic, now, now if stamp is None else self._date(stamp), sequence, data))
+
+    def _date(self, stamp: float) -> int:
+        """A robot time [s] as nanoseconds since 1970; MCAP has no earlier times."""
+        return max(0, nanoseconds(stamp) + self._epoch)
 
     def _enqueue(self, item: _Item | threading.Event) -> None:
         self._check()
@@ -267,7 +286,8 @@ class SessionRecorder:
     def _write(self, stream: BinaryIO) -> None:
         writer = Writer(stream, chunk_size=CHUNK_BYTES)
         writer.start(profile="", library=f"gelflow {__version__}")
-        writer.add_metadata("gelflow", {"format": str(FORMAT), "version": __version__})
+        first = {"format": str(FORMAT), "version": __version__, "epoch_ns": str(self._epoch)}
+        writer.add_metadata("gelflow", first)
         channels = _register(writer)
         writer.flush()  # type: ignore[no-untyped-call]
         with _Syncer(stream.fileno(), self._fail, self._syncing) as syncer:

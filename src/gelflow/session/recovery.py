@@ -17,7 +17,8 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.reader import DECODE_ERRORS, SessionReader, is_being_recorded, open_recording
+from gelflow.session.messages import DECODE_ERRORS
+from gelflow.session.reader import SessionReader, is_being_recorded, open_recording
 from gelflow.session.recorder import CHUNK_BYTES
 
 
