@@ -34,8 +34,12 @@ class MotionLimits:
     target_distance: float = 0.050  # from the arm to a target [m]
     target_turn_deg: float = 35.0  # from the arm to a target, in the insertion runner [°]
     target_turn_driver_deg: float = 20.0  # the same for the EGM driver used without a lab file [°]
-    reference_lead: float = 2e-3  # of the reference over the measured pose [m]
+    reference_lead: float = 2e-3  # distance from the measured pose to the reference, in any direction [m]
     reference_turn_lead_deg: float = 1.0  # the same as an angle [°]
+    # In the direction of motion the reference leads the measured pose by its speed times this time, plus a margin.
+    reference_lead_time: float = 0.025  # [s]
+    reference_lead_margin: float = 0.05e-3  # [m]
+    reference_turn_lead_margin_deg: float = 0.05  # [°]
 
     # Workspace of the gripper about the taught hole.
     workspace_x: float = 0.016  # |x| [m]

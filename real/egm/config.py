@@ -24,8 +24,12 @@ class EgmConfig:
     ramp_time: float = 0.1  # from rest to full speed [s]
     max_step: float = LIMITS.target_distance  # from the reference to a target [m]
     max_turn: float = math.radians(LIMITS.target_turn_driver_deg)  # from the reference to a target [rad]
-    max_lead: float = LIMITS.reference_lead  # the reference waits when it is farther ahead of the robot [m]
+    joint_speed: float = math.radians(LIMITS.joint_speed_deg)  # of each joint: MaxSpeedDeviation [rad/s]
+    max_lead: float = LIMITS.reference_lead  # the reference waits when it is farther away from the robot [m]
     max_turn_lead: float = math.radians(LIMITS.reference_turn_lead_deg)  # the same as an angle [rad]
+    lead_time: float = LIMITS.reference_lead_time  # lead in the direction of motion over the speed [s]
+    lead_margin: float = LIMITS.reference_lead_margin  # in addition [m]
+    turn_lead_margin: float = math.radians(LIMITS.reference_turn_lead_margin_deg)  # in addition [rad]
     max_lifetime: float = LIMITS.longest_target_lifetime  # of a target [s]
     cycle: float = 0.004  # period of EGM [s]
     stale: float = LIMITS.pose_age  # feedback older than this: hold [s]
@@ -41,7 +45,8 @@ class EgmConfig:
         if not 0 <= self.port < 65536:
             raise UsageError(f"port must be 0 to 65535, got {self.port}")
         for name in (
-            *("max_speed", "max_turn_speed", "ramp_time", "max_step", "max_turn", "max_lead", "max_turn_lead"),
+            *("max_speed", "max_turn_speed", "ramp_time", "max_step", "max_turn", "joint_speed"),
+            *("max_lead", "max_turn_lead", "lead_time", "lead_margin", "turn_lead_margin"),
             *("max_lifetime", "cycle", "stale", "silence", "connect_timeout", "log_records"),
         ):
             value = getattr(self, name)

@@ -26,6 +26,7 @@ _LARGEST_MESSAGE = 4096
 # Period of the check that the parent still runs [s, wall]: the closed link does not show it while another process holds
 # the parent's end of the link.
 _PARENT_CHECK = 0.1
+_SHORTEST_WAIT = 2e-4  # [s, wall]
 
 
 class EgmLoop:
@@ -49,7 +50,9 @@ class EgmLoop:
         self._event("listening", f"{'real-time' if raise_priority() else 'normal'} priority")
         while not self._parent.closed and os.getppid() == parent:
             self._report()
-            wait = min(self._clock.wall(self._config.stale) / 2, _PARENT_CHECK)
+            # The time-out ends just after the instant at which the feedback becomes stale.
+            left = self._clock.wall(self._generator.due - self._clock.now()) + _SHORTEST_WAIT
+            wait = min(max(left, _SHORTEST_WAIT), _PARENT_CHECK)
             readable, _, _ = select.select(sources, (), (), wait)
             if self._parent in readable:
                 for command in self._parent.read():
@@ -72,7 +75,7 @@ class EgmLoop:
         elif kind == "hold":
             self._generator.hold(now, values[0])
         elif kind == "stop":
-            self._generator.latch(values[0], now)
+            self._generator.stop(values[0], now)
         elif kind == "reset":
             self._robot = None
             self._generator.reset(now)

@@ -1,8 +1,9 @@
 """Generates the reference pose of every EGM cycle: a state machine without I/O.
 
 Waiting: the reference equals the feedback, so that nothing moves when the controller starts to follow. Following: the
-reference moves in a straight line to the newest target with bounded steps; it is frozen without a target, and while the
-robot lags behind it. Latched: nothing is sent until `reset`.
+reference moves in a straight line to the newest target, with bounded steps, joint speeds and a bounded lead over the
+robot. Hold: the reference returns to the robot, which has followed it with a lag, and is then frozen. Latched: nothing
+is sent until `reset`.
 """
 
 import math
@@ -10,13 +11,15 @@ from enum import IntFlag
 from typing import NamedTuple
 
 from gelflow.errors import SafetyError
-from gelflow.geometry import PoseTuple, Quaternion, Vector, angle_between, multiply
+from gelflow.geometry import PoseTuple, Quaternion, Vector, compose, invert, multiply
 from gelflow.real.egm.codec import EgmFeedback
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.target import Target, check_target, tool_frame
+from gelflow.real.kinematics import inverse
 
 # UDP may reorder messages by a few; a larger step back means that the controller restarted its counter.
 _MAX_REORDERING = 10
+_BRAKING_CYCLES = 25  # after which the reference is frozen at the latest
 
 
 class EgmFlag(IntFlag):
@@ -25,8 +28,8 @@ class EgmFlag(IntFlag):
     MOTORS_ON = 1
     FOLLOWING = 2  # the controller follows references
     CONVERGED = 4  # the controller's convergence condition is met
-    HOLD = 8  # no target: the reference is frozen
-    LAGGING = 16  # the robot lags behind: the reference is frozen until it catches up
+    HOLD = 8  # no target: the reference returns to the robot and is frozen
+    LAGGING = 16  # the robot lags behind: the reference waits for it
     LOST = 32  # messages before this one are missing
     UNANSWERED = 64  # a newer message had arrived and was answered instead
     LATCHED = 128  # stopped: nothing is sent
@@ -51,6 +54,9 @@ class ReferenceGenerator:
         self._reference: PoseTuple | None = None
         self._target: Target | None = None
         self._rate = 0.0  # fraction of the target's speed, 0 to 1
+        # After a hold: cycles left, and the directions of the motion and of the rotation (unit vectors, or zero).
+        self._braking: tuple[int, Vector, Vector] | None = None
+        self._stopping = ""  # reason of a stop that takes effect when the arm is at rest
         self._following = False
         self._flags = EgmFlag(0)
         self.latched = ""
@@ -104,17 +110,22 @@ class ReferenceGenerator:
             return None, self._flags | EgmFlag.LATCHED
         if self._target is not None and now >= self._target.expires:
             self.hold(now, "the target expired")
-        if self._target is None:
-            return self._reference, self._flags | EgmFlag.HOLD
-        if self._too_far_ahead():
-            self._rate = 0.0
-            return self._reference, self._flags | EgmFlag.LAGGING
-        self._reference = self._step(self._reference, self._target)
-        return self._reference, self._flags
+        if self._target is not None:
+            try:
+                self._reference, lagging = self._step(self._reference, self._target)
+            except SafetyError as error:
+                self._refuse(f"target refused: {error}", now)
+            else:
+                return self._reference, self._flags | (EgmFlag.LAGGING if lagging else EgmFlag(0))
+        self._brake()
+        if self._stopping and self._braking is None:
+            self.latch(self._stopping, now)
+            return None, self._flags | EgmFlag.LATCHED
+        return self._reference, self._flags | EgmFlag.HOLD
 
     def set_target(self, target: Target, now: float) -> None:
         """Follow `target` from now on; an invalid target is refused and the arm holds."""
-        if self.latched:
+        if self.latched or self._stopping:
             return
         if self._feedback is None or self._reference is None or self._tool is None or not self._following:
             self._refuse("target refused: the controller does not follow references", now)
@@ -125,14 +136,24 @@ class ReferenceGenerator:
             self._refuse(str(error), now)
             return
         self._rate *= self._kept_rate(target)
-        self._target = target
+        self._target, self._braking = target, None
 
     def hold(self, now: float, reason: str) -> None:
-        """Freeze the reference."""
-        if self._target is not None:
+        """Come to rest: the reference returns to the robot in bounded steps, and is then frozen."""
+        if self._target is not None and self._reference is not None:
             self._event(now, "hold", reason)
+            move, turn = _difference(self._reference, (self._target.position, self._target.quaternion))
+            self._braking = (_BRAKING_CYCLES, _direction(move), _direction(turn))
         self._target = None
         self._rate = 0.0
+
+    def stop(self, reason: str, now: float) -> None:
+        """Hold, and latch as soon as the arm is at rest."""
+        self.hold(now, reason)
+        if self._braking is None:
+            self.latch(reason, now)
+        else:
+            self._stopping = self._stopping or reason
 
     def latch(self, reason: str, now: float) -> None:
         """Stop: nothing is sent until `reset`. The first reason is kept."""
@@ -140,21 +161,33 @@ class ReferenceGenerator:
             self.latched = reason
             self._event(now, "stopped", reason)
         self._target, self._rate, self._following = None, 0.0, False
+        self._braking, self._stopping = None, ""
 
     def reset(self, now: float) -> None:
         """Return to the initial state, on the operator's command."""
         self.latched = ""
         self._feedback, self._received = None, -math.inf
-        self._tool = self._reference = self._target = None
+        self._tool = self._reference = self._target = self._braking = None
+        self._stopping = ""
         self._rate, self._following, self._flags = 0.0, False, EgmFlag(0)
         self._event(now, "reset", "latch cleared by the operator")
+
+    @property
+    def due(self) -> float:
+        """Robot time at which `check_age` has to be called when no message arrives before [s]."""
+        if not self._following or self.latched:
+            return math.inf
+        moving = self._target is not None or self._stopping
+        return self._received + (self._config.stale if moving else self._config.silence)
 
     def check_age(self, now: float) -> None:
         """Hold, then stop, when no feedback arrives while the controller follows."""
         if not self._following or self.latched:
             return
         age = now - self._received
-        if age > self._config.silence:
+        if age > self._config.stale and self._stopping:
+            self.latch(self._stopping, now)
+        elif age > self._config.silence:
             self.latch(f"no EGM message for {age:.3f} s, at most {self._config.silence} s is allowed", now)
         elif age > self._config.stale:
             self.hold(now, f"no EGM message for {age:.3f} s")
@@ -173,28 +206,64 @@ class ReferenceGenerator:
     def _event(self, now: float, kind: str, text: str) -> None:
         self.events.append(EgmEvent(now, kind, text))
 
-    def _too_far_ahead(self) -> bool:
-        assert self._feedback is not None and self._reference is not None
-        position, quaternion = self._reference
-        lead = math.dist(position, self._feedback.position)
-        turn = angle_between(self._feedback.quaternion, quaternion)
-        return lead > self._config.max_lead or turn > self._config.max_turn_lead
+    def _step(self, reference: PoseTuple, target: Target) -> tuple[PoseTuple, bool]:
+        """One cycle along the straight line and the shorter rotation, both ending together, with ramps at both ends.
 
-    def _step(self, reference: PoseTuple, target: Target) -> PoseTuple:
-        """One cycle along the straight line and the shorter rotation, both ending together, with ramps at both ends."""
-        move, turn = _difference(reference, target)
-        # Times at the speeds of the target [s]: to the target, and of this cycle.
-        remaining = max(_length(move) / target.speed, _length(turn) / target.turn_speed)
+        Returns the new reference and whether it waits for the robot. Raises SafetyError when the path leaves the joint
+        ranges.
+        """
+        cycle, ramp = self._config.cycle, self._config.ramp_time
+        move, turn = _difference(reference, (target.position, target.quaternion))
+        distance, angle = _length(move), _length(turn)
+        # Times at full speed [s]: to the target, and of this cycle.
+        remaining = max(distance / target.speed, angle / target.turn_speed)
+        if remaining == 0.0:
+            return (target.position, target.quaternion), False
+        remaining *= self._joint_stretch(reference, move, turn, min(1.0, cycle / remaining))
         # Accelerate from rest to full rate in ramp_time; decelerate equally to rest at the target.
-        ramp = self._config.ramp_time
-        self._rate = min(1.0, self._rate + self._config.cycle / ramp, math.sqrt(2 * remaining / ramp))
-        advance = self._rate * self._config.cycle
+        rate = min(1.0, self._rate + cycle / ramp, math.sqrt(2 * remaining / ramp))
+        advance = min(rate * cycle, self._allowed_advance(reference, move, turn, remaining))
+        lagging = advance < rate * cycle
+        # While the reference waits, its rate falls gradually: feedback that is late by a cycle causes no jerk.
+        self._rate = max(advance / cycle, rate - 2 * cycle / ramp) if lagging else rate
         if advance >= remaining:
-            return target.position, target.quaternion
-        share = advance / remaining
-        (x, y, z), quaternion = reference
-        position = (x + share * move[0], y + share * move[1], z + share * move[2])
-        return position, _turned(quaternion, turn, share)
+            return (target.position, target.quaternion), False
+        return _moved(reference, move, turn, advance / remaining), lagging
+
+    def _joint_stretch(self, reference: PoseTuple, move: Vector, turn: Vector, share: float) -> float:
+        """Factor by which a step of `share` of the way must last longer than a cycle to keep the joint speed."""
+        assert self._feedback is not None and self._tool is not None
+        flange = invert(self._tool)
+        here = inverse(*compose(reference, flange), near=self._feedback.joints)
+        there = inverse(*compose(_moved(reference, move, turn, share), flange), near=here)
+        largest = max(abs(b - a) for a, b in zip(here, there, strict=True))
+        return max(1.0, largest / (self._config.joint_speed * self._config.cycle))
+
+    def _allowed_advance(self, reference: PoseTuple, move: Vector, turn: Vector, remaining: float) -> float:
+        """Time [s] by which the reference may advance at full speed until its lead is the largest allowed one."""
+        assert self._feedback is not None
+        config = self._config
+        lead, lead_turn = _difference((self._feedback.position, self._feedback.quaternion), reference)
+        if _length(lead) > config.max_lead or _length(lead_turn) > config.max_turn_lead:
+            return 0.0
+        allowed = math.inf
+        for way, ahead, margin in ((move, lead, config.lead_margin), (turn, lead_turn, config.turn_lead_margin)):
+            speed = _length(way) / remaining
+            if speed > 0.0:
+                allowed = min(allowed, config.lead_time + (margin - _dot(ahead, _direction(way))) / speed)
+        return max(0.0, allowed)
+
+    def _brake(self) -> None:
+        """One cycle of the return of the reference to the robot, along the line on which it was moving."""
+        if self._braking is None or self._reference is None or self._feedback is None:
+            return
+        count, along, about = self._braking
+        lead, lead_turn = _difference((self._feedback.position, self._feedback.quaternion), self._reference)
+        back = max(0.0, min(_dot(lead, along), self._config.max_speed * self._config.cycle))
+        turned = max(0.0, min(_dot(lead_turn, about), self._config.max_turn_speed * self._config.cycle))
+        self._reference = _moved(self._reference, _scaled(along, -back), _scaled(about, -turned), 1.0)
+        at_rest = back == turned == 0.0
+        self._braking = None if at_rest or count <= 1 else (count - 1, along, about)
 
     def _kept_rate(self, target: Target) -> float:
         """Fraction of the rate that a new target keeps: the part of the motion that continues in the same direction."""
@@ -204,7 +273,8 @@ class ReferenceGenerator:
             return 0.0
         a, b = (
             [c / t.speed for c in move] + [c / t.turn_speed for c in turn]
-            for t, (move, turn) in ((t, _difference(self._reference, t)) for t in (old, target))
+            for t in (old, target)
+            for move, turn in (_difference(self._reference, (t.position, t.quaternion)),)
         )
         size = math.sqrt(sum(c * c for c in a) * sum(c * c for c in b))
         if size == 0.0:
@@ -213,17 +283,23 @@ class ReferenceGenerator:
         return max(0.0, aligned) * min(1.0, old.speed / target.speed)
 
 
-def _difference(reference: PoseTuple, target: Target) -> tuple[Vector, Vector]:
+def _difference(reference: PoseTuple, target: PoseTuple) -> tuple[Vector, Vector]:
     """Displacement [m] and rotation vector [rad], in the reference's frame, from the reference to the target."""
     (px, py, pz), (rw, rx, ry, rz) = reference
-    x, y, z = target.position
-    w, i, j, k = multiply((rw, -rx, -ry, -rz), target.quaternion)
+    (x, y, z), quaternion = target
+    w, i, j, k = multiply((rw, -rx, -ry, -rz), quaternion)
     if w < 0:
         w, i, j, k = -w, -i, -j, -k
     sine = math.sqrt(i * i + j * j + k * k)
     # The limit of angle / sine is 2; for smaller sines the quotient is dominated by rounding.
     scale = 2 * math.atan2(sine, w) / sine if sine > 1e-12 else 2.0
     return (x - px, y - py, z - pz), (i * scale, j * scale, k * scale)
+
+
+def _moved(pose: PoseTuple, move: Vector, turn: Vector, share: float) -> PoseTuple:
+    """`pose` moved by the fraction `share` of a displacement [m] and of a rotation vector [rad]."""
+    (x, y, z), quaternion = pose
+    return (x + share * move[0], y + share * move[1], z + share * move[2]), _turned(quaternion, turn, share)
 
 
 def _turned(quaternion: Quaternion, turn: Vector, share: float) -> Quaternion:
@@ -240,3 +316,17 @@ def _turned(quaternion: Quaternion, turn: Vector, share: float) -> Quaternion:
 
 def _length(v: Vector) -> float:
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _scaled(v: Vector, factor: float) -> Vector:
+    return (factor * v[0], factor * v[1], factor * v[2])
+
+
+def _direction(v: Vector) -> Vector:
+    """The unit vector along `v`; zero for a zero vector."""
+    length = _length(v)
+    return (0.0, 0.0, 0.0) if length == 0.0 else _scaled(v, 1 / length)

@@ -115,6 +115,7 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
         robot=lab.arm.robot,
         max_speed=lab.arm.max_speed,
         max_turn_speed=math.radians(lab.arm.max_turn_speed_deg),
+        joint_speed=math.radians(lab.arm.joint_speed_deg),
         max_step=space.max_step,
         max_turn=math.radians(space.max_turn_deg),
         stale=stale,

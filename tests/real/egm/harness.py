@@ -25,7 +25,12 @@ DOWN = np.array([0.0, 0.0, 1.0, 0.0])
 
 # Generous limits, because a busy test machine may stall a process for tens of ms; tests of staleness use shorter ones.
 CONFIG = EgmConfig(
-    workspace_min=(0.35, -0.05, 0.25), workspace_max=(0.45, 0.05, 0.35), host="127.0.0.1", stale=1.0, silence=5.0
+    workspace_min=(0.35, -0.05, 0.25),
+    workspace_max=(0.45, 0.05, 0.35),
+    host="127.0.0.1",
+    stale=1.0,
+    silence=5.0,
+    joint_speed=math.radians(30),
 )
 
 
@@ -47,10 +52,12 @@ def free_port() -> int:
 class ArmAndMock:
     """The driver and the mock arm, connected to each other."""
 
-    def __init__(self, factor: float = 1.0, *, config: EgmConfig = CONFIG, mock: MockEgmConfig = MOCK) -> None:
+    def __init__(
+        self, factor: float = 1.0, *, config: EgmConfig = CONFIG, mock: MockEgmConfig = MOCK, lag: float = 0.004
+    ) -> None:
         self.clock = ScaledClock(factor)
         port = free_port()
-        self.plant = KinematicArm(self.clock, position=START, quaternion=DOWN, lag=0.004)
+        self.plant = KinematicArm(self.clock, position=START, quaternion=DOWN, lag=lag)
         self.mock = MockEgmArm(self.plant, clock=self.clock, config=dataclasses.replace(mock, port=port))
         self.arm = EgmArm(dataclasses.replace(config, port=port), clock=self.clock)
 
@@ -83,6 +90,11 @@ class ArmAndMock:
             return bool(np.linalg.norm(self.arm.state().position - position) < within)
 
         self.until(there, f"at {position}, is at {self.arm.state().position}")
+
+    def at_rest(self) -> None:
+        """Wait until the reference has returned to the robot after a hold: at most 25 cycles."""
+        last = self.mock.report.answers
+        self.until(lambda: self.mock.report.answers > last + 30, "30 answers")
 
     def latched(self) -> str:
         def fault() -> str:

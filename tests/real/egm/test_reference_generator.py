@@ -17,7 +17,7 @@ from gelflow.real.egm.reference_generator import EgmFlag, ReferenceGenerator
 from gelflow.real.egm.target import Target, check_target, tool_frame
 from gelflow.real.kinematics import HOME, Joints, forward, inverse
 
-CONFIG = EgmConfig(workspace_min=(0.35, -0.05, 0.25), workspace_max=(0.45, 0.05, 0.35))
+CONFIG = EgmConfig(workspace_min=(0.35, -0.05, 0.25), workspace_max=(0.45, 0.05, 0.35), joint_speed=math.radians(30))
 CYCLE = CONFIG.cycle
 DOWN = (0.0, 0.0, 1.0, 0.0)
 START = (0.40, 0.0, 0.30)
@@ -260,8 +260,14 @@ def test_invalid_target_is_refused_and_the_arm_holds(wrong: Target, text: str) -
     robot.step(30)
     before = robot.sent[-1]
     robot.generator.set_target(wrong, robot.now)
-    robot.step(30)
-    assert robot.sent[-1] == before
+    robot.step(15)
+    at_rest = robot.sent[-1]
+    robot.step(15)
+    # The reference returns to where the robot was, not beyond, and stays there.
+    assert robot.sent[-1] == at_rest
+    behind = before[0][0] - at_rest[0][0]
+    assert 0 <= behind <= (robot.lag + 1) * CONFIG.max_speed * CYCLE * (1 + 1e-9)
+    assert at_rest[0][1:] == pytest.approx(before[0][1:], abs=1e-12)
     refusals = [event for event in robot.events() if event.startswith("refused: target refused: ")]
     assert len(refusals) == 1
     assert text in refusals[0]
