@@ -30,12 +30,17 @@ def draw_flow_map(axes: Any, grid: Grid, flow: NDArray[np.floating[Any]]) -> Non
 
     `flow` are the vectors (x, y), shape (2, rows * cols), whose longest has length 1.
     """
-    down, right = flow * grid.pitch * _ARROW
-    x, y = grid.positions().T
-    axes.quiver(y, x, right, down, color=BLUE, angles="xy", scale_units="xy", scale=1, width=0.008)
+    add_arrows(axes, grid, flow, color=BLUE, width=0.008)
     axes.set(aspect="equal", xticks=[], yticks=[])
     axes.invert_yaxis()
     axes.margins(0.18)
+
+
+def add_arrows(axes: Any, grid: Grid, flow: NDArray[np.floating[Any]], *, color: str, width: float) -> None:
+    """Add the arrows of a flow map, as in `draw_flow_map`; `width` is relative to the width of the axes."""
+    down, right = flow * grid.pitch * _ARROW
+    x, y = grid.positions().T
+    axes.quiver(y, x, right, down, color=color, angles="xy", scale_units="xy", scale=1, width=width)
 
 
 def save(figure: Any, path: str | Path, *, dpi: int = 100, make_folder: bool = True) -> None:

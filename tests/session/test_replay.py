@@ -1,31 +1,24 @@
 """Replay: the same images in the same order give the same decisions; every difference is detected."""
 
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError
 from gelflow.observation import FlowMap, Grid, TactileFrame, flow_map
-from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
-from gelflow.perception.synthetic.appearance import GelAppearance
-from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
-from gelflow.perception.tracker import MarkerTracker
-from gelflow.policies import checkpoint
-from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
 from gelflow.protocols import CameraImage, Policy
 from gelflow.session.decision_replay import Comparison, PerceptionPipeline, difference, replay
+from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
-from gelflow.session.records import Decision, describe_session
-from gelflow.task import INSERTION, InsertionTask
+from gelflow.session.records import Decision
+from gelflow.task import InsertionTask
 
 CLOCK = ScaledClock(1.0)
 SMALL = InsertionTask(grid=Grid(2, 3, 1.0))
@@ -162,11 +155,43 @@ def test_another_policy_and_another_tracker_differ(tmp_path: Path) -> None:
     assert all(made.flow_difference > 0 for made in replayed(tmp_path / "a.mcap", perception=swapped))
 
 
-def test_a_missing_image_is_an_error(tmp_path: Path) -> None:
+def test_a_decision_with_a_missing_image_is_skipped_and_the_next_ones_are_identical(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         run_live(recorder, lose=23)
-    with pytest.raises(PeerError, match="image 23 of sensor"):
-        replayed(tmp_path / "a.mcap")
+    comparisons = replayed(tmp_path / "a.mcap")
+    assert [made.skipped for made in comparisons] == ["", "", "", "image 23 of the left camera is missing", "", ""]
+    # The policy has a memory: it continues from the recorded flow map of the skipped decision.
+    assert [made.identical for made in comparisons] == [True, True, True, False, True, True]
+    assert not any(made.differs for made in comparisons)
+
+
+def test_a_replay_goes_on_past_damaged_chunks(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with SessionRecorder(path, CLOCK) as recorder:
+        run_live(recorder)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    decisions = [key for key, channel in summary.channels.items() if channel.topic == "/decision"]
+    # The chunk of the third decision, the last of the first insertion.
+    chunk = [index for index in summary.chunk_indexes if set(decisions) & set(index.message_index_offsets)][2]
+    data = bytearray(path.read_bytes())
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(PeerError, match="is damaged"):
+        replayed(path)
+    damage = Damage()
+    with SessionReader(path) as session:
+        found = list(replay(session, perception=PERCEPTION, policy=EchoPolicy(), task=SMALL, damage=damage))
+    assert [(made.recorded.insertion, made.recorded.attempt) for made in found] == [
+        (0, 0),
+        (0, 1),
+        (1, 0),
+        (1, 1),
+        (1, 2),
+    ]
+    assert all(made.identical for made in found)
+    assert damage.chunks == 1 and damage.records >= 2
 
 
 class RejectingTracker(SumTracker):
@@ -180,7 +205,7 @@ class RejectingTracker(SumTracker):
         return super().track(data)
 
 
-def test_an_image_that_the_tracker_rejects_is_an_error_only_if_required(tmp_path: Path) -> None:
+def test_an_image_that_the_tracker_rejects_skips_the_decision_only_if_required(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         run_live(recorder)
     with SessionReader(tmp_path / "a.mcap") as session:
@@ -188,135 +213,15 @@ def test_an_image_that_the_tracker_rejects_is_an_error_only_if_required(tmp_path
         first = next(session.decisions())
     rejecting = PerceptionPipeline(RejectingTracker, sum_frame)
     RejectingTracker.refused = data[first.tracked[0][1]]
-    assert not replayed(tmp_path / "a.mcap", perception=rejecting)[0].identical
+    made = replayed(tmp_path / "a.mcap", perception=rejecting)[0]
+    assert made.differs and not made.skipped
     RejectingTracker.refused = data[first.frames[0][0]]
-    with pytest.raises(PeerError, match="no markers"):
-        replayed(tmp_path / "a.mcap", perception=rejecting)
+    made, *others = replayed(tmp_path / "a.mcap", perception=rejecting)
+    assert "left camera is unreadable: no markers" in made.skipped and not made.identical
+    assert all(other.identical for other in others)
 
 
 def test_difference_of_arrays() -> None:
     assert difference(np.array([1.0, 2.0]), np.array([1.0, 2.5])) == 0.5
     assert difference(np.array([np.nan]), np.array([np.nan])) == np.inf
     assert difference(np.zeros(2), np.zeros(3)) == np.inf
-
-
-# The replay command with the marker tracker and a checkpoint
-
-LOOK = GelAppearance()
-MOUNT = CameraMount(pixels_per_mm=LOOK.pixels_per_mm)
-
-
-def untrained(path: Path, seed: int) -> Path:
-    """A checkpoint with random weights."""
-    rng = np.random.default_rng(seed)
-    shape = Architecture(hidden=(8,))
-    tensors = {name: 0.1 * rng.normal(size=size) for name, size in tensor_shapes(shape, INSERTION).items()}
-    tensors["scale"] = np.ones_like(tensors["scale"])
-    checkpoint.save_checkpoint(path, task=INSERTION, architecture=shape, tensors=tensors, training={})
-    return path
-
-
-@pytest.fixture(scope="module")
-def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("session")
-    policy_file = untrained(folder / "policy.safetensors", 1)
-    policy: NetworkPolicy = checkpoint.load_policy(policy_file)
-    renderer = [FastGelRenderer(dataclasses.replace(LOOK, seed=sensor)) for sensor in (0, 1)]
-    rng = np.random.default_rng(3)
-    config = MOUNT.tracker_config()
-    with SessionRecorder(folder / "session.mcap", CLOCK) as recorder:
-        recorder.metadata(
-            describe_session(task=INSERTION, trackers=[config, config], mounts=[MOUNT, MOUNT], checkpoint=policy_file)
-        )
-        sequence = 0
-        for insertion, attempt in [(0, 0), (0, 1), (1, 0)]:
-            if attempt == 0:
-                policy.reset()
-            push = rng.normal(size=(2, 1, 2)) * 0.15
-            trackers = [MarkerTracker(config), MarkerTracker(config)]
-            frames = []
-            first = sequence
-            for step in range(4):
-                tracked = []
-                for sensor in (0, 1):
-                    moved = push[sensor] * step / 3 * np.ones((LOOK.grid.rows * LOOK.grid.cols, 1))
-                    picture = renderer[sensor].render(moved, sequence=sequence)
-                    image = CameraImage(renderer[sensor].encode(picture), CLOCK.now(), sequence)
-                    recorder.image(sensor, image)
-                    pixels = decode_image(image.data)
-                    tracked.append(trackers[sensor].track(pixels) if step else trackers[sensor].start(pixels))
-                frames.append(tactile_frame(tracked, [MOUNT, MOUNT], CLOCK.now()))
-                sequence += 1
-            observation = flow_map(frames[-1:], frames[0], grid=INSERTION.grid)
-            images = tuple(range(first, sequence))
-            decision = Decision.of(
-                observation,
-                insertion=insertion,
-                attempt=attempt,
-                tracked=(images, images),
-                reference=(first, first),
-                frames=((sequence - 1, sequence - 1),),
-                action=policy.act(observation),
-                correction=np.zeros(3),
-            )
-            recorder.decision(decision.to_json())
-            recorder.attempt_end({"insertion": insertion, "attempt": attempt})
-    return folder / "session.mcap"
-
-
-def test_the_command_reports_identical_decisions(
-    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    picture = tmp_path / "maps.png"
-    assert main(["replay", str(real_session), "--out", str(picture)]) == 0
-    out = capsys.readouterr().out
-    with SessionReader(real_session) as session:
-        actions = {tuple(decision.action) for decision in session.decisions()}
-    assert len(actions) == 3 and all(0 < abs(x) < 8e-3 for x, _, _ in actions)  # not zero: the policy was evaluated
-    assert "all 3 decisions identical" in out and "note:" not in out
-    drawn = cv2.imread(str(picture))
-    assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
-
-
-def test_the_command_prints_json(real_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", str(real_session), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["identical"] and printed["notes"] == [] and printed["picture"] is None
-    assert [decision["action_difference"] for decision in printed["decisions"]] == [0, 0, 0]
-
-
-def test_the_command_detects_another_policy(
-    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    other = untrained(tmp_path / "other.safetensors", 2)
-    assert main(["replay", str(real_session), "--checkpoint", str(other)]) == 1
-    out = " ".join(capsys.readouterr().out.split())
-    assert "3 of 3 decisions differ" in out and "is not the policy that the session ran" in out
-
-
-def test_the_command_rejects_wrong_input_with_one_line(
-    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(real_session.read_bytes()[:-100])
-    (tmp_path / "text.mcap").write_text("no session")
-    with SessionRecorder(tmp_path / "moved.mcap", CLOCK) as recorder:
-        gone = {"path": "/gone/policy.safetensors", "digest": "0" * 64}
-        recorder.metadata({**describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2), "checkpoint": gone})
-    with SessionRecorder(tmp_path / "bare.mcap", CLOCK) as recorder:
-        recorder.metadata({})
-    with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
-        recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
-    for arguments, message in [
-        ([str(tmp_path / "none.mcap")], "No such file"),
-        ([str(cut)], f"recover it with: gelflow recover {cut}"),
-        ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
-        ([str(tmp_path / "moved.mcap")], "name the file with --checkpoint"),
-        ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
-        ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
-        ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
-        ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "cannot write the picture"),
-    ]:
-        assert main(["replay", *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error and error.count("\n") == 1, error

@@ -1,4 +1,4 @@
-from .decision_picture import draw_decisions as draw_decisions
+from .decision_picture import draw_comparisons as draw_comparisons
 from .decision_replay import Comparison as Comparison
 from .decision_replay import ImageTracker as ImageTracker
 from .decision_replay import PerceptionPipeline as PerceptionPipeline
@@ -25,7 +25,7 @@ __all__ = [
     "SessionReader",
     "SessionRecorder",
     "describe_session",
-    "draw_decisions",
+    "draw_comparisons",
     "recover",
     "replay",
 ]

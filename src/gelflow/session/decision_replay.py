@@ -1,7 +1,9 @@
 """Replay of a session: recomputes each decision from the recorded images and compares it with the recorded one.
 
 The tracker, the conversion to tactile frames and the policy are arguments. This module depends only on the contents of
-a session and on the order in which the live run used them.
+a session and on the order in which the live run used them. A decision whose images are missing or damaged is skipped;
+its recorded flow map then takes the place of the recomputed one, so that the policy has the same state in the next
+decision as in the live run.
 """
 
 from collections import Counter
@@ -12,9 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, UsageError
 from gelflow.observation import FlowMap, TactileFrame, flow_map
 from gelflow.protocols import CameraImage, Policy
+from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS, Decision
 from gelflow.task import InsertionTask
@@ -43,6 +46,7 @@ class Comparison:
     recorded: Decision
     flow: FlowMap  # recomputed
     action: NDArray[np.float64]  # recomputed, shape (3,) [m, m, rad]
+    skipped: str = ""  # the reason why the flow map could not be recomputed; `flow` is then the recorded one
 
     @property
     def action_difference(self) -> float:
@@ -60,8 +64,13 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether both agree in every bit."""
-        return self.action_difference == 0 and self.flow_difference == 0
+        """Whether the decision was recomputed and agrees in every bit."""
+        return not self.skipped and not self.differs
+
+    @property
+    def differs(self) -> bool:
+        """Whether the action or the flow map differs in any bit."""
+        return self.action_difference > 0 or self.flow_difference > 0
 
 
 def difference(one: NDArray[Any], other: NDArray[Any]) -> float:
@@ -73,21 +82,31 @@ def difference(one: NDArray[Any], other: NDArray[Any]) -> float:
 
 
 def replay(
-    session: SessionReader, *, perception: PerceptionPipeline, policy: Policy, task: InsertionTask
+    session: SessionReader,
+    *,
+    perception: PerceptionPipeline,
+    policy: Policy,
+    task: InsertionTask,
+    damage: Damage | None = None,
 ) -> Iterator[Comparison]:
     """Recompute the decisions of `session` in order. The policy is reset at the start of each insertion.
 
-    Raises PeerError when the file lacks an image of a decision.
+    A decision whose images are missing or unreadable is `skipped`: only its action is recomputed, from the recorded
+    flow map. With `damage`, damaged records are counted in it and passed over; without, they raise PeerError. A
+    decision whose own record is lost does not appear: from there to the end of its insertion, a policy with a memory
+    does not have the state of the live run.
     """
+    reading = Damage() if damage is not None else None  # the first pass reads a part of the same records
     needed: Counter[tuple[int, int]] = Counter()
-    for decision in session.decisions():
-        if len(decision.tracked) != task.sensors:
-            raise PeerError(f"a decision names {len(decision.tracked)} sensors, but the task has {task.sensors}")
-        needed.update(_images_of(decision))
+    for record in session.records(["/decision"], damage=reading):
+        if len(record.value.tracked) != task.sensors:
+            raise PeerError(f"a decision names {len(record.value.tracked)} sensors, but the task has {task.sensors}")
+        needed.update(_images_of(record.value))
     images: dict[tuple[int, int], CameraImage] = {}
     insertion: int | None = None
     # One pass over the file: images precede their decisions and are dropped after the last one that uses them.
-    for record in session.records(["/decision", *(f"/{sensor}/image" for sensor in SENSORS)]):
+    topics = ["/decision", *(f"/{sensor}/image" for sensor in SENSORS)]
+    for record in session.records(topics, damage=damage):
         if isinstance(record.value, CameraImage):
             sensor = SENSORS.index(record.topic.split("/")[1])
             if (sensor, record.value.sequence) in needed:
@@ -97,12 +116,27 @@ def replay(
         if decision.insertion != insertion:
             policy.reset()
             insertion = decision.insertion
-        observation = observe(decision, images, perception=perception, task=task)
-        yield Comparison(decision, observation, np.asarray(policy.act(observation), dtype=float))
+        yield _compare(decision, images, perception=perception, policy=policy, task=task)
         for key in _images_of(decision):
             needed[key] -= 1
             if needed[key] == 0:
                 images.pop(key, None)
+
+
+def _compare(
+    decision: Decision,
+    images: dict[tuple[int, int], CameraImage],
+    *,
+    perception: PerceptionPipeline,
+    policy: Policy,
+    task: InsertionTask,
+) -> Comparison:
+    skipped = ""
+    try:
+        observation = observe(decision, images, perception=perception, task=task)
+    except PeerError as error:
+        skipped, observation = str(error), decision.observation
+    return Comparison(decision, observation, np.asarray(policy.act(observation), dtype=float), skipped)
 
 
 def observe(
@@ -112,7 +146,10 @@ def observe(
     perception: PerceptionPipeline,
     task: InsertionTask,
 ) -> FlowMap:
-    """The flow map of `decision`, from images by (sensor, sequence), tracked in the order of the live run."""
+    """The flow map of `decision`, from images by (sensor, sequence), tracked in the order of the live run.
+
+    Raises PeerError when an image is missing, or when one that the decision requires is unreadable.
+    """
     required = {(s, sequence) for moment in (decision.reference, *decision.frames) for s, sequence in enumerate(moment)}
     tracked: dict[tuple[int, int], Any] = {}
     for sensor, sequences in enumerate(decision.tracked):
@@ -120,16 +157,14 @@ def observe(
         for order, sequence in enumerate(sequences):
             image = images.get((sensor, sequence))
             if image is None:
-                raise PeerError(
-                    f"insertion {decision.insertion}, attempt {decision.attempt} used image {sequence} of sensor "
-                    f"{sensor}; the session lacks it, so the decision cannot be replayed"
-                )
+                raise PeerError(f"image {sequence} of the {SENSORS[sensor]} camera is missing")
             try:
                 tracked[sensor, sequence] = tracker.track(image.data) if order else tracker.start(image.data)
-            except PeerError:
+            except (PeerError, UsageError) as error:
                 # The live run got the same error, and continued unless the decision required this image.
                 if (sensor, sequence) in required:
-                    raise
+                    text = f"image {sequence} of the {SENSORS[sensor]} camera is unreadable: {error}"
+                    raise PeerError(text) from error
 
     def at(moment: tuple[int, ...]) -> TactileFrame:
         stamp = max(images[sensor, sequence].stamp for sensor, sequence in enumerate(moment))

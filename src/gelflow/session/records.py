@@ -11,14 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
-from gelflow.observation import FlowMap
+from gelflow.observation import FlowMap, Unit
 from gelflow.task import InsertionTask
 
 FORMAT = 1
@@ -126,6 +126,14 @@ class Decision:
     def of(cls, observation: FlowMap, **values: Any) -> "Decision":
         """A decision for `observation`; `values` are the other fields."""
         return cls(flow=observation.image, divisor=observation.divisor, unit=observation.unit, **values)
+
+    @property
+    def observation(self) -> FlowMap:
+        """The recorded flow map; which of its values were interpolated is not recorded."""
+        channels, rows, cols = self.flow.shape
+        return FlowMap(
+            self.flow, self.divisor, cast(Unit, self.unit), np.zeros((channels // 2, rows, cols), dtype=bool)
+        )
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, for `SessionRecorder.decision`."""

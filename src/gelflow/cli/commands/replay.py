@@ -1,7 +1,9 @@
 """`gelflow replay`: recompute the decisions of a session from its recorded images and compare them."""
 
 import argparse
+import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
 from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
+from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import file_digest, from_plain, software_versions
 from gelflow.task import InsertionTask
@@ -24,12 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("session", type=Path, metavar="SESSION", help="a recorded session (.mcap)")
     add_checkpoint(parser, default="the policy of the session")
-    add_out(parser, "a picture (.png) of flow maps and corrections")
+    add_out(parser, "a picture (.png) of flow maps and corrections, recorded and recomputed")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay the session and print the differences. A negative result: a decision differs, or there is none."""
+    """Replay the session and print the differences.
+
+    A negative result: a decision differs, could not be recomputed or is lost, or there is none.
+    """
     from gelflow.policies.checkpoint import load_policy
 
     output = Output(args.json)
@@ -40,22 +46,65 @@ def run(args: argparse.Namespace) -> int:
         notes = _notes(description, args.checkpoint)
         for note in notes:
             output.text(f"note: {note}")
-        total = session.counts().get("/decision", 0)
+        total, damage = session.counts().get("/decision", 0), Damage()
         comparisons = []
         with progress_bar(count=True) as progress:
             bar = progress.add_task("replaying", total=total)
-            for comparison in replay(session, perception=perception, policy=policy, task=task):
+            for comparison in replay(session, perception=perception, policy=policy, task=task, damage=damage):
                 comparisons.append(comparison)
                 progress.advance(bar)
-    if not comparisons:
-        output.text("The session contains no decision: there is nothing to compare.")
-        output.result({"decisions": [], "identical": False, "notes": notes})
-        return NEGATIVE_RESULT
-    if args.out:
-        from gelflow.session.decision_picture import draw_decisions
+    result = _Result(comparisons, total - len(comparisons), damage, notes)
+    if args.out and comparisons:
+        from gelflow.session.decision_picture import draw_comparisons
 
-        draw_decisions([comparison.recorded for comparison in comparisons], task.grid, args.out)
-    return _show(output, comparisons, notes, args.out)
+        draw_comparisons(comparisons, task.grid, args.out)
+    return _show(output, result, args.out if comparisons else None)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """The result of a replay."""
+
+    comparisons: Sequence[Comparison]
+    lost: int  # decisions whose own record is damaged
+    damage: Damage
+    notes: list[str]
+
+    @property
+    def skipped(self) -> list[Comparison]:
+        return [comparison for comparison in self.comparisons if comparison.skipped]
+
+    @property
+    def identical(self) -> bool:
+        """Whether there is a decision and all were recomputed identically."""
+        return bool(self.comparisons) and not self.lost and all(c.identical for c in self.comparisons)
+
+    def verdict(self) -> list[str]:
+        """Lines about all decisions together."""
+        count = len(self.comparisons) + self.lost
+        if not count:
+            return ["The session contains no decision: there is nothing to compare."]
+        differ = sum(comparison.differs for comparison in self.comparisons)
+        same = sum(comparison.identical for comparison in self.comparisons)
+        verdict = f"{differ} of {count} decisions differ" if differ else f"{same} of {count} decisions identical"
+        action = max((comparison.action_difference for comparison in self.comparisons), default=0.0)
+        flow = max((comparison.flow_difference for comparison in self.comparisons), default=0.0)
+        verdict = f"all {count} decisions identical" if same == count else verdict
+        lines = [f"{verdict}; largest difference: action {action:.3g} [m, rad], flow map {flow:.3g}"]
+        if self.skipped:
+            first = self.skipped[0].skipped
+            lines.append(
+                f"{len(self.skipped)} of {count} decisions could not be recomputed: images missing or unreadable "
+                f"(first: {first}); their actions were recomputed from the recorded flow maps"
+            )
+        if self.damage:
+            lines.append(f"passed over: {self.damage.records} damaged records, {self.damage.chunks} damaged chunks")
+        if self.lost:
+            lines.append(
+                f"{self.lost} of {count} decisions are lost with them; a policy with a memory has another state until "
+                "the next insertion"
+            )
+        return lines
 
 
 def _perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
@@ -115,37 +164,44 @@ def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]
     return notes
 
 
-def _show(output: Output, comparisons: Sequence[Comparison], notes: list[str], picture: Path | None) -> int:
+def _show(output: Output, result: _Result, picture: Path | None) -> int:
     """Print the comparison and return the exit code."""
-    action = max(comparison.action_difference for comparison in comparisons)
-    flow = max(comparison.flow_difference for comparison in comparisons)
-    wrong = sum(not comparison.identical for comparison in comparisons)
-    count = len(comparisons)
-    verdict = f"{wrong} of {count} decisions differ" if wrong else f"all {count} decisions identical"
-    if output.json:
-        decisions = [
-            {
-                "insertion": comparison.recorded.insertion,
-                "attempt": comparison.recorded.attempt,
-                "recorded_action": comparison.recorded.action,
-                "action": comparison.action,
-                "action_difference": comparison.action_difference,
-                "flow_difference": comparison.flow_difference,
-            }
-            for comparison in comparisons
-        ]
-        output.result({"decisions": decisions, "identical": not wrong, "notes": notes, "picture": picture})
-    else:
-        output.console.print(_table(comparisons))
-        if picture:
-            output.text(f"picture: {picture}")
-        output.text(f"{verdict}; largest difference: action {action:.3g} [m, rad], flow map {flow:.3g}")
-    return NEGATIVE_RESULT if wrong else SUCCESS
+    decisions = [
+        {
+            "insertion": comparison.recorded.insertion,
+            "attempt": comparison.recorded.attempt,
+            "recorded_action": comparison.recorded.action,
+            "action": comparison.action,
+            "action_difference": comparison.action_difference,
+            "flow_difference": None if comparison.skipped else comparison.flow_difference,
+            "skipped": comparison.skipped,
+        }
+        for comparison in result.comparisons
+    ]
+    if not output.json and decisions:
+        output.console.print(_table(result.comparisons))
+    if picture:
+        output.text(f"picture: {picture}")
+    for line in result.verdict():
+        output.text(line)
+    output.result(
+        {
+            "decisions": decisions,
+            "identical": result.identical,
+            "skipped": len(result.skipped),
+            "lost_decisions": result.lost,
+            "damaged": dataclasses.asdict(result.damage),
+            "notes": result.notes,
+            "picture": picture,
+        }
+    )
+    return SUCCESS if result.identical else NEGATIVE_RESULT
 
 
 def _table(comparisons: Sequence[Comparison]) -> Table:
-    table = Table(title="Recorded decisions, and differences (Δ) of the recomputed ones", box=SIMPLE_HEAD)
-    for name in ("insertion", "attempt", "images", "x mm", "y mm", "yaw °", "Δ action", "Δ map"):
+    table = Table(title="Recorded decisions, and differences of the recomputed ones", box=SIMPLE_HEAD)
+    differences = ("difference\nof action", "difference\nof map")
+    for name in ("insertion", "attempt", "images", "x mm", "y mm", "yaw °", *differences):
         table.add_column(name, justify="right", no_wrap=True)
     for comparison in comparisons:
         recorded = comparison.recorded
@@ -157,7 +213,7 @@ def _table(comparisons: Sequence[Comparison]) -> Table:
             f"{dy:+.3f}",
             f"{turn:+.3f}",
             f"{comparison.action_difference:.3g}",
-            f"{comparison.flow_difference:.3g}",
+            "skipped" if comparison.skipped else f"{comparison.flow_difference:.3g}",
             style=None if comparison.identical else "red",
         )
     return table

@@ -1,0 +1,230 @@
+"""The replay command with the marker tracker and a checkpoint."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from gelflow.cli.main import main
+from gelflow.clock import ScaledClock
+from gelflow.observation import FlowMap, flow_map
+from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.synthetic.appearance import GelAppearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
+from gelflow.perception.tracker import MarkerTracker
+from gelflow.policies import checkpoint
+from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
+from gelflow.protocols import CameraImage
+from gelflow.session.decision_picture import draw_comparisons
+from gelflow.session.decision_replay import Comparison
+from gelflow.session.reader import SessionReader
+from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import Decision, describe_session
+from gelflow.task import INSERTION
+
+CLOCK = ScaledClock(1.0)
+LOOK = GelAppearance()
+MOUNT = CameraMount(pixels_per_mm=LOOK.pixels_per_mm)
+
+
+def untrained(path: Path, seed: int) -> Path:
+    """A checkpoint with random weights."""
+    rng = np.random.default_rng(seed)
+    shape = Architecture(hidden=(8,))
+    tensors = {name: 0.1 * rng.normal(size=size) for name, size in tensor_shapes(shape, INSERTION).items()}
+    tensors["scale"] = np.ones_like(tensors["scale"])
+    checkpoint.save_checkpoint(path, task=INSERTION, architecture=shape, tensors=tensors, training={})
+    return path
+
+
+@pytest.fixture(scope="module")
+def real_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("session")
+    policy_file = untrained(folder / "policy.safetensors", 1)
+    policy: NetworkPolicy = checkpoint.load_policy(policy_file)
+    renderer = [FastGelRenderer(dataclasses.replace(LOOK, seed=sensor)) for sensor in (0, 1)]
+    rng = np.random.default_rng(3)
+    config = MOUNT.tracker_config()
+    with SessionRecorder(folder / "session.mcap", CLOCK) as recorder:
+        recorder.metadata(
+            describe_session(task=INSERTION, trackers=[config, config], mounts=[MOUNT, MOUNT], checkpoint=policy_file)
+        )
+        sequence = 0
+        for insertion, attempt in [(0, 0), (0, 1), (1, 0)]:
+            if attempt == 0:
+                policy.reset()
+            push = rng.normal(size=(2, 1, 2)) * 0.15
+            trackers = [MarkerTracker(config), MarkerTracker(config)]
+            frames = []
+            first = sequence
+            for step in range(4):
+                tracked = []
+                for sensor in (0, 1):
+                    moved = push[sensor] * step / 3 * np.ones((LOOK.grid.rows * LOOK.grid.cols, 1))
+                    picture = renderer[sensor].render(moved, sequence=sequence)
+                    image = CameraImage(renderer[sensor].encode(picture), CLOCK.now(), sequence)
+                    recorder.image(sensor, image)
+                    pixels = decode_image(image.data)
+                    tracked.append(trackers[sensor].track(pixels) if step else trackers[sensor].start(pixels))
+                frames.append(tactile_frame(tracked, [MOUNT, MOUNT], CLOCK.now()))
+                sequence += 1
+            observation = flow_map(frames[-1:], frames[0], grid=INSERTION.grid)
+            images = tuple(range(first, sequence))
+            decision = Decision.of(
+                observation,
+                insertion=insertion,
+                attempt=attempt,
+                tracked=(images, images),
+                reference=(first, first),
+                frames=((sequence - 1, sequence - 1),),
+                action=policy.act(observation),
+                correction=np.zeros(3),
+            )
+            recorder.decision(decision.to_json())
+            recorder.attempt_end({"insertion": insertion, "attempt": attempt})
+    return folder / "session.mcap"
+
+
+def test_the_command_reports_identical_decisions(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    picture = tmp_path / "maps.png"
+    assert main(["replay", str(real_session), "--out", str(picture)]) == 0
+    out = capsys.readouterr().out
+    with SessionReader(real_session) as session:
+        actions = {tuple(decision.action) for decision in session.decisions()}
+    assert len(actions) == 3 and all(0 < abs(x) < 8e-3 for x, _, _ in actions)  # not zero: the policy was evaluated
+    assert "all 3 decisions identical" in out and "note:" not in out
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
+
+
+def test_the_command_prints_json(real_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(real_session), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["identical"] and printed["notes"] == [] and printed["picture"] is None
+    assert [decision["action_difference"] for decision in printed["decisions"]] == [0, 0, 0]
+
+
+def test_the_command_detects_another_policy(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    other, picture = untrained(tmp_path / "other.safetensors", 2), tmp_path / "both.png"
+    assert main(["replay", str(real_session), "--checkpoint", str(other), "--out", str(picture)]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "3 of 3 decisions differ" in out and "is not the policy that the session ran" in out
+    assert "difference" in out and "Δ" not in out
+    assert reddish(picture) > 100  # the corrections of the other policy
+    assert main(["replay", str(real_session), "--out", str(tmp_path / "same.png")]) == 0
+    assert reddish(tmp_path / "same.png") == 0
+
+
+def reddish(path: Path) -> int:
+    """Number of pixels in the colour of the recomputed decisions."""
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    blue, green, red = cv2.split(picture.astype(int))
+    return int(((red > 150) & (blue < 100) & (green < 150)).sum())
+
+
+def without(source: Path, target: Path, *, topic: str, sequences: set[int]) -> Path:
+    """A copy of a session that lacks some messages."""
+    with source.open("rb") as stream, target.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out)
+        writer.start()
+        for metadata in reader.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            if channel.topic == topic and message.sequence in sequences:
+                continue
+            key = channels[channel.id]
+            writer.add_message(key, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return target
+
+
+def test_the_command_counts_decisions_without_images(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    cut = without(real_session, tmp_path / "cut.mcap", topic="/right/image", sequences={5, 6})  # of the second attempt
+    assert main(["replay", str(cut), "--out", str(tmp_path / "maps.png")]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 decisions identical" in out and "1 of 3 decisions could not be recomputed: images missing" in out
+    assert "image 5 of the right camera is missing" in out and "skipped" in out
+    assert main(["replay", str(cut), "--json"]) == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert not printed["identical"] and printed["skipped"] == 1 and printed["lost_decisions"] == 0
+    assert [bool(decision["skipped"]) for decision in printed["decisions"]] == [False, True, False]
+    assert [decision["action_difference"] for decision in printed["decisions"]] == [0, 0, 0]
+
+
+def test_both_flow_maps_are_drawn_where_they_differ(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    grid = INSERTION.grid
+    image = rng.normal(0, 0.3, (4, grid.rows, grid.cols)).astype(np.float32)
+    flow = FlowMap(image, 0.4, "mm", np.zeros((2, grid.rows, grid.cols), dtype=bool))
+    recorded = Decision.of(
+        flow,
+        insertion=0,
+        attempt=0,
+        tracked=((1, 2), (1, 2)),
+        reference=(1, 1),
+        frames=((2, 2),),
+        action=np.zeros(3),
+        correction=np.zeros(3),
+    )
+    for shift, different in [(1e-4, False), (0.2, True)]:
+        moved = FlowMap(image + np.float32(shift), 0.4, "mm", flow.filled)
+        draw_comparisons([Comparison(recorded, moved, np.zeros(3))], grid, tmp_path / f"{shift}.png")
+        assert (reddish(tmp_path / f"{shift}.png") > 0) == different
+
+
+def test_the_command_counts_damaged_records(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    data = bytearray(real_session.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    assert main(["replay", str(tmp_path / "damaged.mcap")]) == 1
+    out = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"passed over: \d+ damaged records, 1 damaged chunks", out)
+    assert re.search(r"[12] of 3 decisions (could not be recomputed|are lost)", out)
+
+
+def test_the_command_rejects_wrong_input_with_one_line(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(real_session.read_bytes()[:-100])
+    (tmp_path / "text.mcap").write_text("no session")
+    with SessionRecorder(tmp_path / "moved.mcap", CLOCK) as recorder:
+        gone = {"path": "/gone/policy.safetensors", "digest": "0" * 64}
+        recorder.metadata({**describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2), "checkpoint": gone})
+    with SessionRecorder(tmp_path / "bare.mcap", CLOCK) as recorder:
+        recorder.metadata({})
+    with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
+        recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
+    for arguments, message in [
+        ([str(tmp_path / "none.mcap")], "No such file"),
+        ([str(cut)], f"recover it with: gelflow recover {cut}"),
+        ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
+        ([str(tmp_path / "moved.mcap")], "name the file with --checkpoint"),
+        ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
+        ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
+        ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
+        ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "cannot write the picture"),
+    ]:
+        assert main(["replay", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1, error
