@@ -2,6 +2,10 @@ from .camera.device import MockMjpegCamera as MockMjpegCamera
 from .egm.controller import MockEgmConfig as MockEgmConfig
 from .egm.controller import MockEgmReport as MockEgmReport
 from .egm.device import MockEgmArm as MockEgmArm
+from .faults.plan import Fault as Fault
+from .faults.plan import FaultPlan as FaultPlan
+from .faults.plan_file import load_plan as load_plan
+from .faults.random_plan import random_plan as random_plan
 from .plant import ArmPlant as ArmPlant
 from .plant import GelPlant as GelPlant
 from .plant import GripperPlant as GripperPlant
@@ -20,6 +24,8 @@ from .wsg.finger_controller import MockWsgConfig as MockWsgConfig
 
 __all__ = [
     "ArmPlant",
+    "Fault",
+    "FaultPlan",
     "GelPlant",
     "GripperPlant",
     "KinematicArm",
@@ -36,6 +42,8 @@ __all__ = [
     "SimulatedCellConfig",
     "SimulatedCellProcess",
     "World",
+    "load_plan",
     "load_world",
     "preset_config",
+    "random_plan",
 ]

@@ -20,6 +20,8 @@ from gelflow.errors import UsageError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.hardware_mocks.egm.controller import MockEgmConfig
 from gelflow.hardware_mocks.egm.device import MockEgmArm
+from gelflow.hardware_mocks.faults.injector import Devices, FaultInjector
+from gelflow.hardware_mocks.faults.plan import FaultPlan
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
@@ -44,6 +46,7 @@ class MockRobotConfig:
     egm_port: int = 6510  # UDP port to which the arm sends its feedback
     tcp_port: int = 0  # of the gripper, in addition to its pty; 0 takes a free port
     truth_port: int = 0  # of the HTTP server of the ground truth; 0 takes a free port
+    faults: FaultPlan = field(default_factory=FaultPlan)
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
 
     def view(self, finger: int) -> tuple[GelAppearance, Lens]:
@@ -91,7 +94,8 @@ class MockRobot:
             )
             for finger, slot in enumerate((LEFT_CAMERA, RIGHT_CAMERA))
         )
-        self._truth = _TruthServer((config.host, config.truth_port), self.cell)
+        self.faults = FaultInjector(config.faults, Devices(self.arm, self.gripper, self.cameras, self.cell), clock)
+        self._truth = _TruthServer((config.host, config.truth_port), self.cell, self.faults)
         self._stack = contextlib.ExitStack()
 
     @property
@@ -116,6 +120,9 @@ class MockRobot:
             stack.enter_context(self.gripper)
             for camera in self.cameras:
                 stack.enter_context(camera)
+            if self.config.faults.faults:
+                self.faults.start()
+                stack.callback(self.faults.stop)
             threading.Thread(target=self._truth.serve_forever, args=(0.05,), name="truth", daemon=True).start()
             stack.callback(self._truth.close)
             self._stack = stack.pop_all()
@@ -154,8 +161,8 @@ class _TruthServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, where: tuple[str, int], cell: SimulatedCellProcess) -> None:
-        self.cell = cell
+    def __init__(self, where: tuple[str, int], cell: SimulatedCellProcess, faults: FaultInjector) -> None:
+        self.cell, self.faults = cell, faults
         try:
             super().__init__(where, _TruthHandler)
         except OSError as error:
@@ -173,7 +180,7 @@ class _TruthHandler(BaseHTTPRequestHandler):
     server: _TruthServer
 
     def do_GET(self) -> None:
-        self._answer(self.server.cell.truth())
+        self._answer({**self.server.cell.truth(), "faults": self.server.faults.log})
 
     def do_POST(self) -> None:
         text = parse_qs(urlsplit(self.path).query).get("seed", [""])[0]

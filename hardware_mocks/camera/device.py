@@ -4,14 +4,17 @@ import contextlib
 import math
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 from urllib.parse import parse_qs, urlsplit
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
+from gelflow.hardware_mocks.camera.faults import CameraFaults
+from gelflow.hardware_mocks.message_faults import MessageFaults
 from gelflow.time_sync import MAX_LEAD
 
 BOUNDARY = "boundarydonotcross"
@@ -56,6 +59,9 @@ class MockMjpegCamera:
         self._stalled = False
         self._epoch = 0  # incremented to end all streams
         self._corrupt: list[Corruption] = []
+        self._faults = CameraFaults()
+        self._refused: set[int] = set()  # faults that keep clients from connecting
+        self._stalled_by: set[int] = set()  # faults
         self._failure: Exception | None = None
 
     # Server
@@ -137,15 +143,35 @@ class MockMjpegCamera:
             self._epoch += 1
             self._changed.notify_all()
 
+    def begin_fault(self, number: int, kind: str, values: dict[str, Any]) -> None:
+        """Begin a fault: disconnect, stall, or one of the images (`IMAGE_KINDS`) or of the stream (`MESSAGE_KINDS`)."""
+        with self._changed:
+            if kind == "disconnect":
+                self._refused.add(number)
+                self._epoch += 1
+            elif kind == "stall":
+                self._stalled_by.add(number)
+            else:
+                self._faults.begin(number, kind, values)
+            self._changed.notify_all()
+
+    def end_fault(self, number: int) -> None:
+        """End the fault with this number."""
+        with self._changed:
+            self._faults.end(number)
+            self._refused.discard(number)
+            self._stalled_by.discard(number)
+            self._changed.notify_all()
+
     # Between the threads
 
     def _produce(self) -> None:
         due = self._clock.now()
         while True:
             with self._changed:
-                if self._closing or self._watchers == 0 or self._stalled:
+                if self._closing or self._watchers == 0 or self._silent:
                     self._allow(math.inf)
-                self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._stalled))
+                self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._silent))
                 if self._closing:
                     return
             try:
@@ -157,6 +183,7 @@ class MockMjpegCamera:
                     self._changed.notify_all()
                 return
             with self._changed:
+                image = self._faults.image(image)
                 self._image, self._stamp = image, self._clock.now() + CLOCK_OFFSET
                 self._number += 1
                 self._changed.notify_all()
@@ -164,33 +191,69 @@ class MockMjpegCamera:
             self._allow(due + MAX_LEAD)
             self._clock.sleep(due - self._clock.now())
 
+    @property
+    def _silent(self) -> bool:
+        return self._stalled or bool(self._stalled_by)
+
     def _allow(self, until: float) -> None:
         if self._slot is not None:
             self._clock.grant(self._slot, until)
 
-    def _watch(self, change: int) -> int:
-        """Add or remove a client; returns the current epoch."""
+    def _watch(self, change: int) -> None:
+        """Add or remove a client."""
         with self._changed:
             self._watchers += change
             self._changed.notify_all()
-            return self._epoch
 
-    def _next(self, after: int, epoch: int) -> tuple[int, bytes, float, Corruption | None] | None:
-        """Number, image and stamp of the newest image with a number above `after`; None when the stream ends."""
+    def _next(self, client: "_Client") -> list[bytes] | None:
+        """The parts for a client, which wait for a new image or for the time of a delayed part; None at the end."""
 
         def ended() -> bool:
-            return self._closing or self._failure is not None or self._epoch != epoch
+            return self._closing or self._failure is not None or self._epoch != client.epoch
+
+        def new_image() -> bool:
+            return self._number > client.number and not self._silent
 
         with self._changed:
-            self._changed.wait_for(lambda: ended() or (self._number > after and not self._stalled))
-            if ended():
-                return None
-            corruption = self._corrupt.pop(0) if self._corrupt else None
-            return self._number, self._image, self._stamp, corruption
+            while not ended():
+                now = self._clock.now()
+                if new_image():
+                    corruption = self._corrupt.pop(0) if self._corrupt else None
+                    client.number = self._number
+                    client.stream.put(_part(self._image, self._stamp, corruption), now)
+                if parts := client.stream.take(now):
+                    return parts
+                left = self._clock.wall(client.stream.next_due - now)
+                self._changed.wait_for(lambda: ended() or new_image(), None if math.isinf(left) else left)
+            return None
 
-    def _newest(self) -> int:
+    def _snapshot(self) -> bytes | None:
+        """The next image; None at the end."""
         with self._changed:
-            return self._number
+            before, epoch = self._number, self._epoch
+            self._changed.wait_for(lambda: self._closing or self._epoch != epoch or self._number > before)
+            return self._image if self._number > before else None
+
+    @contextlib.contextmanager
+    def _client(self) -> Iterator["_Client"]:
+        with self._changed:
+            client = _Client(self._number, self._epoch, self._faults.add_stream())
+        self._watch(+1)
+        try:
+            yield client
+        finally:
+            self._watch(-1)
+            with self._changed:
+                self._faults.remove_stream(client.stream)
+
+
+@dataclass
+class _Client:
+    """One client of the stream."""
+
+    number: int  # of the newest image that was sent
+    epoch: int
+    stream: MessageFaults
 
 
 class _Server(ThreadingHTTPServer):
@@ -210,6 +273,9 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 5.0  # of the socket [s], for clients that neither read nor disconnect
 
     def do_GET(self) -> None:
+        if self.server.camera._refused:
+            self.send_error(503, "the camera is not available")
+            return
         action = parse_qs(urlsplit(self.path).query).get("action", [""])[0]
         if action == "stream":
             self._stream()
@@ -228,34 +294,29 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         camera = self.server.camera
-        epoch = camera._watch(+1)
-        number = camera._newest()
-        try:
+        # The client may disconnect at any time.
+        with contextlib.suppress(OSError), camera._client() as client:
             self.wfile.write(f"--{BOUNDARY}\r\n".encode())
-            while (step := camera._next(number, epoch)) is not None:
-                number, image, stamp, corruption = step
-                self.wfile.write(_part(image, stamp, corruption))
-        except OSError:
-            return  # the client has disconnected
-        finally:
-            camera._watch(-1)
+            while (parts := camera._next(client)) is not None:
+                for part in parts:
+                    self.wfile.write(part)
 
     def _snapshot(self) -> None:
         camera = self.server.camera
-        epoch = camera._watch(+1)
+        camera._watch(+1)
         try:
-            step = camera._next(camera._newest(), epoch)
+            image = camera._snapshot()
         finally:
             camera._watch(-1)
-        if step is None:
+        if image is None:
             self.send_error(503, "the camera has no image")
             return
         self.send_response(200)
         self.send_header("Content-Type", "image/jpeg")
-        self.send_header("Content-Length", str(len(step[1])))
+        self.send_header("Content-Length", str(len(image)))
         self.end_headers()
         with contextlib.suppress(OSError):  # the client has disconnected
-            self.wfile.write(step[1])
+            self.wfile.write(image)
 
 
 def _part(image: bytes, stamp: float, corruption: Corruption | None) -> bytes:

@@ -15,6 +15,7 @@ from typing import Any
 from gelflow.clock import Clock, ScaledClock, raise_priority
 from gelflow.errors import PeerError, SafetyError, UsageError
 from gelflow.geometry import PoseTuple, angle_between, compose, invert
+from gelflow.hardware_mocks.message_faults import MessageFault, MessageFaults
 from gelflow.helper_process import Messages, connect_to_parent
 from gelflow.real.egm.codec import EgmFeedback, EgmReference, decode_sensor, encode_robot
 from gelflow.real.kinematics import HOME, Joints, forward, inverse
@@ -84,6 +85,10 @@ class Controller:
         self._reference: EgmReference | None = None
         self._motors = self._rapid = True
         self._random = random.Random(0)
+        self.links = {direction: MessageFaults(ordered=False) for direction in ("in", "out")}
+        self._frozen: dict[int, bytes] = {}  # the feedback that a fault repeats, by its number
+        self._newest = b""  # feedback
+        self._blocked: set[int] = set()  # faults that keep the arm from moving
         self._lose, self._loss = 0, 0.0
         self._silent_until = -math.inf
         self._sequence = self._ticks = 0
@@ -107,6 +112,24 @@ class Controller:
 
     def silence(self, seconds: float) -> None:
         self._silent_until = self._clock.now() + seconds
+
+    def begin_fault(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
+        """Begin a fault: freeze (feedback repeats), stall (the arm does not move) or one of the messages."""
+        if kind == "freeze":
+            self._frozen[number] = self._newest
+        elif kind == "stall":
+            self._blocked.add(number)
+        else:
+            for name, link in self.links.items():
+                if direction in (name, "both"):
+                    link.begin(number, MessageFault(kind, **values))
+
+    def end_fault(self, number: int) -> None:
+        """End the fault with this number."""
+        self._frozen.pop(number, None)
+        self._blocked.discard(number)
+        for link in self.links.values():
+            link.end(number)
 
     def receive(self, data: bytes) -> None:
         """Process a datagram: start or continue to follow."""
@@ -153,8 +176,9 @@ class Controller:
                 self._end(f"no answer for {self._config.comm_timeout} s")
         elif report.state == "ended" and self._motors and self._rapid and self._rested():
             self._begin()
-        data = encode_robot(self._feedback(elapsed))
+        self._newest = encode_robot(self._feedback(elapsed))
         self._sequence += 1
+        data = next(iter(self._frozen.values()), self._newest)
         return (None if self._is_lost() else data), move
 
     def _is_lost(self) -> bool:
@@ -184,6 +208,8 @@ class Controller:
             self._reference = None
 
     def _move(self, elapsed: float) -> PoseTuple | None:
+        if self._blocked:
+            return None
         share = 1 - math.exp(-elapsed / self._config.lag)
         change = [(w - q) * share for w, q in zip(self._target_joints, self._joints, strict=True)]
         largest = max(map(abs, change))
@@ -260,12 +286,18 @@ class _Loop:
             missed = int((self._clock.now() - due) / self._config.period)
             due += (1 + missed) * self._config.period
             data, move = self._controller.cycle(1 + missed)
-            if data is not None:
-                self._udp.sendto(data, (self._config.host, self._config.port))
+            self._send(data)
             self._move = move or self._move
             if self._asked is None:
                 self._parent.send(["cycle", self._move])
                 self._asked, self._move = due, None
+
+    def _send(self, data: bytes | None) -> None:
+        link, now = self._controller.links["out"], self._clock.now()
+        if data is not None:
+            link.put(data, now)
+        for message in link.take(now):
+            self._udp.sendto(message, (self._config.host, self._config.port))
 
     def _wait_until(self, due: float) -> None:
         """Wait for the next cycle; robot time waits for late cycles and for the plant's answer."""
@@ -281,11 +313,14 @@ class _Loop:
 
     def _listen(self) -> None:
         self._hear_parent()
+        link, now = self._controller.links["in"], self._clock.now()
         with suppress(BlockingIOError):
             while True:
                 data, sender = self._udp.recvfrom(4096)
                 if sender[1] == self._config.port:
-                    self._controller.receive(data)
+                    link.put(data, now)
+        for message in link.take(now):
+            self._controller.receive(message)
 
     def _hear_parent(self) -> None:
         for kind, *values in self._parent.read():

@@ -101,6 +101,17 @@ class MockEgmArm:
         """Neither send nor receive for `seconds` of robot time."""
         self._call("silence", seconds)
 
+    def begin_fault(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
+        """Begin a fault of the arm (freeze, stall) or of its messages (`MESSAGE_KINDS`) with its parameters.
+
+        `direction` is "out" (feedback), "in" (references) or "both".
+        """
+        self._call("begin_fault", number, kind, direction, values)
+
+    def end_fault(self, number: int) -> None:
+        """End the fault with this number."""
+        self._call("end_fault", number)
+
     def _call(self, name: str, *values: Any) -> MockEgmReport:
         helper = self._helper
         if helper is None:

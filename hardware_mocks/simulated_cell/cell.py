@@ -20,7 +20,8 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
 from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside, lower_face_corners
-from gelflow.hardware_mocks.simulated_cell.world import PART_SIZE, World
+from gelflow.hardware_mocks.simulated_cell.progress import Progress, ProgressMonitor
+from gelflow.hardware_mocks.simulated_cell.world import PART_SIZE, Friction, Gels, World
 from gelflow.observation import Grid, resampling_weights
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -112,10 +113,14 @@ class SimulatedCell:
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
         self._slip: SlipMonitor | None = None  # while a part is gripped
+        self._progress = ProgressMonitor(task)
+        self._taught_to_base = config.taught_hole.inverse()
+        self._height = 0.0  # of the gripper's lower face above the taught hole [m]
         self._truth_due = 0.0  # time of its next measurement [s]
         contacts = enumerate(sim.model.contact_names)
         self._hole_contacts = [i for i, name in contacts if name.startswith(("part_hole", "part_floor"))]
         self._tool = self._rest = self._start = Pose(*config.start_tool())
+        self._height = self._gripper_height()
         self._reset_arm()
         self._hold_part()
 
@@ -160,7 +165,10 @@ class SimulatedCell:
         with self._lock:
             if not pose.is_near(self._rest, *_AT_REST):
                 self._rest, self._still_since = pose, self._time
+            if not pose.is_near(self._start, *_AT_REST):
+                self._progress.note_command(self._time)
             self._tool = pose
+            self._height = self._gripper_height()
             self._u[self._arm_u] = self._in_scene()
 
     # GripperPlant
@@ -173,6 +181,7 @@ class SimulatedCell:
     def command_gripper(self, *, width: float, speed: float, force: float) -> None:
         """Move towards `width` [m] at `speed` [m/s], pushing with at most `force` [N]."""
         with self._lock:
+            self._progress.note_command(self._time)
             self._gripper.command(width=width, speed=speed, force=force)
 
     # GelPlant
@@ -208,7 +217,24 @@ class SimulatedCell:
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
+    def progress(self) -> Progress:
+        """Progress of the present part."""
+        with self._lock:
+            return replace(self._progress.progress)
+
+    def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
+        """Multiply the stiffness of both gels and the friction of the pads by these factors of the world's values."""
+        world = self.config.world
+        gels = Gels(world.gels.left * gel_stiffness, world.gels.right * gel_stiffness)
+        friction = Friction(world.friction.pads * pad_friction, world.friction.hole, world.friction.floor)
+        with self._lock:
+            self._physics.apply(replace(world, gels=gels, friction=friction))
+
     # Internal; the caller holds the lock
+
+    def _gripper_height(self) -> float:
+        gripper = self._taught_to_base @ (self._tool @ self.config.tool)
+        return float(gripper.position[2]) - self.config.grasp_height
 
     def _in_scene(self) -> Array:
         """Positions of the arm's four joints in the scene for the present tool pose: x, y, z [m], yaw [rad]."""
@@ -235,6 +261,7 @@ class SimulatedCell:
         self._sim.check()
         self._hold_part()
         self._update_operator()
+        self._progress.update(self._time, "none" if self._current is None else self._current.phase, self._height)
 
     def _update_operator(self) -> None:
         """Simulate the operator: present a part, let it go when it is gripped, remove it after its release."""

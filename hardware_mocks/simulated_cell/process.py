@@ -8,6 +8,7 @@ import os
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
+from gelflow.hardware_mocks.simulated_cell.progress import Progress
 from gelflow.helper_process import HelperProcess, Messages, connect_to_parent
 from gelflow.observation import Grid
 from gelflow.session.records import from_plain, to_plain
@@ -62,11 +64,12 @@ class _Shared:
         self.command = _SharedBlock(words, self.arm.end, 3)  # of the gripper: width [m], speed [m/s], force [N]
         self.fingers = _SharedBlock(words, self.command.end, 3)  # measured: width, speed, force
         self.gels = _SharedBlock(words, self.fingers.end, 4 * markers)
+        self.progress = _SharedBlock(words, self.gels.end, Progress.WORDS)
 
     @staticmethod
     def size(grid: Grid) -> int:
         """Size of the memory [bytes]."""
-        return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols)
+        return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols + 1 + Progress.WORDS)
 
 
 class SimulatedCellProcess:
@@ -151,6 +154,14 @@ class SimulatedCellProcess:
         """See `SimulatedCell.next_seed`."""
         self._ask({"ask": "next_seed", "seed": seed})
 
+    def progress(self) -> Progress:
+        """See `SimulatedCell.progress`."""
+        return Progress.from_words(self._running().progress.read()[1].tolist())
+
+    def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
+        """See `SimulatedCell.change_world`."""
+        self._ask({"ask": "change_world", "gel_stiffness": gel_stiffness, "pad_friction": pad_friction})
+
     def _running(self) -> _Shared:
         if self._shared is None:
             raise SimulationError("the simulated cell was not started")
@@ -178,6 +189,13 @@ class SimulatedCellProcess:
         return values[0]
 
 
+_ANSWERS: dict[str, Callable[..., Any]] = {
+    "truth": SimulatedCell.truth,
+    "next_seed": SimulatedCell.next_seed,
+    "change_world": SimulatedCell.change_world,
+}
+
+
 class _Service:
     """Serves the parent inside the helper process."""
 
@@ -201,6 +219,7 @@ class _Service:
             self._commands = commands
             cell.command_gripper(width=float(width), speed=float(speed), force=float(force))
         shared.fingers.write(cell.gripper_state())
+        shared.progress.write(cell.progress().to_words())
         if self._steps % self._gel_every == 0:
             shared.gels.write(cell.displacements().reshape(-1))
         self._steps += 1
@@ -210,12 +229,8 @@ class _Service:
         try:
             while not self._parent.closed:
                 for question in self._parent.wait():
-                    reply: Any = None
-                    if question["ask"] == "truth":
-                        reply = self._cell.truth()
-                    else:
-                        self._cell.next_seed(int(question["seed"]))
-                    self._parent.send(reply)
+                    values = {key: value for key, value in question.items() if key != "ask"}
+                    self._parent.send(_ANSWERS[question["ask"]](self._cell, **values))
         except OSError:
             return  # the parent ended during an answer
         finally:

@@ -6,9 +6,11 @@ import selectors
 import socket
 import threading
 import tty
+from typing import Any
 
 from gelflow.clock import Clock
 from gelflow.errors import UsageError
+from gelflow.hardware_mocks.message_faults import MessageFault, MessageFaults
 from gelflow.hardware_mocks.plant import GripperPlant
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.hardware_mocks.wsg.protocol import WsgDevice, WsgSession
@@ -17,6 +19,43 @@ _TICK = 0.005  # period of the device [s]; half the shortest period of updates
 _SHORTEST_WAIT = 0.0005  # lower bound of the wait for any clock factor [s, wall]
 _READ_SIZE = 4096  # bytes
 _BACKLOG = 65536  # a TCP client with more unread bytes is disconnected
+
+
+class _Link:
+    """Faults of one connection, in both directions. Used by the device's thread; faults begin and end in others."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._faults = {direction: MessageFaults(ordered=True) for direction in ("in", "out")}
+
+    def begin(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
+        with self._lock:
+            for name, faults in self._faults.items():
+                if direction in (name, "both"):
+                    faults.begin(number, MessageFault(kind, **values))
+
+    def end(self, number: int) -> None:
+        with self._lock:
+            for faults in self._faults.values():
+                faults.end(number)
+
+    def receive(self, data: bytes, now: float) -> None:
+        with self._lock:
+            self._faults["in"].put(data, now)
+
+    def deliver(self, session: WsgSession, now: float) -> None:
+        """Give received bytes that are due to `session`."""
+        with self._lock:
+            portions = self._faults["in"].take(now)
+        for portion in portions:
+            session.receive(portion)
+
+    def send(self, packets: list[bytes], now: float) -> list[bytes]:
+        """The packets that reach the client now, instead of `packets`."""
+        with self._lock:
+            for packet in packets:
+                self._faults["out"].put(packet, now)
+            return self._faults["out"].take(now)
 
 
 class MockWsgGripper:
@@ -49,6 +88,8 @@ class MockWsgGripper:
         self._unsent = b""
         self._master = self._slave = -1
         self._line_session: WsgSession | None = None
+        self._line, self._network = _Link(), _Link()
+        self._refused: set[int] = set()  # faults that keep clients from connecting
         self._thread: threading.Thread | None = None
         self._ending = threading.Event()
         self.serial_path = ""
@@ -94,6 +135,27 @@ class MockWsgGripper:
     def raise_fast_stop(self) -> None:
         """Inject a fault: FAST STOP."""
         self._device.stop(fast=True)
+
+    def begin_fault(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
+        """Begin a fault: freeze (state values repeat), disconnect, stall (no answer) or one of the messages.
+
+        `direction` is "out" (replies), "in" (commands) or "both". A disconnected pty passes no bytes.
+        """
+        if kind == "freeze":
+            self._device.freeze(number)
+            return
+        if kind == "disconnect":
+            self._refused.add(number)
+        cut = kind in ("disconnect", "stall")
+        for link in (self._line, self._network):
+            link.begin(number, "drop" if cut else kind, "both" if cut else direction, {} if cut else values)
+
+    def end_fault(self, number: int) -> None:
+        """End the fault with this number."""
+        self._refused.discard(number)
+        self._device.unfreeze(number)
+        for link in (self._line, self._network):
+            link.end(number)
 
     @property
     def addresses(self) -> tuple[str, ...]:
@@ -146,19 +208,26 @@ class MockWsgGripper:
             for key, _ in self._selector.select(wait):
                 key.data()
             self._device.poll()
+            now = self._clock.now()
             if self._line_session is not None:
-                for packet in self._line_session.tick():
+                self._line.deliver(self._line_session, now)
+                for packet in self._line.send(self._line_session.tick(), now):
                     # A serial line has no flow control: unread bytes are lost.
                     with contextlib.suppress(BlockingIOError):
                         os.write(self._master, packet)
+            if self._refused and self._client is not None:
+                self._drop_client()
             if self._client_session is not None:
-                self._unsent += b"".join(self._client_session.tick())
+                self._network.deliver(self._client_session, now)
+                self._unsent += b"".join(self._network.send(self._client_session.tick(), now))
                 self._flush()
 
     def _read_line(self) -> None:
         assert self._line_session is not None
         with contextlib.suppress(BlockingIOError):
-            self._line_session.receive(os.read(self._master, _READ_SIZE))
+            now = self._clock.now()
+            self._line.receive(os.read(self._master, _READ_SIZE), now)
+            self._line.deliver(self._line_session, now)
 
     def _accept(self) -> None:
         assert self._listener is not None and self._selector is not None
@@ -167,7 +236,7 @@ class MockWsgGripper:
         except OSError:
             return  # the client disconnected before it was accepted
         self._read_client()  # the disconnect of the previous client may still be unread
-        if self._client is not None:
+        if self._client is not None or self._refused:
             client.close()
             return
         client.setblocking(False)
@@ -184,7 +253,9 @@ class MockWsgGripper:
             except OSError:
                 data = b""
             if data:
-                self._client_session.receive(data)
+                now = self._clock.now()
+                self._network.receive(data, now)
+                self._network.deliver(self._client_session, now)
             else:
                 self._drop_client()
 

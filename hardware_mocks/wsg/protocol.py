@@ -74,6 +74,17 @@ class WsgDevice:
         self.fingers = FingerController(plant, self.config)
         self.lock = threading.RLock()
         self._owner: WsgSession | None = None
+        self._frozen: dict[int, dict[Command, float]] = {}  # state values that a fault repeats, by its number
+
+    def freeze(self, number: int) -> None:
+        """Report the present state values until `unfreeze(number)`."""
+        with self.lock:
+            self._frozen[number] = self._state_values()
+
+    def unfreeze(self, number: int) -> None:
+        """End the fault with this number."""
+        with self.lock:
+            self._frozen.pop(number, None)
 
     def poll(self) -> None:
         """Advance the motion in progress; its result goes to the session that started it."""
@@ -104,8 +115,12 @@ class WsgDevice:
 
     def state_reply(self, command: Command) -> Reply:
         """The reply to a request of a state value."""
+        values = next(iter(self._frozen.values()), None) or self._state_values()
+        return reply(command, Status.SUCCESS, values[command])
+
+    def _state_values(self) -> dict[Command, float]:
         width, speed, force = self.fingers.measured
-        values: dict[Command, float] = {
+        return {
             Command.SYSTEM_STATE: int(self.fingers.flags()),
             Command.GRASP_STATE: int(self.fingers.grasp),
             Command.WIDTH: width * MM,
@@ -113,7 +128,6 @@ class WsgDevice:
             Command.FORCE: force,
             Command.TEMPERATURE: 312,
         }
-        return reply(command, Status.SUCCESS, values[command])
 
     def _finish(self, command: Command, status: Status) -> None:
         if self._owner is not None:

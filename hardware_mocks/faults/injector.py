@@ -1,0 +1,187 @@
+"""Executes a fault plan on the devices of the mock robot."""
+
+import math
+import random
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import GelflowError
+from gelflow.hardware_mocks.camera.device import MockMjpegCamera
+from gelflow.hardware_mocks.egm.device import MockEgmArm
+from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
+from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
+from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
+from gelflow.hardware_mocks.wsg.device import MockWsgGripper
+from gelflow.task import INSERTION
+from gelflow.time_sync import MIN_WAIT
+
+_PERIOD = 0.002  # of the checks for events [s]
+# Heights of the lower face at which descent and lowering begin, without `below` [m]: 0.1 mm after the begin.
+_DESCENT_BELOW = INSERTION.start_height - 0.1e-3
+_LOWERING_BELOW = INSERTION.start_height - INSERTION.descent - 0.1e-3
+
+
+@dataclass(frozen=True)
+class Devices:
+    """The devices of a mock robot."""
+
+    arm: MockEgmArm
+    gripper: MockWsgGripper
+    cameras: tuple[MockMjpegCamera, ...]
+    cell: SimulatedCellProcess
+
+    def begin(self, number: int, fault: Fault) -> None:
+        """Begin a fault under this number."""
+        if fault.device == "arm":
+            self._begin_arm(number, fault)
+        elif fault.device == "gripper":
+            self._begin_gripper(number, fault)
+        elif fault.device == "world":
+            self._change_world(fault, fault.values["factor"])
+        else:
+            for camera in self._chosen(fault.device):
+                camera.begin_fault(number, fault.kind, fault.values)
+
+    def end(self, number: int, fault: Fault) -> None:
+        """End a fault; an emergency stop is released, and the controller may start EGM again."""
+        if fault.device == "arm":
+            if fault.kind in ("emergency_stop", "motors_off", "rapid_stop"):
+                self.arm.motors(True)
+                self.arm.rapid(True)
+            elif fault.kind == "disconnect":
+                self.arm.silence(0.0)
+            else:
+                self.arm.end_fault(number)
+        elif fault.device == "gripper":
+            self.gripper.end_fault(number)  # FAST STOP remains until it is acknowledged
+        elif fault.device == "world":
+            self._change_world(fault, 1.0)
+        else:
+            for camera in self._chosen(fault.device):
+                camera.end_fault(number)
+
+    def _begin_arm(self, number: int, fault: Fault) -> None:
+        if fault.kind == "restart":
+            self.arm.restart_sequence()
+        elif fault.kind == "disconnect":
+            self.arm.silence(min(fault.duration, 1e9))
+        elif fault.kind in ("emergency_stop", "motors_off", "rapid_stop"):
+            if fault.kind != "rapid_stop":
+                self.arm.motors(False)
+            if fault.kind != "motors_off":
+                self.arm.rapid(False)
+        else:
+            self.arm.begin_fault(number, fault.kind, fault.direction, fault.values)
+
+    def _begin_gripper(self, number: int, fault: Fault) -> None:
+        if fault.kind == "emergency_stop":
+            self.gripper.raise_fast_stop()
+        elif fault.kind == "lose_part":
+            self.gripper.lose_part()
+        else:
+            self.gripper.begin_fault(number, fault.kind, fault.direction, fault.values)
+
+    def _change_world(self, fault: Fault, factor: float) -> None:
+        stiff = fault.kind == "stiff_gel"
+        self.cell.change_world(gel_stiffness=factor if stiff else 1.0, pad_friction=1.0 if stiff else factor)
+
+    def _chosen(self, device: str) -> tuple[MockMjpegCamera, ...]:
+        return self.cameras if device == "cameras" else (self.cameras[device == "right_camera"],)
+
+
+def event_has_come(fault: Fault, progress: Progress) -> bool:
+    """Whether the event of a fault has come."""
+    gripped = progress.phase == PHASES.index("gripped")
+    if fault.event == "gripped":
+        return gripped
+    if fault.event == "released":
+        return progress.phase == PHASES.index("released")
+    if fault.event == "approach":
+        return progress.approaching
+    if not gripped or progress.attempts < fault.attempt:
+        return False
+    if fault.event == "attempt":
+        return True
+    default = _DESCENT_BELOW if fault.event == "descent" else _LOWERING_BELOW
+    return progress.height < (default if fault.below is None else fault.below)
+
+
+class _Occurrence:
+    """The state of one fault of the plan: when it begins next, and when it ends."""
+
+    def __init__(self, number: int, fault: Fault) -> None:
+        self.number, self.fault = number, fault
+        self._random = random.Random(f"begin {fault.seed}")
+        self._due: float | None = None  # of the next begin [s]
+        self._done = False
+        self._end = math.inf  # while it is active [s]
+        self.active = False
+
+    def begins(self, now: float, progress: Progress) -> bool:
+        """Whether it begins now; `now` is robot time [s]."""
+        fault = self.fault
+        if self.active or self._done or not progress.started <= now:  # started is NaN before the first command
+            return False
+        if self._due is None:
+            if fault.rate > 0:
+                self._due = now + self._random.expovariate(fault.rate)
+            elif fault.at is not None:
+                self._due = progress.started + fault.at
+            elif event_has_come(fault, progress):
+                self._due = now + fault.after
+        if self._due is None or now < self._due:
+            return False
+        self.active, self._due = True, None
+        self._end = now + fault.duration
+        self._done = fault.rate == 0
+        return True
+
+    def ends(self, now: float) -> bool:
+        """Whether it ends now."""
+        if not self.active or now < self._end:
+            return False
+        self.active = False
+        return True
+
+
+class FaultInjector:
+    """Begins and ends the faults of a plan in a thread. Use `start` and `stop`."""
+
+    def __init__(self, plan: FaultPlan, devices: Devices, clock: ScaledClock) -> None:
+        self._devices, self._clock = devices, clock
+        self._occurrences = [_Occurrence(number, fault) for number, fault in enumerate(plan.faults)]
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.log: list[dict[str, Any]] = []  # begins and ends: time [s], fault, what
+
+    def start(self) -> None:
+        """Start to watch for the times and events of the plan."""
+        self._thread = threading.Thread(target=self._run, name="faults", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop; active faults stay active."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self) -> None:
+        wait = max(self._clock.wall(_PERIOD), MIN_WAIT)
+        while not self._ending.wait(wait):
+            now, progress = self._clock.now(), self._devices.cell.progress()
+            for occurrence in self._occurrences:
+                if occurrence.ends(now):
+                    self._do("end", occurrence, self._devices.end)
+                elif occurrence.begins(now, progress):
+                    self._do("begin", occurrence, self._devices.begin)
+
+    def _do(self, what: str, occurrence: _Occurrence, action: Callable[[int, Fault], None]) -> None:
+        entry = {"time": self._clock.now(), "fault": str(occurrence.fault), "what": what}
+        try:
+            action(occurrence.number, occurrence.fault)
+        except GelflowError as error:
+            entry["error"] = str(error)
+        self.log.append(entry)

@@ -1,0 +1,80 @@
+"""The mock robot executes its fault plan: clients see each fault begin and end at the planned times and events."""
+
+import os
+import socket
+import struct
+import time
+import urllib.request
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from gelflow.clock import ScaledClock
+from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
+from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
+from gelflow.real.wsg.codec import Packet
+from gelflow.real.wsg.constants import Command
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def brightness(url: str) -> float:
+    with urllib.request.urlopen(url.replace("stream", "snapshot"), timeout=5) as answer:
+        return float(cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR).mean())
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < end, "the condition was not met in time"
+        time.sleep(0.01)
+
+
+def test_faults_begin_at_their_time_and_event_and_end_after_their_duration() -> None:
+    plan = FaultPlan(
+        (
+            Fault("left_camera", "blacken", at=0.5, duration=1.0),
+            Fault("gripper", "lose_part", event="gripped", after=0.3),
+            Fault("arm", "emergency_stop", event="descent"),  # does not come
+        )
+    )
+    with MockRobot(2.0, MockRobotConfig(egm_port=free_port(), faults=plan)) as robot:
+        time.sleep(0.5)
+        assert robot.faults.log == []  # time 0 of a plan is the first command
+        assert brightness(robot.cameras[0].url) > 50
+        wait_for(lambda: robot.cell.truth()["part"] is not None)
+        descriptor = os.open(robot.gripper.serial_path, os.O_RDWR | os.O_NOCTTY)
+        try:
+            os.write(descriptor, Packet(Command.GRASP, struct.pack("<ff", 35.0, 50.0)).encode())
+            wait_for(lambda: brightness(robot.cameras[0].url) < 6)
+            assert brightness(robot.cameras[1].url) > 50
+            wait_for(lambda: brightness(robot.cameras[0].url) > 50)
+            wait_for(lambda: len(robot.faults.log) == 3)
+        finally:
+            os.close(descriptor)
+        log = {(entry["fault"].split()[1], entry["what"]): entry["time"] for entry in robot.faults.log}
+        assert set(log) == {("blacken", "begin"), ("blacken", "end"), ("lose_part", "begin")}
+        assert 0.9 < log["blacken", "end"] - log["blacken", "begin"] < 1.5
+        started = robot.cell.progress().started
+        assert 0.45 < log["blacken", "begin"] - started < 1.0
+        assert robot.cell.progress().attempts == 0
+
+
+def test_grip_friction_and_gel_stiffness_change_while_the_cell_runs() -> None:
+    cell = SimulatedCell(ScaledClock(), SimulatedCellConfig(seed=3))
+    cell.advance(100)
+    cell.command_gripper(width=0.032, speed=0.1, force=12.0)
+    cell.advance(120)
+    held = np.abs(cell.marker_displacement(0)).mean()
+    cell.change_world(gel_stiffness=10.0, pad_friction=1.0)
+    cell.advance(50)
+    assert np.abs(cell.marker_displacement(0)).mean() < 0.3 * held
+    cell.change_world(gel_stiffness=1.0, pad_friction=0.001)
+    cell.advance(50)
+    assert cell.truth()["part"]["largest_slip"] > 5e-3  # the part falls
