@@ -40,7 +40,7 @@ class Friction:
     floor: float = 0.8  # against the floor of the hole
 
     def __post_init__(self) -> None:
-        _check(self, {"pads": (0.01, 5), "hole": (0, 5), "floor": (0, 5)})
+        _check(self, {"pads": (1e-5, 5), "hole": (0, 5), "floor": (0, 5)})
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Gels:
     right: float = 1.0
 
     def __post_init__(self) -> None:
-        _check(self, {"left": (0.02, 50), "right": (0.02, 50)})
+        _check(self, {"left": (1e-3, 2500), "right": (1e-3, 2500)})
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,9 @@ def free_port() -> int:
 
 def brightness(url: str) -> float:
     with urllib.request.urlopen(url.replace("stream", "snapshot"), timeout=5) as answer:
-        return float(cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR).mean())
+        image = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return float(np.mean(image))
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -51,10 +53,13 @@ def test_faults_begin_at_their_time_and_event_and_end_after_their_duration() -> 
         wait_for(lambda: robot.cell.truth()["part"] is not None)
         descriptor = os.open(robot.gripper.serial_path, os.O_RDWR | os.O_NOCTTY)
         try:
-            os.write(descriptor, Packet(Command.GRASP, struct.pack("<ff", 35.0, 50.0)).encode())
+            os.write(descriptor, Packet(Command.HOME, b"\x01").encode())
             wait_for(lambda: brightness(robot.cameras[0].url) < 6)
             assert brightness(robot.cameras[1].url) > 50
             wait_for(lambda: brightness(robot.cameras[0].url) > 50)
+            wait_for(lambda: robot.cell.gripper_state()[0] > 0.109)
+            time.sleep(0.2)
+            os.write(descriptor, Packet(Command.GRASP, struct.pack("<ff", 35.0, 200.0)).encode())
             wait_for(lambda: len(robot.faults.log) == 3)
         finally:
             os.close(descriptor)

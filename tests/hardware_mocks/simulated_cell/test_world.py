@@ -113,7 +113,7 @@ def test_world_file_changes_the_named_values_and_no_others(tmp_path: Path) -> No
         ("[frictions]\npads = 1", "unknown key 'frictions'; did you mean 'friction'?"),
         ("[friction]\npad = 1", "unknown key 'pad'; did you mean 'pads'?"),
         ("[friction]\nwalls = 1", "valid names: floor, hole, pads"),
-        ("[gels]\nleft = 0", "left must be within 0.02 to 50"),
+        ("[gels]\nleft = 0", "left must be within 0.001 to 2500"),
         ("[hole]\nclearance = [0, 1e-3]", "clearance must be above 0"),
         ("[cameras]\nbarrel = 2", "barrel of a lens must be within"),
         ("[cameras]\nblur_px = -1", "blur of a gel appearance must be within"),
