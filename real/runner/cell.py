@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from gelflow import interrupts
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.geometry import Pose, yaw_quaternion
@@ -51,6 +52,9 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
     """
     clock = lab.clock
     with contextlib.ExitStack() as stack:
+        # A signal between the opening of a device and its registration would leave the device open.
+        stack.callback(interrupts.resume)
+        interrupts.defer()
         left = stack.enter_context(_open_camera(lab, clock, "left", 0, recorder))
         right = stack.enter_context(_open_camera(lab, clock, "right", 1, recorder))
         gripper = stack.enter_context(_gripper(lab, clock, recorder, dry_run=dry_run))
@@ -58,6 +62,8 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         stack.callback(arm.close)
         arm.connect()
         stack.enter_context(_StopArm(arm, recorder))
+        interrupts.resume()
+        stack.callback(interrupts.defer)
         yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run)
 
 

@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from gelflow.interrupts import SIGNALS
+
 _EXIT_LIMIT = 1.0  # time from the closed link to the helper's exit [s, wall]
 
 
@@ -163,8 +165,10 @@ class HelperProcess:
 def connect_to_parent(arguments: Sequence[str]) -> tuple[dict[str, Any], Messages, list[int]]:
     """The helper's side: its settings, the link to its parent, and the file descriptors that it inherited.
 
-    Ignores Ctrl-C, which reaches every process of the terminal: the parent decides when its helpers end.
+    Ignores Ctrl-C and the signals that end a terminal or a service, which reach every process: the parent decides when
+    its helpers end.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     link, *descriptors = map(int, arguments[1:])
     return json.loads(arguments[0]), Messages(socket.socket(fileno=link)), descriptors

@@ -5,14 +5,16 @@ one is imported, so that `gelflow --help` loads neither torch nor OpenCV.
 """
 
 import argparse
+import contextlib
 import importlib
 import os
 import sys
 from collections.abc import Sequence
 
 from gelflow import __version__
-from gelflow.cli.exit_codes import ERROR, INTERRUPTED, NEGATIVE_RESULT
+from gelflow.cli.exit_codes import ERROR, INTERRUPTED, NEGATIVE_RESULT, SIGNALLED
 from gelflow.errors import GelflowError
+from gelflow.interrupts import Interrupted
 
 # Command → description in one line. Its module is gelflow.cli.commands.<command>, with _ for -.
 COMMANDS = {
@@ -55,8 +57,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return NEGATIVE_RESULT
     except GelflowError as error:
-        print(f"gelflow {args.command}: {error}", file=sys.stderr)
+        # Notes are later errors and hints; the error stays one line.
+        text = "; ".join([str(error), *getattr(error, "__notes__", [])])
+        print(f"gelflow {args.command}: {text}", file=sys.stderr)
         return ERROR
+    except Interrupted as interrupt:
+        with contextlib.suppress(OSError):  # after SIGHUP the terminal is gone
+            print(f"gelflow {args.command}: ended by {interrupt}", file=sys.stderr)
+        return SIGNALLED + interrupt.number
     except KeyboardInterrupt:
         print(f"gelflow {args.command}: interrupted", file=sys.stderr)
         return INTERRUPTED

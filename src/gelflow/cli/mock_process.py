@@ -50,6 +50,7 @@ def mock_robot(*, factor: float, seed: int, preset: str | None = None) -> Iterat
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=errors,
+            start_new_session=True,  # signals of the terminal end the run first, and the mock robot after it
         )
         try:
             _await_file(lab, process, errors)

@@ -22,7 +22,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import ArrayLike
 
-from gelflow import __version__
+from gelflow import __version__, interrupts
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import ArmState, CameraImage, GripperState
@@ -231,12 +231,15 @@ class SessionRecorder:
         return self if self._thread is not None else self.open()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        interrupts.defer()
         try:
             self.close()
         except GelflowError as failure:
             if error is None:
                 raise
             error.add_note(str(failure))  # the first error is the cause
+        finally:
+            interrupts.resume()
 
     # Queue
 

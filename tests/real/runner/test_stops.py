@@ -6,13 +6,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
 
 from gelflow.cli.mock_lab import lab_for
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, PeerTimeout
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.run_plan import run_insertions
@@ -51,6 +52,30 @@ def test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run(
     # The recording is complete and contains the reason.
     recorded = dict(events(plan.session))
     assert expected.lower() in recorded["stopped"]["reason"].lower()
+
+
+def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each fsync takes 3 s (wall); a record may be late by 1 s."""
+    lab = lab_for(robot)
+    lab = replace(lab, limits=replace(lab.limits, recording_delay=1.0 * robot.clock.factor))
+    plan = plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab)
+    finish = in_background(lambda: run_insertions(plan))
+    wait_for(lambda: moving(robot))
+    fsync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        time.sleep(3.0)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    begun = robot.clock.now()
+    with pytest.raises(PeerTimeout, match=r"is 1\.\d s behind, at most 1 s is allowed; is the disk full or slow\?"):
+        finish()
+    recorded = events(plan.session)
+    stops = [values["at"] for name, values in recorded if name == "arm stopped" and "at" in values]
+    assert stops and stops[0] - begun < 3.0 * robot.clock.factor, "stopped before the first record was stored"
+    assert "behind" in dict(recorded)["stopped"]["reason"]
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
 
 
 def test_interrupt_stops_the_arm_and_closes_the_recording(robot: MockRobot, tmp_path: Path) -> None:

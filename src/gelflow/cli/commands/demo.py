@@ -4,7 +4,7 @@ import argparse
 import math
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from gelflow.cli.options import (
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import GelflowError, UsageError
+from gelflow.interrupts import interruptible
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
@@ -163,10 +164,12 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
             on_insertion=observer.on_insertion,
         )
         error = None
-        try:
-            run_insertions(plan)
-        except GelflowError as caught:
-            error = caught  # raised after the results so far are shown
+        with interruptible() as at_once:
+            plan = replace(plan, on_motion=lambda motion: at_once.append(motion.hold))
+            try:
+                run_insertions(plan)
+            except GelflowError as caught:
+                error = caught  # raised after the results so far are shown
         waited = true_state(truth_url)["waited"] / series.factor
     wall = time.monotonic() - begun
     note = ""

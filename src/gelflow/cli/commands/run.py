@@ -1,6 +1,7 @@
 """`gelflow run insertion`: run the insertion policy on the robot of a lab file, or on the mock robot."""
 
 import argparse
+import dataclasses
 import datetime
 import sys
 from pathlib import Path
@@ -18,7 +19,10 @@ from gelflow.cli.insertion_text import (
 )
 from gelflow.cli.options import add_checkpoint, add_json, add_out, check_at_least
 from gelflow.cli.output import Output
-from gelflow.errors import UsageError
+from gelflow.cli.prompt import read_line
+from gelflow.cli.way_out import way_out
+from gelflow.errors import GelflowError
+from gelflow.interrupts import interruptible
 from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
@@ -64,8 +68,22 @@ def run(args: argparse.Namespace) -> int:
         on_attempt=lambda number, attempt: output.text(attempt_line(number, attempt)),
     )
     if args.dry_run:
-        return _dry_run(output, plan)
-    results = run_insertions(plan)
+        with interruptible():
+            return _dry_run(output, plan)
+    moved = False
+
+    def on_motion(motion: "MotionExecutor") -> None:
+        nonlocal moved
+        moved = True
+        at_once.append(motion.hold)
+
+    with interruptible() as at_once:
+        try:
+            results = run_insertions(dataclasses.replace(plan, on_motion=on_motion))
+        except GelflowError as error:
+            if hint := way_out(str(error), args.lab, moved=moved):
+                error.add_note(hint)
+            raise
     output.console.print(insertion_table(results))
     output.text(f"recorded: {session}; replay it with: gelflow replay {session}")
     output.result({"session": session, "insertions": [insertion_to_json(result) for result in results]})
@@ -107,8 +125,5 @@ class _Prompt:
         self._ask(f"Part {number + 1} could not be inserted. Hold it, then press Enter: the fingers will open.")
 
     def _ask(self, text: str) -> None:
-        try:
-            self._console.input(f"[bold]{text}[/] ")
-        except EOFError:
-            raise UsageError('the lab file says presentation = "prompt", but standard input is closed') from None
-        self._motion.wait(0.0)
+        # A stopped arm, an old image or a gripper fault ends the run at once, and not when Enter is pressed.
+        read_line(self._console, text, check=lambda: self._motion.wait(0.0))

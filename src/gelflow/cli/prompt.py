@@ -1,0 +1,51 @@
+"""Questions at the terminal that do not block: the caller's check runs while the program waits for an answer."""
+
+import os
+import select
+import sys
+from collections.abc import Callable
+
+from rich.console import Console
+
+from gelflow.errors import UsageError
+
+_PERIOD = 0.02  # of the check [s]
+
+
+def read_line(console: Console, text: str, *, check: Callable[[], None] = lambda: None) -> str:
+    """Show `text` and return the line that is typed. Calls `check` every 20 ms, and raises what it raises.
+
+    Raises UsageError when standard input is closed.
+    """
+    console.print(f"[bold]{text}[/] ", end="")
+    console.file.flush()
+    descriptor = _standard_input()
+    line = b""
+    while not line.endswith(b"\n"):
+        check()
+        if select.select((descriptor,), (), (), _PERIOD)[0]:
+            # One byte: what follows the line belongs to the next question.
+            character = os.read(descriptor, 1)
+            if not character:
+                raise _closed()
+            line += character
+    check()
+    return line.decode(errors="replace").strip()
+
+
+def confirmed(console: Console, text: str, *, check: Callable[[], None] = lambda: None) -> bool:
+    """Ask a question; True for the answer "y" or "yes"."""
+    return read_line(console, f"{text} \\[y/N]", check=check).lower() in ("y", "yes")
+
+
+def _standard_input() -> int:
+    try:
+        descriptor = sys.stdin.fileno()
+        os.fstat(descriptor)
+    except (AttributeError, OSError, ValueError):
+        raise _closed() from None
+    return descriptor
+
+
+def _closed() -> UsageError:
+    return UsageError("standard input is closed, and the question above was not answered; run it in a terminal")
