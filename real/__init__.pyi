@@ -5,7 +5,7 @@ from .egm.config import EgmConfig as EgmConfig
 from .egm.driver import EgmArm as EgmArm
 from .runner.cell import Cell as Cell
 from .runner.cell import open_cell as open_cell
-from .runner.insertion_runner import InsertionRunner as InsertionRunner
+from .runner.insertion.insertion_runner import InsertionRunner as InsertionRunner
 from .runner.lab import Lab as Lab
 from .runner.lab_file import load_lab as load_lab
 from .runner.lab_file import save_lab as save_lab

@@ -178,6 +178,7 @@ class HoleSettings:
 
     position: Vector  # centre of the hole's floor in the robot's base frame [m]
     yaw_deg: float  # of the gripper about the base's z axis, when the part fits [°]
+    height_error: float = 4e-3  # largest error of the taught height, within which the rim is searched by touch [m]
 
     def __post_init__(self) -> None:
         _check_ranges(self, "hole.")
@@ -197,6 +198,7 @@ class PartSettings:
     presentation: str = "prompt"  # "prompt": the operator presses Enter; "wait": the part is present after load_wait
     load_wait: float = 2.0  # [s]
     insert_to: float = 0.002  # height of the lower face above the hole's floor at the release [m]
+    max_slip: float = 1e-3  # slip in the grip, summed over the attempts on a part, after which it is handed back [m]
 
     def __post_init__(self) -> None:
         _require(
@@ -233,6 +235,8 @@ class DescentSettings:
     # Thresholds of the mean change of shear along the finger since the reference, the larger of both pads [mm].
     contact_shear_mm: float = 0.04  # contact: the part is not in the hole
     stop_shear_mm: float = 0.12  # the descent stops at once
+    weight_check: bool = True  # both pads must show the part's weight at every grasp, which scales the thresholds
+    max_overshoot: float = 0.1e-3  # motion towards contact until the arm is at rest [m]: limits the speed of lowering
     max_depth: float = LIMITS.descent_depth  # largest depth below the start of an attempt [m]
 
     def __post_init__(self) -> None:

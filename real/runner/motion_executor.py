@@ -11,7 +11,7 @@ import numpy as np
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
 from gelflow.geometry import Pose, angle_between
-from gelflow.protocols import ArmState, Camera, Gripper
+from gelflow.protocols import ArmState, Camera, Gripper, GripperState
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
@@ -21,8 +21,9 @@ from gelflow.session.recorder import SessionRecorder
 
 RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
 _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
-_ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
-_PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of _ARRIVED
+ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
+_PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of ARRIVED
+_WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _BLOCKED_AFTER = 3.0  # without progress [s]
 
 
@@ -57,7 +58,8 @@ class MotionExecutor:
         self._goal: Pose | None = None
         self._speeds = (lab.arm.max_speed, math.radians(lab.arm.max_turn_speed_deg))
         self._part_expected = False
-        self._part_lost = False
+        self._held_width = math.nan  # of the gripper at the grasp [m]
+        self._part_lost = ""  # the evidence that the part was lost
         self._ending = threading.Event()
         self._heights: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
         self._cycles = 0
@@ -85,13 +87,19 @@ class MotionExecutor:
         state = self._arm.state()
         return self._lab.gripper_pose(state.position, state.quaternion)
 
-    def go(self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None) -> None:
+    def go(
+        self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None, guarded: bool = False
+    ) -> None:
         """Start a straight motion of the gripper frame to `target` and return.
 
-        Speeds [m/s], [rad/s]; None: those of the lab file. Raises SafetyError when the supervisor refuses the target;
-        the arm then holds.
+        Speeds [m/s], [rad/s]; None: those of the lab file. `guarded` states that the caller observes both pads until
+        the end of the motion, as `GuardedMotion` does. Raises SafetyError when the supervisor refuses the target, when
+        the phase allows no motion, and when a part is held and the motion is not guarded; the arm then holds.
         """
         self._raise_failure()
+        self.supervisor.phases.require_motion()
+        if self._part_expected and not guarded:
+            raise SafetyError("target refused: a held part is moved only while both pads are observed")
         fastest = (self._lab.arm.max_speed, math.radians(self._lab.arm.max_turn_speed_deg))
         speeds = (fastest[0] if speed is None else speed, fastest[1] if turn_speed is None else turn_speed)
         try:
@@ -112,12 +120,12 @@ class MotionExecutor:
             self._goal = None
             self._arm.hold()
 
-    def arrived(self, *, within: float = _ARRIVED[0]) -> bool:
+    def arrived(self, *, within: float = ARRIVED[0]) -> bool:
         """Whether the arm is `within` [m] of the newest target."""
         goal = self._goal
         if goal is None:
             return False
-        return self.pose().is_near(goal, within, _ARRIVED[1])
+        return self.pose().is_near(goal, within, ARRIVED[1])
 
     def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
         """Move to `target` and wait for the arrival. Raises PeerTimeout when the arm comes no closer for 3 s."""
@@ -138,11 +146,12 @@ class MotionExecutor:
         self._clock.sleep(seconds)
         self._raise_failure()
         if self._part_lost:
-            raise PartLost("the gripper reports that the part was lost")
+            raise PartLost(self._part_lost)
 
     def expect_part(self, held: bool) -> None:
         """Set whether a part is held from now on. When it is lost, the arm holds and `wait` raises PartLost."""
-        self._part_lost = False
+        self._part_lost = ""
+        self._held_width = self._gripper.state().width
         self._part_expected = held
 
     def height_at(self, stamp: float) -> float:
@@ -191,8 +200,17 @@ class MotionExecutor:
         gripper = self._gripper.state()
         if gripper.fault:
             raise PeerError(f"the gripper reports {gripper.fault}; inspect it before anything moves again")
-        if self._part_expected and gripper.grasp in ("part lost", "no part") and not self._part_lost:
-            self._part_lost = True
+        if self._part_expected and not self._part_lost:
+            self._watch_part(gripper)
+
+    def _watch_part(self, gripper: GripperState) -> None:
+        """Hold when the gripper shows that the part is no longer held as it was grasped."""
+        change = gripper.width - self._held_width
+        if gripper.grasp in ("part lost", "no part"):
+            self._part_lost = "the gripper reports that the part was lost"
+        elif abs(change) > _WIDTH_CHANGE:
+            self._part_lost = f"the grip width changed by {1e3 * change:+.2f} mm since the grasp: the part moved"
+        if self._part_lost:
             self.hold()
             self._recorder.event("part lost", {"grasp": gripper.grasp, "width": gripper.width})
 
@@ -241,8 +259,13 @@ class MotionExecutor:
         known = isinstance(error, GelflowError)
         self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
         self._goal = None
-        self.supervisor.latch(str(self.failure))
-        for action in (self._arm.hold, lambda: self._arm.stop(str(self.failure)), self._log):
+        reason = str(self.failure)
+        for action in (
+            self._arm.hold,
+            lambda: self.supervisor.latch(reason),
+            lambda: self._arm.stop(reason),
+            self._log,
+        ):
             # The first failure is reported; errors of the remaining actions are not.
             with contextlib.suppress(GelflowError):
                 action()
@@ -268,14 +291,14 @@ class Progress:
     def check(self) -> None:
         """Hold and raise PeerTimeout when the arm came no closer for 3 s [robot time]."""
         pose = self._motion.pose()
-        distance = float(np.linalg.norm(pose.position - self._target.position)) / _ARRIVED[0]
-        turn = angle_between(pose.quaternion, self._target.quaternion) / _ARRIVED[1]
+        distance = float(np.linalg.norm(pose.position - self._target.position)) / ARRIVED[0]
+        turn = angle_between(pose.quaternion, self._target.quaternion) / ARRIVED[1]
         remaining = max(distance, turn)  # 1 at the arrival
         if remaining < self._best - _PROGRESS:
             self._best, self._since = remaining, self._clock.now()
         elif self._clock.now() - self._since > _BLOCKED_AFTER:
             self._motion.hold()
-            millimetres, degrees = 1e3 * distance * _ARRIVED[0], math.degrees(turn * _ARRIVED[1])
+            millimetres, degrees = 1e3 * distance * ARRIVED[0], math.degrees(turn * ARRIVED[1])
             raise PeerTimeout(
                 f"the arm is {millimetres:.2f} mm and {degrees:.2f}° from its target and came no closer for "
                 f"{_BLOCKED_AFTER:g} s; is it blocked, or slower than its MaxSpeedDeviation?"

@@ -1,5 +1,6 @@
 """Runs of several insertions: open the cell, preflight, insert, record, close; and dry runs."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -8,15 +9,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import GelflowError
 from gelflow.observation import FlowMap, flow_map
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell, open_cell
-from gelflow.real.runner.insertion_runner import Attempt, Insertion, InsertionRunner, Operator
+from gelflow.real.runner.insertion.attempt import Attempt, Insertion
+from gelflow.real.runner.insertion.insertion_runner import InsertionRunner, Operator
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.motion_executor import MotionExecutor
+from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.preflight import PreflightItem, run_preflight
 from gelflow.real.runner.supervisor import Supervisor
-from gelflow.real.runner.tactile_observer import TactileObserver
+from gelflow.real.runner.touch.observer import TactileObserver
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import describe_session
 from gelflow.task import InsertionTask
@@ -69,6 +73,7 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
     with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
         supervisor, motion = create_motion(cell)
         plan.on_motion(motion)
+        supervisor.phases.enter(Phase.PREFLIGHT)
         plan.on_preflight(run_preflight(cell, supervisor))
         operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
         with motion:
@@ -90,11 +95,9 @@ def dry_run(plan: RunPlan) -> DryRun:
         runner = InsertionRunner(
             cell, plan.policy, task=plan.task, motion=motion, operator=WaitingOperator(motion, plan.lab.part.load_wait)
         )
-        observer = TactileObserver(cell.cameras, runner.mounts, stale=plan.lab.limits.stale_frame)
+        observer = TactileObserver(cell.cameras, runner.mounts, clock=cell.clock, stale=plan.lab.limits.stale_frame)
         observer.start(0.0)
-        reading = observer.next()
-        while reading is None:
-            reading = observer.next()
+        reading = observer.at_rest(cell.clock.now())[-1]
         assert observer.reference is not None
         observation = flow_map([reading.frame], observer.reference.frame, grid=plan.task.grid)
         plan.policy.reset()
@@ -104,7 +107,13 @@ def dry_run(plan: RunPlan) -> DryRun:
 
 def create_motion(cell: Cell) -> tuple[Supervisor, MotionExecutor]:
     """The supervisor and the motion executor of a cell; `with` starts the executor's thread."""
-    supervisor = Supervisor(cell.lab)
+
+    def record_phase(phase: Phase) -> None:
+        # A recorder that has failed must not keep the supervisor from latching; its own check ends the run.
+        with contextlib.suppress(GelflowError):
+            cell.recorder.event("state", {"state": str(phase)})
+
+    supervisor = Supervisor(cell.lab, on_phase=record_phase)
     motion = MotionExecutor(
         cell.arm,
         cell.gripper,

@@ -5,7 +5,7 @@ nothing moves for the rest of the run; an operator starts the next run.
 """
 
 import math
-import threading
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,19 @@ from gelflow.errors import SafetyError
 from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.phases import Phase, PhaseMachine
 
 _TOLERANCE = 1e-6  # rounding at a bound
 
 
 class Supervisor:
-    """Checks targets of the gripper frame against a lab's limits. Thread-safe."""
+    """Checks targets of the gripper frame against a lab's limits and the phase of the run. Thread-safe."""
 
-    def __init__(self, lab: Lab) -> None:
+    def __init__(self, lab: Lab, *, on_phase: Callable[[Phase], None] = lambda phase: None) -> None:
         self._lab = lab
         self._base_to_hole = lab.hole.pose.inverse()
         self._latched = ""
-        self._lock = threading.Lock()
+        self.phases = PhaseMachine(on_phase)
 
     @property
     def latched(self) -> str:
@@ -34,8 +35,8 @@ class Supervisor:
 
     def latch(self, reason: str) -> None:
         """Forbid motion for the rest of the run. The first reason is kept."""
-        with self._lock:
-            self._latched = self._latched or reason
+        self._latched = self._latched or reason
+        self.phases.enter(Phase.LATCHED)
 
     def watch(self, state: ArmState) -> None:
         """Latch, and raise SafetyError, when the controller is not ready to move."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from gelflow.real.runner.insertion_runner import Attempt, Insertion
+    from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.preflight import PreflightItem
 
 ATTEMPT_HEADER = "  part  try   x [mm]   y [mm]  yaw [°]  depth [mm]  shear [mm]"

@@ -10,7 +10,7 @@ from tests.real.runner.harness import OraclePolicy, events, mean_displacement, p
 from gelflow.errors import SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
-from gelflow.real.runner.insertion_runner import Attempt, Insertion
+from gelflow.real.runner.insertion.attempt import Attempt, Insertion
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION

@@ -30,7 +30,7 @@ from gelflow.task import INSERTION
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
     from gelflow.policies.networks import NetworkPolicy
-    from gelflow.real.runner.insertion_runner import Attempt, Insertion
+    from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.lab import Lab
 
 _DELAY_NOTE = 0.1  # share of the wall time that robot time must have waited for a note below the table
@@ -182,7 +182,7 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
 
 
 def _draw(result: _SeriesResult, lab: "Lab", series: _Series) -> None:
-    from gelflow.real.runner.insertion_picture import draw_insertion
+    from gelflow.real.runner.insertion.insertion_picture import draw_insertion
 
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
     for insertion, _ in result.insertions:

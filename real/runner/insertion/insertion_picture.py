@@ -10,7 +10,7 @@ from gelflow.figures import draw_flow_map, save
 
 if TYPE_CHECKING:
     from gelflow.perception.frames import CameraMount
-    from gelflow.real.runner.insertion_runner import Attempt, Insertion
+    from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.task import InsertionTask
 
 _MAX_ATTEMPTS = 6  # in one picture

@@ -1,0 +1,207 @@
+"""Motions of a held part about the hole, each of them guarded, and the search of the rim's height by touch."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError, SafetyError
+from gelflow.geometry import Pose
+from gelflow.real.runner.insertion.attempt import PlanarPose
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.motion_executor import MotionExecutor
+from gelflow.real.runner.phases import Phase
+from gelflow.real.runner.touch.grasp_check import GraspCheck, check_release
+from gelflow.real.runner.touch.guarded_motion import Contact, GuardedMotion, along_finger, downward, in_any_direction
+from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
+from gelflow.real.runner.touch.slip import SlipMonitor
+from gelflow.session.recorder import SessionRecorder
+from gelflow.task import InsertionTask
+
+_SEARCHES = 3  # contacts on the way to one start pose after which the search of the rim ends
+_AT_DEPTH = 0.02e-3  # distance from its end at which a descent is complete [m]
+
+
+class HoleNotFound(PeerError):
+    """The rim is not within the expected error of the taught height."""
+
+
+class PartSlipped(PeerError):
+    """The part slipped in the grip by more than is allowed."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Result of one descent."""
+
+    stopped: bool  # by contact
+    slipped: bool
+    last: TactileReading
+
+
+class HeldPart:
+    """One held part. The planar pose of the gripper is an argument of every motion; the height is relative to the rim.
+
+    `height_offset` is the height of the rim found by touch above the taught one [m].
+    """
+
+    def __init__(
+        self,
+        motion: MotionExecutor,
+        observer: TactileObserver,
+        check: GraspCheck,
+        pose: Callable[[PlanarPose, float], Pose],
+        *,
+        lab: Lab,
+        clock: ScaledClock,
+        task: InsertionTask,
+        recorder: SessionRecorder,
+    ) -> None:
+        self._motion, self._pose, self._lab, self._clock = motion, pose, lab, clock
+        self._task, self._recorder = task, recorder
+        self._check = check
+        self.thresholds = check.thresholds
+        self.height_offset = 0.0
+        self._slip = 0.0
+        self._baseline: NDArray[np.float64] = np.zeros((2, 2))
+        self.observe(observer)
+
+    def observe(self, observer: TactileObserver) -> None:
+        """Use `observer` from now on, at rest at its reference."""
+        self._guard = GuardedMotion(self._motion, observer, self._lab, self._clock, self._recorder)
+        self._baseline = np.zeros((2, 2))
+
+    @property
+    def start_height(self) -> float:
+        """Height of the lower face at the start of an attempt, above the taught floor [m]."""
+        return self._task.start_height + self.height_offset
+
+    def set_baseline(self) -> None:
+        """Compare the pads with their present state from now on; the arm is at rest."""
+        self._baseline = self._guard.observer.mean_at_rest(self._clock.now())
+
+    def go_to_start(self, planar_pose: PlanarPose, phase: Phase) -> None:
+        """Move to the start of an attempt; contact on the way shows the height of the rim.
+
+        Raises HoleNotFound when the rim is further from its taught height than `hole.height_error`.
+        """
+        for _ in range(_SEARCHES):
+            self._motion.supervisor.phases.enter(phase)
+            target = self._pose(planar_pose, self.start_height)
+            contact = self._guard.move(
+                target, threshold=self.thresholds.contact, baseline=self._baseline, measure=in_any_direction
+            )
+            if contact is None:
+                return
+            height = self._lower_face()
+            self._event("contact during the approach", contact, height=height)
+            self._set_rim(height)
+            self.retreat(self.start_height)
+            self.set_baseline()
+            phase = Phase.CORRECT
+        raise HoleNotFound(
+            f"contact {_SEARCHES} times on the way to the start of an attempt; check the taught hole and the grasp"
+        )
+
+    def descend(self, planar_pose: PlanarPose, observer: TactileObserver, *, deadline: float) -> Descent:
+        """Descend from the start while `observer`, whose reference was taken there, keeps the readings."""
+        self.observe(observer)
+        self._guard.limit(deadline)
+        start = self._motion.pose().position[2]
+        slip = SlipMonitor(self.thresholds.contact)
+
+        def on_reading(reading: TactileReading) -> bool:
+            depth = self._keep(reading, start)
+            if depth > self._lab.descent.max_depth:
+                raise SafetyError(f"the gripper is deeper than max_depth ({1e3 * self._lab.descent.max_depth:g} mm)")
+            return slip.add(depth, reading.shear)
+
+        contact = self._guard.move(
+            self._pose(planar_pose, self.start_height - self._task.descent),
+            threshold=self.thresholds.stop,
+            measure=along_finger,
+            speed=self._lab.descent.speed,
+            within=_AT_DEPTH,
+            on_reading=on_reading,
+        )
+        if contact is not None:
+            self._event("slip in the grip" if slip.slipped else "stopped by contact", contact)
+        # A stopped descent, like a complete one, ends with a pair of images at rest: the cameras are not synchronized.
+        reading = self._guard.rest() if contact is not None else observer.update_pair(self._clock.now())
+        if reading is not None:
+            self._keep(reading, start)
+        self._slip += slip.distance
+        if self._slip > self._lab.part.max_slip:
+            raise PartSlipped(f"the part slipped in the grip by up to {1e3 * self._slip:.1f} mm; hand it over again")
+        return Descent(contact is not None, slip.slipped, observer.readings[-1])
+
+    def lower(self, planar_pose: PlanarPose) -> TactileReading | None:
+        """Lower the part into the hole; None when it arrived, or stands on the floor.
+
+        After contact above the floor returns the reading at rest; the rim is then searched at that height.
+        """
+        part, space = self._lab.part, self._lab.workspace
+        end = max(part.insert_to + self.height_offset, space.height_min)
+        self._motion.supervisor.phases.enter(Phase.LOWER)
+        contact = self._guard.move(
+            self._pose(planar_pose, end), threshold=self.thresholds.contact, measure=along_finger
+        )
+        if contact is None:
+            return None
+        height = self._lower_face()
+        on_floor = height - end <= self._lab.hole.height_error
+        self._event("contact with the floor" if on_floor else "contact below the rim", contact, height=height)
+        if on_floor:
+            return None
+        reading = self._guard.rest() or contact.reading
+        if self._task.rim_height - height <= self._lab.hole.height_error:
+            self._set_rim(height)
+        return reading
+
+    def retreat(self, height: float) -> None:
+        """Move straight up until the lower face is at `height` [m] above the taught floor.
+
+        Raises PeerError when the part is stuck.
+        """
+        supervisor = self._motion.supervisor
+        supervisor.phases.enter(Phase.RETREAT)
+        x, y, yaw, _ = supervisor.hole_coordinates(self._motion.pose())
+        contact = self._guard.move(self._pose((x, y, yaw), height), threshold=self.thresholds.stuck, measure=downward)
+        if contact is not None:
+            self._event("stuck", contact)
+            raise PeerError("the part is stuck in the hole: it is pulled down while the arm moves up; free it by hand")
+
+    def check_release(self, open_fingers: Callable[[], None]) -> None:
+        """Open the fingers. Raises TouchImplausible when a pad does not show that the part was released."""
+        observer = self._guard.observer
+        held = observer.at_rest(self._clock.now())
+        open_fingers()
+        check_release(held, observer.at_rest(self._clock.now()), self._check)
+
+    def _set_rim(self, height: float) -> None:
+        offset = height - self._task.rim_height
+        limit = self._lab.hole.height_error
+        if abs(offset) > limit:
+            where = "above" if offset > 0 else "below"
+            raise HoleNotFound(
+                f"contact {1e3 * abs(offset):.1f} mm {where} the taught rim, at most {1e3 * limit:g} mm is searched; "
+                "teach the height of the hole again, and check part.grasp_height"
+            )
+        self.height_offset = offset
+
+    def _keep(self, reading: TactileReading, start: float) -> float:
+        """Add a reading to those of the attempt; returns its depth below `start` [m]."""
+        depth = float(start - self._motion.height_at(reading.frame.stamp))
+        self._guard.observer.keep(replace(reading, depth=depth))
+        return depth
+
+    def _lower_face(self) -> float:
+        """Height of the part's lower face above the taught floor, by the measured pose [m]."""
+        return self._motion.supervisor.hole_coordinates(self._motion.pose())[3]
+
+    def _event(self, name: str, contact: Contact, **values: Any) -> None:
+        reading = {"shear_mm": contact.reading.shear, "change_mm": contact.change, "depth": contact.reading.depth}
+        self._recorder.event(name, {**reading, **values})

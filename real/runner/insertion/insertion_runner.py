@@ -1,0 +1,297 @@
+"""The insertion runner: grasp a part, then repeat descent, tactile observation and correction until it is inserted.
+
+This module contains the sequence of an insertion and its records. `held_part` moves the part, `runner.touch` observes
+the pads, `motion_executor` executes and monitors motions, `supervisor` checks targets and phases.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerRefused, SafetyError
+from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.observation import FlowMap
+from gelflow.protocols import Policy
+from gelflow.real.runner.cell import Cell
+from gelflow.real.runner.insertion.attempt import Attempt, Insertion, PlanarPose
+from gelflow.real.runner.insertion.held_part import HeldPart, HoleNotFound, PartSlipped
+from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
+from gelflow.real.runner.phases import Phase
+from gelflow.real.runner.supervisor import Supervisor
+from gelflow.real.runner.touch.grasp_check import GraspCheck, TouchImplausible, check_grasp
+from gelflow.real.runner.touch.observer import MarkersUnreadable, TactileObserver, TactileReading
+from gelflow.session.records import Decision
+from gelflow.task import InsertionTask
+
+_HAND_OVER_TIME = 3.0  # after the grasp, for the operator to let the part go [s]
+
+
+class Operator(Protocol):
+    """Hands parts over: a person who confirms, or a feeder with a fixed time."""
+
+    def present(self, number: int) -> None:
+        """Return when part `number` is between the open fingers."""
+        ...
+
+    def take(self, number: int) -> None:
+        """Return when the operator is ready to take part `number`, which was not inserted, from the fingers."""
+        ...
+
+
+class InsertionRunner:
+    """Inserts parts in a connected cell. The thread of `motion` must be running."""
+
+    def __init__(
+        self,
+        cell: Cell,
+        policy: Policy,
+        *,
+        task: InsertionTask,
+        motion: MotionExecutor,
+        operator: Operator,
+        on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None,
+    ) -> None:
+        lab = cell.lab
+        if task.descent > lab.descent.max_depth:
+            deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
+            raise SafetyError(f"the task descends {deep:g} mm, the lab's max_depth allows {allowed:g} mm")
+        self._cell, self._policy, self._task = cell, policy, task
+        self._lab, self._clock, self._recorder = lab, cell.clock, cell.recorder
+        self._motion, self._operator, self._on_attempt = motion, operator, on_attempt
+        self._planar_pose: PlanarPose = (0.0, 0.0, 0.0)
+        self.mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
+
+    def insert(self, number: int) -> Insertion:
+        """Insert one part; returns the result. Raises errors after which continuing is unsafe (stale data, a fault)."""
+        start = self._clock.now()
+        attempts: list[Attempt] = []
+        self._planar_pose = (0.0, 0.0, 0.0)
+        self._policy.reset()
+        self._recorder.event("insertion", {"number": number})
+        try:
+            part = self._load(number)
+            outcome = self._insert_held(number, part, attempts)
+        except PartLost:
+            outcome = "part lost"
+            self._retreat_empty()
+        except NotGrasped as error:
+            outcome = str(error)
+            self._retreat_empty()
+        self._motion.supervisor.phases.enter(Phase.IDLE)
+        result = Insertion(number, outcome, self._planar_pose, self._clock.now() - start, tuple(attempts))
+        tries = len(attempts)
+        self._recorder.event("insertion ended", {"number": number, "outcome": outcome, "attempts": tries})
+        return result
+
+    def _insert_held(self, number: int, part: HeldPart, attempts: list[Attempt]) -> str:
+        """Attempts on a held part until it is inserted, then its release; returns the outcome."""
+        outcome = "not inserted"
+        try:
+            for index in range(self._task.attempts):
+                attempt = self._attempt(number, index, part)
+                attempts.append(attempt)
+                self._on_attempt(number, attempt)
+                if attempt.inserted:
+                    self._release_inserted(part)
+                    return "inserted"
+                self._correct(part, attempt)
+        except (HoleNotFound, PartSlipped) as error:
+            outcome = str(error)
+        self._hand_back(number, part)
+        return outcome
+
+    def check_plan(self, supervisor: Supervisor) -> list[str]:
+        """Check the first targets of a run, each relative to the one before; returns them as text. Nothing moves."""
+        lab, task = self._lab, self._task
+        state = self._cell.arm.state()
+        before = lab.gripper_pose(state.position, state.quaternion)
+        turn_speed = math.radians(lab.arm.max_turn_speed_deg)
+        taught: PlanarPose = (0.0, 0.0, 0.0)
+        checked = []
+        for name, height, speed in (
+            ("hand-over", lab.part.load_height, lab.arm.max_speed),
+            ("start of an attempt", task.start_height, lab.arm.max_speed),
+            ("end of an attempt", task.start_height - task.descent, lab.descent.speed),
+            ("in the hole", lab.part.insert_to, lab.arm.max_speed),
+        ):
+            target = self.pose(taught, height)
+            supervisor.check(target, before, speed=speed, turn_speed=turn_speed)
+            checked.append(f"{name}: lower face at {1e3 * height:.1f} mm, {1e3 * speed:g} mm/s")
+            before = target
+        return checked
+
+    # Steps of an insertion
+
+    def pose(self, planar_pose: PlanarPose, height: float) -> Pose:
+        """Gripper pose in the base frame from a planar pose about the taught hole and the lower face's `height` [m]."""
+        x, y, yaw = planar_pose
+        above = np.array([x, y, height + self._lab.part.grasp_height])
+        return self._lab.hole.pose @ Pose(above, yaw_quaternion(yaw))
+
+    def _load(self, number: int) -> HeldPart:
+        """Move above the hole, wait for a part, grasp it and check that both pads show its weight."""
+        lab = self._lab
+        self._motion.supervisor.phases.enter(Phase.LOAD)
+        self._motion.expect_part(False)
+        self._motion.move(self.pose((0.0, 0.0, 0.0), lab.part.load_height))
+        if abs(self._cell.gripper.state().width - lab.gripper.open_width) > 1e-3:
+            self._cell.gripper.move(width=lab.gripper.open_width, speed=lab.gripper.speed)
+        self._operator.present(number)
+        self._motion.wait(0.0)
+        observer = self._observer()
+        before = observer.at_rest(self._clock.now())
+        try:
+            self._cell.gripper.grasp(
+                width=lab.gripper.part_width, speed=lab.gripper.speed, force=lab.gripper.grasp_force
+            )
+        except PeerRefused as error:
+            raise NotGrasped(str(error)) from error
+        self._motion.expect_part(True)
+        check = self._check_grasp(observer, before)
+        part = HeldPart(
+            self._motion, observer, check, self.pose,
+            lab=lab, clock=self._clock, task=self._task, recorder=self._recorder,
+        )  # fmt: skip
+        part.set_baseline()
+        return part
+
+    def _observer(self) -> TactileObserver:
+        """A new observer; the pads are at rest, and its reference is the first pair of images from now on.
+
+        Raises MarkersUnreadable after `limits.retries` repetitions.
+        """
+        for left in reversed(range(self._lab.limits.retries + 1)):
+            stale = self._lab.limits.stale_frame
+            observer = TactileObserver(self._cell.cameras, self.mounts, clock=self._clock, stale=stale)
+            try:
+                observer.start(self._clock.now())
+                return observer
+            except MarkersUnreadable as error:
+                if not left:
+                    raise
+                self._recorder.event("reference repeated", {"reason": str(error)})
+        raise AssertionError("the loop returns or raises")
+
+    def _check_grasp(self, observer: TactileObserver, before: list[TactileReading]) -> GraspCheck:
+        """Compare the pads before and after the grasp, until both show the part's weight or the time is over."""
+        self._motion.wait(self._lab.descent.settle)
+        end = self._clock.now() + _HAND_OVER_TIME
+        while True:
+            self._motion.wait(0.0)
+            after = observer.at_rest(self._clock.now())
+            try:
+                check = check_grasp(before, after, self._lab.descent)
+            except TouchImplausible:
+                # The operator may still hold the part.
+                if self._clock.now() > end:
+                    raise
+                continue
+            values = {"weight_mm": check.weight, "noise_mm": check.noise, "contact_mm": check.thresholds.contact}
+            self._recorder.event("grasp checked", values)
+            return check
+
+    def _attempt(self, number: int, index: int, part: HeldPart) -> Attempt:
+        begun = self._clock.now()
+        planar_pose = self._planar_pose
+        part.go_to_start(planar_pose, Phase.CORRECT if index else Phase.APPROACH)
+        self._motion.supervisor.phases.enter(Phase.DESCEND)
+        self._motion.wait(self._lab.descent.settle)
+        observer = self._observer()
+        descent = part.descend(planar_pose, observer, deadline=begun + self._lab.limits.attempt_time)
+        last, frames = descent.last, observer.chosen(self._task.frame_depths)
+        contact = last.shear > part.thresholds.contact
+        reached = self._task.start_height - last.depth < self._task.success_height
+        inserted = False
+        if reached and not contact and not descent.stopped:
+            below = part.lower(planar_pose)
+            inserted = below is None
+            if below is not None:
+                frames = [below] * len(frames)
+        observation, correction = None, None
+        if not inserted:
+            observation = observer.observe(frames, self._task)
+            correction = np.asarray(self._policy.act(observation), dtype=float)
+            self._record_decision(number, index, part, observer, frames, observation, correction)
+        result = Attempt(
+            index, planar_pose, last.depth, last.shear, contact, descent.stopped, inserted,
+            self._clock.now() - begun, descent.slipped, part.height_offset,
+            observation, correction, observer.reference, last,
+        )  # fmt: skip
+        self._recorder.attempt_end(result.summary(number))
+        return result
+
+    def _record_decision(
+        self,
+        number: int,
+        attempt: int,
+        part: HeldPart,
+        observer: TactileObserver,
+        frames: list[TactileReading],
+        observation: FlowMap,
+        correction: NDArray[np.float64],
+    ) -> None:
+        assert observer.reference is not None
+        target = self.pose(self._corrected(self._planar_pose, correction), part.start_height)
+        decision = Decision.of(
+            observation,
+            insertion=number,
+            attempt=attempt,
+            tracked=tuple(map(tuple, observer.tracked)),
+            reference=observer.reference.sequences,
+            frames=tuple(reading.sequences for reading in frames),
+            # Keys of the file format: `action` is the correction, `correction` the corrected pose (see `Decision`).
+            action=correction,
+            correction=np.array([target.position[0], target.position[1], target.yaw]),
+            depths=(observer.reference.depth, *(reading.depth for reading in frames)),
+        )
+        self._recorder.decision(decision.to_json())
+
+    def _correct(self, part: HeldPart, attempt: Attempt) -> None:
+        """Raise the part and set the corrected pose, to which the next attempt moves."""
+        assert attempt.correction is not None
+        part.retreat(part.start_height)
+        part.set_baseline()
+        self._planar_pose = self._corrected(self._planar_pose, attempt.correction)
+
+    def _corrected(self, planar_pose: PlanarPose, correction: NDArray[np.float64]) -> PlanarPose:
+        """The planar pose after a correction, limited to the task's workspace as in the simulated environment.
+
+        This limit is part of the definition of a correction; the supervisor then checks the resulting target, which it
+        refuses and never clamps. Raises SafetyError when the policy's output is not three finite numbers.
+        """
+        if correction.shape != (3,) or not np.isfinite(correction).all():
+            given = correction.tolist()
+            raise SafetyError(f"correction refused: the policy gave {given}, expected three finite numbers")
+        x, y, yaw = (float(v) for v in self._task.corrected(np.array(planar_pose), correction))
+        return x, y, yaw
+
+    def _release_inserted(self, part: HeldPart) -> None:
+        """Release the part in the hole. Raises TouchImplausible when the pads do not show the release."""
+        self._motion.supervisor.phases.enter(Phase.RELEASE)
+        part.check_release(self._open)
+        self._retreat_empty()
+
+    def _hand_back(self, number: int, part: HeldPart) -> None:
+        """Raise the part and release it to the operator."""
+        part.retreat(self._lab.part.load_height)
+        self._operator.take(number)
+        self._motion.supervisor.phases.enter(Phase.RELEASE)
+        self._open()
+
+    def _open(self) -> None:
+        self._motion.expect_part(False)
+        self._motion.wait(0.0)
+        self._cell.gripper.release(width=self._lab.gripper.open_width, speed=self._lab.gripper.speed)
+
+    def _retreat_empty(self) -> None:
+        """Without a held part: move up, with the fingers unchanged."""
+        self._motion.expect_part(False)
+        self._motion.supervisor.phases.enter(Phase.RETREAT)
+        self._motion.move(self.pose(self._planar_pose, self._lab.part.load_height))
+
+
+class NotGrasped(PeerRefused):
+    """The gripper closed and holds no part: the insertion ends, and the next one may start."""

@@ -1,0 +1,96 @@
+"""Phases of a run: one table of what each phase allows, and the state machine that enforces it."""
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+
+from gelflow.errors import SafetyError
+
+
+class Phase(StrEnum):
+    """What the runner is doing."""
+
+    IDLE = "idle"
+    PREFLIGHT = "preflight"
+    LOAD = "load"
+    APPROACH = "approach"
+    DESCEND = "descend"
+    LOWER = "lower"
+    RETREAT = "retreat"
+    CORRECT = "correct"
+    RELEASE = "release"
+    HOLD = "hold"
+    LATCHED = "latched"
+
+
+@dataclass(frozen=True)
+class PhaseRule:
+    """What a phase allows, and the phases that may follow it. `LATCHED` may follow every phase."""
+
+    action: str
+    moves: bool  # targets are accepted; a held part is moved only while both pads are observed
+    on_contact: str  # reaction to contact above the threshold; empty where nothing can touch
+    following: tuple[Phase, ...]
+
+
+P = Phase
+PHASES: Mapping[Phase, PhaseRule] = MappingProxyType(
+    {
+        P.IDLE: PhaseRule("no run, or between two parts", False, "", (P.PREFLIGHT, P.LOAD)),
+        P.PREFLIGHT: PhaseRule("checks of all devices", False, "", (P.LOAD, P.IDLE)),
+        P.LOAD: PhaseRule(
+            "without a part to the hand-over; grasp; comparison of the pads before and after it",
+            *(True, "", (P.APPROACH, P.RETREAT)),
+        ),
+        P.APPROACH: PhaseRule(
+            "with the part down to the start height", True, "hold, retreat; the rim is there", (P.DESCEND, P.RETREAT)
+        ),
+        P.DESCEND: PhaseRule(
+            "reference at rest, then the descent of an attempt", True, "hold, observe", (P.LOWER, P.RETREAT)
+        ),
+        P.LOWER: PhaseRule("into the hole", True, "hold, observe; near the floor: release", (P.RELEASE, P.RETREAT)),
+        P.RETREAT: PhaseRule("straight up", True, "hold, end: the part is stuck", (P.CORRECT, P.RELEASE, P.IDLE)),
+        P.CORRECT: PhaseRule("to the corrected pose", True, "hold, retreat; the rim is there", (P.DESCEND, P.RETREAT)),
+        P.RELEASE: PhaseRule("the fingers open; comparison of the pads", False, "", (P.RETREAT, P.IDLE)),
+        P.HOLD: PhaseRule(
+            "the reference is frozen while a pad is not readable, for at most stale_frame",
+            *(False, "", (P.APPROACH, P.DESCEND, P.LOWER, P.RETREAT, P.CORRECT)),
+        ),
+        P.LATCHED: PhaseRule("no motion until a new run", False, "", ()),
+    }
+)
+# The reference may be frozen in every phase in which a part is moved.
+HOLDABLE = PHASES[P.HOLD].following
+
+
+class PhaseMachine:
+    """The present phase of a run. Thread-safe; `on_change` is called with every new phase."""
+
+    def __init__(self, on_change: Callable[[Phase], None] = lambda phase: None) -> None:
+        self._phase = Phase.IDLE
+        self._on_change = on_change
+        self._lock = threading.Lock()
+
+    @property
+    def phase(self) -> Phase:
+        """The present phase."""
+        return self._phase
+
+    def enter(self, phase: Phase) -> None:
+        """Change to `phase`. Raises SafetyError when the table does not allow it after the present one."""
+        with self._lock:
+            present = self._phase
+            if phase == present:
+                return
+            allowed = phase in PHASES[present].following or phase == Phase.LATCHED
+            if not allowed and not (phase == Phase.HOLD and present in HOLDABLE):
+                raise SafetyError(f"phase {phase} may not follow phase {present}; start a new run")
+            self._phase = phase
+        self._on_change(phase)
+
+    def require_motion(self) -> None:
+        """Raise SafetyError when the present phase allows no motion."""
+        if not PHASES[self._phase].moves:
+            raise SafetyError(f"target refused: no motion is allowed in phase {self._phase}")

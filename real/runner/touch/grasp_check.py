@@ -1,0 +1,110 @@
+"""Check of the pads at every grasp: both must show the part's weight, which also scales the contact thresholds.
+
+The weight of the grasped part pulls the markers of both pads towards the fingertips. A camera whose image shows no such
+change, or a change in another direction, is not a sense of touch: it repeats an old image, belongs to another finger or
+is mounted as the lab file does not say. The size of the change is a force known to both pads. A threshold below it is
+exceeded before a held part can slip: contact from below first takes the weight off the pads.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import PeerError
+from gelflow.real.runner.lab import DescentSettings
+from gelflow.real.runner.touch.observer import TactileReading
+
+_WEIGHT_FRACTION = 0.7  # of the change by the weight: the largest contact threshold
+_NOISE_FACTOR = 5.0  # a change is significant above this multiple of the noise of one reading
+_LEAST_NOISE = 3e-4  # of the mean change of a pad, for a few readings that agree by chance [mm]
+_LARGEST_ANGLE = 45.0  # between the change and the finger's axis [°]
+_SIDES = ("left", "right")
+
+Array = NDArray[np.float64]
+
+
+class TouchImplausible(PeerError):
+    """The pads do not show what the grasp must have caused."""
+
+
+@dataclass(frozen=True)
+class TouchThresholds:
+    """Mean change of shear of a pad since a reference [mm]."""
+
+    contact: float  # contact: the part is not free
+    stop: float  # a descent stops at once
+    stuck: float  # an upward motion stops: the part is held by something else
+
+
+@dataclass(frozen=True)
+class GraspCheck:
+    """Result of the check at one grasp."""
+
+    weight: Array  # mean change of each pad by the part's weight [mm], shape (sensors, 2): x, y on the pad
+    noise: float  # standard deviation of the mean change of a pad between readings at rest [mm]
+    thresholds: TouchThresholds
+
+
+def nominal_thresholds(settings: DescentSettings) -> TouchThresholds:
+    """The thresholds of the lab file."""
+    return TouchThresholds(settings.contact_shear_mm, settings.stop_shear_mm, 2 * settings.stop_shear_mm)
+
+
+def check_grasp(
+    before: Sequence[TactileReading], after: Sequence[TactileReading], settings: DescentSettings
+) -> GraspCheck:
+    """Compare the pads before and after a grasp, both at rest, and scale the thresholds.
+
+    The contact threshold is that of the lab file, but at most 70 % of the change by the weight: a gel five times as
+    stiff moves its markers a fifth as far. The other thresholds are scaled by the same factor.
+
+    Raises TouchImplausible when a pad shows no change, or a change in another direction than that of the weight.
+    """
+    weight = _mean(after) - _mean(before)
+    noise = max(_noise(before), _noise(after), _LEAST_NOISE)
+    nominal = nominal_thresholds(settings)
+    if not settings.weight_check:
+        return GraspCheck(weight, noise, nominal)
+    least = _NOISE_FACTOR * noise
+    for side, (x, y) in zip(_SIDES, weight, strict=False):
+        size = float(np.hypot(x, y))
+        if size < least:
+            raise TouchImplausible(
+                f"{side} camera: the pad shows no weight of the grasped part ({size:.4f} mm of mean shear, noise "
+                f"{noise:.4f} mm); check that this camera is live, on its finger, and that nothing supports the part"
+            )
+        angle = float(np.degrees(np.arctan2(y, x)))
+        if abs(angle) > _LARGEST_ANGLE:
+            raise TouchImplausible(
+                f"{side} camera: the weight of the grasped part points {angle:+.0f}° away from the fingertip; "
+                f"check rotation_deg, mirrored and the gripper's orientation in the lab file"
+            )
+    contact = min(nominal.contact, _WEIGHT_FRACTION * float(weight[:, 0].min()))
+    if contact < least:
+        raise TouchImplausible(
+            f"contact cannot be told from noise: its threshold would be {contact:.4f} mm, the noise is {noise:.4f} mm; "
+            "the gels are too stiff or the part is too light (descent.weight_check = false omits this check)"
+        )
+    scale = contact / nominal.contact
+    return GraspCheck(weight, noise, TouchThresholds(contact, scale * nominal.stop, scale * nominal.stuck))
+
+
+def check_release(held: Sequence[TactileReading], released: Sequence[TactileReading], check: GraspCheck) -> None:
+    """Raise TouchImplausible when a pad shows no change as the fingers open: the run before it was not observed."""
+    change = np.abs(_mean(released) - _mean(held)).max(axis=1)
+    for side, size in zip(_SIDES, change, strict=False):
+        if size < _NOISE_FACTOR * check.noise:
+            raise TouchImplausible(
+                f"{side} camera: the pad shows no change at the release ({size:.4f} mm); the result is not believed: "
+                "check that this camera is live, then inspect the part"
+            )
+
+
+def _mean(readings: Sequence[TactileReading]) -> Array:
+    return np.asarray(np.mean([reading.change for reading in readings], axis=0))
+
+
+def _noise(readings: Sequence[TactileReading]) -> float:
+    return float(np.std([reading.change for reading in readings], axis=0).max())

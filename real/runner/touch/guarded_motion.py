@@ -1,0 +1,161 @@
+"""Guarded motion: every motion of a held part ends at contact, and holds while a pad is not readable."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.clock import ScaledClock
+from gelflow.errors import PeerTimeout
+from gelflow.geometry import Pose
+from gelflow.real.limits import LIMITS
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.motion_executor import ARRIVED, MotionExecutor
+from gelflow.real.runner.phases import Phase
+from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
+from gelflow.session.recorder import SessionRecorder
+from gelflow.time_sync import RUNNER
+
+# From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
+_REACTION_TIME = 0.05
+_REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
+_SIDEWAYS_OVERSHOOT = 0.5e-3  # of motions that lead away from the hole or sideways [m]
+_DOWNWARD = 0.05e-3  # a target further below the arm than this is a motion towards contact [m]
+
+Array = NDArray[np.float64]
+
+
+class TouchLost(PeerTimeout):
+    """A pad was not readable for longer than the limit while a part was held."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Contact that ended a motion."""
+
+    reading: TactileReading
+    change: float  # of the mean shear, as measured for the threshold [mm]
+
+
+def along_finger(change: Array) -> float:
+    """Shear along the finger, the larger of both pads [mm]; `change` is the mean of each pad, shape (sensors, 2)."""
+    return float(np.abs(change[:, 0]).max())
+
+
+def downward(change: Array) -> float:
+    """Shear towards the fingertip, the larger of both pads [mm]: the part is pulled out of the grip."""
+    return float(change[:, 0].max())
+
+
+def in_any_direction(change: Array) -> float:
+    """Magnitude of the shear, the larger of both pads [mm]."""
+    return float(np.hypot(change[:, 0], change[:, 1]).max())
+
+
+class GuardedMotion:
+    """Moves a held part while both pads are observed."""
+
+    def __init__(
+        self,
+        motion: MotionExecutor,
+        observer: TactileObserver,
+        lab: Lab,
+        clock: ScaledClock,
+        recorder: SessionRecorder,
+    ) -> None:
+        self._motion, self.observer = motion, observer
+        self._lab, self._clock, self._recorder = lab, clock, recorder
+        self._deadline = math.inf
+
+    def limit(self, deadline: float) -> None:
+        """Set the robot time [s] after which every motion ends with PeerTimeout."""
+        self._deadline = deadline
+
+    def speed_towards(self, target: Pose) -> float:
+        """Largest speed of a motion to `target` [m/s].
+
+        Downward it is limited so that the arm is at rest at most `descent.max_overshoot` after contact: within one
+        period of the images and the reaction time.
+        """
+        downward_motion = self._motion.pose().position[2] - target.position[2] > _DOWNWARD
+        overshoot = self._lab.descent.max_overshoot if downward_motion else _SIDEWAYS_OVERSHOOT
+        return min(self._lab.arm.max_speed, overshoot / (self.observer.image_period + _REACTION_TIME))
+
+    def move(
+        self,
+        target: Pose,
+        *,
+        threshold: float,
+        measure: Callable[[Array], float],
+        baseline: Array | None = None,
+        speed: float | None = None,
+        within: float = ARRIVED[0],
+        on_reading: Callable[[TactileReading], bool] = lambda reading: False,
+    ) -> Contact | None:
+        """Move to `target`; returns the contact that ended the motion, or None at the target.
+
+        Parameters
+        ----------
+        target: gripper frame in the base frame
+        threshold: value of `measure` that is contact [mm]
+        measure: contact measure of the mean change of each pad, shape (sensors, 2) [mm]
+        baseline: mean change of each pad that is no contact [mm], shape (sensors, 2); None: zero
+        speed: [m/s]; None: `speed_towards` the target
+        within: distance from the target at which the motion has ended [m]
+        on_reading: called with every reading; its return value True ends the motion as at contact
+
+        Raises TouchLost when a pad is not readable for `limits.stale_frame`, PeerTimeout when the arm does not arrive.
+        When a pad is not readable for 250 ms the arm holds.
+        """
+        zero = np.zeros((2, 2)) if baseline is None else baseline
+        speed = self.speed_towards(target) if speed is None else speed
+        self._motion.go(target, speed=speed, guarded=True)
+        progress = self._motion.progress(target)
+        while not self._motion.arrived(within=within):
+            self._motion.wait(0.0)
+            with self._clock.bounded(RUNNER):
+                reading = self.observer.update()
+                if reading is not None:
+                    change = measure(reading.change - zero)
+                    if change > threshold or on_reading(reading):
+                        self._motion.hold()
+                        return Contact(reading, change)
+                blind = self.observer.blind_time() > LIMITS.image_age
+                if blind:
+                    self._motion.hold()
+            if blind:
+                self._wait_until_readable()
+                self._motion.go(target, speed=speed, guarded=True)
+                progress = self._motion.progress(target)
+            progress.check()
+            self._check_deadline()
+        return None
+
+    def rest(self) -> TactileReading | None:
+        """A reading of both pads at rest: the cameras are not synchronized, so pads in motion are inconsistent."""
+        self._motion.wait(_REST_TIME)
+        return self.observer.update_pair(self._clock.now())
+
+    def _wait_until_readable(self) -> None:
+        """Hold until both pads are readable again. Raises TouchLost after `limits.stale_frame`."""
+        phases = self._motion.supervisor.phases
+        before = phases.phase
+        phases.enter(Phase.HOLD)
+        self._recorder.event("pads not readable", {"seconds": self.observer.blind_time()})
+        while (seconds := self.observer.blind_time()) > LIMITS.image_age:
+            if seconds > self._lab.limits.stale_frame:
+                raise TouchLost(
+                    f"a pad was not readable for {seconds:.2f} s while a part was held, at most "
+                    f"{self._lab.limits.stale_frame:g} s is allowed; check the gels, their light and the cameras"
+                )
+            self._motion.wait(0.0)
+            with self._clock.bounded(RUNNER):
+                self.observer.update()
+        phases.enter(before)
+
+    def _check_deadline(self) -> None:
+        if self._clock.now() > self._deadline:
+            self._motion.hold()
+            raise PeerTimeout(f"an attempt took more than {self._lab.limits.attempt_time:g} s; does the arm follow?")
