@@ -128,7 +128,8 @@ class HeldPart:
             on_reading=on_reading,
         )
         if contact is not None:
-            self._event("slip in the grip" if slip.slipped else "stopped by contact", contact)
+            depth = observer.readings[-1].depth if observer.readings else 0.0
+            self._event("slip in the grip" if slip.slipped else "stopped by contact", contact, depth=depth)
         # A stopped descent, like a complete one, ends with a pair of images at rest: the cameras are not synchronized.
         reading = self._guard.rest() if contact is not None else observer.update_pair(self._clock.now())
         if reading is not None:
@@ -203,5 +204,4 @@ class HeldPart:
         return self._motion.supervisor.hole_coordinates(self._motion.pose())[3]
 
     def _event(self, name: str, contact: Contact, **values: Any) -> None:
-        reading = {"shear_mm": contact.reading.shear, "change_mm": contact.change, "depth": contact.reading.depth}
-        self._recorder.event(name, {**reading, **values})
+        self._recorder.event(name, {"shear_mm": contact.reading.shear, "change_mm": contact.change, **values})

@@ -119,7 +119,8 @@ class GuardedMotion:
                 reading = self.observer.update()
                 if reading is not None:
                     change = measure(reading.change - zero)
-                    if change > threshold or on_reading(reading):
+                    # `on_reading` is called for the reading at contact too.
+                    if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
                 blind = self.observer.blind_time() > LIMITS.image_age
@@ -143,12 +144,13 @@ class GuardedMotion:
         phases = self._motion.supervisor.phases
         before = phases.phase
         phases.enter(Phase.HOLD)
-        self._recorder.event("pads not readable", {"seconds": self.observer.blind_time()})
+        values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
+        self._recorder.event("pad not readable", values)
         while (seconds := self.observer.blind_time()) > LIMITS.image_age:
             if seconds > self._lab.limits.stale_frame:
                 raise TouchLost(
-                    f"a pad was not readable for {seconds:.2f} s while a part was held, at most "
-                    f"{self._lab.limits.stale_frame:g} s is allowed; check the gels, their light and the cameras"
+                    f"camera {self.observer.blind_camera}: no readable image for {seconds:.2f} s while a part was held, "
+                    f"at most {self._lab.limits.stale_frame:g} s is allowed; check the gel, its light and the camera"
                 )
             self._motion.wait(0.0)
             with self._clock.bounded(RUNNER):

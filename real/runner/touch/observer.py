@@ -153,6 +153,11 @@ class TactileObserver:
         return self._clock.now() - min(self._readable_stamps)
 
     @property
+    def blind_camera(self) -> str:
+        """Name of the camera whose newest readable image is the older one."""
+        return self._cameras[int(np.argmin(self._readable_stamps))].name
+
+    @property
     def image_period(self) -> float:
         """Largest recent interval between two images of a camera [s]; `stale` before any is known."""
         return max(self._intervals, default=self._stale)
