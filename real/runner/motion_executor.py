@@ -5,6 +5,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from types import TracebackType
 
 import numpy as np
 
@@ -71,12 +72,16 @@ class MotionExecutor:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """Hold; after an exception also stop and latch."""
         self._goal = None
-        self._ending.set()
-        self._thread.join(2.0)
         with contextlib.suppress(GelflowError):
             self._arm.hold()
+        self._ending.set()
+        self._thread.join(2.0)
+        if isinstance(error, Exception) and self.failure is None:
+            self._fail(error)
+        with contextlib.suppress(GelflowError):
             self._log()
 
     # Called from the runner's thread
