@@ -149,8 +149,8 @@ class GuardedMotion:
         while (seconds := self.observer.blind_time()) > LIMITS.image_age:
             if seconds > self._lab.limits.stale_frame:
                 raise TouchLost(
-                    f"camera {self.observer.blind_camera}: no readable image for {seconds:.2f} s while a part was held, at "
-                    f"most {self._lab.limits.stale_frame:g} s is allowed; check the gel, its light and the camera"
+                    f"camera {self.observer.blind_camera}: no readable image for {seconds:.2f} s with a part held, "
+                    "which is longer than limits.stale_frame; check the gel, its light and the camera"
                 )
             self._motion.wait(0.0)
             with self._clock.bounded(RUNNER):
