@@ -36,7 +36,7 @@ class InsertionTask:
     rim_height: float = 25.0e-3  # height of the hole's rim above its floor
     # Necessary for success: the part's lower face is below this height. The simulation also requires the face inside
     # the hole and no stop by contact (`sim/tasks/insertion.py`); the robot requires a descent without contact, then
-    # lowers the part into the hole without contact (`real/runner/insertion_runner.py`).
+    # lowers the part into the hole without contact (`real/runner/insertion/insertion_runner.py`).
     success_height: float = 24.7e-3
     attempts: int = 15
     # Correction in x, y, yaw for an action of ±1 of the Gymnasium environments. The output ±1 of a trained network has
