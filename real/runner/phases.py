@@ -10,7 +10,7 @@ from gelflow.errors import SafetyError
 
 
 class Phase(StrEnum):
-    """What the runner is doing."""
+    """Phases of a run."""
 
     IDLE = "idle"
     PREFLIGHT = "preflight"
@@ -27,7 +27,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class PhaseRule:
-    """What a phase allows, and the phases that may follow it. `LATCHED` may follow every phase."""
+    """One row of the table: rights of a phase, and the phases that may follow it. `LATCHED` may follow every phase."""
 
     action: str
     moves: bool  # targets are accepted; a held part is moved only while both pads are observed
