@@ -54,6 +54,7 @@ class MotionLimits:
     pose_silence: float = 0.100  # then the arm stops [s]
     image_age: float = 0.250  # [s]
     gripper_age: float = 0.500  # [s]
+    controller_age: float = 3.0  # of the state over Robot Web Services [s]
     target_lifetime: float = 0.100  # a target that is not renewed expires [s]
     longest_target_lifetime: float = 1.0  # [s]
     recording_delay: float = 1.0  # of the oldest record that is not stored yet [s]

@@ -1,0 +1,5 @@
+"""Mock of ABB Robot Web Services 1.0."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

@@ -1,0 +1,3 @@
+from .device import MockWebServices as MockWebServices
+
+__all__ = ["MockWebServices"]
