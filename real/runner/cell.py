@@ -19,9 +19,11 @@ from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
-from gelflow.real.limits import LIMITS
+from gelflow.real.limits import LIMITS, MOCK_TIME_SCALE
 from gelflow.real.runner.lab import CameraSettings, Lab
 from gelflow.real.transport import transport_for
+from gelflow.real.web_services.client import WebServicesClient
+from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
@@ -41,6 +43,7 @@ class Cell:
     cameras: tuple[StreamCamera, StreamCamera]  # of the left and of the right finger
     recorder: SessionRecorder
     dry_run: bool
+    controller: ControllerMonitor | None = None  # with `arm.web_services` in the lab file
 
 
 @contextlib.contextmanager
@@ -58,13 +61,14 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         left = stack.enter_context(_open_camera(lab, clock, "left", 0, recorder))
         right = stack.enter_context(_open_camera(lab, clock, "right", 1, recorder))
         gripper = stack.enter_context(_gripper(lab, clock, recorder, dry_run=dry_run))
+        controller = stack.enter_context(_controller(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
         stack.callback(arm.close)
         arm.connect()
         stack.enter_context(_StopArm(arm, recorder))
         interrupts.resume()
         stack.callback(interrupts.defer)
-        yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run)
+        yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run, controller)
 
 
 def _open_camera(
@@ -97,6 +101,13 @@ def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run
         on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
         on_measurement=recorder.gripper_state,
     )
+
+
+def _controller(lab: Lab, clock: ScaledClock) -> ControllerMonitor:
+    """The monitor of the controller's mode and program, not yet opened."""
+    scale = MOCK_TIME_SCALE * lab.clock_factor if lab.time_sync else 1.0
+    client = WebServicesClient(lab.arm.web_services)
+    return ControllerMonitor(client, clock, stale=LIMITS.controller_age * scale)
 
 
 def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:

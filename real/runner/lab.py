@@ -20,6 +20,7 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.calibration import load_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range
+from gelflow.real.web_services.client import WebServicesClient
 
 FORMAT = 1
 Vector = tuple[float, float, float]
@@ -78,9 +79,14 @@ class ArmSettings:
     connect_timeout: float = 5.0  # for the first message of the robot [s]
     host: str = "0.0.0.0"  # address of this computer to listen on; 0.0.0.0: all
     robot: str = ""  # IP address of the controller; empty: the first sender
+    web_services: str = (
+        ""  # "http://HOST" of the controller's Robot Web Services; empty: mode and program not supervised
+    )
 
     def __post_init__(self) -> None:
         _check_ranges(self, "arm.")
+        if self.web_services:
+            WebServicesClient(self.web_services)  # checks the address
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
+from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.session.recorder import SessionRecorder
 
 RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
@@ -50,7 +51,9 @@ class MotionExecutor:
         clock: Clock,
         supervisor: Supervisor,
         recorder: SessionRecorder,
+        controller: ControllerMonitor | None = None,
     ) -> None:
+        self._controller = controller
         self._arm, self._gripper, self._cameras = arm, gripper, cameras
         self._lab, self._clock = lab, clock
         self.supervisor = supervisor
@@ -198,6 +201,8 @@ class MotionExecutor:
         """Raise when data that motion relies on is stale, or a device reports a fault."""
         state = self._arm.state()
         self.supervisor.watch(state)
+        if self._controller is not None:
+            self._controller.check()
         self._check_age("pose", state, self._lab.limits.stale_pose)
         self._recorder.check()
         for camera in self._cameras:
@@ -253,7 +258,7 @@ class MotionExecutor:
             stamp=record.stamp,
             motors_on=EgmFlag.MOTORS_ON in record.flags,
             running=EgmFlag.FOLLOWING in record.flags,
-            operating_mode="unknown",
+            operating_mode="unknown" if self._controller is None else self._controller.operating_mode,
         )
         self._recorder.arm_state(state)
         if record.applied is not None:

@@ -95,7 +95,10 @@ def _arm(cell: Cell) -> str:
     # In a dry run no message is answered, so the controller does not follow; all other conditions must hold.
     if (reason := not_ready_reason(state)) and not (cell.dry_run and state.motors_on and not state.fault):
         raise SafetyError(reason)
-    return f"motors on, mode {state.operating_mode}, {'following' if state.running else 'not following (dry run)'}"
+    following = "following" if state.running else "not following (dry run)"
+    if cell.controller is None:
+        return f"motors on, mode unknown (no web_services in the lab file), {following}"
+    return f"{cell.controller.approve()}, {following}"
 
 
 def _pose(cell: Cell, supervisor: Supervisor) -> str:

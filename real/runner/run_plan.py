@@ -122,6 +122,7 @@ def create_motion(cell: Cell) -> tuple[Supervisor, MotionExecutor]:
         clock=cell.clock,
         supervisor=supervisor,
         recorder=cell.recorder,
+        controller=cell.controller,
     )
     return supervisor, motion
 

@@ -74,6 +74,14 @@ class ControllerMonitor:
             raise UsageError("web services: open the monitor first")
         raise PeerTimeout(f"web services: the newest state is {age:.1f} s old, at most {self._stale:g} s is allowed")
 
+    @property
+    def operating_mode(self) -> str:
+        """The newest operating mode; "unknown" when it is too old."""
+        try:
+            return self.state().operating_mode
+        except PeerError:
+            return "unknown"
+
     def approve(self) -> ControllerState:
         """The newest state, which `check` compares with from now on.
 

@@ -95,6 +95,11 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
             "pixels_per_mm = 1e12",
             "left: pixels_per_mm must be 1 to 200 px/mm, got 1000000000000",
         ),
+        (
+            '# web_services = "" ',
+            'web_services = "192.168.125.1" #',
+            "lab.toml, arm: web services: expected http://HOST or http://HOST:PORT, got '192.168.125.1'",
+        ),
         ("# latency = 0.0 ", "latency = 0.3 #", "lab.toml, cameras.left: latency must be 0 to 0.2 s, got 0.3"),
         ("pixels_per_mm = 15.7", 'calibration = "none.json"', "lab.toml, cameras.left: cannot read"),
         ("# stale_pose = 0.020", "stale_pose = 0", "lab.toml: limits.stale_pose must be 0.008 to 0.1 s, got 0"),
