@@ -16,6 +16,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "external_links",
+    "phases",
     "plain_docstrings",
     "public_names",
 ]
