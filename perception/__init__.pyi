@@ -6,8 +6,8 @@ from .errors import TrackerInitError as TrackerInitError
 from .frames import CameraMount as CameraMount
 from .frames import decode_image as decode_image
 from .frames import tactile_frame as tactile_frame
+from .mount_check import check_scale as check_scale
 from .overlay import draw_overlay as draw_overlay
-from .scale import check_scale as check_scale
 from .sources import ImageSource as ImageSource
 from .sources import SourceImage as SourceImage
 from .sources import image_source as image_source

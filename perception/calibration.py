@@ -57,11 +57,13 @@ class Calibration:
     center: tuple[float, float]  # lens centre in the image (right, down) [px]
     residual_px: float  # root mean square distance of the markers from the fitted grid
     largest_px: float  # largest distance of a marker from the fitted grid
+    skipped: tuple[int, int, int, int] = (0, 0, 0, 0)  # printed lines not in the image: above, below, left, right
 
     def __post_init__(self) -> None:
         whole = (self.width, self.height, self.rows, self.cols)
         try:
             good = all(type(number) is int and number >= 1 for number in whole)
+            good &= len(self.skipped) == 4 and all(type(number) is int and number >= 0 for number in self.skipped)
             good &= np.shape(self.matrix) == (3, 3) and len(self.radial) <= 3 and len(self.center) == 2
             numbers = np.array([*np.ravel(self.matrix), *self.radial, *self.center, self.spacing_mm, self.residual_px])
             good &= numbers.dtype.kind in "if" and bool(np.isfinite(numbers).all())
@@ -70,6 +72,12 @@ class Calibration:
             good = False
         if not good:
             raise UsageError("its values are not a valid image-to-gel mapping: calibrate the camera again")
+
+    @property
+    def printed_grid(self) -> tuple[int, int]:
+        """(rows, columns) of the printed grid in the orientation of the image, lines outside the image included."""
+        above, below, left, right = self.skipped
+        return self.rows + above + below, self.cols + left + right
 
     @cached_property
     def _matrix(self) -> Floats:
@@ -105,6 +113,12 @@ class Calibration:
         right, down = np.meshgrid(np.arange(self.cols), np.arange(self.rows))
         middle = ((self.cols - 1) / 2, (self.rows - 1) / 2)
         return np.asarray((np.stack([right.ravel(), down.ravel()], axis=1) - middle) * self.spacing_mm)
+
+    def marker_pixels(self, row: float, col: float) -> Floats:
+        """Image position [px], shape (2,), at rest, of a marker by its row and column in the printed grid, from 0."""
+        above, _, left, _ = self.skipped
+        offset = (col - left - (self.cols - 1) / 2, row - above - (self.rows - 1) / 2)
+        return np.asarray(self.to_pixels(self.spacing_mm * np.array([offset]))[0])
 
     def check_size(self, image: Image) -> None:
         """Raises PeerError when `image` does not have the size of this calibration."""

@@ -67,6 +67,14 @@ def local_contrast(image: NDArray[np.uint8], appearance: DotAppearance, window: 
     return np.asarray(share, dtype=np.float32)
 
 
+def smooth_response(response: Floats, radius: float) -> Floats:
+    """`response` averaged over about a dot of `radius` [px], which suppresses the noise."""
+    sigma = max(0.6 * radius, 0.8)
+    side = 2 * int(np.ceil(1.8 * sigma)) + 1
+    smooth = cv2.GaussianBlur(response, (side, side), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(smooth, dtype=np.float32)
+
+
 def detect_dots(
     response: Floats, *, radius: float, min_distance: float, threshold: float | None = None
 ) -> DetectedDots:
@@ -74,9 +82,7 @@ def detect_dots(
 
     `threshold` is the smallest accepted contrast; None means 0.4 times the median of the thirty strongest peaks.
     """
-    sigma = max(0.6 * radius, 0.8)
-    side = 2 * int(np.ceil(1.8 * sigma)) + 1
-    smooth = cv2.GaussianBlur(response, (side, side), sigma, borderType=cv2.BORDER_REPLICATE)
+    smooth = smooth_response(response, radius)
     half = max(int(min_distance), 1)
     highest = cv2.dilate(smooth, np.ones((2 * half + 1, 2 * half + 1), np.uint8))
     minimum = 0.02 if threshold is None else threshold

@@ -5,6 +5,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -38,6 +39,10 @@ class CameraMount:
     mirrored: bool = True  # the camera views the gel from behind
     pixels_per_mm: float | None = None  # uniform scale
     calibration: Calibration | None = None  # position-dependent scale; with neither, frames are in px
+    # First and last visible row and column, from 1 at the base of the finger and at the smallest y. None: those of the
+    # calibration, without one all.
+    visible_rows: tuple[int, int] | None = None
+    visible_cols: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.rotation not in (0, 90, 180, 270):
@@ -46,16 +51,34 @@ class CameraMount:
             raise UsageError(f"pixels_per_mm must be positive, got {self.pixels_per_mm}")
         if self.pixels_per_mm is not None and self.calibration is not None:
             raise UsageError("a camera has a calibration or pixels_per_mm, not both")
-        self._check_calibration()
         _ = self.grid  # raises UsageError for invalid rows, cols and pitch
+        self._check_calibration()
+        self._check_visible()
 
     def _check_calibration(self) -> None:
         c = self.calibration
-        if c is not None and (c.rows, c.cols, c.spacing_mm) != (*self.image_grid, self.pitch):
-            rows, cols = self.image_grid
+        if c is not None and (*c.printed_grid, c.spacing_mm) != (*self.printed_grid, self.pitch):
+            (rows, cols), (fitted_rows, fitted_cols) = self.printed_grid, c.printed_grid
+            advice = "calibrate again" if c.spacing_mm != self.pitch else f"calibrate with --rows {rows} --cols {cols}"
             raise UsageError(
-                f"the calibration is for {c.rows} rows of {c.cols} markers with spacing {c.spacing_mm:g} mm; the mount "
-                f"has {rows} rows of {cols} with spacing {self.pitch:g} mm"
+                f"the calibration is for {fitted_rows} rows of {fitted_cols} markers with spacing {c.spacing_mm:g} mm; "
+                f"the mount has {rows} rows of {cols} with spacing {self.pitch:g} mm: correct the mount, or {advice}"
+            )
+
+    def _check_visible(self) -> None:
+        for name, lines, printed in (
+            ("visible_rows", self.visible_rows, self.rows),
+            ("visible_cols", self.visible_cols, self.cols),
+        ):
+            if lines is not None and not (lines[0] >= 1 and lines[0] + 2 <= lines[1] <= printed):
+                raise UsageError(
+                    f"{name} must name the first and the last of at least 3 lines of 1 to {printed}, got {list(lines)}"
+                )
+        above, below, left, right = self.skipped
+        if self.calibration is None and ((above and below) or (left and right)):
+            raise UsageError(
+                "a grid that extends beyond two opposite borders of the image needs a calibration, which tells its "
+                "lines apart: gelflow calibrate-camera"
             )
 
     @property
@@ -64,18 +87,71 @@ class CameraMount:
         return Grid(self.rows, self.cols, self.pitch, self.center)
 
     @property
-    def image_grid(self) -> tuple[int, int]:
-        """(rows, columns) of the grid in the image."""
+    def printed_grid(self) -> tuple[int, int]:
+        """(rows, columns) of the printed grid in the orientation of the image."""
         return (self.cols, self.rows) if self.rotation in (90, 270) else (self.rows, self.cols)
 
-    def tracker_config(self, *, polarity: Literal["auto", "dark", "bright"] = "auto") -> TrackerConfig:
-        """Tracker configuration for this grid in this orientation."""
+    @property
+    def image_grid(self) -> tuple[int, int]:
+        """(rows, columns) of the visible part of the grid in the image."""
+        (rows, cols), (above, below, left, right) = self.printed_grid, self.skipped
+        return rows - above - below, cols - left - right
+
+    @property
+    def visible_count(self) -> int:
+        """Number of markers in the visible part of the grid."""
         rows, cols = self.image_grid
-        return TrackerConfig(rows=rows, cols=cols, either_way=False, polarity=polarity)
+        return rows * cols
+
+    @cached_property
+    def skipped(self) -> tuple[int, int, int, int]:
+        """Numbers of printed lines that are not visible in the image: above, below, left and right of the others."""
+        skipped = (0, 0, 0, 0) if self.calibration is None else self.calibration.skipped
+        rows, cols = self.pad_lines(skipped)
+        (first_row, last_row), (first_col, last_col) = self.visible_rows or rows, self.visible_cols or cols
+        on_pad = np.zeros((self.rows, self.cols), dtype=bool)
+        on_pad[first_row - 1 : last_row, first_col - 1 : last_col] = True
+        in_image = np.zeros(on_pad.size, dtype=bool)
+        in_image[self._printed_order()] = on_pad.reshape(-1)
+        return skipped_lines(in_image.reshape(self.printed_grid))
+
+    def pad_lines(self, skipped: tuple[int, int, int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last visible row and column on the pad, from 1, where the image does not show `skipped` lines."""
+        rows, cols = self.printed_grid
+        above, below, left, right = skipped
+        in_image = np.zeros((rows, cols), dtype=bool)
+        in_image[above : rows - below, left : cols - right] = True
+        on_pad = in_image.reshape(-1)[self._printed_order()].reshape(self.rows, self.cols)
+        first_row, last_row, first_col, last_col = skipped_lines(on_pad)
+        return (first_row + 1, self.rows - last_row), (first_col + 1, self.cols - last_col)
+
+    def tracker_config(self, *, polarity: Literal["auto", "dark", "bright"] = "auto") -> TrackerConfig:
+        """Tracker configuration for the visible part of this grid in this orientation."""
+        rows, cols = self.image_grid
+        anchor = None
+        if self.calibration is not None and any(self.skipped):
+            above, _, left, _ = self.skipped
+            right, down = self.calibration.marker_pixels(above + rows // 2, left + cols // 2).tolist()
+            anchor = (right, down)
+        return TrackerConfig(
+            rows=rows, cols=cols, either_way=False, polarity=polarity, skipped=self.skipped, anchor=anchor
+        )
 
     def marker_order(self) -> NDArray[np.intp]:
-        """Index in the image (row by row) of each marker of the pad (row by row), shape (markers,)."""
-        rows, cols = self.image_grid
+        """Index in the image (row by row) of each marker of the pad (row by row), −1 if not visible; shape (markers,).
+
+        The image's markers are those of its visible part, `image_grid`.
+        """
+        rows, cols = self.printed_grid
+        above, below, left, right = self.skipped
+        index = np.full((rows, cols), -1, dtype=np.intp)
+        part = index[above : rows - below, left : cols - right]
+        part[:] = np.arange(part.size).reshape(part.shape)
+        return np.asarray(index.reshape(-1)[self._printed_order()])
+
+    def _printed_order(self) -> NDArray[np.intp]:
+        """Index in the printed grid as the image shows it (row by row) of each marker of the pad (row by row)."""
+        rows, cols = self.printed_grid
         index = np.arange(rows * cols).reshape(rows, cols)
         rotated = np.rot90(index, k=self.rotation // 90)  # counterclockwise: fingertip at the bottom
         return np.ascontiguousarray(rotated[:, ::-1] if self.mirrored else rotated).reshape(-1)
@@ -104,6 +180,15 @@ class CameraMount:
         return np.stack([down, -right if self.mirrored else right], axis=1)
 
 
+def skipped_lines(seen: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """Lines before the first and after the last row of `seen`, shape (rows, columns), then the same of its columns."""
+    counts = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(seen.any(axis=axis))
+        counts += [int(lines[0]), int(seen.shape[1 - axis] - 1 - lines[-1])]
+    return counts[0], counts[1], counts[2], counts[3]
+
+
 def decode_image(data: bytes) -> Image:
     """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3).
 
@@ -122,7 +207,8 @@ def decode_image(data: bytes) -> Image:
 def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:
     """The tactile frame of all sensors: one tracking result and one mount per sensor, sensor 0 (left finger) first.
 
-    The unit is "mm" if every mount has a scale, otherwise "px"; `stamp` is in seconds. Raises UsageError when the
+    The unit is "mm" if every mount has a scale, otherwise "px"; `stamp` is in seconds. Markers outside the visible part
+    of a grid are not valid. Raises UsageError when the
     numbers of results and mounts differ, the pads have different grids, or a tracked grid is not that of its mount.
     """
     if not results or len(results) != len(mounts):
@@ -138,10 +224,10 @@ def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMoun
             rows, cols = mount.image_grid
             raise UsageError(
                 f"sensor {sensor} shows {result.rows} rows of {result.cols} markers, its mount "
-                f"({mount.rows} × {mount.cols}, rotated by {mount.rotation}°) expects {rows} rows of {cols}"
+                f"({mount.rows} × {mount.cols}, rotated by {mount.rotation}°) expects {rows} rows of {cols} visible"
             )
         order = mount.marker_order()
-        valid[sensor] = result.valid[order]
+        valid[sensor] = (order >= 0) & result.valid[order]
         displacement = mount.displacement_mm(result) if unit == "mm" else result.displacement
         vectors = mount.to_pad(displacement[order])
         shear[sensor] = np.where(valid[sensor, :, None], vectors, np.nan)

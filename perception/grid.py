@@ -1,17 +1,25 @@
 """Finds the grid of markers in a first image. The numbers of rows and columns are optional."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import UsageError
-from gelflow.perception.detect import BRIGHT, DARK, DetectedDots, DotAppearance, detect_dots, downsample, local_contrast
+from gelflow.perception.detect import (
+    BRIGHT,
+    DARK,
+    DetectedDots,
+    DotAppearance,
+    detect_dots,
+    downsample,
+    image_plane,
+    local_contrast,
+    smooth_response,
+)
 from gelflow.perception.errors import TrackerInitError, draw_detections
-from gelflow.perception.lattice import Lattice, fill_from_neighbours, grow_lattice
-
-Polarity = Literal["auto", "dark", "bright"]
+from gelflow.perception.grid_part import GridExtent, GridRequest, Polarity, completeness, grid_extent, select_part, trim
+from gelflow.perception.lattice import Lattice, grow_lattice, interpolate_nodes
 
 _RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of the searched dots [px], in an image of about _SEARCH_SIZE px
 _SEARCH_SIZE = 360
@@ -40,31 +48,66 @@ class MarkerGrid:
         return replace(self, radius=factor * self.radius, spacing=factor * self.spacing, positions=positions)
 
 
-@dataclass(frozen=True)
-class _Request:
-    """The grid that the caller expects."""
-
-    rows: int | None
-    cols: int | None
-    shapes: tuple[tuple[int, int], ...]  # accepted (rows, columns); empty: any
-    polarity: Polarity
-
-
-def find_grid(
-    image: NDArray[np.uint8],
-    *,
-    rows: int | None = None,
-    cols: int | None = None,
-    either_way: bool = True,
-    polarity: Polarity = "auto",
-) -> MarkerGrid:
+def find_grid(image: NDArray[np.uint8], request: GridRequest) -> MarkerGrid:
     """Finds the grid of markers in `image` (B G R).
 
-    With `rows` and `cols`, the grid has this shape or, with `either_way`, the transposed one; further lines that the
-    image border cuts are ignored. Without them, the grid consists of all lines that are mostly visible. Raises
-    TrackerInitError when no grid or a grid of another shape is found, UsageError for impossible `rows` and `cols`.
+    With `rows` and `cols` of the request, the grid has this shape or, with `either_way`, the transposed one; further
+    lines that the image border cuts are ignored. Without them, the grid consists of all lines that are mostly visible.
+    Raises TrackerInitError when no grid or a grid of another shape is found, UsageError for impossible requests.
     """
-    request = _Request(rows, cols, _accepted_shapes(rows, cols, either_way), polarity)
+    _ = request.shapes  # raises UsageError
+    found = _detect(image, request.polarity)
+    reason, part = select_part(found.lattice, found.dots, found.request(request), found.extent)
+    if part is None:
+        raise found.error(reason)
+    return _marker_grid(found.appearance, part, found.dots).scaled(found.shrink)
+
+
+def find_extent(image: NDArray[np.uint8], polarity: Polarity = "auto") -> GridExtent:
+    """The part of a printed grid of unknown shape that `image` (B G R) shows.
+
+    Raises TrackerInitError when no grid is found.
+    """
+    found = _detect(image, polarity)
+    extent = found.extent()
+    right, down = ((value + 0.5) * found.shrink - 0.5 for value in extent.middle)
+    return replace(extent, middle=(right, down))
+
+
+@dataclass(frozen=True)
+class _Detection:
+    """The lattice of all dots of an image, found in the image downsampled by `shrink`."""
+
+    image: NDArray[np.uint8]  # downsampled
+    shrink: int
+    appearance: DotAppearance
+    response: NDArray[np.float32]  # contrast of `image`
+    radius: float  # of a dot in `image` [px]
+    dots: DetectedDots
+    lattice: Lattice
+
+    def request(self, request: GridRequest) -> GridRequest:
+        """`request` for an image that is an image of `self.shrink` times the size."""
+        if request.anchor is None:
+            return request
+        right, down = ((value + 0.5) / self.shrink - 0.5 for value in request.anchor)
+        return replace(request, anchor=(right, down))
+
+    def extent(self) -> GridExtent:
+        """The visible part of the printed grid, in pixels of `self.image`."""
+        # The local mean is the brightness of the gel, slightly changed by the dots.
+        window = 2 * _background_window(self.lattice.spacing) + 1
+        grey = image_plane(self.image, "value").astype(np.float32)
+        brightness = np.asarray(cv2.boxFilter(grey, -1, (window, window)), dtype=np.float32)
+        return grid_extent(self.lattice, self.dots, smooth_response(self.response, self.radius), brightness)
+
+    def error(self, reason: str) -> TrackerInitError:
+        """An error with a picture of this detection."""
+        return TrackerInitError(reason, draw_detections(self.image, self.dots.centers, self.radius, self.lattice.dots))
+
+
+def _detect(image: NDArray[np.uint8], polarity: Polarity) -> _Detection:
+    """Detects the lattice of all dots in `image`. Raises TrackerInitError when there is none."""
     shrink = max(1, round(max(image.shape[:2]) / _SEARCH_SIZE))
     small = downsample(image, shrink)
     appearances = _candidate_appearances(small, polarity)
@@ -76,12 +119,10 @@ def find_grid(
     response = local_contrast(small, appearance, _background_window(spacing))
     dots = _plausible(detect_dots(response, radius=radius, min_distance=0.4 * spacing))
     lattice = grow_lattice(dots.centers)
-    reason, part = _rejection_reason(lattice, dots, polarity), None
-    if lattice is not None and not reason:
-        reason, part = _select_part(lattice, dots, request)
-    if part is None:
+    reason = _rejection_reason(lattice, dots, polarity)
+    if lattice is None or reason:
         raise TrackerInitError(reason, draw_detections(small, dots.centers, radius, lattice.dots if lattice else None))
-    return _marker_grid(appearance, part, dots).scaled(shrink)
+    return _Detection(small, shrink, appearance, response, radius, dots, lattice)
 
 
 def _background_window(spacing: float) -> int:
@@ -122,16 +163,6 @@ def _hint(polarity: Polarity) -> str:
     return f"{restriction[polarity]}; check illumination, focus and that the image shows a gel"
 
 
-def _accepted_shapes(rows: int | None, cols: int | None, either_way: bool) -> tuple[tuple[int, int], ...]:
-    if rows is None and cols is None:
-        return ()
-    if rows is None or cols is None:
-        raise UsageError("give both rows and cols of the grid of markers, or neither")
-    if min(rows, cols) < 3 or max(rows, cols) > 200:
-        raise UsageError(f"a grid of markers has 3 to 200 rows and columns, got {rows} × {cols}")
-    return ((rows, cols), (cols, rows)) if either_way and rows != cols else ((rows, cols),)
-
-
 def _plausible(dots: DetectedDots) -> DetectedDots:
     """The strongest dots, without those of unusual area."""
     if len(dots) > _MAX_DOTS:
@@ -168,12 +199,6 @@ def _dot_radius(dots: DetectedDots, lattice: Lattice) -> float:
     return float(np.sqrt(np.median(dots.areas[lattice.dots[lattice.dots >= 0]]) / np.pi))
 
 
-def _completeness(lattice: Lattice, dots: DetectedDots) -> NDArray[np.float64]:
-    """1 at nodes with an entire dot, 0.01 at nodes with a cut one, 0 elsewhere, shape (rows, columns)."""
-    occupied = lattice.dots >= 0
-    return np.where(occupied, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
-
-
 def _search(
     image: NDArray[np.uint8], appearances: tuple[DotAppearance, ...]
 ) -> tuple[DotAppearance, float, float] | None:
@@ -196,9 +221,9 @@ def _search(
 
 def _score(response: NDArray[np.float32], dots: DetectedDots, lattice: Lattice) -> tuple[float, bool]:
     """Score of a grid, and whether the search can stop with it."""
-    completeness = _completeness(lattice, dots)
-    top, bottom, left, right = _trim(completeness)
-    inner = completeness[top:bottom, left:right]
+    complete = completeness(lattice, dots)
+    top, bottom, left, right = trim(complete)
+    inner = complete[top:bottom, left:right]
     texture = 1.5 * float(np.median(np.abs(response[::3, ::3]))) + 1e-3
     clear = float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) / texture
     share = float(inner.mean())
@@ -216,65 +241,10 @@ def _are_gaps(response: NDArray[np.float32], dots: DetectedDots, lattice: Lattic
     return float(np.median(dots.peaks[lattice.dots[lattice.dots >= 0]])) < 0.5 * opposite
 
 
-def _trim(completeness: NDArray[np.float64]) -> tuple[int, int, int, int]:
-    """The part of the grid whose outer lines are mostly complete: top, bottom, left, right."""
-    top, bottom, left, right = 0, completeness.shape[0], 0, completeness.shape[1]
-    while bottom - top >= 3 and right - left >= 3:
-        part = completeness[top:bottom, left:right]
-        rows, columns = part.mean(axis=1), part.mean(axis=0)
-        edges = (rows[0], rows[-1], columns[0], columns[-1])
-        worst = int(np.argmin(edges))
-        if edges[worst] >= 0.6:
-            break
-        top, bottom = top + (worst == 0), bottom - (worst == 1)
-        left, right = left + (worst == 2), right - (worst == 3)
-    return top, bottom, left, right
-
-
-def _best_window(completeness: NDArray[np.float64], rows: int, cols: int) -> tuple[float, int, int, float]:
-    """The window of rows × cols with the most dots: (dots, top, left, dots of the second best window)."""
-    if rows > completeness.shape[0] or cols > completeness.shape[1]:
-        return 0.0, 0, 0, 0.0
-    total = np.pad(completeness.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    sums = total[rows:, cols:] - total[:-rows, cols:] - total[rows:, :-cols] + total[:-rows, :-cols]
-    top, left = np.unravel_index(int(sums.argmax()), sums.shape)
-    others = np.delete(sums.reshape(-1), int(sums.argmax()))
-    return float(sums.max()), int(top), int(left), float(others.max()) if len(others) else 0.0
-
-
-def _select_part(lattice: Lattice, dots: DetectedDots, request: _Request) -> tuple[str, Lattice | None]:
-    """The part of `lattice` that is the printed grid, or None and the reason when it is ambiguous."""
-    completeness = _completeness(lattice, dots)
-    top, bottom, left, right = _trim(completeness)
-    if not request.shapes:
-        if bottom - top < 3 or right - left < 3:
-            return "the grid of markers in the image has fewer than 3 × 3 entire dots", None
-        return "", Lattice(lattice.dots[top:bottom, left:right], lattice.spacing, lattice.irregularity)
-    windows = ((size, _best_window(completeness, *size)) for size in request.shapes)
-    size, (count, top_best, left_best, second) = max(windows, key=lambda choice: choice[1][0])
-    found = f"the image shows {bottom - top} rows of {right - left} entire markers"
-    found += f", expected {request.rows} × {request.cols}"
-    if count < 0.7 * size[0] * size[1]:
-        return f"{found}: correct rows and columns, or leave them out to detect them", None
-    if count - second < 0.25 * min(size):
-        return f"{found}, and it is ambiguous which lines to ignore: correct rows and columns", None
-    part = lattice.dots[top_best : top_best + size[0], left_best : left_best + size[1]]
-    return "", Lattice(part, lattice.spacing, lattice.irregularity)
-
-
 def _marker_grid(appearance: DotAppearance, lattice: Lattice, dots: DetectedDots) -> MarkerGrid:
     index = lattice.dots
     median = float(np.median(dots.areas[index[index >= 0]]))
     area = dots.areas[index]
     visible = (index >= 0) & dots.inside[index] & (area > 0.4 * median) & (area < 2.0 * median)
-    positions = _interpolate(dots.centers[index], index >= 0)
+    positions = interpolate_nodes(dots.centers[index], index >= 0)
     return MarkerGrid(appearance, float(np.sqrt(median / np.pi)), lattice.spacing, positions, visible)
-
-
-def _interpolate(positions: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Interpolates unknown nodes: a bilinear fit to the known nodes plus the deviation of the neighbours from it."""
-    row, column = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij")
-    terms = np.stack([np.ones_like(row), row, column, row * column], axis=-1)
-    fit = terms @ np.linalg.lstsq(terms[known], positions[known], rcond=None)[0]
-    deviation = fill_from_neighbours(positions - fit, known)
-    return np.where(known[..., None], positions, fit + deviation)

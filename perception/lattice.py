@@ -95,6 +95,18 @@ def fill_from_neighbours(values: Points, known: NDArray[np.bool_]) -> Points:
     return filled
 
 
+def interpolate_nodes(positions: Points, known: NDArray[np.bool_]) -> Points:
+    """`positions`, shape (rows, columns, 2), with the unknown nodes interpolated.
+
+    They are a bilinear fit to the known nodes plus the deviation of the neighbours from it.
+    """
+    row, column = np.meshgrid(*(np.arange(n, dtype=float) for n in known.shape), indexing="ij")
+    terms = np.stack([np.ones_like(row), row, column, row * column], axis=-1)
+    fit = terms @ np.linalg.lstsq(terms[known], positions[known], rcond=None)[0]
+    deviation = fill_from_neighbours(positions - fit, known)
+    return np.where(known[..., None], positions, fit + deviation)
+
+
 def _axes(centers: Points, tree: cKDTree) -> Points | None:
     """Typical rightward step and typical downward step [px], shape (2, 2); None when too few dots have neighbours."""
     _, nearest = tree.query(centers, k=min(9, len(centers)))

@@ -16,7 +16,8 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
 from gelflow.perception.detect import downsample
 from gelflow.perception.dot_model import fit_dot_model
-from gelflow.perception.grid import Polarity, find_grid
+from gelflow.perception.grid import find_grid
+from gelflow.perception.grid_part import GridRequest, Polarity
 
 _MAX_RADIUS = 10.0  # of a dot [px]; larger images are downsampled, since more pixels add no accuracy
 
@@ -29,6 +30,9 @@ class TrackerConfig:
     cols: int | None = None  # markers in a row; None: detected
     either_way: bool = True  # also accept the transposed shape, rows and cols exchanged in the image
     polarity: Polarity = "auto"  # dots are "dark" or "bright" relative to the gel
+    # Of a partly visible grid, `rows` and `cols` being the visible ones; see `GridRequest`.
+    skipped: tuple[int, int, int, int] = (0, 0, 0, 0)
+    anchor: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ class MarkerTracker:
         config = self.config
         image = _as_bgr(image)
         rows, cols = (config.rows, config.cols) if rows is None and cols is None else (rows, cols)
-        grid = find_grid(image, rows=rows, cols=cols, either_way=config.either_way, polarity=config.polarity)
+        request = GridRequest(rows, cols, config.either_way, config.polarity, config.skipped, config.anchor)
+        grid = find_grid(image, request)
         shrink = max(1, int(np.ceil(grid.radius / _MAX_RADIUS)))
         tracker, model = fit_dot_model(downsample(image, shrink), grid.scaled(1 / shrink))
         rest = _upscaled(model.rest, shrink)

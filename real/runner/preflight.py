@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gelflow.errors import GelflowError, PeerError, SafetyError
 from gelflow.perception.frames import CameraMount, decode_image
-from gelflow.perception.scale import check_scale
+from gelflow.perception.mount_check import check_scale
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, not_ready_reason

@@ -7,7 +7,7 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.perception import CameraMount, MarkerTracker, check_scale, fit_calibration
-from gelflow.perception.scale import neighbour_spacing
+from gelflow.perception.mount_check import neighbour_spacing
 from gelflow.perception.synthetic.appearance import GelAppearance, make_appearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.synthetic.sequences import GelSequence
