@@ -178,7 +178,12 @@ def select_part(
         return f"{found}: correct rows and columns, or leave them out to detect them", None
     if count - second < 0.25 * min(size):
         return f"{found}, and it is ambiguous which lines to ignore: correct rows and columns", None
-    return "", _part(lattice, top_best, left_best, *size)
+    part = _part(lattice, top_best, left_best, *size)
+    occupied = part.dots >= 0
+    outer = min(float(line.mean()) for line in (occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1]))
+    if outer < _PARTLY_COMPLETE:  # a line of few dots may be dirt beside a grid of which another line is missing
+        return f"{found}: an outer line has {outer:.0%} of its markers; correct rows and columns", None
+    return "", part
 
 
 def _select_visible_part(
@@ -200,6 +205,8 @@ def _select_visible_part(
             f"{found}; it shows lines that are said to be outside the image: correct the visible rows and columns",
             None,
         )
+    if any(lines < 0 and side == "ends" for lines, side in zip(outside, extent.sides, strict=True)):
+        return f"{found}; the grid ends before the visible rows and columns: calibrate the camera again", None
     wider = Lattice(np.pad(lattice.dots, _BEYOND, constant_values=-1), lattice.spacing, lattice.irregularity)
     top, left = top + _BEYOND, left + _BEYOND
     inside = 0 <= top <= wider.shape[0] - rows and 0 <= left <= wider.shape[1] - cols

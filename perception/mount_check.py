@@ -89,6 +89,19 @@ class VisiblePart:
     skipped: Skipped
     anchor: tuple[float, float]  # as in `GridRequest`
 
+    @classmethod
+    def of_calibration(cls, calibration: Calibration) -> "VisiblePart":
+        """The part that a camera showed when it was calibrated."""
+        above, _, left, _ = calibration.skipped
+        right, down = calibration.marker_pixels(above + calibration.rows // 2, left + calibration.cols // 2).tolist()
+        return cls(*calibration.printed_grid, calibration.skipped, (right, down))
+
+    @property
+    def lines(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """First and last visible row, from 1 at the top of the image, and first and last column, from 1 at its left."""
+        above, below, left, right = self.skipped
+        return (above + 1, self.rows - below), (left + 1, self.cols - right)
+
     @property
     def shape(self) -> tuple[int, int]:
         """Visible (rows, columns)."""
@@ -121,16 +134,19 @@ def find_visible_part(
     return sorted(parts, key=lambda part: abs(np.diff(np.reshape(part.skipped, (2, 2)))).sum())
 
 
-def start_tracker(mount: CameraMount, image: NDArray[np.uint8]) -> tuple[MarkerTracker, TrackingResult]:
-    """A tracker started on `image` (B G R) with the visible part of `mount`.
+def start_at_rest(mount: CameraMount, image: NDArray[np.uint8]) -> TrackingResult:
+    """The markers in `image` (B G R) of the gel at rest, found as `mount` describes them.
 
-    Raises PeerError, with the lines for the lab file, when the image shows another part of the printed grid.
+    Raises PeerError, with the lines for the lab file, when the image shows another part of the printed grid,
+    UsageError when the scale does not fit.
     """
-    tracker = MarkerTracker(mount.tracker_config())
     try:
-        return tracker, tracker.start(image)
+        rest = MarkerTracker(mount.tracker_config()).start(image)
     except TrackerInitError as error:
-        raise PeerError(f"{error}; {_advice(mount, find_extent(image))}") from None
+        extent = find_extent(image)  # raises when there is no grid at all
+        raise PeerError(f"{error}; {_advice(mount, extent)}") from None
+    check_scale(mount, rest)
+    return rest
 
 
 def _advice(mount: CameraMount, extent: GridExtent) -> str:
@@ -156,10 +172,13 @@ def _is_calibrated_part(calibration: Calibration, extent: GridExtent, skipped: S
     return float(np.linalg.norm(off[0] - off[1])) < _ROW_TOLERANCE * calibration.spacing_mm
 
 
+def lines_text(lines: tuple[tuple[int, int], tuple[int, int]], rows: int, cols: int) -> str:
+    """The visible rows and columns of a printed grid."""
+    (first_row, last_row), (first_col, last_col) = lines
+    return f"rows {first_row}-{last_row} of {rows}, columns {first_col}-{last_col} of {cols}"
+
+
 def visible_text(mount: CameraMount, rest: TrackingResult) -> str:
     """The number of measured markers, and the visible lines of the printed grid."""
-    (first_row, last_row), (first_col, last_col) = mount.pad_lines(mount.skipped)
-    return (
-        f"{int(rest.valid.sum())} of {mount.rows * mount.cols} markers: rows {first_row}-{last_row} of {mount.rows}, "
-        f"columns {first_col}-{last_col} of {mount.cols}"
-    )
+    count, total = int(rest.valid.sum()), mount.rows * mount.cols
+    return f"{count} of {total} markers: {lines_text(mount.pad_lines(mount.skipped), mount.rows, mount.cols)}"

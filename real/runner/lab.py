@@ -103,6 +103,9 @@ class CameraSettings:
     rotation_deg: int = 0  # of the image, clockwise; at 0 the fingertip is at the bottom [°]: 0, 90, 180 or 270
     mirrored: bool = True  # the camera views the gel from behind
     latency: float = 0.0  # constant time from the exposure to the reception of an image [s], 0 to 0.2
+    # First and last row and column that the image shows, from 1; [0, 0]: those of the calibration, without one all.
+    visible_rows: tuple[int, int] = (0, 0)
+    visible_cols: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         known = self.source.startswith("http://") or re.fullmatch(r"uvc:(\d{1,4}|/dev/.+)", self.source)
@@ -128,6 +131,8 @@ class CameraSettings:
             mirrored=self.mirrored,
             pixels_per_mm=self.pixels_per_mm or None,
             calibration=load_calibration(self.calibration) if self.calibration else None,
+            visible_rows=self.visible_rows if any(self.visible_rows) else None,
+            visible_cols=self.visible_cols if any(self.visible_cols) else None,
         )
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from gelflow.errors import GelflowError, PeerError, SafetyError
 from gelflow.perception.frames import CameraMount, decode_image
-from gelflow.perception.mount_check import check_scale
-from gelflow.perception.tracker import MarkerTracker
+from gelflow.perception.mount_check import start_at_rest, visible_text
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 
@@ -60,13 +59,14 @@ def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     picture = decode_image(image.data)
     if mount.calibration is not None:
         mount.calibration.check_size(picture)
-    tracked = MarkerTracker(mount.tracker_config()).start(picture)
-    visible, total = int(tracked.valid.sum()), mount.rows * mount.cols
-    if visible < _VISIBLE_FRACTION * total:
-        raise PeerError(f"{visible} of {total} markers are visible; check the gel, its light and the camera")
-    check_scale(mount, tracked)
+    tracked = start_at_rest(mount, picture)
+    visible = int(tracked.valid.sum())
+    if visible < _VISIBLE_FRACTION * mount.visible_count:
+        raise PeerError(
+            f"{visible} of {mount.visible_count} markers are visible; check the gel, its light and the camera"
+        )
     age = cell.clock.now() - image.stamp
-    return f"{visible} of {total} markers, {mount.rows} × {mount.cols}; newest image {1e3 * age:.0f} ms old"
+    return f"{visible_text(mount, tracked)}; newest image {1e3 * age:.0f} ms old"
 
 
 def _check_distinct(cell: Cell) -> None:

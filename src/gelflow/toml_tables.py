@@ -130,6 +130,14 @@ class TomlTable:
             raise UsageError(f"{self.location}: {key} must be {count} finite numbers, got {value!r}")
         return tuple(float(v) for v in value)
 
+    def integers(self, key: str, count: int) -> tuple[int, ...]:
+        """A list of `count` integers."""
+        value = self._get(key, None)
+        valid = isinstance(value, list | tuple) and len(value) == count
+        if not valid or any(isinstance(v, bool) or not isinstance(v, int) for v in value):
+            raise UsageError(f"{self.location}: {key} must be {count} integers, got {value!r}")
+        return tuple(value)
+
     def strings(self, key: str, default: Sequence[str] | None = None) -> tuple[str, ...]:
         """A non-empty list of strings; a single string counts as a list of one."""
         value = self._get(key, default)
@@ -147,8 +155,8 @@ class TomlTable:
     def as_dataclass(self, cls: type[T], *, renamed: Mapping[str, str] | None = None) -> T:
         """An instance of a dataclass: one key per field, one subtable per field that is a dataclass.
 
-        Supports fields of type bool, int, float, str and fixed-length tuples of float. Errors of `__post_init__`
-        are prefixed with the location. `renamed` is that of `check_keys`, for this table only.
+        Supports fields of type bool, int, float, str and fixed-length tuples of float or of int. Errors of
+        `__post_init__` are prefixed with the location. `renamed` is that of `check_keys`, for this table only.
         """
         fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, cls))}
         self.check_keys(fields, renamed=renamed)
@@ -168,7 +176,8 @@ class TomlTable:
         if dataclasses.is_dataclass(kind):
             return self.table(key).as_dataclass(typing.cast(type, kind))
         if typing.get_origin(kind) is tuple:
-            return self.numbers(key, len(typing.get_args(kind)))
+            members = typing.get_args(kind)
+            return self.integers(key, len(members)) if set(members) == {int} else self.numbers(key, len(members))
         if kind is int:
             return self.integer(key, minimum=None)
         if kind is float:

@@ -158,6 +158,7 @@ def test_every_number_of_a_lab_file_has_a_range() -> None:
 
     # These have their own checks.
     own = {"format", "cameras.rows", "cameras.cols", "cameras.rotation_deg", "tool.quaternion"}
+    own |= {"cameras.visible_rows", "cameras.visible_cols"}
     assert numbers(load_lab(EXAMPLE), "") - own == set(LAB_RANGES)
 
 
@@ -213,6 +214,22 @@ def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: s
     assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
     path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
     assert "lab.toml, cameras.left: the calibration is for 18 rows of 14" in refused(tmp_path, path.read_text())
+
+
+def test_visible_lines_are_read_and_checked(tmp_path: Path, example: str) -> None:
+    path = tmp_path / "lab.toml"
+    path.write_text(example.replace("# visible_cols = [0, 0]", "visible_cols = [1, 12]", 1), encoding="utf-8")
+    lab = load_lab(path)
+    assert lab.cameras.left.mount.image_grid == (18, 12) and lab.cameras.right.mount.image_grid == (18, 14)
+    save_lab(lab, tmp_path / "again.toml", title="visible lines")
+    assert load_lab(tmp_path / "again.toml") == lab
+    for lines, expected in (
+        ("[1, 15]", "cameras.left: visible_cols must name the first and the last of at least 3 lines of 1 to 14"),
+        ("[2, 13]", "cameras.left: a grid that extends beyond two opposite borders of the image needs a calibration"),
+        ("[1.5, 12]", "cameras.left: visible_cols must be 2 integers, got [1.5, 12]"),
+    ):
+        text = example.replace("# visible_cols = [0, 0]", f"visible_cols = {lines}", 1)
+        assert expected in refused(tmp_path, text)
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`gelflow calibrate-camera`: camera calibration in millimetres from one image of the gel at rest."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,15 @@ from gelflow.cli.options import add_json, add_out
 from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
+from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.grid import find_extent
+from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
 from gelflow.perception.output.calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.sources import image_source
-from gelflow.perception.tracker import MarkerTracker
+from gelflow.perception.tracker import MarkerTracker, TrackingResult
+
+_MAX_OPTIONS = 4  # possible visible parts that an error lists
 
 Floats = NDArray[np.float64]
 
@@ -26,8 +32,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spacing-mm", type=float, required=True, metavar="MM", help="distance of neighbouring markers"
     )
-    parser.add_argument("--rows", type=int, metavar="N", help="rows of markers (default: detected)")
-    parser.add_argument("--cols", type=int, metavar="N", help="markers in a row (default: detected)")
+    parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
+    parser.add_argument("--cols", type=int, metavar="N", help="printed markers in a row (default: detected)")
+    for name, start in (("rows", "top"), ("cols", "left")):
+        parser.add_argument(
+            f"--visible-{name}",
+            type=int,
+            nargs=2,
+            metavar=("FIRST", "LAST"),
+            help=f"first and last of the printed {name} in the image, from 1 at its {start} (default: detected)",
+        )
     parser.add_argument("--sensor", default="left", help="sensor of a session: left or right (default %(default)s)")
     add_out(parser, "the new calibration; a picture (.png) goes beside it", default=Path("calibration.json"))
     add_json(parser)
@@ -43,12 +57,12 @@ def run(args: argparse.Namespace) -> int:
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
     image = next(iter(image_source(args.source, sensor=args.sensor))).image
-    tracker = MarkerTracker()
     with picture_of_init_error(args.out):
-        first = tracker.start(image, rows=args.rows, cols=args.cols)
+        tracker, first, part = _start(image, args)
     rest, measured = tracker.rest, first.valid
     size = (image.shape[1], image.shape[0])
     fit = fit_calibration(rest, measured, rows=first.rows, cols=first.cols, spacing_mm=args.spacing_mm, size=size)
+    fit = replace(fit, skipped=part.skipped) if part else fit
     save_calibration(fit, args.out)
     draw_calibration(image, rest, measured, fit, picture)
     rejected = _rejected(fit, rest, measured)
@@ -60,6 +74,8 @@ def run(args: argparse.Namespace) -> int:
                 "picture": picture,
                 "rows": fit.rows,
                 "cols": fit.cols,
+                "printed_grid": fit.printed_grid,
+                "skipped_lines": fit.skipped,
                 "measured_markers": int(measured.sum()),
                 "rejected_markers": rejected,
                 "pixels_per_mm": scale,
@@ -70,6 +86,54 @@ def run(args: argparse.Namespace) -> int:
     else:
         output.console.print(_table(fit, measured, rejected, written=f"{args.out}, and the picture {picture}"))
     return SUCCESS
+
+
+def _start(
+    image: NDArray[np.uint8], args: argparse.Namespace
+) -> tuple[MarkerTracker, TrackingResult, VisiblePart | None]:
+    """A started tracker, its result, and the visible part of a printed grid of which the image shows a part."""
+    told = [lines for lines in (args.visible_rows, args.visible_cols) if lines is not None]
+    if told and (args.rows is None or args.cols is None):
+        raise UsageError("--visible-rows and --visible-cols need --rows and --cols, the numbers of printed lines")
+    if not told:
+        tracker = MarkerTracker()
+        try:
+            return tracker, tracker.start(image, rows=args.rows, cols=args.cols), None
+        except TrackerInitError:
+            if args.rows is None or args.cols is None:
+                raise
+    part = _visible_part(image, args, told=bool(told))
+    tracker = MarkerTracker(part.tracker_config())
+    return tracker, tracker.start(image), part
+
+
+def _visible_part(image: NDArray[np.uint8], args: argparse.Namespace, *, told: bool) -> VisiblePart:
+    """The part of the printed grid that the image shows. Raises UsageError when there is none or a choice."""
+    possible = find_visible_part(image, args.rows, args.cols, either_way=not told)
+    parts = [
+        part
+        for part in possible
+        if all(
+            wanted is None or tuple(wanted) == lines
+            for wanted, lines in zip((args.visible_rows, args.visible_cols), part.lines, strict=True)
+        )
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    options = [
+        "--rows {} --cols {} --visible-rows {} {} --visible-cols {} {}".format(
+            part.rows, part.cols, *(number for lines in part.lines for number in lines)
+        )
+        for part in (parts or possible)[:_MAX_OPTIONS]
+    ]
+    if not options:
+        extent = find_extent(image)
+        raise UsageError(
+            f"the image shows {extent.rows} rows of {extent.cols} markers, which is no part of a grid of {args.rows} × "
+            f"{args.cols}: correct --rows and --cols"
+        )
+    reason = "does not tell which lines of the printed grid it shows" if parts else "does not show these lines"
+    raise UsageError(f"the image {reason}: look at the gel, and give {', or '.join(options)}")
 
 
 def _rejected(fit: Calibration, rest: Floats, measured: NDArray[np.bool_]) -> int:
@@ -89,6 +153,9 @@ def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, writ
     table.add_row(
         "markers", f"{fit.rows} rows of {fit.cols}, {measured.sum()} measured, {rejected} rejected as outliers"
     )
+    if any(fit.skipped):
+        lines = VisiblePart.of_calibration(fit).lines
+        table.add_row("visible", f"{lines_text(lines, *fit.printed_grid)} of the printed grid, counted in the image")
     table.add_row("scale", f"{along:.2f} px/mm along rows, {down:.2f} along columns (centre)")
     table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid")
     table.add_row("lens", lens)
