@@ -32,7 +32,7 @@ class View(DegradedGelAppearance):
 def view(preset: str = "typical", zoom: float = 1.0, grid: Grid = GELSLIM_GRID, **changed: object) -> View:
     scale = 22.0 / grid.pitch * zoom
     size = {"pixels_per_mm": scale, "radius": 0.2 * 22.0 * zoom, "light": 115.0, "grid": grid}
-    return View(**{**size, **PRESETS[preset], "barrel": 0.0, **changed})  # type: ignore[arg-type]
+    return View(**{**size, **PRESETS[preset], "barrel": 0.0, **changed})
 
 
 def shown(appearance: View, number: int = 0) -> tuple[RenderedImage, np.ndarray, np.ndarray]:
