@@ -53,6 +53,7 @@ def test_faults_begin_at_their_time_and_event_and_end_after_their_duration() -> 
         wait_for(lambda: robot.cell.truth()["part"] is not None)
         descriptor = os.open(robot.gripper.serial_path, os.O_RDWR | os.O_NOCTTY)
         try:
+            os.write(descriptor, Packet(Command.SET_FORCE_LIMIT, struct.pack("<f", 12.0)).encode())
             os.write(descriptor, Packet(Command.HOME, b"\x01").encode())
             wait_for(lambda: brightness(robot.cameras[0].url) < 6)
             assert brightness(robot.cameras[1].url) > 50
