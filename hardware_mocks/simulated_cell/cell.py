@@ -206,13 +206,16 @@ class SimulatedCell:
             self._next_seed = seed
 
     def truth(self) -> dict[str, Any]:
-        """Ground truth as plain data: the present part, all parts so far, and the time lost by robot time [s]."""
+        """Ground truth as plain data: the parts, robot time and its delay [s], position of tool and fingers [m]."""
         with self._lock:
             if self._current is not None:
                 self._measure(self._current)
             return {
                 "part": None if self._current is None else asdict(self._current),
                 "parts": [asdict(part) for part in self.parts],
+                "time": self._time,
+                "tool": self._tool.position.tolist(),
+                "width": self._gripper.width(),
                 "waited": self._clock.delay,
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import json
 import math
 import tomllib
 import typing
@@ -25,6 +26,25 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"cannot read {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path} is not valid TOML: {error}") from None
+
+
+def toml_text(tables: Mapping[str, Any], *, name: str = "") -> str:
+    """TOML of nested tables of numbers, strings, booleans and lists, and of lists of tables."""
+    values = {key: value for key, value in tables.items() if not _has_tables(value)}
+    # JSON strings, finite numbers, booleans and lists are valid TOML.
+    lines = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+    for key, value in tables.items():
+        if not _has_tables(value):
+            continue
+        dotted = f"{name}.{key}" if name else key
+        head, inner = (f"[{dotted}]", [value]) if isinstance(value, dict) else (f"[[{dotted}]]", value)
+        for table in inner:
+            lines += ["", head, toml_text(table, name=dotted).rstrip("\n")]
+    return "\n".join(lines) + "\n"
+
+
+def _has_tables(value: Any) -> bool:
+    return isinstance(value, dict) or (isinstance(value, list) and bool(value) and isinstance(value[0], dict))
 
 
 def suggestion(name: str, valid: Collection[str]) -> str:

@@ -30,6 +30,7 @@ COMMANDS = {
     "bench": "measure the speed of the simulator and the tracker",
     "tradeoff": "measure speed and error of a scene for many settings and for the presets",
     "describe": "describe a scene: model, omissions, size, and time of a step",
+    "soak": "insert parts with the mock robot under random faults, and count violated rules",
     "demo": "insert five parts with the mock robot, with pictures and a recorded session",
 }
 

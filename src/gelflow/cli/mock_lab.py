@@ -15,8 +15,11 @@ if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
 
-def lab_for(robot: "MockRobot") -> lab.Lab:
-    """Addresses, calibration, taught poses and time limits of `robot`."""
+def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
+    """Addresses, calibration, taught poses and time limits of `robot`.
+
+    The time limits are those of a robot plus `jitter` [s, wall], or `MOCK_TIME_SCALE` times as long without it.
+    """
     cell = robot.config.cell
     taught = cell.taught_hole
     factor, time_sync = robot.clock.settings
@@ -42,7 +45,7 @@ def lab_for(robot: "MockRobot") -> lab.Lab:
         part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
-        limits=_limits(MOCK_TIME_SCALE * factor),
+        limits=_limits(MOCK_TIME_SCALE * factor) if jitter is None else _limits(1.0, jitter * factor, disk=factor),
         clock_factor=factor,
         time_sync=time_sync,
     )
@@ -84,14 +87,15 @@ def _write_calibration(robot: "MockRobot", finger: int) -> Path:
     return path
 
 
-def _limits(scale: float) -> lab.LimitsSettings:
+def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0) -> lab.LimitsSettings:
+    """Limits of a robot, `scale` times as long (that of the disk again `disk` times) plus `jitter` [s, robot time]."""
     return lab.LimitsSettings(
-        stale_pose=0.020 * scale,
-        stale_frame=0.250 * scale,
-        stale_gripper=0.500 * scale,
-        target_lifetime=min(1.0, 0.100 * scale),
-        gripper_reply=1.0 * scale,
-        gripper_motion=6.0 * scale,
-        attempt_time=60.0 * scale,
-        recording_delay=1.0 * scale,
+        stale_pose=0.020 * scale + jitter,
+        stale_frame=0.250 * scale + jitter,
+        stale_gripper=0.500 * scale + jitter,
+        target_lifetime=min(1.0, 0.100 * scale + jitter),
+        gripper_reply=1.0 * scale + jitter,
+        gripper_motion=6.0 * scale + jitter,
+        attempt_time=60.0 * scale + jitter,
+        recording_delay=1.0 * scale * disk + jitter,
     )

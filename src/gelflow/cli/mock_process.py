@@ -20,23 +20,23 @@ _STOP_LIMIT = 10.0  # [s, wall]
 
 
 @contextlib.contextmanager
-def mock_robot(*, factor: float, seed: int, preset: str | None = None) -> Iterator[tuple[Path, str]]:
+def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: object) -> Iterator[tuple[Path, str]]:
     """Run a mock robot in a separate process; yields its lab file and the URL of its true state.
 
+    `more` are further options of `gelflow mock`, by name; None omits one.
     Raises PeerError with the process's last line of standard error when it does not start.
     """
     truth_port = _free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as errors:
         lab = Path(folder) / "lab.toml"
-        options = {
+        options: dict[str, object] = {
             "--out": lab,
             "--factor": factor,
             "--seed": seed,
             "--truth-port": truth_port,
             "--egm-port": _free_port(socket.SOCK_DGRAM),
         }
-        if preset is not None:
-            options["--preset"] = preset
+        options |= {f"--{name}": value for name, value in {"preset": preset, **more}.items() if value is not None}
         code = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
         process = subprocess.Popen(
             [

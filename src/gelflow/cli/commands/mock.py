@@ -36,6 +36,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="TOML file of a world that differs from training (docs/guide/mock.md)",
     )
     parser.add_argument("--faults", type=Path, metavar="FILE", help="TOML file of a fault plan (docs/guide/mock.md)")
+    parser.add_argument(
+        "--jitter",
+        type=float,
+        metavar="S",
+        help="time limits of the lab file: those of a robot plus S seconds (default: twelve times as long)",
+    )
     parser.add_argument("--attached", action="store_true", help="end when standard input is closed")
     add_seed(parser)
     add_preset(parser)
@@ -53,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.hardware_mocks.simulated_cell.world import World, load_world
     from gelflow.real.runner.lab_file import save_lab
 
-    check_at_least(args, seed=0)
+    check_at_least(args, seed=0, jitter=0)
     world = load_world(args.world) if args.world is not None else World()
     config = MockRobotConfig(
         cell=preset_config(args.preset, seed=args.seed, world=world),
@@ -67,7 +73,11 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(5e-4)
     with MockRobot(args.factor, config) as robot:
         if args.out is not None:
-            save_lab(lab_for(robot), args.out, title="Written by gelflow mock for the running mock robot.")
+            save_lab(
+                lab_for(robot, jitter=args.jitter),
+                args.out,
+                title="Written by gelflow mock for the running mock robot.",
+            )
         _show(Output(args.json), robot, args.out)
         _wait_for_end(attached=args.attached)
     return SUCCESS

@@ -1,0 +1,119 @@
+"""`gelflow soak`: insertions with the mock robot under random fault plans and worlds, judged by fixed rules."""
+
+import argparse
+import statistics
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.table import Table
+
+from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
+from gelflow.cli.options import add_json, add_out, add_preset, add_seed, check_at_least
+from gelflow.cli.output import Output, progress_bar
+from gelflow.errors import PeerError
+
+if TYPE_CHECKING:
+    from gelflow.cli.soak_case import SoakCase
+    from gelflow.real.soak.ledger import Ledger
+
+_FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test ends
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("--plans", type=int, default=20, metavar="N", help="number of plans (default %(default)s)")
+    parser.add_argument("--only", type=int, metavar="SEED", help="run the plan of this seed alone, and keep its files")
+    parser.add_argument("--factor", type=float, default=4.0, metavar="X", help="robot time over wall time (default 4)")
+    parser.add_argument(
+        "--jitter",
+        type=float,
+        default=0.05,
+        metavar="S",
+        help="added to a robot's time limits, for a computer with load (default %(default)s s)",
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="plans at the same time (default 1)")
+    add_seed(parser)
+    add_preset(parser)
+    add_out(parser, "folder of the results, continued if it exists", default=Path("out/soak"), folder=True)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the plans that the folder does not contain yet, then print all counts. Negative: a rule was violated."""
+    from gelflow.cli.soak_case import SoakCase
+    from gelflow.real.soak.ledger import Ledger
+
+    check_at_least(args, plans=1, seed=0, only=0, jobs=1)
+    output = Output(args.json)
+    ledger = Ledger(args.out / "soak.jsonl")
+    seeds = [args.only] if args.only is not None else range(args.seed, args.seed + args.plans)
+    left = [seed for seed in seeds if args.only is not None or seed not in ledger.rows]
+    if len(left) < len(seeds):
+        output.text(f"{len(seeds) - len(left)} of {len(seeds)} plans are in {args.out} already.")
+    cases = [SoakCase.of(seed, factor=args.factor, jitter=args.jitter, preset=args.preset) for seed in left]
+    _run_all(cases, ledger, output, args)
+    if args.only is not None:
+        output.result({"rows": [ledger.rows[args.only]]})
+        return NEGATIVE_RESULT if ledger.rows[args.only]["violations"] else SUCCESS
+    _show(output, ledger)
+    output.result({"plans": len(ledger.rows), "failing": ledger.failing(), **ledger.counts()})
+    return NEGATIVE_RESULT if ledger.failing() else SUCCESS
+
+
+def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: argparse.Namespace) -> None:
+    """Run the cases, `--jobs` at a time; raises PeerError when the mock robot repeatedly fails to start."""
+    from gelflow.cli.soak_case import try_case
+
+    failed = 0
+    with progress_bar(count=True) as progress, ThreadPoolExecutor(args.jobs) as pool:
+        bar = progress.add_task("plans", total=len(cases))
+        waiting = list(cases)
+        running: dict[Future[dict[str, Any] | str], SoakCase] = {}
+        while waiting or running:
+            while waiting and len(running) < args.jobs:
+                case = waiting.pop(0)
+                running[pool.submit(try_case, case, args.out / "failing" / str(case.seed))] = case
+            for done in wait(running, return_when=FIRST_COMPLETED).done:
+                case, row = running.pop(done), done.result()
+                failed = failed + 1 if isinstance(row, str) else 0
+                if isinstance(row, str):
+                    output.text(f"plan {case.seed} did not run: {row}")
+                    if failed >= _FAILED_STARTS:
+                        raise PeerError(f"{failed} plans in sequence did not run: {row}")
+                else:
+                    ledger.add(case.seed, row)
+                    output.text(_line(case.seed, row))
+                progress.advance(bar)
+
+
+def _line(seed: int, row: dict[str, Any]) -> str:
+    broken = f"  VIOLATED: {', '.join(row['violations'])}" if row["violations"] else ""
+    truth = "in the hole" if row["truth"].get("inserted") else "not in the hole"
+    pushed = 1e3 * row["truth"].get("largest_push", 0.0)
+    return f"{seed:6d}  {row['wall']:5.1f} s  {row['outcome']} ({truth}, pushed {pushed:.2f} mm)  {row['plan']}{broken}"
+
+
+def _show(output: Output, ledger: "Ledger") -> None:
+    """Tables of the outcomes, of the kinds of faults, and of the rules."""
+    from gelflow.real.soak.rules import RULES
+
+    counts, rows = ledger.counts(), list(ledger.rows.values())
+    table = Table(title=f"Soak test: {len(rows)} plans")
+    for name in ("outcome", "plans"):
+        table.add_column(name, justify="right" if name == "plans" else "left")
+    for outcome, count in sorted(counts["outcomes"].items(), key=lambda item: -item[1]):
+        table.add_row(outcome, str(count))
+    table.add_section()
+    for rule in RULES:
+        count = counts["violations"].get(rule, 0)
+        table.add_row(f"violated: {rule}", str(count), style="red" if count else "green")
+    output.console.print(table)
+    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(counts["kinds"].items()))
+    output.text(f"kinds of faults: {kinds}")
+    pushes = [1e3 * row["truth"].get("largest_push", 0.0) for row in rows]
+    if pushes:
+        output.text(f"largest push: {max(pushes):.2f} mm, median {statistics.median(pushes):.2f} mm")
+    if ledger.failing():
+        seeds = " ".join(map(str, ledger.failing()))
+        output.text(f"failing seeds: {seeds}; run one again with: gelflow soak --only SEED")
