@@ -29,6 +29,7 @@ COMMON_OPTIONS = {
     "bench": {"--json", "--out", "--quick", "--repeats"},
     "tradeoff": {"--json", "--out", "--quick", "--repeats"},
     "describe": {"--json", "--preset", "--repeats"},
+    "soak": {"--json", "--out", "--seed", "--preset"},
     "demo": {"--json", "--out", "--seed", "--preset", "--quick", "--checkpoint"},
 }
 

@@ -46,7 +46,7 @@ class SoakCase:
         return cls(seed, factor, jitter, random_plan(seed), random_world(seed), preset)
 
     def run(self, keep: Path | None = None) -> dict[str, Any]:
-        """Run the case and judge it; returns the row for the ledger. `keep` is the folder for its files.
+        """Run the case and check the rules; returns the row for the ledger. `keep` is the folder for its files.
 
         Raises PeerError when the mock robot does not start.
         """

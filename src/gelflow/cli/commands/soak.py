@@ -1,4 +1,4 @@
-"""`gelflow soak`: insertions with the mock robot under random fault plans and worlds, judged by fixed rules."""
+"""`gelflow soak`: insertions with the mock robot under random fault plans and worlds, checked by fixed rules."""
 
 import argparse
 import statistics
