@@ -103,7 +103,7 @@ class SoakCase:
 
 @dataclass
 class _Watch:
-    """What is seen of a run from outside."""
+    """A run as seen from outside."""
 
     allowed_idle: float  # [s]
     exit_code: int | None = None  # None: it was ended
