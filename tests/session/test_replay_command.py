@@ -101,6 +101,7 @@ def test_the_command_reports_identical_decisions(
         actions = {tuple(decision.action) for decision in session.decisions()}
     assert len(actions) == 3 and all(0 < abs(x) < 8e-3 for x, _, _ in actions)  # not zero: the policy was evaluated
     assert "all 3 decisions identical" in out and "note:" not in out
+    assert "…" not in out  # the table fits into 80 columns
     drawn = cv2.imread(str(picture))
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
 

@@ -199,7 +199,8 @@ def _show(output: Output, result: _Result, picture: Path | None) -> int:
 
 
 def _table(comparisons: Sequence[Comparison]) -> Table:
-    table = Table(title="Recorded decisions, and differences of the recomputed ones", box=SIMPLE_HEAD)
+    title = "Recorded decisions, and differences of the recomputed ones"
+    table = Table(title=title, box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     differences = ("difference\nof action", "difference\nof map")
     for name in ("insertion", "attempt", "images", "x mm", "y mm", "yaw °", *differences):
         table.add_column(name, justify="right", no_wrap=True)
