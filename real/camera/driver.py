@@ -23,6 +23,7 @@ def open_camera(
     *,
     timeout: float = LIMITS.image_age,
     latency: float = 0.0,
+    frozen_after: float | None = None,
     on_image: OnImage | None = None,
 ) -> StreamCamera:
     """Open the camera at `source`: "http://HOST:PORT/?action=stream", "uvc:INDEX" or "uvc:/dev/videoN".
@@ -30,11 +31,15 @@ def open_camera(
     Raises UsageError for any other source, and PeerError when the camera cannot be opened.
     """
     if source.startswith("http://"):
-        return MjpegCamera(source, name, clock, timeout=timeout, latency=latency, on_image=on_image).open()
+        return MjpegCamera(
+            source, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image
+        ).open()
     if source.startswith("uvc:"):
         device = source.removeprefix("uvc:")
         chosen = int(device) if device.isdigit() else device
-        return UvcCamera(chosen, name, clock, timeout=timeout, latency=latency, on_image=on_image).open()
+        return UvcCamera(
+            chosen, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image
+        ).open()
     raise UsageError(f"camera {name}: expected http://HOST:PORT/… or uvc:INDEX, got {source!r}")
 
 
@@ -53,10 +58,13 @@ class MjpegCamera(StreamCamera):
         *,
         timeout: float = LIMITS.image_age,
         latency: float = 0.0,
+        frozen_after: float | None = None,
         connect_timeout: float = 3.0,
         on_image: OnImage | None = None,
     ) -> None:
-        super().__init__(url, name, clock, timeout=timeout, latency=latency, on_image=on_image)
+        super().__init__(
+            url, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image
+        )
         parts = urlsplit(url)
         try:
             port = parts.port or 80
@@ -166,10 +174,19 @@ class UvcCamera(StreamCamera):
         *,
         timeout: float = LIMITS.image_age,
         latency: float = 0.0,
+        frozen_after: float | None = None,
         size: tuple[int, int] | None = None,
         on_image: OnImage | None = None,
     ) -> None:
-        super().__init__(f"video device {device}", name, clock, timeout=timeout, latency=latency, on_image=on_image)
+        super().__init__(
+            f"video device {device}",
+            name,
+            clock,
+            timeout=timeout,
+            latency=latency,
+            frozen_after=frozen_after,
+            on_image=on_image,
+        )
         if isinstance(device, int) and device < 0:
             raise UsageError(f"camera {name}: a device index is 0 or more, got {device}")
         self._device = device if isinstance(device, int) else str(device)

@@ -15,6 +15,7 @@ from gelflow.real.camera.liveness import CameraClock, RepeatFilter
 from gelflow.time_sync import MIN_WAIT
 
 OnImage = Callable[[CameraImage], None]
+_LEAST_REJECTED = 3  # images in a row that are not new, for a frozen camera
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,8 @@ class StreamCamera(ABC):
 
     An image that repeats a recent one, that carries no later time of the camera's own clock than its predecessor, or
     that is older than `timeout` at its reception is passed to `on_image` but is not new: `latest` and `next` do not
-    return it, so that a frozen camera ends in their time-outs as a silent one does. `repeated`, `unclocked` and `late`
-    count such images.
+    return it, and raise PeerTimeout when only such images arrive for `frozen_after` [s, robot time; by default
+    `timeout`]. `repeated`, `unclocked` and `late` count them.
 
     The stamp of an image is the robot time of its reception, less `latency` and less its delay in addition to the
     shortest one by the camera's own clock (if the camera sends its time). `latency` [s] is the constant time from the
@@ -51,6 +52,7 @@ class StreamCamera(ABC):
         *,
         timeout: float,
         latency: float = 0.0,
+        frozen_after: float | None = None,
         on_image: OnImage | None = None,
     ) -> None:
         if not timeout > 0:
@@ -61,6 +63,7 @@ class StreamCamera(ABC):
         self.name = name
         self.timeout = timeout  # largest age of the image that `latest` returns [s, robot time]
         self.latency = latency
+        self._frozen_after = timeout if frozen_after is None else frozen_after
         self._clock = clock
         self._on_image = on_image
         self._changed = threading.Condition()
@@ -68,6 +71,8 @@ class StreamCamera(ABC):
         self.repeated = self.unclocked = self.late = 0
         self._rejected = 0  # images since the newest one
         self._rejection = ("", "")  # of the last of them: what the camera does, and the likely cause
+        self._since: tuple[float, float | None] | None = None  # reception and camera time before the first of them [s]
+        self._frozen = False
         self._repeats = RepeatFilter()  # continues after a reconnect, which does not revive a frozen server
         self._camera_clock = CameraClock()
         self._stamp = -math.inf  # of the last image [s]
@@ -132,7 +137,7 @@ class StreamCamera(ABC):
             if self._newest is None:
                 self._wait_for(lambda: self._newest is not None, self.timeout)
             self._raise_failure()
-            if self._newest is None or self._clock.now() - self._newest.stamp > self.timeout:
+            if self._frozen or self._newest is None or self._clock.now() - self._newest.stamp > self.timeout:
                 raise self._no_image(self.timeout)
             return self._newest
 
@@ -150,9 +155,9 @@ class StreamCamera(ABC):
             raise self._no_image(timeout)
 
     def _wait_for(self, arrived: Callable[[], bool], timeout: float) -> None:
-        """Wait until `arrived` or a failure, at most `timeout` [s, robot time]; the caller holds the lock."""
+        """Wait until `arrived`, a failure or a frozen camera, at most `timeout` [s, robot time], with the lock held."""
         end = self._clock.now() + timeout
-        while not (arrived() or self._failure is not None) and (left := end - self._clock.now()) > 0:
+        while not (arrived() or self._failure is not None or self._frozen) and (left := end - self._clock.now()) > 0:
             self._changed.wait(max(self._clock.wall(left), MIN_WAIT))
 
     # Implemented by each camera class
@@ -203,21 +208,32 @@ class StreamCamera(ABC):
         with self._changed:
             if repeat:
                 self.repeated += 1
-                self._reject("repeats the same image", "the camera or its server is frozen")
+                self._reject("repeats the same image", "the camera or its server is frozen", now, received)
             elif delay is None:
                 self.unclocked += 1
-                self._reject("sends images whose X-Timestamp does not advance", "the camera or its server is frozen")
+                what = "sends images whose X-Timestamp does not advance"
+                self._reject(what, "the camera or its server is frozen", now, received)
             elif age > self.timeout:
                 self.late += 1
-                self._reject(f"sends images {age:.2f} s late by its own clock", "its server or network buffers images")
+                what = f"sends images {age:.2f} s late by its own clock"
+                self._reject(what, "its server or network buffers images", now, received)
             else:
                 self._newest = image
-                self._rejected = 0
+                self._rejected, self._since, self._frozen = 0, (now, received.camera_time), False
                 self._changed.notify_all()
 
-    def _reject(self, what: str, cause: str) -> None:
+    def _reject(self, what: str, cause: str, now: float, received: ReceivedImage) -> None:
+        """Count an image that is not new; the camera is frozen when such images arrive for too long."""
         self._rejected += 1
         self._rejection = what, cause
+        since, camera_since = self._since = self._since or (now, received.camera_time)
+        elapsed = now - since
+        # The camera's own clock, where it advances, does not include the jitter of the reception.
+        if camera_since is not None and received.camera_time is not None and received.camera_time > camera_since:
+            elapsed = received.camera_time - camera_since
+        if self._rejected >= _LEAST_REJECTED and elapsed > self._frozen_after:
+            self._frozen = True
+            self._changed.notify_all()
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

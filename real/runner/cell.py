@@ -76,12 +76,14 @@ def _open_camera(
 ) -> StreamCamera:
     """A connected camera that records every image."""
     settings: CameraSettings = getattr(lab.cameras, name)
+    stale = lab.limits.stale_frame
     return open_camera(
         settings.source,
         name,
         clock,
-        timeout=lab.limits.stale_frame,
+        timeout=stale,
         latency=settings.latency,
+        frozen_after=stale / _time_scale(lab),  # images arrive: the computer's jitter is no reason to wait longer
         on_image=lambda image: recorder.image(sensor, image),
     )
 
@@ -105,9 +107,13 @@ def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run
 
 def _controller(lab: Lab, clock: ScaledClock) -> ControllerMonitor:
     """The monitor of the controller's mode and program, not yet opened."""
-    scale = MOCK_TIME_SCALE * lab.clock_factor if lab.time_sync else 1.0
     client = WebServicesClient(lab.arm.web_services)
-    return ControllerMonitor(client, clock, stale=LIMITS.controller_age * scale)
+    return ControllerMonitor(client, clock, stale=LIMITS.controller_age * _time_scale(lab))
+
+
+def _time_scale(lab: Lab) -> float:
+    """The factor by which time limits are larger for a mock robot."""
+    return MOCK_TIME_SCALE * lab.clock_factor if lab.time_sync else 1.0
 
 
 def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:

@@ -83,10 +83,11 @@ class TimedStream:
         self._link.close()
         self._listener.close()
 
-    def send(self, received: float, camera_time: float) -> CameraImage:
-        """Send a new image that is received at the robot time `received` [s]; returns the recorded image."""
+    def send(self, received: float, camera_time: float, *, repeat: bool = False) -> CameraImage:
+        """Send an image that is received at the robot time `received` [s]; returns the recorded image."""
         self.clock.time = received
-        rejected, count, image = self._rejected(), len(self.seen), jpeg(len(self.seen))
+        rejected, count = self._rejected(), len(self.seen)
+        image = self.seen[-1].data if repeat else jpeg(count)
         header = f"Content-Type: image/jpeg\r\nContent-Length: {len(image)}\r\nX-Timestamp: {camera_time:.6f}\r\n\r\n"
         self._link.sendall(header.encode() + image + b"\r\n--xyz\r\n")
         wait(lambda: len(self.seen) > count)
@@ -125,7 +126,8 @@ def test_frozen_server_ends_in_a_timeout_of_latest_and_next(length: int) -> None
         with pytest.raises(PeerTimeout, match="repeats the same image"):
             camera.next(last.sequence, 0.2)
         source.loop = []
-        assert camera.next(last.sequence, PATIENT).sequence > last.sequence  # the camera runs again
+        wait(lambda: not camera._frozen)  # the camera runs again
+        assert camera.next(last.sequence, PATIENT).sequence > last.sequence
         camera.latest()
     # The recording holds the repeated images too.
     assert [image.sequence for image in seen] == list(range(len(seen)))
@@ -209,6 +211,21 @@ def test_growing_delay_of_a_server_is_a_timeout() -> None:
             stream.camera.latest()
         image = stream.send(sent + 0.5, 5000.0 + 0.5 + sent - 100.0)  # the server has caught up
         assert stream.camera.latest() is image
+
+
+def test_frozen_camera_is_reported_before_a_longer_time_limit() -> None:
+    with TimedStream(timeout=12.0, frozen_after=0.25) as stream:
+        newest = stream.send(100.0, 50.0)
+        for number in range(1, 4):  # late receptions of images that were sent 80 ms apart
+            stream.send(100.0 + number, 50.0 + 0.08 * number, repeat=True)
+            assert stream.camera.latest() is newest
+        stream.send(104.0, 50.32, repeat=True)
+        with pytest.raises(PeerTimeout, match=r"repeats the same image \(4 times\).*the last 4\.00 s ago"):
+            stream.camera.latest()
+        with pytest.raises(PeerTimeout, match="repeats the same image"):
+            stream.camera.next(newest.sequence, 10.0)  # without waiting
+        newest = stream.send(104.5, 50.4)
+        assert stream.camera.latest() is newest is stream.camera.next(0, 10.0)
 
 
 def test_image_in_order_of_arrival_but_not_of_the_camera_is_not_new() -> None:
