@@ -18,6 +18,7 @@ from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingRes
 # lens that moves the corners by 10 %.
 TOLERANCE = 0.1
 _ROW_TOLERANCE = 0.4  # of the distance of a marker from its calibrated position / pitch; at 0.5 rows are exchanged
+_MIN_VISIBLE = 0.8  # fraction of valid markers of the visible part, at rest
 _MAX_CHOICES = 4  # possible ranges that a message lists
 
 Floats = NDArray[np.float64]
@@ -137,14 +138,20 @@ def find_visible_part(
 def start_at_rest(mount: CameraMount, image: NDArray[np.uint8]) -> TrackingResult:
     """The markers in `image` (B G R) of the gel at rest, found as `mount` describes them.
 
-    Raises PeerError, with the lines for the lab file, when the image shows another part of the printed grid,
-    UsageError when the scale does not fit.
+    Raises PeerError when fewer than 80 % of the markers are visible, with the lines for the lab file where the image
+    shows another part of the printed grid, UsageError when the scale does not fit.
     """
     try:
         rest = MarkerTracker(mount.tracker_config()).start(image)
     except TrackerInitError as error:
         extent = find_extent(image)  # raises when there is no grid at all
         raise PeerError(f"{error}; {_advice(mount, extent)}") from None
+    visible = int(rest.valid.sum())
+    if visible < _MIN_VISIBLE * mount.visible_count:
+        extent = find_extent(image)
+        whole = (extent.rows, extent.cols) == mount.image_grid
+        advice = "check the gel, its light and the camera" if whole else _advice(mount, extent)
+        raise PeerError(f"{visible} of {mount.visible_count} markers are visible; {advice}")
     check_scale(mount, rest)
     return rest
 
@@ -159,10 +166,14 @@ def _advice(mount: CameraMount, extent: GridExtent) -> str:
         rows, cols = mount.printed_grid
         return f"it shows {extent.rows} rows of {extent.cols} markers, which is no part of {rows} rows of {cols}"
     lines = [f"visible_rows = {list(rows)} and visible_cols = {list(cols)}" for rows, cols in choices]
-    if len(lines) == 1:
-        return f"write {lines[0]} in the lab file"
     several = ", or ".join(lines[:_MAX_CHOICES]) + (", or …" if len(lines) > _MAX_CHOICES else "")
-    return f"the image does not tell which lines are outside: look at the gel and write {several} in the lab file"
+    text = f"write {several} in the lab file"
+    if len(lines) > 1:
+        text = f"the image does not tell which lines are outside: look at the gel and {text}"
+    if mount.calibration is None:
+        rows, cols = mount.printed_grid
+        text += f", or calibrate the camera with gelflow calibrate-camera --rows {rows} --cols {cols}"
+    return text
 
 
 def _is_calibrated_part(calibration: Calibration, extent: GridExtent, skipped: Skipped) -> bool:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.perception.mount_check import VisiblePart
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.tracker import TrackingResult
 
@@ -23,6 +24,7 @@ class TrackingSummary:
     largest_mm: float | None = None
     largest_at: str = ""  # image and marker of the largest displacement
     first: TrackingResult | None = None
+    visible: list[VisiblePart] = field(default_factory=list)  # possible visible parts of a partly visible grid
     _valid: list[float] = field(default_factory=list)  # share of each image
     _inferred: list[float] = field(default_factory=list)
     _noise: list[float] = field(default_factory=list)  # of each three consecutive images [px]
@@ -72,6 +74,9 @@ class TrackingSummary:
             "rows": self.first.rows,
             "cols": self.first.cols,
             "spacing_px": self.first.spacing,
+            "printed_grid": (self.visible[0].rows, self.visible[0].cols) if self.visible else None,
+            "visible_rows": self._lines(0),
+            "visible_cols": self._lines(1),
             "tracked_share": float(np.mean(self._valid)),
             "tracked_share_min": min(self._valid),
             "inferred_share": float(np.mean(self._inferred)),
@@ -82,6 +87,10 @@ class TrackingSummary:
             "seconds_per_image": self.frame_seconds(),
             "seconds_first_image": self.seconds[0],
         }
+
+    def _lines(self, axis: int) -> tuple[int, int] | None:
+        """First and last visible row (axis 0) or column, from 1; None where unknown or all are visible."""
+        return self.visible[0].lines[axis] if len(self.visible) == 1 else None
 
 
 def _noise(second: NDArray[np.float64], position: NDArray[np.float64]) -> float | None:

@@ -10,7 +10,6 @@ from gelflow.perception.mount_check import start_at_rest, visible_text
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 
-_VISIBLE_FRACTION = 0.8  # of the markers, at rest
 _COMPARED_IMAGES = 3  # consecutive images of each camera
 _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
 
@@ -60,11 +59,6 @@ def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     if mount.calibration is not None:
         mount.calibration.check_size(picture)
     tracked = start_at_rest(mount, picture)
-    visible = int(tracked.valid.sum())
-    if visible < _VISIBLE_FRACTION * mount.visible_count:
-        raise PeerError(
-            f"{visible} of {mount.visible_count} markers are visible; check the gel, its light and the camera"
-        )
     age = cell.clock.now() - image.stamp
     return f"{visible_text(mount, tracked)}; newest image {1e3 * age:.0f} ms old"
 

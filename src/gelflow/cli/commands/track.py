@@ -6,6 +6,8 @@ import time
 from contextlib import ExitStack, closing
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
@@ -13,6 +15,9 @@ from gelflow.cli.options import add_json, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, load_calibration
+from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.grid_part import Polarity
+from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
@@ -26,9 +31,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", help="folder of images, image, video, session (.mcap), stream URL, or number of a camera"
     )
-    parser.add_argument("--rows", type=int, metavar="N", help="rows of markers (default: detected)")
+    parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
     parser.add_argument(
-        "--cols", type=int, metavar="N", help="markers in a row (default: detected); rows and cols may be swapped"
+        "--cols",
+        type=int,
+        metavar="N",
+        help="printed markers in a row (default: detected); rows and cols may be swapped, and partly outside the image",
     )
     polarity = parser.add_mutually_exclusive_group()
     polarity.add_argument("--dark", action="store_true", help="dots are darker than the gel (default: detected)")
@@ -61,12 +69,10 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     output = Output(args.json)
     source = image_source(args.source, sensor=args.sensor, rate=args.rate)
-    polarity = "dark" if args.dark else "bright" if args.bright else "auto"
-    tracker = MarkerTracker(TrackerConfig(rows=args.rows, cols=args.cols, polarity=polarity))  # type: ignore[arg-type]
     calibration = load_calibration(args.calibration) if args.calibration else None
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
-        _track(source, tracker, calibration, summary, args)
+        _track(source, calibration, summary, args)
     except KeyboardInterrupt:
         if not source.live or not summary.images:
             raise
@@ -91,7 +97,6 @@ def _check(args: argparse.Namespace) -> None:
 
 def _track(
     source: ImageSource,
-    tracker: MarkerTracker,
     calibration: Calibration | None,
     summary: TrackingSummary,
     args: argparse.Namespace,
@@ -102,12 +107,16 @@ def _track(
     with ExitStack() as open_files, progress_bar(count=True) as progress:
         bar = progress.add_task("tracking", total=total)
         writers: list[TrackWriter] = []
+        tracker = MarkerTracker()
         for number, frame in enumerate(itertools.islice(source, args.images)):
             if number == 0 and calibration is not None:
                 calibration.check_size(frame.image)
             begin = time.perf_counter()
             with picture_of_init_error((args.out or [Path("track")])[0]):
-                tracked = tracker.track(frame.image)
+                if number == 0:
+                    tracker, tracked, summary.visible = _start(frame.image, calibration, args)
+                else:
+                    tracked = tracker.track(frame.image)
             seconds = time.perf_counter() - begin
             if number == 0:
                 # Files are created after the first image: a failed start leaves no empty files.
@@ -117,6 +126,32 @@ def _track(
                 writer.add(step)
             summary.add(step, seconds)
             progress.advance(bar)
+
+
+def _start(
+    image: NDArray[np.uint8], calibration: Calibration | None, args: argparse.Namespace
+) -> tuple[MarkerTracker, TrackingResult, list[VisiblePart]]:
+    """A tracker started on the first image, its result, and the possible visible parts of a partly visible grid."""
+    polarity: Polarity = "dark" if args.dark else "bright" if args.bright else "auto"
+    parts: list[VisiblePart] = []
+    config = TrackerConfig(rows=args.rows, cols=args.cols, polarity=polarity)
+    if calibration is not None and any(calibration.skipped):
+        parts = [VisiblePart.of_calibration(calibration)]
+        config = parts[0].tracker_config(polarity)
+    tracker = MarkerTracker(config)
+    try:
+        first = tracker.start(image)
+    except TrackerInitError:
+        if parts or args.rows is None or args.cols is None:
+            raise
+        parts = find_visible_part(image, args.rows, args.cols, polarity=polarity)
+        if not parts:
+            raise
+        tracker = MarkerTracker(parts[0].tracker_config(polarity))
+        first = tracker.start(image)
+    if calibration is not None:
+        check_calibrated_scale(calibration, first)
+    return tracker, first, parts
 
 
 def _writers(args: argparse.Namespace, calibration: Calibration | None) -> list[TrackWriter]:
@@ -152,6 +187,8 @@ def _show(output: Output, summary: TrackingSummary, wall: float, files: list[Pat
     table = Table(show_header=False)
     table.add_row("images", str(values["images"]))
     table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")
+    if summary.visible:
+        table.add_row("visible", _visible_text(summary.visible, markers))
     worst = f"in the worst image {100 * values['tracked_share_min']:.1f} %"
     table.add_row("tracked", f"{100 * values['tracked_share']:.1f} % ({worst})")
     table.add_row("inferred", f"{100 * values['inferred_share']:.1f} %, from neighbours")
@@ -169,3 +206,13 @@ def _show(output: Output, summary: TrackingSummary, wall: float, files: list[Pat
     for file in files:
         table.add_row("written", str(file))
     output.console.print(table)
+
+
+def _visible_text(parts: list[VisiblePart], markers: int) -> str:
+    """The visible lines of a printed grid, or how many there are where the image does not tell which ones."""
+    rows, cols = parts[0].rows, parts[0].cols
+    count = f"{markers} of {rows * cols} printed markers"
+    if len(parts) == 1:
+        return f"{count}: {lines_text(parts[0].lines, rows, cols)}, counted in the image"
+    seen_rows, seen_cols = parts[0].shape
+    return f"{count}: {seen_rows} of {rows} rows, {seen_cols} of {cols} columns; the image does not tell which ones"
