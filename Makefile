@@ -1,6 +1,7 @@
 # make demo and make test do all set-up themselves: Python 3.11 or newer, a C++20 compiler and make are enough.
 #   make demo    the main job on the mock robot
-#   make test    all tests
+#   make test    all tests except the slow ones
+#   make test-slow  the slow tests, which continuous integration runs too
 #   make check   lint, format, types, import rules
 #   make docs    the documentation site, in build/docs
 #   make core    rebuild the C++ parts after a change
@@ -32,13 +33,16 @@ SANITIZE_TESTS = $(patsubst %,tests/sim/core/test_%.py,every_part batch contact)
 FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
 
-.PHONY: demo test check docs core sanitize wheel setup clean
+.PHONY: demo test test-slow check docs core sanitize wheel setup clean
 
 demo: core
 	@.venv/bin/gelflow demo
 
 test: core
 	@.venv/bin/python -m pytest
+
+test-slow: core
+	@.venv/bin/python -m pytest -m slow
 
 check: core
 	.venv/bin/ruff check .
