@@ -55,7 +55,10 @@ def lowered_to(robot: MockRobot, height: float) -> bool:
     return present is not None and present["phase"] == "gripped" and present["height"] < height
 
 
-FROZEN, LOOP, BLACK = ("freeze", {"loop": 1}), ("freeze", {"loop": 3}), ("blacken", {})
+Fault = tuple[str, dict[str, Any]]  # kind and parameters
+FROZEN: Fault = ("freeze", {"loop": 1})
+LOOP: Fault = ("freeze", {"loop": 3})
+BLACK: Fault = ("blacken", {})
 DESCENT, LOWERING = 24.2e-3, 20e-3  # heights of the part at which the fault begins [m]
 
 
@@ -70,7 +73,7 @@ DESCENT, LOWERING = 24.2e-3, 20e-3  # heights of the part at which the fault beg
     ],
 )
 def test_part_is_not_moved_without_readable_images(
-    robot: MockRobot, tmp_path: Path, fault: tuple[str, dict[str, Any]], height: float
+    robot: MockRobot, tmp_path: Path, fault: Fault, height: float
 ) -> None:
     finish = in_background(lambda: insert(robot, tmp_path))
     wait_for(lambda: lowered_to(robot, height), 280)
