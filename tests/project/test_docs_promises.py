@@ -64,7 +64,7 @@ def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_commands_in_blocks_parse(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    rules = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    rules = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for program, *arguments in shell_lines(document):
         if program == "gelflow":
             assert arguments[0] in COMMANDS
@@ -75,7 +75,7 @@ def test_commands_in_blocks_parse(document: str, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_commands_in_sentences_exist(document: str) -> None:
-    rules = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    rules = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     for span in code_spans(document):
         words = span.removeprefix(".venv/bin/").split()
         if words[0] == "make" and len(words) > 1:
