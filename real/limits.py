@@ -49,6 +49,11 @@ class MotionLimits:
     workspace_height: tuple[float, float] = (0.001, 0.060)  # of the part's lower face above the hole's floor [m]
     descent_depth: float = 1.5e-3  # below the start of an attempt [m]
 
+    # One jog by hand (gelflow robot jog).
+    jog_distance: float = 0.020  # [m]
+    jog_turn_deg: float = 10.0  # [°]
+    jog_speed: float = 0.005  # [m/s]
+
     # Age of data that motion relies on.
     pose_age: float = 0.020  # then the arm holds [s]
     pose_silence: float = 0.100  # then the arm stops [s]

@@ -3,7 +3,7 @@
 import contextlib
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
@@ -14,7 +14,7 @@ from gelflow import interrupts
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.protocols import Gripper
+from gelflow.protocols import CameraImage, Gripper
 from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
@@ -58,25 +58,30 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         # A signal between the opening of a device and its registration would leave the device open.
         stack.callback(interrupts.resume)
         interrupts.defer()
-        left = stack.enter_context(_open_camera(lab, clock, "left", 0, recorder))
-        right = stack.enter_context(_open_camera(lab, clock, "right", 1, recorder))
-        gripper = stack.enter_context(_gripper(lab, clock, recorder, dry_run=dry_run))
+        left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder))
+        right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder))
+        gripper = stack.enter_context(gripper_of(lab, clock, recorder, dry_run=dry_run))
         controller = stack.enter_context(_controller(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
         stack.callback(arm.close)
         arm.connect()
-        stack.enter_context(_StopArm(arm, recorder))
+        stack.enter_context(StopArm(arm, recorder))
         interrupts.resume()
         stack.callback(interrupts.defer)
         yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run, controller)
 
 
-def _open_camera(
-    lab: Lab, clock: ScaledClock, name: Literal["left", "right"], sensor: int, recorder: SessionRecorder
+def connect_camera(
+    lab: Lab, clock: ScaledClock, name: Literal["left", "right"], sensor: int, recorder: SessionRecorder | None
 ) -> StreamCamera:
-    """A connected camera that records every image."""
+    """A connected camera; `recorder`, if any, records every image."""
     settings: CameraSettings = getattr(lab.cameras, name)
     stale = lab.limits.stale_frame
+
+    def record(image: CameraImage) -> None:
+        if recorder is not None:
+            recorder.image(sensor, image)
+
     return open_camera(
         settings.source,
         name,
@@ -84,12 +89,17 @@ def _open_camera(
         timeout=stale,
         latency=settings.latency,
         frozen_after=stale / _time_scale(lab),  # images arrive: the computer's jitter is no reason to wait longer
-        on_image=lambda image: recorder.image(sensor, image),
+        on_image=record,
     )
 
 
-def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run: bool) -> Gripper:
+def gripper_of(lab: Lab, clock: ScaledClock, recorder: SessionRecorder | None, *, dry_run: bool) -> WsgGripper:
     """The gripper of the lab file, not yet connected. Another driver is created here, with the same two callbacks."""
+
+    def record(name: str, values: Mapping[str, float]) -> None:
+        if recorder is not None:
+            recorder.gripper_command(clock.now(), name, values)
+
     return WsgGripper(
         transport_for(lab.gripper.address, clock=clock),
         clock=clock,
@@ -100,8 +110,8 @@ def _gripper(lab: Lab, clock: ScaledClock, recorder: SessionRecorder, *, dry_run
             home_timeout=max(LIMITS.gripper_home_time, lab.limits.gripper_motion),
             dry_run=dry_run,
         ),
-        on_command=lambda name, values: recorder.gripper_command(clock.now(), name, values),
-        on_measurement=recorder.gripper_state,
+        on_command=record,
+        on_measurement=None if recorder is None else recorder.gripper_state,
     )
 
 
@@ -149,7 +159,7 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
     )
 
 
-class _StopArm:
+class StopArm:
     """Context manager that stops the arm at the exit and records the reason."""
 
     def __init__(self, arm: EgmArm, recorder: SessionRecorder) -> None:

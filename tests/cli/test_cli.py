@@ -22,6 +22,7 @@ COMMON_OPTIONS = {
     "track": {"--json", "--out"},
     "calibrate-camera": {"--json", "--out"},
     "run": {"--json", "--out", "--checkpoint"},
+    "robot": set(),  # its actions have options of their own
     "replay": {"--json", "--out", "--checkpoint"},
     "recover": {"--json", "--out"},
     "mock": {"--json", "--out", "--seed", "--preset"},
@@ -54,6 +55,18 @@ def test_commands_accept_the_common_options(command: str, capsys: pytest.Capture
     options = set(re.findall(r"^  (--[a-z-]+)", help_text(command, capsys), re.MULTILINE))
     common = set().union(*COMMON_OPTIONS.values())
     assert options & common == COMMON_OPTIONS[command]
+
+
+@pytest.mark.parametrize("action", ["status", "home", "open", "acknowledge", "jog"])
+def test_actions_of_robot_have_their_own_help(
+    action: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["robot", action, "--help"])
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert {"--lab", "--json"} <= set(re.findall(r"^  (--[a-z-]+)", text, re.MULTILINE))
 
 
 def test_common_options_have_the_same_help_everywhere(capsys: pytest.CaptureFixture[str]) -> None:

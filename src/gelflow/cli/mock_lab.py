@@ -34,7 +34,11 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
         ),
         # EGM's own limit is 1°/s per joint: the arm could not follow faster references.
         arm=lab.ArmSettings(
-            egm_port=robot.config.egm_port, host=robot.config.host, max_speed=5e-3, max_turn_speed_deg=0.9
+            egm_port=robot.config.egm_port,
+            host=robot.config.host,
+            max_speed=5e-3,
+            max_turn_speed_deg=0.9,
+            connect_timeout=min(60.0, 5.0 * factor),
         ),
         cameras=lab.CamerasSettings(_camera(robot, 0), _camera(robot, 1)),
         tool=lab.ToolSettings(

@@ -12,7 +12,7 @@ from gelflow.errors import UsageError
 _PERIOD = 0.02  # of the check [s]
 
 
-def read_line(console: Console, text: str, *, check: Callable[[], None] = lambda: None) -> str:
+def read_line(console: Console, text: str, *, check: Callable[[], object] = lambda: None) -> str:
     """Show `text` and return the line that is typed. Calls `check` every 20 ms, and raises what it raises.
 
     Raises UsageError when standard input is closed.
@@ -33,7 +33,7 @@ def read_line(console: Console, text: str, *, check: Callable[[], None] = lambda
     return line.decode(errors="replace").strip()
 
 
-def confirmed(console: Console, text: str, *, check: Callable[[], None] = lambda: None) -> bool:
+def confirmed(console: Console, text: str, *, check: Callable[[], object] = lambda: None) -> bool:
     """Ask a question; True for the answer "y" or "yes"."""
     return read_line(console, f"{text} \\[y/N]", check=check).lower() in ("y", "yes")
 

@@ -1,0 +1,5 @@
+"""Manual operation of a cell after a stop: status, gripper actions, and jogging in bounded steps."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
