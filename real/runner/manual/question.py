@@ -1,4 +1,4 @@
-"""What every manual action needs: the lab, the recording, and the operator who is asked before anything moves."""
+"""Context of a manual action: the lab, the recording, and the operator, who is asked before anything moves."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
