@@ -20,7 +20,7 @@ from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.policies import checkpoint
 from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
-from gelflow.protocols import CameraImage
+from gelflow.protocols import CameraImage, GripperState
 from gelflow.session.decision_picture import draw_comparisons
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.reader import SessionReader
@@ -124,6 +124,43 @@ def test_the_command_detects_another_policy(
     assert reddish(picture) > 100  # the corrections of the other policy
     assert main(["replay", str(real_session), "--out", str(tmp_path / "same.png")]) == 0
     assert reddish(tmp_path / "same.png") == 0
+
+
+def with_grasp(source: Path, target: Path, *, delay: float) -> Path:
+    """A session with the first image of each camera and a grasp whose images arrive `delay` [s] late."""
+    rng = np.random.default_rng(4)
+    with SessionReader(source) as session, SessionRecorder(target, CLOCK) as recorder:
+        recorder.metadata({key: value for key, value in session.description().items() if key != "epoch"})
+        renderer, state = FastGelRenderer(LOOK), GripperState(0.05, 0.0, 0.0, True, "grasping", "", 0.0)
+        for grasp in range(3):
+            start, contact = 100.0 + 10 * grasp, 100.6 + 10 * grasp + rng.uniform(0, 0.05)
+            recorder.gripper_command(start, "grasp", {"force": 12.0})
+            for number in range(60):
+                stamp = start + 0.02 * number
+                force = 0.5 if stamp < contact else 12.0
+                held = "holding" if stamp > contact + 0.1 else "grasping"
+                recorder.gripper_state(dataclasses.replace(state, stamp=stamp, force=force, grasp=held))
+            for number in range(30):
+                exposed = start + number / 30 + 0.01
+                moved = np.full((LOOK.grid.rows * LOOK.grid.cols, 2), 0.2 if exposed > contact else 0.0)
+                data = renderer.encode(renderer.render(moved, sequence=number))
+                recorder.image(0, CameraImage(data, exposed + delay, 100 * grasp + number))
+    return target
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.08])
+def test_the_command_shows_the_latency_of_the_cameras(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, delay: float
+) -> None:
+    path = with_grasp(real_session, tmp_path / "grasps.mcap", delay=delay)
+    assert main(["replay", str(path), "--json"]) == 1  # no decision
+    printed = json.loads(capsys.readouterr().out)["latency"]
+    assert printed["right"] is None and printed["left"]["low"] - 1e-3 <= delay <= printed["left"]["high"] + 1e-3
+    assert printed["left"]["high"] - printed["left"]["low"] < 0.06
+    main(["replay", str(path)])
+    out = capsys.readouterr().out
+    assert "left camera: latency beyond that of the lab file" in out and "from 3 grasps" in out
+    assert ("correct cameras.left.latency" in out) == (delay > 0.0)
 
 
 def reddish(path: Path) -> int:

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,11 @@ from gelflow.cli.options import add_checkpoint, add_json, add_out
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
+from gelflow.real.camera.latency import LatencyEstimate, combine_latencies
 from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
 from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import file_digest, from_plain, software_versions
+from gelflow.session.records import SENSORS, file_digest, from_plain, software_versions
 from gelflow.task import InsertionTask
 
 
@@ -53,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
             for comparison in replay(session, perception=perception, policy=policy, task=task, damage=damage):
                 comparisons.append(comparison)
                 progress.advance(bar)
-    result = _Result(comparisons, total - len(comparisons), damage, notes)
+        latencies = _latencies(session, description)
+    result = _Result(comparisons, total - len(comparisons), damage, notes, latencies)
     if args.out and comparisons:
         from gelflow.session.decision_picture import draw_comparisons
 
@@ -69,6 +71,7 @@ class _Result:
     lost: int  # decisions whose own record is damaged
     damage: Damage
     notes: list[str]
+    latencies: list[list[LatencyEstimate]]  # of each camera, from each grasp
 
     @property
     def skipped(self) -> list[Comparison]:
@@ -105,6 +108,28 @@ class _Result:
                 "the next insertion"
             )
         return lines
+
+
+def _latencies(session: SessionReader, description: Mapping[str, Any]) -> list[list[LatencyEstimate]]:
+    """For each camera the estimates of its latency, from the recorded grasps."""
+    from gelflow.perception.tracker import TrackerConfig
+    from gelflow.real.runner.session_latency import session_latencies
+
+    configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
+    return session_latencies(session, configs)
+
+
+def _latency_lines(latencies: Sequence[Sequence[LatencyEstimate]]) -> Iterator[str]:
+    for name, estimates in zip(SENSORS, latencies, strict=False):
+        if not estimates:
+            continue
+        together = combine_latencies(estimates)
+        if together is None:
+            yield f"{name} camera: its {len(estimates)} grasps contradict each other, so its latency varies"
+            continue
+        hint = f": correct cameras.{name}.latency in the lab file" if together.low > 0 or together.high < 0 else ""
+        grasps = "1 grasp" if len(estimates) == 1 else f"{len(estimates)} grasps"
+        yield f"{name} camera: latency beyond that of the lab file {together}, from {grasps}{hint}"
 
 
 def _perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
@@ -182,7 +207,7 @@ def _show(output: Output, result: _Result, picture: Path | None) -> int:
         output.console.print(_table(result.comparisons))
     if picture:
         output.text(f"picture: {picture}")
-    for line in result.verdict():
+    for line in (*_latency_lines(result.latencies), *result.verdict()):
         output.text(line)
     output.result(
         {
@@ -191,6 +216,9 @@ def _show(output: Output, result: _Result, picture: Path | None) -> int:
             "skipped": len(result.skipped),
             "lost_decisions": result.lost,
             "damaged": dataclasses.asdict(result.damage),
+            "latency": {
+                name: combine_latencies(estimates) for name, estimates in zip(SENSORS, result.latencies, strict=False)
+            },
             "notes": result.notes,
             "picture": picture,
         }
