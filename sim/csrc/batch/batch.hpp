@@ -60,7 +60,7 @@ class Batch {
     return u.u + (u.shared ? 0 : static_cast<std::size_t>(env) * model->actuators.size());
   }
   void kinematics(int env, Workspace<T>& w);
-  void read(T* out, DirtyMarkers* dirty);
+  void read(T* out, NonzeroMarkers* nonzero);
   void rollout_one(const Trajectory<T>& r, int env, StepMemory<T>& memory);
   void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q, double* by_v);
   void check_state() const;
@@ -68,7 +68,7 @@ class Batch {
   std::vector<StepMemory<T>> memory_;            // one per thread
   std::vector<T> q_rounding_;                    // (N, nq) in single precision: rounding residual of q (StateView)
   std::unique_ptr<Batch<double>> double_batch_;  // in single precision: computes the gradients
-  std::vector<DirtyMarkers> dirty_;              // per environment, of `readings`
+  std::vector<NonzeroMarkers> nonzero_;          // per environment, of `readings`
   ThreadPool pool_;
 };
 

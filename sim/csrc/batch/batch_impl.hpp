@@ -144,21 +144,21 @@ void Batch<T>::tactile(T* out) {
 
 template <class T>
 void Batch<T>::update_readings() {
-  if (dirty_.empty()) {
+  if (nonzero_.empty()) {
     readings.resize(static_cast<std::size_t>(n) * model->markers * 3);
-    dirty_.resize(n);
+    nonzero_.resize(n);
   }
-  read(readings.data(), dirty_.data());
+  read(readings.data(), nonzero_.data());
 }
 
 template <class T>
-void Batch<T>::read(T* out, DirtyMarkers* dirty) {
+void Batch<T>::read(T* out, NonzeroMarkers* nonzero) {
   pool_.run(n, [&](int e, int thread) {
     const StateView<T> s = state(e);
     Workspace<T>& w = memory_[thread].work;
     forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
     read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
-                    out + static_cast<std::size_t>(e) * model->markers * 3, dirty == nullptr ? nullptr : dirty + e);
+                    out + static_cast<std::size_t>(e) * model->markers * 3, nonzero == nullptr ? nullptr : nonzero + e);
   });
 }
 
@@ -177,8 +177,8 @@ void Batch<T>::contact_forces(T* out) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();
-    const StepStart<T> from{T(1), nullptr, nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
-    subtract_contact_forces<false, T>(*model, params_of(e), from, CacheState::stale, false, w);
+    const StepStart<T> start{T(1), nullptr, nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
+    subtract_contact_forces<false, T>(*model, params_of(e), start, CacheState::stale, false, w);
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }

@@ -15,7 +15,7 @@ struct TapedState {
 
   TapedState(const Model& m, const double* numbers, const ParamState& s) {
     Tape::current().clear();
-    for (std::size_t i = 0; i < m.param_names.size(); ++i) params.push_back(Taped::watched(numbers[i]));
+    for (std::size_t i = 0; i < m.param_names.size(); ++i) params.push_back(Taped::variable(numbers[i]));
     q0.assign(s.q0, s.q0 + m.nq);
     v0.assign(s.v0, s.v0 + m.nv);
     if (s.history != nullptr) history.assign(s.history, s.history + 2 * m.nv);
@@ -27,7 +27,7 @@ struct TapedState {
   // Adds the gradient with respect to the parameters, which are the first entries on the tape. `weights` are the
   // gradients of all its entries.
   void add_to(double* by_params, std::vector<double>& weights) const {
-    Tape::current().back(weights);
+    Tape::current().backward(weights);
     for (std::size_t i = 0; i < params.size(); ++i) by_params[i] += weights[i];
   }
 };
@@ -42,17 +42,17 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
                              const V3<double>* by_next, double* by_params) {
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
-  const Taped h(s.h);
-  const StepStart<Taped> from{
-      h,          t.q0.data(), t.v0.data(), nullptr, t.history.empty() ? nullptr : t.history.data(), t.anchors.data(),
-      s.anchored, t.u.data()};
-  evaluate<false, Taped>(m, t.params.data(), from, t.v1.data(), CacheState::stale, false, w);
+  const Taped beta_h(s.beta_h);
+  const StepStart<Taped> start{
+      beta_h,           t.q0.data(), t.v0.data(), nullptr, t.history.empty() ? nullptr : t.history.data(),
+      t.anchors.data(), s.anchored,  t.u.data()};
+  evaluate<false, Taped>(m, t.params.data(), start, t.v1.data(), CacheState::stale, false, w);
   std::vector<V3<Taped>> next = t.anchors;
   std::vector<std::uint8_t> next_set(s.anchored, s.anchored + m.na);
   if (m.na > 0) {
-    advance_contact_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
+    advance_contact_anchors<Taped>(m, t.params.data(), start.length(), t.anchors.data(), s.anchored, w, next.data(),
                                    next_set.data());
-    advance_marker_anchors<Taped>(m, t.params.data(), from.length(), t.anchors.data(), s.anchored, w, next.data(),
+    advance_marker_anchors<Taped>(m, t.params.data(), start.length(), t.anchors.data(), s.anchored, w, next.data(),
                                   next_set.data());
   }
   std::vector<double> weights(Tape::current().size(), 0.0);

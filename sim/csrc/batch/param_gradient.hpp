@@ -8,7 +8,7 @@ namespace gelflow {
 
 // A step from (q0, v0) to v1, see StepStart; or the state (q0, v0) of a reading, with null pointers for the rest.
 struct ParamState {
-  double h;
+  double beta_h;                             // β h
   const double *q0, *v0, *history, *v1, *u;  // v0 is v* of a step
   const V3<double>* anchors;
   const std::uint8_t* anchored;

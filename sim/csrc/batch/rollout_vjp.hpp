@@ -30,14 +30,15 @@ void record_substeps(const Model& m, const T* params, const T* u, const StateVie
                      bool halved, StepMemory<T>& memory, std::vector<SubstepRecord<T>>& records) {
   records.clear();
   if (!halved) {
-    const StepStart<T> from = step_start<T>(m, T(m.step), true, old, u, memory);
-    records.emplace_back(m, from, Eigen::Map<const VX<T>>(now.v, m.nv), true);
+    const StepStart<T> start = step_start<T>(m, T(m.step), true, old, u, memory);
+    records.emplace_back(m, start, Eigen::Map<const VX<T>>(now.v, m.nv), true);
     return;
   }
   StateCopy<T> scratch(m, old);
-  gelflow::step<T>(
-      m, params, u, m.polish, scratch.view(), memory, false,
-      [&](const StepStart<T>& from, const StepMemory<T>& taken) { records.emplace_back(m, from, taken.v_new, false); });
+  gelflow::step<T>(m, params, u, m.polish, scratch.view(), memory, false,
+                   [&](const StepStart<T>& start, const StepMemory<T>& taken) {
+                     records.emplace_back(m, start, taken.v_new, false);
+                   });
 }
 
 // The reverse pass of environment e. Gradients by parameters need T = double.
@@ -61,12 +62,12 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
     T* by_u = out.u + (u - r.u);
     record_substeps<T>(m, params, u, r.state(m, t - 1, e), now, r.halvings[r.row(t - 1, e)] != 0, memory, records);
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
-      substep_vjp<T>(m, params, u, *it, gradient, by_u, memory, [&](const VX<T>& c) {
+      substep_vjp<T>(m, params, u, *it, gradient, by_u, memory, [&](const VX<T>& multiplier) {
         if (by_params == nullptr) return;
         const ParamState at{
-            it->h, it->q0.data(),      it->v_star.data(),  it->bdf2 ? it->history.data() : nullptr, it->v1.data(),
-            u,     it->anchors.data(), it->anchored.data()};
-        add_step_param_gradient(m, params, at, c.data(), gradient.anchors.data(), by_params);
+            it->beta_h, it->q0.data(),      it->v_star.data(),  it->bdf2 ? it->history.data() : nullptr, it->v1.data(),
+            u,          it->anchors.data(), it->anchored.data()};
+        add_step_param_gradient(m, params, at, multiplier.data(), gradient.anchors.data(), by_params);
       });
     }
   }

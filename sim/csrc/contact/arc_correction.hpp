@@ -16,8 +16,8 @@
 //     dm = Σ_j a(N_j Q) dθ_j + a(N [φ]× Q) + Σ [N r]× (∂p/∂x dx + ∂p/∂v dv)
 #pragma once
 
-#include "contact/arc_moment_arm.hpp"
-#include "contact/contact_points.hpp"
+#include "contact/contact_point_loops.hpp"
+#include "math/moment_arm_correction.hpp"
 
 namespace gelflow {
 
@@ -34,7 +34,7 @@ struct SpringForce {
   Mat3<P> by_x, by_v;
 };
 template <bool derivatives, class T>
-GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const T& h) {
+GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const T& step_length) {
   using P = Pack<T>;
   SpringForce<P> s{-(t.law.kn * t.at.d) * t.at.n, zero33<P>(), zero33<P>()};
   s.by_x.row[2].z = -t.law.kn;  // n = z
@@ -42,7 +42,7 @@ GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const 
   // −k_s s = k_t v_t + q f_t + (1 − q) f*
   PointForce<P> f;
   point_force<derivatives>(t.law, t.at, t.v, t.e, t.has_anchor, f);
-  const P zero(0.0), q = relaxation_factor(t.law, P(h)), rest = P(1.0) - q;
+  const P zero(0.0), q = relaxation_factor(t.law, P(step_length)), rest = P(1.0) - q;
   const auto if_anchored = [&](const P& x) GELFLOW_LOOP_BODY { return select(t.has_anchor, x, zero); };
   const Vec3<P> e = t.law.kt * f.slip_velocity + q * f.friction + rest * f.trial;
   s.force.x += if_anchored(e.x);
@@ -89,7 +89,7 @@ GELFLOW_INLINE void sum_springs(const PairFrame<T>& frame, const CandidatePoints
           by_angular = outer_sum;
   for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
     const Vec3<P> r = t.center - origin;
-    const SpringForce<P> s = spring_force<derivatives, T>(t, settings.h);
+    const SpringForce<P> s = spring_force<derivatives, T>(t, settings.step_length);
     outer_sum += outer(r, s.force);
     if constexpr (derivatives) {
       const Vec3<P> corrected = n * r;
@@ -116,27 +116,27 @@ GELFLOW_INLINE void sum_springs(const PairFrame<T>& frame, const CandidatePoints
 template <bool derivatives, class T>
 void subtract_arc_correction(const Model& m, int body, const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
                              const ContactSettings<T>& settings, Workspace<T>& w) {
-  const T& h = settings.h;
-  const MomentArmCorrection<T> arm(h * frame.angular, derivatives);
+  const T& step_length = settings.step_length;
+  const MomentArmCorrection<T> arm(step_length * frame.angular, derivatives);
   ArcSums<T> sums;
   sum_springs<derivatives, T>(frame, candidates, settings, arm.value, body_origin_in_shape<T>(frame, body, w), sums);
   const int k = m.joints[m.bodies[body].joint_begin].v;
   const M3<T>& q = sums.outer;
   const M3<T> rotation = frame.to_world.transpose() * as<T>(w.rotation[body]);
   const V3<T> moment = rotation.transpose() * moment_of<T>(arm.value * q);
-  for (int i = 0; i < 3; ++i) w.residual[k + 3 + i] -= h * moment[i];
+  for (int i = 0; i < 3; ++i) w.residual[k + 3 + i] -= step_length * moment[i];
   if constexpr (derivatives) {
     M3<T> by_theta, by_rotation = sums.by_rotation;
     for (int j = 0; j < 3; ++j) {
       by_theta.col(j) = moment_of<T>(arm.by[j] * q);
       by_rotation.col(j) += moment_of<T>(arm.value * skew<T>(V3<T>(V3<T>::Unit(j))) * q);
     }
-    by_rotation -= h * (by_theta * skew<T>(frame.angular));
-    const M3<T> to_body = h * rotation.transpose();
+    by_rotation -= step_length * (by_theta * skew<T>(frame.angular));
+    const M3<T> to_body = step_length * rotation.transpose();
     w.by_q.template block<3, 3>(k + 3, k) -= to_body * sums.by_translation * frame.to_world.transpose();
-    w.by_q.template block<3, 3>(k + 3, k + 3) -= h * skew<T>(moment) + to_body * by_rotation * rotation;
+    w.by_q.template block<3, 3>(k + 3, k + 3) -= step_length * skew<T>(moment) + to_body * by_rotation * rotation;
     w.by_v.template block<3, 3>(k + 3, k) -= to_body * sums.by_linear * frame.to_world.transpose();
-    w.by_v.template block<3, 3>(k + 3, k + 3) -= to_body * (sums.by_angular + h * by_theta) * rotation;
+    w.by_v.template block<3, 3>(k + 3, k + 3) -= to_body * (sums.by_angular + step_length * by_theta) * rotation;
   }
 }
 

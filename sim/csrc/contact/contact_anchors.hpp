@@ -1,9 +1,9 @@
-// Update of the anchors of all contacts of the model at the end of a step (anchors.hpp: of one point cloud), and its
-// vector-Jacobian products.
+// Update of the anchors of all contacts of the model at the end of a step (cloud_anchors.hpp: of one point cloud), and
+// its vector-Jacobian products.
 #pragma once
 
-#include "contact/anchors.hpp"
 #include "contact/arc_correction.hpp"
+#include "contact/cloud_anchors.hpp"
 #include "contact/contact_jacobian.hpp"
 
 namespace gelflow {
@@ -11,14 +11,14 @@ namespace gelflow {
 // Anchors of all contacts after an accepted step, the last one evaluated in w. `next` and `next_set` may be the arrays
 // that are read.
 template <class T>
-void advance_contact_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+void advance_contact_anchors(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
                              const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, h),
+    advance_anchors<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, step_length),
                        set.cloud.size(), next + contact.anchor, next_set + contact.anchor);
   }
 }
@@ -26,7 +26,7 @@ void advance_contact_anchors(const Model& m, const T* params, const T& h, const 
 // Gradients with respect to the anchors after the step (`by_next`), carried to the state at the step's end (by_q, by_v)
 // and to the anchors before it (by_anchor).
 template <class T>
-void contact_anchors_vjp(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+void contact_anchors_vjp(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
                          const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
                          V3<T>* by_anchor) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
@@ -36,7 +36,7 @@ void contact_anchors_vjp(const Model& m, const T* params, const T& h, const V3<T
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     contact_jacobian<T>(contact.pair, first.body, frame, w);
     V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-    anchors_vjp<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, h),
+    anchors_vjp<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, step_length),
                    by_next + contact.anchor, by_pose, by_twist, by_anchor + contact.anchor);
     pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
   }
@@ -54,7 +54,7 @@ V6<T> virtual_twist(const ContactJacobian<T>& c, const VX<T>& multipliers) {
 
 // Adds −cᵀ ∂g/∂(anchors before the step) with c the multipliers of the residual g. `bdf2`: the step was one of BDF2.
 template <class T>
-void residual_anchors_vjp(const Model& m, const T* params, const T& h, bool bdf2, const V3<T>* anchors,
+void residual_anchors_vjp(const Model& m, const T* params, const T& beta_h, bool bdf2, const V3<T>* anchors,
                           const std::uint8_t* anchored, Workspace<T>& w, const VX<T>& multipliers, V3<T>* by_anchor) {
   using P = Pack<T>;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
@@ -63,18 +63,18 @@ void residual_anchors_vjp(const Model& m, const T* params, const T& h, bool bdf2
     const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     contact_jacobian<T>(contact.pair, first.body, frame, w);
-    const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored, h);
+    const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored);
     V3<T>* const by_contact = by_anchor + contact.anchor;
     const V6<T> twist = virtual_twist<T>(w.jacobian, multipliers);
     const bool arc = contact.uses_arc_correction && !bdf2;
     const Mat3<P> arm =
-        broadcast<P>(arc ? MomentArmCorrection<T>(h * frame.angular, false).value : M3<T>(M3<T>::Zero()));
+        broadcast<P>(arc ? MomentArmCorrection<T>(beta_h * frame.angular, false).value : M3<T>(M3<T>::Zero()));
     const Vec3<P> origin = broadcast<P>(arc ? body_origin_in_shape<T>(frame, first.body, w) : V3<T>(V3<T>::Zero()));
     const Vec3<P> angular = broadcast<P>(V3<T>(top(twist))), linear = broadcast<P>(V3<T>(bottom(twist)));
     for_contact_points<true, T>(frame, w.candidates[n], settings, [&](const ContactPack<T>& t) {
-      const Vec3<P> by_friction = P(h) * (linear + cross(angular, t.x)), none = zero3<P>();
-      const Vec3<P> by_spring = P(h) * cross(angular, arm * (t.center - origin));
-      const P q = relaxation_factor(t.law, P(h));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
+      const Vec3<P> by_friction = P(beta_h) * (linear + cross(angular, t.x)), none = zero3<P>();
+      const Vec3<P> by_spring = P(beta_h) * cross(angular, arm * (t.center - origin));
+      const P q = relaxation_factor(t.law, P(beta_h));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
       const Vec3<P> by = point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, none, by_friction + q * by_spring,
                                          (P(1.0) - q) * by_spring, none)
                              .anchor;

@@ -40,16 +40,16 @@ GELFLOW_INLINE void wrench_changes(const ContactSums<T>& sums, ContactJacobian<T
   }
 }
 
-// Subtracts row r of h Sᵀ (K S + D Y), h Sᵀ D S and the change of the axis from w.by_q and w.by_v. `first_component`: 3
-// for an axis without angular part; `coupled`: displacements of other dofs change the axis.
+// Subtracts row r of β h Sᵀ (K S + D Y), β h Sᵀ D S and the change of the axis from w.by_q and w.by_v. `first_component`:
+// 3 for an axis without angular part; `coupled`: displacements of other dofs change the axis.
 template <int first_component, bool coupled, class T>
-GELFLOW_INLINE void subtract_row(const T& h, int r, Workspace<T>& w) {
+GELFLOW_INLINE void subtract_row(const T& beta_h, int r, Workspace<T>& w) {
   using P = Pack<T>;
   constexpr int width = pack_width<T>;
   const ContactJacobian<T>& c = w.jacobian;
   const int row = c.dofs->dof[r];
   P s[6];
-  for (int a = first_component; a < 6; ++a) s[a] = P(T(h * c.s.at(r - r % width, a)[r % width]));
+  for (int a = first_component; a < 6; ++a) s[a] = P(T(beta_h * c.s.at(r - r % width, a)[r % width]));
   for (int i = 0; i < c.n; i += width) {
     P by_q(0.0), by_v(0.0), by_axis(0.0);
     for (int a = first_component; a < 6; ++a) {
@@ -64,19 +64,19 @@ GELFLOW_INLINE void subtract_row(const T& h, int r, Workspace<T>& w) {
   }
 }
 
-// Subtracts h · ∂(generalized forces of the pair)/∂(q, v) from w.by_q and w.by_v; w.jacobian is that of the pair.
+// Subtracts β h · ∂(generalized forces of the pair)/∂(q, v) from w.by_q and w.by_v; w.jacobian is that of the pair.
 template <class T>
-void subtract_contact_derivatives(const T& h, const ContactSums<T>& sums, Workspace<T>& w) {
+void subtract_contact_derivatives(const T& beta_h, const ContactSums<T>& sums, Workspace<T>& w) {
   ContactJacobian<T>& c = w.jacobian;
   wrench_changes<T>(sums, c);
   for (int r = 0; r < c.n; ++r) {
     if (c.dofs->dof[r] < 0) continue;
     if (!c.dofs->linear[r]) {
-      subtract_row<0, true, T>(h, r, w);
+      subtract_row<0, true, T>(beta_h, r, w);
     } else if (c.dofs->has_coupling[r]) {
-      subtract_row<3, true, T>(h, r, w);
+      subtract_row<3, true, T>(beta_h, r, w);
     } else {
-      subtract_row<3, false, T>(h, r, w);
+      subtract_row<3, false, T>(beta_h, r, w);
     }
   }
 }
@@ -88,9 +88,9 @@ V6<T> wrench_in_world(const PairFrame<T>& frame, const T* wrench) {
   return stack<T>(moment + cross<T>(frame.origin, push), push);
 }
 
-// Subtracts the impulses h Sᵀ W from w.residual. `add_impulses`: adds their absolute values to w.impulses.
+// Subtracts the impulses β h Sᵀ W from w.residual. `add_impulses`: adds their absolute values to w.impulses.
 template <class T>
-void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bool add_impulses, Workspace<T>& w) {
+void subtract_impulses(const PairDofs& pair, const T& beta_h, const V6<T>& wrench, bool add_impulses, Workspace<T>& w) {
   using std::abs;
   using P = Pack<T>;
   constexpr int width = pack_width<T>;
@@ -100,7 +100,7 @@ void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bo
     P sum = P(wrench[0]) * load<P>(w.axis.row(0) + at);
     for (int a = 1; a < 6; ++a) sum += P(wrench[a]) * load<P>(w.axis.row(a) + at);
     T impulse[width];
-    store(P(h) * load<P>(&dofs.sign[n * width]) * sum, impulse);
+    store(P(beta_h) * load<P>(&dofs.sign[n * width]) * sum, impulse);
     for (int k = 0; k < width; ++k) {
       const int dof = dofs.dof[n * width + k];
       if (dof < 0) continue;
@@ -110,29 +110,30 @@ void subtract_impulses(const PairDofs& pair, const T& h, const V6<T>& wrench, bo
   }
 }
 
-// Subtracts h · (generalized contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `cache`: the
-// state of the candidate points in w. `add_impulses`: adds the absolute values to w.impulses.
+// Subtracts β h · (generalized contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `cache`:
+// the state of the candidate points in w. `add_impulses`: adds the absolute values to w.impulses.
 template <bool derivatives, class T>
-void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& from, CacheState cache,
+void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& start, CacheState cache,
                              bool add_impulses, Workspace<T>& w) {
   ContactSums<T> sums;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     const PointSet& set = m.point_sets[contact.points];
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    ContactSettings<T> settings = contact_settings<T>(m, contact, params, from.anchors, from.anchored, from.h);
-    settings.continuation = from.continuation;
+    // The step length serves the arc correction only, under BDF1, where β h = h.
+    ContactSettings<T> settings = contact_settings<T>(m, contact, params, start.anchors, start.anchored, start.beta_h);
+    settings.continuation = start.continuation;
     find_candidate_points<T>(frame, set.cloud, settings, cache, w.candidates[n]);
     if (!sum_forces<derivatives, T>(frame, w.candidates[n], settings, sums)) {
       if (!is_finite(frame.finiteness_probe())) w.residual[0] = frame.finiteness_probe();
       continue;
     }
-    subtract_impulses<T>(contact.pair, from.h, wrench_in_world<T>(frame, sums.wrench()), add_impulses, w);
+    subtract_impulses<T>(contact.pair, start.beta_h, wrench_in_world<T>(frame, sums.wrench()), add_impulses, w);
     if constexpr (derivatives) {
       contact_jacobian<T>(contact.pair, set.mount.body, frame, w);
-      subtract_contact_derivatives<T>(from.h, sums, w);
+      subtract_contact_derivatives<T>(start.beta_h, sums, w);
     }
-    if (contact.uses_arc_correction && from.history == nullptr) {
+    if (contact.uses_arc_correction && start.history == nullptr) {
       subtract_arc_correction<derivatives, T>(m, set.mount.body, frame, w.candidates[n], settings, w);
     }
   }

@@ -111,7 +111,7 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
   if constexpr (derivatives) {
     // d f* = −k_t (1 − n nᵀ) dv − k_s (1 − n nᵀ) dx + curvature terms, the second only with an anchor, and
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
-    const P memory = law.elastic ? select(anchored, law.ks, zero) : zero;
+    const P anchor_stiffness = law.elastic ? select(anchored, law.ks, zero) : zero;
     const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
     Vec3<P> normal_by_x = p.normal_by_d * n;
     const Vec3<P> force_by_normal = n + law.mu * direction;  // ∂f/∂N
@@ -124,7 +124,7 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
     out.by_v = -law.kt * project;
     out.by_v += outer(force_by_normal, p.normal_by_rate * n);
     if (law.elastic) {
-      out.by_x = -memory * project;
+      out.by_x = -anchor_stiffness * project;
     } else {
       out.by_x = zero33<P>();
     }
@@ -133,7 +133,7 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
       const Vec3<P> hv = hessian * v;
       normal_by_x += p.normal_by_rate * hv;
       Mat3<P> trial_by_x = law.kt * (outer(n, hv) + p.rate * hessian);
-      if (law.elastic) trial_by_x += memory * (outer(n, hessian * e) + p.normal_offset * hessian);
+      if (law.elastic) trial_by_x += anchor_stiffness * (outer(n, hessian * e) + p.normal_offset * hessian);
       out.by_x += p.ratio * (trial_by_x - outer(direction, transposed_times(trial_by_x, direction)));
       out.by_x += p.normal * hessian;
     }
@@ -173,9 +173,9 @@ GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Di
   g.anchor = zero3<P>();
   P by_normal_offset = zero;
   if (law.elastic) {
-    const P memory = select(anchored, law.ks, zero);
-    by_normal_offset = memory * dot(n, by_trial);
-    g.anchor = memory * by_trial - by_normal_offset * n;
+    const P anchor_stiffness = select(anchored, law.ks, zero);
+    by_normal_offset = anchor_stiffness * dot(n, by_trial);
+    g.anchor = anchor_stiffness * by_trial - by_normal_offset * n;
     g.x -= g.anchor;
   }
   if (at.form != HessianForm::zero) {
@@ -188,27 +188,27 @@ GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Di
 
 // q (see the head of this file).
 template <class P>
-GELFLOW_INLINE P relaxation_factor(const PointLaw<P>& law, const P& h) {
-  const P spring = h * law.ks, both = spring + law.kt;
+GELFLOW_INLINE P relaxation_factor(const PointLaw<P>& law, const P& step_length) {
+  const P spring = step_length * law.ks, both = spring + law.kt;
   return spring / select(both > P(0.0), both, P(1.0));
 }
 
-// Anchor after an accepted step of length h, for an active point (else it is cleared).
+// Anchor after an accepted step, for an active point (else it is cleared).
 template <class P>
-GELFLOW_INLINE Vec3<P> next_anchor(const PointLaw<P>& law, const P& h, const PointForce<P>& f, const Vec3<P>& x,
-                                   const Vec3<P>& anchor, const Mask<P>& anchored) {
+GELFLOW_INLINE Vec3<P> next_anchor(const PointLaw<P>& law, const P& step_length, const PointForce<P>& f,
+                                   const Vec3<P>& x, const Vec3<P>& anchor, const Mask<P>& anchored) {
   const P stiffness = select(law.ks > P(0.0), law.ks, P(1.0));  // at weight 0 the result is not used
-  const P q = relaxation_factor(law, h);
+  const P q = relaxation_factor(law, step_length);
   const Vec3<P> s = -(P(1.0) / stiffness) * (law.kt * f.slip_velocity + q * f.friction + (P(1.0) - q) * f.trial);
   return select3<P>(anchored, select3<P>(f.sliding, x - s, anchor), x);
 }
 
 // Vector-Jacobian product of `next_anchor`: carries the gradient λ of the anchor after the step to (x, v, X).
 template <class P>
-GELFLOW_INLINE PointGradient<P> next_anchor_vjp(const PointLaw<P>& law, const P& h, const Distance<P>& at,
+GELFLOW_INLINE PointGradient<P> next_anchor_vjp(const PointLaw<P>& law, const P& step_length, const Distance<P>& at,
                                                 const Vec3<P>& v, const Vec3<P>& e, const Mask<P>& anchored,
                                                 const Vec3<P>& lambda) {
-  const P zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one), q = relaxation_factor(law, h);
+  const P zero(0.0), one(1.0), stiffness = select(law.ks > zero, law.ks, one), q = relaxation_factor(law, step_length);
   const Vec3<P> none = zero3<P>(), scaled = one / stiffness * lambda;
   PointGradient<P> g = point_force_vjp(law, at, v, e, anchored, none, q * scaled, (one - q) * scaled, law.kt * scaled);
   const Mask<P> relaxes = g.sliding && anchored;

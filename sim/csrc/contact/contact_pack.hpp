@@ -1,5 +1,5 @@
-// One SIMD pack of contact points (contact_points.hpp: the loops over packs), and the evaluation of their kinematics and
-// contact-law coefficients.
+// One SIMD pack of contact points (contact_point_loops.hpp: the loops over packs), and the evaluation of their kinematics
+// and contact-law coefficients.
 #pragma once
 
 #include <bit>

@@ -6,7 +6,7 @@
 //     D = Σ [x]×B | B   times  −[x]× | 1,      K = Σ [x]×A − [f]× | A   times  −[c]× | 1,     [f]×[c]× = c fᵀ − f·c
 #pragma once
 
-#include "contact/contact_points.hpp"
+#include "contact/contact_point_loops.hpp"
 
 namespace gelflow {
 

@@ -9,7 +9,7 @@ namespace gelflow {
 
 // Which readings in an array may differ from zero: all, or those of these markers. Usually few markers are in contact;
 // clearing the whole array would cost more than reading them.
-struct DirtyMarkers {
+struct NonzeroMarkers {
   bool all = true;
   bool track = true;  // whether the next reading lists its markers: not after one with many of them
   std::vector<int> markers;
@@ -148,33 +148,33 @@ __attribute__((noinline)) Vec3<Pack<T>> from_curved_pad(const Pad& pad, const Pa
   return broadcast<Pack<T>>(frame.rotation) * in_body;
 }
 
-// Clears what an earlier reading has written, and lists the active markers of a new one. `dirty` may be null: then the
+// Clears what an earlier reading has written, and lists the active markers of a new one. `nonzero` may be null: then the
 // array has unknown contents.
 template <class T>
-class DirtyTracker {
+class NonzeroTracker {
  public:
-  DirtyTracker(const Model& m, T* out, DirtyMarkers* dirty)
-      : dirty_(dirty), track_(dirty != nullptr && dirty->track), max_tracked_(m.markers / 8) {
-    if (dirty == nullptr) return;
-    for (const int marker : dirty->markers) std::fill_n(out + 3 * static_cast<std::size_t>(marker), 3, T(0));
-    dirty->markers.clear();
-    if (track_) dirty->markers.reserve(static_cast<std::size_t>(max_tracked_) + pack_width<T>);
+  NonzeroTracker(const Model& m, T* out, NonzeroMarkers* nonzero)
+      : nonzero_(nonzero), track_(nonzero != nullptr && nonzero->track), max_tracked_(m.markers / 8) {
+    if (nonzero == nullptr) return;
+    for (const int marker : nonzero->markers) std::fill_n(out + 3 * static_cast<std::size_t>(marker), 3, T(0));
+    nonzero->markers.clear();
+    if (track_) nonzero->markers.reserve(static_cast<std::size_t>(max_tracked_) + pack_width<T>);
   }
   // Whether the readings that are not listed may differ from zero.
-  bool must_clear() const { return dirty_ == nullptr || dirty_->all; }
+  bool must_clear() const { return nonzero_ == nullptr || nonzero_->all; }
   GELFLOW_INLINE void add(const Pad& pad, const ContactPack<T>& t, unsigned active) {
     count_ += std::popcount(active);
     if (!track_ || count_ > max_tracked_) return;
-    t.for_each_active([&](int, int i) { dirty_->markers.push_back(pad.first_marker + pad.cloud.original[i]); });
+    t.for_each_active([&](int, int i) { nonzero_->markers.push_back(pad.first_marker + pad.cloud.original[i]); });
   }
   void finish() {
-    if (dirty_ == nullptr) return;
-    dirty_->track = count_ <= max_tracked_;
-    dirty_->all = !track_ || !dirty_->track;
+    if (nonzero_ == nullptr) return;
+    nonzero_->track = count_ <= max_tracked_;
+    nonzero_->all = !track_ || !nonzero_->track;
   }
 
  private:
-  DirtyMarkers* const dirty_;
+  NonzeroMarkers* const nonzero_;
   const bool track_;
   const int max_tracked_;
   int count_ = 0;

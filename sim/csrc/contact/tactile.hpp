@@ -8,7 +8,7 @@
 // Robotic Manipulation", CoRL 2022.
 #pragma once
 
-#include "contact/anchors.hpp"
+#include "contact/cloud_anchors.hpp"
 #include "contact/contact_jacobian.hpp"
 #include "contact/readings_view.hpp"
 
@@ -21,11 +21,11 @@ GELFLOW_INLINE Mat3<Pack<T>> marker_axes(const Pad& pad, const PairFrame<T>& fra
 }
 
 // Reads the markers of a pad against its shape number s. The first shape overwrites the readings of active markers and,
-// where `write_all`, sets those of the others to zero; further shapes add to them.
+// where `clears_inactive`, sets those of the others to zero; further shapes add to them.
 template <class T>
 GELFLOW_INLINE void read_pad(const Pad& pad, std::size_t s, const PairFrame<T>& frame,
-                             const ContactSettings<T>& settings, const CandidateRuns& candidates, bool write_all,
-                             const ReadingsView<T, T>& readings, DirtyTracker<T>& tracker) {
+                             const ContactSettings<T>& settings, const CandidateRuns& candidates, bool clears_inactive,
+                             const ReadingsView<T, T>& readings, NonzeroTracker<T>& tracker) {
   using P = Pack<T>;
   constexpr unsigned whole_pack = (1U << pack_width<T>)-1;
   const Mat3<P> axes = marker_axes<T>(pad, frame);
@@ -42,7 +42,7 @@ GELFLOW_INLINE void read_pad(const Pad& pad, std::size_t s, const PairFrame<T>& 
     Vec3<P> reading = transposed_times(axes, force.force);
     reading.z = -reading.z;
     if (first) {
-      if (active == whole_pack || !write_all) return readings.write(t.first, active, reading);
+      if (active == whole_pack || !clears_inactive) return readings.write(t.first, active, reading);
       const unsigned existing = whole_pack >> std::max(0, t.first + pack_width<T> - pad.cloud.size());
       readings.write(t.first, existing, select3<P>(t.active, reading, zero3<P>()));
     } else {
@@ -53,16 +53,16 @@ GELFLOW_INLINE void read_pad(const Pad& pad, std::size_t s, const PairFrame<T>& 
     }
   };
   for_contact_points<false, T>(frame, pad.cloud, candidates, settings, read, [&](int begin, int end) GELFLOW_LOOP_BODY {
-    if (write_all) readings.clear(begin, end);
+    if (clears_inactive) readings.clear(begin, end);
   });
 }
 
-// Readings of all markers, shape (markers, 3); requires the kinematics of (q, v) in w. `dirty`: which entries of `out`
+// Readings of all markers, shape (markers, 3); requires the kinematics of (q, v) in w. `nonzero`: which entries of `out`
 // differ from zero, before and after; null where that is not tracked.
 template <class T>
 void read_markers(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                  const Workspace<T>& w, T* out, DirtyMarkers* dirty) {
-  DirtyTracker<T> tracker(m, out, dirty);
+                  const Workspace<T>& w, T* out, NonzeroMarkers* nonzero) {
+  NonzeroTracker<T> tracker(m, out, nonzero);
   for (const Pad& pad : m.pads) {
     const ReadingsView<T, T> readings(pad, out);
     bool is_clear = !tracker.must_clear();
@@ -84,14 +84,14 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
 
 // Anchors of the markers after an accepted step. Pads that collide share the anchors of their contacts.
 template <class T>
-void advance_marker_anchors(const Model& m, const T* params, const T& h, const V3<T>* anchors,
+void advance_marker_anchors(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
-      const ContactSettings<T> settings = contact_settings<T>(pad, s, params, anchors, anchored, h);
+      const ContactSettings<T> settings = contact_settings<T>(pad, s, params, anchors, anchored, step_length);
       find_candidate_points<T>(frame, pad.cloud, settings, CacheState::stale, w.marker_candidates);
       advance_anchors<T>(frame, w.marker_candidates, settings, pad.cloud.size(), next + slot, next_set + slot);
     }
@@ -153,16 +153,17 @@ void read_markers_vjp(const Model& m, const T* params, const V3<T>* anchors, con
 // Gradients with respect to the anchors after the step (`by_next`), carried to the state at the step's end and to the
 // anchors before it.
 template <class T>
-void marker_anchors_vjp(const Model& m, const T* params, const T& h, const V3<T>* anchors, const std::uint8_t* anchored,
-                        Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
+void marker_anchors_vjp(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
+                        const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
+                        V3<T>* by_anchor) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
-      anchors_vjp<T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored, h), by_next + slot,
-                     by_pose, by_twist, by_anchor + slot);
+      anchors_vjp<T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored, step_length),
+                     by_next + slot, by_pose, by_twist, by_anchor + slot);
       contact_jacobian<T>(pad.pairs[s], pad.mount.body, frame, w);
       pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
     }

@@ -6,20 +6,20 @@
 //     force F (world)  m (a + R y)                moment (body)  J α + ω × J ω + c × Rᵀ F
 //     y = α × c + ω × (ω × c)
 //
-// Over a step of length h that ends with the rotation θ (h is β h, and θ = β h ω + γ δ), y is the change of the velocity
+// Over a step that ends with the rotation θ = β h ω + γ δ (`beta_h` is β h), y is the change of the velocity
 // of the centre of mass, which conserves linear momentum for any choice of the body frame:
-//     y = (ω × c − u)/h,     u = exp(−[θ]×) (ω* × c + z),     z = 0 under BDF1
+//     y = (ω × c − u)/(β h),     u = exp(−[θ]×) (ω* × c + z),     z = 0 under BDF1
 //     BDF2: ω* = 4/3 ω_{t-1} − 1/3 ω_{t-2}, where ω_{t-2} refers to the axes before δ: z = 1/3 (1 − exp(−[δ]×)) (ω_{t-2} × c)
 // Under BDF1 the weight acts along the arc of the centre of mass (arc_correction.hpp): the moment gains (N c) × (−m Rᵀ g).
 //
 // Derivatives, in addition to M (by v_t):
 //     F by φ       −m R [y]×              moment   m [c]× [Rᵀ a]× − m [N c]× [Rᵀ g]×
-//     F by θ       −m/h R [u]× Jr(θ)      moment   m/h (−[c]× [u]× Jr(θ)) − m Σ_j (∂N/∂θ_j c) × Rᵀ g e_jᵀ
+//     F by θ       −m/(β h) R [u]× Jr(θ)  moment   m/(β h) (−[c]× [u]× Jr(θ)) − m Σ_j (∂N/∂θ_j c) × Rᵀ g e_jᵀ
 //     moment by ω  [ω]× J − [J ω]×
 #pragma once
 
-#include "contact/arc_moment_arm.hpp"
 #include "dynamics/kinematics.hpp"
+#include "math/moment_arm_correction.hpp"
 
 namespace gelflow {
 
@@ -34,12 +34,12 @@ M3<T> inverse_rotation(const V3<T>& rotation_vector) {
 }
 // `k`: first rotational dof of the body.
 template <class T>
-CenterVelocity<T> previous_center_velocity(const StepStart<T>& from, int nv, int k, const V3<T>& c,
+CenterVelocity<T> previous_center_velocity(const StepStart<T>& start, int nv, int k, const V3<T>& c,
                                            const Workspace<T>& w) {
-  V3<T> velocity = cross<T>(vec3(from.v_star + k), c);
-  if (from.history != nullptr) {
-    const V3<T> earlier = cross<T>(vec3(from.history + nv + k), c);
-    velocity += (earlier - inverse_rotation<T>(vec3(from.history + k)) * earlier) / T(3);
+  V3<T> velocity = cross<T>(vec3(start.v_star + k), c);
+  if (start.history != nullptr) {
+    const V3<T> earlier = cross<T>(vec3(start.history + nv + k), c);
+    velocity += (earlier - inverse_rotation<T>(vec3(start.history + k)) * earlier) / T(3);
   }
   const M3<T> inverse = inverse_rotation<T>(vec3(w.increment.data() + k));
   return {inverse, inverse * velocity};
@@ -58,12 +58,13 @@ struct FreeBodyTerms {
   CenterVelocity<T> before;
 };
 
-// Derivatives of a free body's force and moment. `from`: see add_inverse_dynamics.
+// Derivatives of a free body's force and moment. `start`: see add_inverse_dynamics.
 template <class T>
-void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& h, const StepStart<T>* from, Workspace<T>& w) {
+void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& beta_h, const StepStart<T>* start, Workspace<T>& w) {
   const int k = b.k;
   for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = b.mass;
-  w.by_v.template block<3, 3>(k + 3, k + 3) += h * (cross_columns<T>(b.spin, b.inertia) - skew<T>(b.angular_momentum));
+  w.by_v.template block<3, 3>(k + 3, k + 3) +=
+      beta_h * (cross_columns<T>(b.spin, b.inertia) - skew<T>(b.angular_momentum));
   if (b.centered) {  // another environment may have another centre of mass: blocks are set, not assumed zero
     w.mass.template block<3, 3>(k + 3, k + 3) = b.inertia;
     w.mass.template block<3, 3>(k, k + 3).setZero();
@@ -74,23 +75,24 @@ void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& h, const Step
   w.mass.template block<3, 3>(k + 3, k + 3) = b.inertia - b.mass * (arm * arm);
   w.mass.template block<3, 3>(k, k + 3) = -turned * arm;
   w.mass.template block<3, 3>(k + 3, k) = arm * turned.transpose();
-  if (!from) return;
-  w.by_q.template block<3, 3>(k, k + 3) -= h * (turned * skew<T>(b.y));
-  w.by_q.template block<3, 3>(k + 3, k + 3) += h * b.mass * (arm * skew<T>(b.rotation.transpose() * b.acceleration));
-  const M3<T> by_turn = h * (skew<T>(b.before.u) * right_jacobian<T>(b.turn));
+  if (!start) return;
+  w.by_q.template block<3, 3>(k, k + 3) -= beta_h * (turned * skew<T>(b.y));
+  w.by_q.template block<3, 3>(k + 3, k + 3) +=
+      beta_h * b.mass * (arm * skew<T>(b.rotation.transpose() * b.acceleration));
+  const M3<T> by_turn = beta_h * (skew<T>(b.before.u) * right_jacobian<T>(b.turn));
   w.by_v.template block<3, 3>(k, k + 3) -= turned * by_turn;
   w.by_v.template block<3, 3>(k + 3, k + 3) -= b.mass * (arm * by_turn);
-  if (from->history != nullptr) return;
+  if (start->history != nullptr) return;
   const MomentArmCorrection<T> arc(b.turn, true);
-  w.by_q.template block<3, 3>(k + 3, k + 3) += h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
+  w.by_q.template block<3, 3>(k + 3, k + 3) += beta_h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
   for (int j = 0; j < 3; ++j) {
-    w.by_v.template block<3, 1>(k + 3, k + 3 + j) += h * h * cross<T>(arc.by[j] * b.c, b.weight);
+    w.by_v.template block<3, 1>(k + 3, k + 3 + j) += beta_h * beta_h * cross<T>(arc.by[j] * b.c, b.weight);
   }
 }
 
 template <bool derivatives, class T>
-void add_free_body(const Model& m, const Body& body, const T* params, const T& h, const T* v, const StepStart<T>* from,
-                   Workspace<T>& w) {
+void add_free_body(const Model& m, const Body& body, const T* params, const T& beta_h, const T* v,
+                   const StepStart<T>* start, Workspace<T>& w) {
   const BodyParams<T>& own = body.params.in(params);
   const V3<T> gravity = m.gravity.in(params).acceleration;
   FreeBodyTerms<T> b;
@@ -100,47 +102,47 @@ void add_free_body(const Model& m, const Body& body, const T* params, const T& h
   b.inertia = own.inertia();
   b.c = own.com;
   b.spin = vec3(v + k + 3);
-  b.acceleration = vec3(w.update.data() + k) - gravity;
+  b.acceleration = vec3(w.generalized_acceleration.data() + k) - gravity;
   b.turn = vec3(w.increment.data() + k + 3);
   b.angular_momentum = b.inertia * b.spin;
   b.centered = std::is_floating_point_v<T> && b.c == V3<T>::Zero();
-  const V3<T> spin_rate = vec3(w.update.data() + k + 3);
+  const V3<T> spin_rate = vec3(w.generalized_acceleration.data() + k + 3);
   V3<T> force = b.mass * b.acceleration, moment = b.inertia * spin_rate + cross<T>(b.spin, b.angular_momentum);
   b.weight = -b.mass * (b.rotation.transpose() * gravity);
   if (!b.centered) {
-    if (from) b.before = previous_center_velocity<T>(*from, m.nv, k + 3, b.c, w);
-    b.y = from ? V3<T>((cross<T>(b.spin, b.c) - b.before.u) / h)
-               : V3<T>(cross<T>(spin_rate, b.c) + cross<T>(b.spin, cross<T>(b.spin, b.c)));
+    if (start) b.before = previous_center_velocity<T>(*start, m.nv, k + 3, b.c, w);
+    b.y = start ? V3<T>((cross<T>(b.spin, b.c) - b.before.u) / beta_h)
+                : V3<T>(cross<T>(spin_rate, b.c) + cross<T>(b.spin, cross<T>(b.spin, b.c)));
     force += b.mass * (b.rotation * b.y);
     moment += cross<T>(b.c, b.rotation.transpose() * force);
-    const bool uses_arc_correction = from && from->history == nullptr;
+    const bool uses_arc_correction = start && start->history == nullptr;
     if (uses_arc_correction) moment += cross<T>(MomentArmCorrection<T>(b.turn, false).value * b.c, b.weight);
   }
   for (int i = 0; i < 3; ++i) {
-    w.residual[k + i] += h * force[i];
-    w.residual[k + 3 + i] += h * moment[i];
+    w.residual[k + i] += beta_h * force[i];
+    w.residual[k + 3 + i] += beta_h * moment[i];
   }
-  if constexpr (derivatives) add_free_body_derivatives<T>(b, h, from, w);
+  if constexpr (derivatives) add_free_body_derivatives<T>(b, beta_h, start, w);
 }
 
 // The terms of −(∂g/∂v*)ᵀ, −(∂g/∂(γ δ))ᵀ and −(∂g/∂v_{t-2})ᵀ times the multipliers that M does not contain: g depends
 // on these through u too.
 template <class T>
-void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& from, const Workspace<T>& w,
+void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& start, const Workspace<T>& w,
                      const VX<T>& multipliers, VX<T>& by_v_star, VX<T>& by_shift, VX<T>& by_earlier) {
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const V3<T> c = body.params.in(params).com;
     if (!body.is_free || c == V3<T>::Zero()) continue;
     const int turn = m.joints[body.joint_begin].v + 3;
-    const CenterVelocity<T> before = previous_center_velocity<T>(from, m.nv, turn, c, w);
+    const CenterVelocity<T> before = previous_center_velocity<T>(start, m.nv, turn, c, w);
     const V3<T> push = as<T>(w.rotation[i]).transpose() * vec3(multipliers.data() + turn - 3);
     const V3<T> by_u = body.params.in(params).mass * (push + cross<T>(vec3(multipliers.data() + turn), c));
     const V3<T> by_velocity = before.inverse_rotation.transpose() * by_u;
     by_v_star.template segment<3>(turn) += cross<T>(c, by_velocity - by_u);
-    if (from.history == nullptr) continue;
-    const V3<T> theta = vec3(w.increment.data() + turn), delta = vec3(from.history + turn);
-    const V3<T> earlier = cross<T>(vec3(from.history + m.nv + turn), c), third = by_velocity / T(3);
+    if (start.history == nullptr) continue;
+    const V3<T> theta = vec3(w.increment.data() + turn), delta = vec3(start.history + turn);
+    const V3<T> earlier = cross<T>(vec3(start.history + m.nv + turn), c), third = by_velocity / T(3);
     const M3<T> inverse = inverse_rotation<T>(delta);
     by_earlier.template segment<3>(turn) += cross<T>(c, third - inverse.transpose() * third);
     const V3<T> by_delta = right_jacobian<T>(delta).transpose() * cross<T>(inverse * earlier, third);

@@ -114,7 +114,7 @@ GELFLOW_INLINE void set_motion_derivatives(int j, Workspace<T>& w) {
 
 // Rows and columns of the mass matrix and of the derivatives that dof j shares with its ancestors and its group.
 template <class T>
-GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& h, int j, Workspace<T>& w) {
+GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& beta_h, int j, Workspace<T>& w) {
   const int body = m.dof_body[j];
   const Composite<T>& composite = w.composite[body];
   const V6<T> s = w.axis[j];
@@ -127,35 +127,35 @@ GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& h, int j, Works
     if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
     const V6<T> sk = w.axis[k];
     const bool same_group = m.group_begin[k] == m.group_begin[j];
-    w.by_q(k, j) += h * dot6<T>(sk, same_group ? force_q : moved_force_q);
-    w.by_v(k, j) += h * dot6<T>(sk, force_v);
+    w.by_q(k, j) += beta_h * dot6<T>(sk, same_group ? force_q : moved_force_q);
+    w.by_v(k, j) += beta_h * dot6<T>(sk, force_v);
     w.mass(k, j) = dot6<T>(sk, force_a);
     if (same_group) continue;
     w.mass(j, k) = w.mass(k, j);
     if (m.translation_only[k]) continue;
     // The transposed entry, the force at dof j by the ancestor k, sums over the subtree of j. I is symmetric:
     // Sⱼᵀ I = (I Sⱼ)ᵀ.
-    w.by_q(j, k) += h * (dot6<T>(force_a, w.motion_by_q[k]) + rate_s.dot(top(w.p[k])));
-    w.by_v(j, k) += h * (dot6<T>(force_a, w.motion_by_v[k]) + rate_s.dot(top(sk)));
+    w.by_q(j, k) += beta_h * (dot6<T>(force_a, w.motion_by_q[k]) + rate_s.dot(top(w.p[k])));
+    w.by_v(j, k) += beta_h * (dot6<T>(force_a, w.motion_by_v[k]) + rate_s.dot(top(sk)));
   }
 }
 
-// Adds h · (inverse dynamics) to w.residual; with derivatives also to w.by_q and w.by_v, and sets w.mass (without the
-// factor h). `from` is the start of the step; null: w.q and w.update alone define the state and the accelerations, and
-// of the derivatives of free bodies only w.mass is set.
+// Adds β h · (inverse dynamics) to w.residual; with derivatives also to w.by_q and w.by_v, and sets w.mass (without the
+// factor β h). `start` is the start of the step; null: w.q and w.generalized_acceleration alone define the state and the
+// accelerations, and of the derivatives of free bodies only w.mass is set.
 template <bool derivatives, class T>
-void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* v, const StepStart<T>* from,
+void add_inverse_dynamics(const Model& m, const T* params, const T& beta_h, const T* v, const StepStart<T>* start,
                           Workspace<T>& w) {
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     if (m.bodies[i].is_free) {
-      add_free_body<derivatives, T>(m, m.bodies[i], params, h, v, from, w);
+      add_free_body<derivatives, T>(m, m.bodies[i], params, beta_h, v, start, w);
       continue;
     }
     w.force[i] = body_force<derivatives, T>(m.bodies[i], params, as<T>(w.rotation[i]), as<T>(w.position[i]), w.twist[i],
                                             w.acceleration[i], w.composite[i]);
   }
   sum_subtrees<derivatives, T>(m, w);
-  for (const int k : m.articulated_dofs) w.residual[k] += h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
+  for (const int k : m.articulated_dofs) w.residual[k] += beta_h * dot6<T>(w.axis[k], w.force[m.dof_body[k]]);
   if constexpr (!derivatives) return;
   for (const int j : m.articulated_dofs) {
     if (m.translation_only[j]) {
@@ -165,7 +165,7 @@ void add_inverse_dynamics(const Model& m, const T* params, const T& h, const T* 
     }
   }
   for (const int j : m.articulated_dofs) {
-    if (!m.translation_only[j]) add_dof_derivatives<T>(m, h, j, w);
+    if (!m.translation_only[j]) add_dof_derivatives<T>(m, beta_h, j, w);
   }
 }
 

@@ -176,10 +176,10 @@ void forward_velocities(const Model& m, const T* params, const T* v, const T* a,
 // Positions and velocities of the state (q, v), with zero accelerations. `q_rounding`: see StateView, or null.
 template <bool store_before, class T>
 void forward_state(const Model& m, const T* params, const T* q, const T* q_rounding, const T* v, Workspace<T>& w) {
-  w.update.setZero();
+  w.generalized_acceleration.setZero();
   for (int i = 0; i < m.nq; ++i) w.q[i] = position_with_rounding(q, q_rounding, i);
   forward_positions<T>(m, params, w.q.data(), w);
-  forward_velocities<store_before, T>(m, params, v, w.update.data(), w);
+  forward_velocities<store_before, T>(m, params, v, w.generalized_acceleration.data(), w);
 }
 
 // q_t = q_{t-1} ⊕ increment. `q_rounding` is that of q_{t-1} (StateView), or null.

@@ -18,7 +18,7 @@ class Tape {
   }
   void clear() { entries_.clear(); }
   // Backward pass. weights: those of the results, one per entry; on return the gradient with respect to every entry.
-  void back(std::vector<double>& weights) const {
+  void backward(std::vector<double>& weights) const {
     for (int i = static_cast<int>(entries_.size()) - 1; i >= 0; --i) {
       const double w = weights[i];
       if (w == 0) continue;
@@ -53,7 +53,7 @@ struct Taped {
     if (i >= 0 || j >= 0) entry = Tape::current().add(i, di, j, dj);
   }
   // An independent variable: the backward pass computes the gradient with respect to it.
-  static Taped watched(double value) {
+  static Taped variable(double value) {
     Taped x(value);
     x.entry = Tape::current().add(-1, 0, -1, 0);
     return x;

@@ -98,7 +98,7 @@ struct ContactJacobian {
 // The start of a step: the arguments of its residual other than v_t.
 template <class T>
 struct StepStart {
-  T h;  // β h
+  T beta_h;  // β h, h the step length
   const T *q0, *v_star;
   const T* q_rounding;  // rounding residual of q0, or null (StateView)
   const T* history;     // δ and v_{t-2}; null under BDF1
@@ -109,7 +109,7 @@ struct StepStart {
   // Continuation factor on k_t, k_s, the slope of dry friction and actuator gains; 1 except in Newton's homotopy.
   double continuation = 1;
 
-  T length() const { return history == nullptr ? h : T(h * T(1.5)); }  // of the step itself
+  T length() const { return history == nullptr ? beta_h : T(beta_h * T(1.5)); }  // of the step itself
 };
 
 template <class T>
@@ -133,11 +133,11 @@ struct Workspace {
         impulses(stride),
         residual_scale(stride),
         increment(m.nv),
-        update(m.nv),
-        trial(m.nv),
+        generalized_acceleration(m.nv),
+        velocity_change(m.nv),
         direction(m.nv),
-        start(m.nv),
-        best(m.nv),
+        search_start(m.nv),
+        best_velocity(m.nv),
         mass(m.nv, stride),
         by_q(m.nv, stride),
         by_v(m.nv, stride),
@@ -170,8 +170,10 @@ struct Workspace {
   // Residual g of the step and its derivatives.
   VX<T> residual, impulses, residual_scale;  // behind the last number as many zeros as rows have (newton.hpp)
   VX<T> increment;                           // q_t = q_{t-1} ⊕ increment
-  VX<T> update, trial;                       // accelerations; v_t − v*
-  VX<T> direction, start, best;              // Newton's
+  VX<T> generalized_acceleration;            // (v_t − v*)/(β h)
+  VX<T> velocity_change;                     // v_t − v*
+  VX<T> direction;                           // of Newton's method
+  VX<T> search_start, best_velocity;         // start of the line search; iterate with the smallest residual
   Rows mass, by_q, by_v;                     // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
   VX<T> by_u;                                // ∂g_dof/∂u per actuator
   Rows tangent;             // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)

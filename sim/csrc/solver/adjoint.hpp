@@ -27,21 +27,22 @@ struct StateGradient {
 // Data of one accepted substep for the reverse pass.
 template <class T>
 struct SubstepRecord {
-  SubstepRecord(const Model& m, const StepStart<T>& from, const VX<T>& v_new, bool full_step)
-      : h(from.h),
-        bdf2(from.history != nullptr),
+  SubstepRecord(const Model& m, const StepStart<T>& start, const VX<T>& v_new, bool full_step)
+      : beta_h(start.beta_h),
+        bdf2(start.history != nullptr),
         full_step(full_step),
-        q0(Eigen::Map<const VX<T>>(from.q0, m.nq)),
-        v_star(Eigen::Map<const VX<T>>(from.v_star, m.nv)),
+        q0(Eigen::Map<const VX<T>>(start.q0, m.nq)),
+        v_star(Eigen::Map<const VX<T>>(start.v_star, m.nv)),
         v1(v_new),
-        anchors(from.anchors, from.anchors + m.na),
-        anchored(from.anchored, from.anchored + m.na) {
-    if (bdf2) history = Eigen::Map<const VX<T>>(from.history, 2 * m.nv);
+        anchors(start.anchors, start.anchors + m.na),
+        anchored(start.anchored, start.anchored + m.na) {
+    if (bdf2) history = Eigen::Map<const VX<T>>(start.history, 2 * m.nv);
   }
   StepStart<T> start(const T* u) const {
-    return {h, q0.data(), v_star.data(), nullptr, bdf2 ? history.data() : nullptr, anchors.data(), anchored.data(), u};
+    return {beta_h,          q0.data(), v_star.data(), nullptr, bdf2 ? history.data() : nullptr, anchors.data(),
+            anchored.data(), u};
   }
-  T h;
+  T beta_h;        // β h
   bool bdf2;       // the step used BDF2
   bool full_step;  // not a part of a divided step: it is the history of a next step by BDF2
   VX<T> q0, v_star, history, v1;
@@ -67,42 +68,42 @@ struct StateCopy {
 // Adds the gradients with respect to the anchors after the substep to those of the state at its end, and returns the
 // part that belongs to the anchors before it.
 template <class T>
-std::vector<V3<T>> end_anchors_vjp(const Model& m, const T* params, const SubstepRecord<T>& r, const T& length,
+std::vector<V3<T>> end_anchors_vjp(const Model& m, const T* params, const SubstepRecord<T>& r, const T& step_length,
                                    StateGradient<T>& g, Workspace<T>& w) {
   std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
   if (m.na == 0) return by_anchor;
-  contact_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+  contact_anchors_vjp<T>(m, params, step_length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                          by_anchor.data());
-  marker_anchors_vjp<T>(m, params, length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
+  marker_anchors_vjp<T>(m, params, step_length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
                         by_anchor.data());
   return by_anchor;
 }
 
-// Transforms g from the gradient at the substep's end to the gradient at its start, and adds to by_u. `multipliers`(c) is
-// called before the gradient of the anchors changes.
-template <class T, class Multipliers>
+// Transforms g from the gradient at the substep's end to the gradient at its start, and adds to by_u.
+// `on_multiplier`(c) is called before the gradient of the anchors changes.
+template <class T, class OnMultiplier>
 void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecord<T>& r, StateGradient<T>& g, T* by_u,
-                 StepMemory<T>& memory, Multipliers&& multipliers) {
+                 StepMemory<T>& memory, OnMultiplier&& on_multiplier) {
   Workspace<T>& w = memory.work;
-  const StepStart<T> from = r.start(u);
-  evaluate<true, T>(m, params, from, r.v1.data(), CacheState::stale, false, w);
-  std::vector<V3<T>> by_anchor = end_anchors_vjp<T>(m, params, r, from.length(), g, w);
+  const StepStart<T> start = r.start(u);
+  evaluate<true, T>(m, params, start, r.v1.data(), CacheState::stale, false, w);
+  std::vector<V3<T>> by_anchor = end_anchors_vjp<T>(m, params, r, start.length(), g, w);
   VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
   if (m.nh > 0 && r.full_step) {
     by_increment = g.history.head(m.nv);
     by_v0 = g.history.segment(m.nv, m.nv);
   }
-  const VX<T> b = g.v + r.h * (position_by_increment_vjp<T>(m, w.increment, g.q) + by_increment);
+  const VX<T> b = g.v + r.beta_h * (position_by_increment_vjp<T>(m, w.increment, g.q) + by_increment);
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
-  VX<T> c(m.nv);
-  solve<T>(w.tangent, m.nv, w.pivots, b.data(), c);
-  multipliers(c);
-  for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= c[m.actuators[a].dof] * w.by_u[a];
-  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * c;
-  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * c, by_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
+  VX<T> multiplier(m.nv);
+  solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+  on_multiplier(multiplier);
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= multiplier[m.actuators[a].dof] * w.by_u[a];
+  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * multiplier;
+  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * multiplier, by_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
   by_increment += position_by_increment_vjp<T>(m, w.increment, by_q1);
-  free_bodies_vjp<T>(m, params, from, w, c, by_v_star, by_increment, by_v_before);
+  free_bodies_vjp<T>(m, params, start, w, multiplier, by_v_star, by_increment, by_v_before);
   g.q = position_by_position_vjp<T>(m, w.increment, by_q1);
   g.v = by_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * by_v_star;
   g.history.setZero();
@@ -111,7 +112,8 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
     g.history.segment(m.nv, m.nv) = by_v_before - by_v_star / T(3);
   }
   if (m.na > 0) {
-    residual_anchors_vjp<T>(m, params, r.h, r.bdf2, r.anchors.data(), r.anchored.data(), w, c, by_anchor.data());
+    residual_anchors_vjp<T>(m, params, r.beta_h, r.bdf2, r.anchors.data(), r.anchored.data(), w, multiplier,
+                            by_anchor.data());
     g.anchors.swap(by_anchor);
   }
 }

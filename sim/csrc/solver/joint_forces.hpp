@@ -71,22 +71,22 @@ ActuatorForce<T> actuator_force(const Actuator& actuator, const ActuatorParams<T
 
 // Damping, dry friction and armature of all dofs of a joint.
 template <bool derivatives, class T>
-GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, const T& h, const T* v, const T& creep,
-                                   bool add_impulses, Workspace<T>& w) {
+GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, const T& beta_h, const T* v,
+                                   const T& creep, bool add_impulses, Workspace<T>& w) {
   using std::abs;
   const T damping = p.damping, armature = p.armature;
   for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
-    w.residual[k] += h * damping * v[k];
-    if constexpr (derivatives) w.by_v(k, k) += h * damping;
+    w.residual[k] += beta_h * damping * v[k];
+    if constexpr (derivatives) w.by_v(k, k) += beta_h * damping;
     if (p.frictionloss != T(0)) {
       const bool slides = abs(v[k]) > creep;
       const T force = slides ? T(v[k] > T(0) ? p.frictionloss : -p.frictionloss) : T(p.frictionloss / creep * v[k]);
-      w.residual[k] += h * force;
-      if (add_impulses) w.impulses[k] += h * p.frictionloss;
-      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(h * p.frictionloss / creep);
+      w.residual[k] += beta_h * force;
+      if (add_impulses) w.impulses[k] += beta_h * p.frictionloss;
+      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(beta_h * p.frictionloss / creep);
     }
     if (armature != T(0)) {
-      w.residual[k] += armature * w.trial[k];  // w.trial holds v_t − v*
+      w.residual[k] += armature * w.velocity_change[k];
       if constexpr (derivatives) {
         w.by_v(k, k) += armature;
         w.mass(k, k) += armature;
@@ -97,31 +97,31 @@ GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, 
 
 // Spring and limit of a slide or hinge.
 template <bool derivatives, class T>
-GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const JointParams<T>& p, const T& h,
+GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const JointParams<T>& p, const T& beta_h,
                                          const PositionScalar<T>* q, const T* v, Workspace<T>& w) {
   const T stiffness = p.stiffness, springref = p.springref;
   const int k = joint.v;
   const T value(q[joint.q]);
-  w.residual[k] += h * stiffness * (value - springref);
-  if constexpr (derivatives) w.by_q(k, k) += h * stiffness;
+  w.residual[k] += beta_h * stiffness * (value - springref);
+  if constexpr (derivatives) w.by_q(k, k) += beta_h * stiffness;
   const LimitForce<T> limit = limit_force<T>(p, value, v[k]);
-  w.residual[k] += h * limit.force;
+  w.residual[k] += beta_h * limit.force;
   if constexpr (derivatives) {
-    w.by_q(k, k) += h * limit.by_q;
-    w.by_v(k, k) += h * limit.by_v;
+    w.by_q(k, k) += beta_h * limit.by_q;
+    w.by_v(k, k) += beta_h * limit.by_v;
   }
 }
 
-// Adds −h f and its derivatives to the residual, f the forces of joints and actuators.
+// Adds −β h f and its derivatives to the residual, f the forces of joints and actuators.
 template <bool derivatives, class T>
-void subtract_joint_forces(const Model& m, const T* params, const T& h, const PositionScalar<T>* q, const T* v,
+void subtract_joint_forces(const Model& m, const T* params, const T& beta_h, const PositionScalar<T>* q, const T* v,
                            const T* u, double continuation, bool add_impulses, Workspace<T>& w) {
   using std::abs;
   const T creep(friction_creep / continuation);
   for (const Joint& joint : m.joints) {
     const JointParams<T>& p = joint.params.in(params);
-    add_dof_forces<derivatives, T>(joint, p, h, v, creep, add_impulses, w);
-    if (!joint.has_quaternion()) add_spring_and_limit<derivatives, T>(joint, p, h, q, v, w);
+    add_dof_forces<derivatives, T>(joint, p, beta_h, v, creep, add_impulses, w);
+    if (!joint.has_quaternion()) add_spring_and_limit<derivatives, T>(joint, p, beta_h, q, v, w);
   }
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
@@ -129,12 +129,12 @@ void subtract_joint_forces(const Model& m, const T* params, const T& h, const Po
     const T gear = p.gear;
     const int k = actuator.dof;
     const ActuatorForce<T> out = actuator_force<T>(actuator, p, u[a], q, v, continuation);
-    w.residual[k] -= h * gear * out.force;
-    if (add_impulses) w.impulses[k] += h * abs(gear * out.force);
+    w.residual[k] -= beta_h * gear * out.force;
+    if (add_impulses) w.impulses[k] += beta_h * abs(gear * out.force);
     if constexpr (derivatives) {
-      w.by_u[a] = -h * gear * out.by_u;
-      w.by_q(k, k) -= h * gear * gear * out.by_length;
-      w.by_v(k, k) -= h * gear * gear * out.by_speed;
+      w.by_u[a] = -beta_h * gear * out.by_u;
+      w.by_q(k, k) -= beta_h * gear * gear * out.by_length;
+      w.by_v(k, k) -= beta_h * gear * gear * out.by_speed;
     }
   }
 }

@@ -38,7 +38,7 @@ double relative_norm(const VX<T>& residual, const VX<T>& impulses, int n) {
 // impulses, of the momenta before the step (with moments about the world's origin), and of the effect of one rounding
 // unit of every position and velocity.
 template <class T>
-bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from, const VX<T>& v,
+bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& start, const VX<T>& v,
                        const Workspace<T>& w) {
   const double unit = 20 * real_part(Eigen::NumTraits<T>::epsilon());
   double reach = 0, angle = 1, mass = 0, speed = 0, spin = 0;  // angle: the largest one, 1 for a quaternion
@@ -46,20 +46,20 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
     for (int a = 0; a < 3; ++a) reach = std::max(reach, std::abs(real_part(position[a])));
   }
   for (const Joint& joint : m.joints) {
-    if (joint.type == JointType::hinge) angle = std::max(angle, std::abs(real_part(from.q0[joint.q])));
+    if (joint.type == JointType::hinge) angle = std::max(angle, std::abs(real_part(start.q0[joint.q])));
   }
   for (const Body& body : m.bodies) mass += std::abs(real_part(body.params.in(params).mass));
   for (int k = 0; k < m.nv; ++k) {
     double& fastest = m.angular[k] ? spin : speed;
-    fastest = std::max(fastest, std::abs(real_part(from.v_star[k])));
+    fastest = std::max(fastest, std::abs(real_part(start.v_star[k])));
   }
-  const double momentum = mass * (speed + reach * spin) * (1 + real_part(from.h) * spin);
+  const double momentum = mass * (speed + reach * spin) * (1 + real_part(start.beta_h) * spin);
   for (int i = 0; i < m.nv; ++i) {
     double velocity_terms = m.angular[i] ? reach * momentum : momentum, position_terms = 0;
     for (int j = 0; j < m.nv; ++j) {
       position_terms += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? angle : reach);
       velocity_terms +=
-          std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(from.v_star[j])));
+          std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(start.v_star[j])));
     }
     const double bound = unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
@@ -88,16 +88,16 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& from
 template <class T>
 class NewtonSolver {
  public:
-  NewtonSolver(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
+  NewtonSolver(const Model& m, const T* params, const StepStart<T>& start, int polish, VX<T>& v, int& iterations,
                Workspace<T>& w)
       : m_(m),
         params_(params),
-        from_(from),
+        start_(start),
         v_(v),
         iterations_(iterations),
         w_(w),
-        tolerance_(tolerance_of(m, from)),
-        inexact_(std::is_floating_point_v<T> && tolerance_ > exact_below),
+        tolerance_(tolerance_of(m, start)),
+        allows_shortcuts_(std::is_floating_point_v<T> && tolerance_ > no_shortcuts_below),
         polish_(polish) {}
 
   GELFLOW_INLINE Status solve() {
@@ -123,7 +123,7 @@ class NewtonSolver {
 
  private:
   static constexpr int full_steps = 6, stall_window = 6, max_reuse_iteration = 6, max_backtracks = 12;
-  static constexpr double reuse_decrease = 0.15, final_fraction = 0.1, exact_below = 1e-9, armijo = 1e-4;
+  static constexpr double reuse_decrease = 0.15, final_fraction = 0.1, no_shortcuts_below = 1e-9, armijo = 1e-4;
   static constexpr bool single_precision = !std::is_same_v<T, PositionScalar<T>>;
   static constexpr double safety = single_precision ? 1.0 : 0.1, far_below = safety * safety;
 
@@ -137,18 +137,18 @@ class NewtonSolver {
 
   // The tolerance is at least 1000 (double) or 100 (single precision) rounding units, and loose while the
   // continuation factor is below 1.
-  static double tolerance_of(const Model& m, const StepStart<T>& from) {
+  static double tolerance_of(const Model& m, const StepStart<T>& start) {
     constexpr double units = single_precision ? 100 : 1000;
     const double tolerance =
         std::max(m.tolerance, units * static_cast<double>(real_part(Eigen::NumTraits<T>::epsilon())));
-    return from.continuation < 1 ? std::max(tolerance, 1e-3) : tolerance;
+    return start.continuation < 1 ? std::max(tolerance, 1e-3) : tolerance;
   }
 
   GELFLOW_INLINE void evaluate_at_v(bool jacobian, CacheState cache) {
     if (jacobian) {
-      evaluate<true, T>(m_, params_, from_, v_.data(), cache, true, w_);
+      evaluate<true, T>(m_, params_, start_, v_.data(), cache, true, w_);
     } else {
-      evaluate<false, T>(m_, params_, from_, v_.data(), cache, true, w_);
+      evaluate<false, T>(m_, params_, start_, v_.data(), cache, true, w_);
     }
     jacobian_current_ = jacobian;
   }
@@ -159,20 +159,20 @@ class NewtonSolver {
 
   // Residual and Jacobian at the initial guess, whose impulses scale all residuals. False where not finite.
   GELFLOW_INLINE bool evaluate_start() {
-    evaluate_at_v(true, from_.cache);
+    evaluate_at_v(true, start_.cache);
     w_.residual_scale = w_.impulses;
     norm_ = relative_norm(w_.residual, w_.residual_scale, m_.nv);
     best_norm_ = previous_norm_ = stall_norm_ = norm_;
     if (!std::isfinite(norm_)) return false;
-    w_.best = v_;
+    w_.best_velocity = v_;
     return true;
   }
 
   GELFLOW_INLINE Convergence test_convergence(int k) const {
     Convergence test;
     test.reuses_jacobian =
-        inexact_ && !jacobian_current_ && k <= max_reuse_iteration && norm_ < reuse_decrease * previous_norm_;
-    test.skips_check = inexact_ && m_.na == 0 && polish_ <= 0 && (jacobian_current_ || test.reuses_jacobian);
+        allows_shortcuts_ && !jacobian_current_ && k <= max_reuse_iteration && norm_ < reuse_decrease * previous_norm_;
+    test.skips_check = allows_shortcuts_ && m_.na == 0 && polish_ <= 0 && (jacobian_current_ || test.reuses_jacobian);
     // At the initial guess both scales are the same.
     test.residual = k == 0 ? norm_ : relative_norm(w_.residual, w_.impulses, m_.nv);
     test.within_tolerance = test.residual <= (jacobian_reused_ ? safety : 1.0) * tolerance_;
@@ -198,7 +198,7 @@ class NewtonSolver {
   GELFLOW_INLINE Status apply_final_update() {
     ++iterations_;
     v_ -= w_.direction;
-    integrate_to_trial_state<T>(m_, from_, v_.data(), w_);
+    integrate_to_trial_state<T>(m_, start_, v_.data(), w_);
     return Status::ok;
   }
 
@@ -206,19 +206,19 @@ class NewtonSolver {
   // decreased sufficiently. Past a kink, steps start from the iterate before it.
   GELFLOW_INLINE bool take_step(bool search, bool converged) {
     if (past_kink_) {
-      w_.direction += w_.start - v_;
+      w_.direction += w_.search_start - v_;
     } else {
-      w_.start = v_;
+      w_.search_start = v_;
       previous_norm_ = norm_;
     }
     ++iterations_;
     double fraction = 1;
     for (int halvings = 0; halvings <= max_backtracks; ++halvings, fraction *= 0.5) {
-      v_ = w_.start - w_.direction * T(fraction);
+      v_ = w_.search_start - w_.direction * T(fraction);
       measure(false);
       const bool decreased = norm_ <= (1 - armijo * fraction) * previous_norm_, finite = std::isfinite(norm_);
       if (converged) return decreased;
-      at_floor_ = norm_ > 0.5 * previous_norm_ && finite && at_rounding_floor<T>(m_, params_, from_, v_, w_);
+      at_floor_ = norm_ > 0.5 * previous_norm_ && finite && at_rounding_floor<T>(m_, params_, start_, v_, w_);
       if (decreased || at_floor_ || (finite && !search)) return decreased;
     }
     return false;
@@ -228,9 +228,9 @@ class NewtonSolver {
   GELFLOW_INLINE void keep_best(bool full_steps_end) {
     if (norm_ < best_norm_) {
       best_norm_ = norm_;
-      w_.best = v_;
+      w_.best_velocity = v_;
     } else if (full_steps_end && !at_floor_) {
-      v_ = w_.best;
+      v_ = w_.best_velocity;
       stall_norm_ = best_norm_;
       measure(true);
     }
@@ -249,26 +249,26 @@ class NewtonSolver {
 
   const Model& m_;
   const T* const params_;
-  const StepStart<T>& from_;
+  const StepStart<T>& start_;
   VX<T>& v_;
   int& iterations_;
   Workspace<T>& w_;
   const double tolerance_;
-  const bool inexact_;  // Jacobian reuse and the unverified last iteration are allowed
+  const bool allows_shortcuts_;  // Jacobian reuse and the unverified last iteration are allowed
   int polish_;
 
   double norm_ = 0, previous_norm_ = 0;    // of the residual at v, and before the last step
   double best_norm_ = 0, stall_norm_ = 0;  // the smallest so far, now and when progress was last checked
   bool at_floor_ = false;                  // the residual is at the rounding floor
-  bool past_kink_ = false;                 // v lies just past a kink; steps start from w.start before it
+  bool past_kink_ = false;                 // v lies just past a kink; steps start from w.search_start before it
   bool jacobian_current_ = false;          // w holds the derivatives at v
   bool jacobian_reused_ = false;           // by the last update
 };
 
 template <class T>
-Status newton(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v, int& iterations,
+Status newton(const Model& m, const T* params, const StepStart<T>& start, int polish, VX<T>& v, int& iterations,
               Workspace<T>& w) {
-  return NewtonSolver<T>(m, params, from, polish, v, iterations, w).solve();
+  return NewtonSolver<T>(m, params, start, polish, v, iterations, w).solve();
 }
 
 // Continuation (homotopy), where Newton's method did not converge. The usual cause is saturation: points stick below a
@@ -277,10 +277,10 @@ Status newton(const Model& m, const T* params, const StepStart<T>& from, int pol
 // are scaled by a factor that starts small, which widens the range, and grows to 1; each solution is the next initial
 // guess.
 template <class T>
-Status newton_by_continuation(const Model& m, const T* params, const StepStart<T>& from, int polish, VX<T>& v,
+Status newton_by_continuation(const Model& m, const T* params, const StepStart<T>& start, int polish, VX<T>& v,
                               int& iterations, Workspace<T>& w) {
   constexpr double smallest = 1e-8, min_growth = 1.3;
-  StepStart<T> scaled = from;
+  StepStart<T> scaled = start;
   VX<T> solution = v;
   double solved = 0, growth = 100;
   for (scaled.continuation = smallest;;) {

@@ -2,8 +2,7 @@
 //
 //     g(v_t) = β h · (inverse dynamics of (q_t, v_t, (v_t − v*)/(β h)) − f),    q_t = q_{t-1} ⊕ (β h v_t + γ δ)
 //
-// with h the step length. In the code `h` is β h here and in what the residual calls; contact_law.hpp takes the step
-// length itself.
+// with h the step length; `beta_h` is β h.
 #pragma once
 
 #include "contact/contact_forces.hpp"
@@ -14,40 +13,40 @@ namespace gelflow {
 
 // Integrates v to the trial configuration: w.increment and w.q.
 template <class T>
-void integrate_to_trial_state(const Model& m, const StepStart<T>& from, const T* v, Workspace<T>& w) {
+void integrate_to_trial_state(const Model& m, const StepStart<T>& start, const T* v, Workspace<T>& w) {
   for (int k = 0; k < m.nv; ++k) {
-    w.increment[k] = from.h * v[k];
-    if (from.history) w.increment[k] += from.history[k] / T(3);
+    w.increment[k] = start.beta_h * v[k];
+    if (start.history) w.increment[k] += start.history[k] / T(3);
   }
-  integrate<T>(m, from.q0, from.q_rounding, w.increment, w.q.data());
+  integrate<T>(m, start.q0, start.q_rounding, w.increment, w.q.data());
 }
 
 // Evaluates the residual at v, and with derivatives w.tangent = ∂g/∂v_t. `add_impulses` also sets w.impulses, the
 // absolute impulses that the tolerance of Newton's method refers to (with the mass matrix of the last evaluation with
 // derivatives). `cache`: the state of the candidate points in w.
 template <bool derivatives, class T>
-void evaluate(const Model& m, const T* params, const StepStart<T>& from, const T* v, CacheState cache,
+void evaluate(const Model& m, const T* params, const StepStart<T>& start, const T* v, CacheState cache,
               bool add_impulses, Workspace<T>& w) {
-  const T& h = from.h;
-  integrate_to_trial_state<T>(m, from, v, w);
-  for (int k = 0; k < m.nv; ++k) w.trial[k] = v[k] - from.v_star[k];
-  w.update = w.trial / h;  // accelerations
+  const T& beta_h = start.beta_h;
+  integrate_to_trial_state<T>(m, start, v, w);
+  for (int k = 0; k < m.nv; ++k) w.velocity_change[k] = v[k] - start.v_star[k];
+  w.generalized_acceleration = w.velocity_change / beta_h;
   forward_positions<T>(m, params, w.q.data(), w);
-  forward_velocities<derivatives, T>(m, params, v, w.update.data(), w);
+  forward_velocities<derivatives, T>(m, params, v, w.generalized_acceleration.data(), w);
   w.residual.setZero();
   if constexpr (derivatives) {
     w.by_q.setZero();
     w.by_v.setZero();
   }
-  add_inverse_dynamics<derivatives, T>(m, params, h, v, &from, w);
+  add_inverse_dynamics<derivatives, T>(m, params, beta_h, v, &start, w);
   if constexpr (derivatives) w.by_v += w.mass;
   if (add_impulses) {
-    for (int k = 0; k < m.nv; ++k) w.impulses[k] = h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
+    for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
-  subtract_joint_forces<derivatives, T>(m, params, h, w.q.data(), v, from.u, from.continuation, add_impulses, w);
-  subtract_contact_forces<derivatives, T>(m, params, from, cache, add_impulses, w);
+  subtract_joint_forces<derivatives, T>(m, params, beta_h, w.q.data(), v, start.u, start.continuation, add_impulses, w);
+  subtract_contact_forces<derivatives, T>(m, params, start, cache, add_impulses, w);
   if constexpr (derivatives) {
-    w.tangent = h * w.by_q;
+    w.tangent = beta_h * w.by_q;
     times_position_by_increment<T>(m, w.increment, w.tangent);
     w.tangent += w.by_v;
   }

@@ -90,12 +90,12 @@ template <class T>
 StepStart<T> step_start(const Model& m, const T& h, bool full_step, const StateView<T>& s, const T* u,
                         StepMemory<T>& memory) {
   memory.v_star = Eigen::Map<const VX<T>>(s.v, m.nv);
-  StepStart<T> from{h, s.q, memory.v_star.data(), s.q_rounding, nullptr, s.anchors, s.anchored, u, memory.cache};
-  if (m.nh == 0 || !full_step || !(s.history[2 * m.nv] > T(0))) return from;
+  StepStart<T> start{h, s.q, memory.v_star.data(), s.q_rounding, nullptr, s.anchors, s.anchored, u, memory.cache};
+  if (m.nh == 0 || !full_step || !(s.history[2 * m.nv] > T(0))) return start;
   for (int k = 0; k < m.nv; ++k) memory.v_star[k] = (T(4) * s.v[k] - s.history[m.nv + k]) / T(3);
-  from.h = h * T(2) / T(3);
-  from.history = s.history;
-  return from;
+  start.beta_h = h * T(2) / T(3);
+  start.history = s.history;
+  return start;
 }
 
 // Default observer. Observers are called after each accepted substep with (its start, memory); memory.work holds the
@@ -110,18 +110,18 @@ struct NoObserver {
 template <class T, class Observer>
 Status substep(const Model& m, const T* params, const T& h, bool full_step, const T* u, int polish,
                const StateView<T>& s, StepMemory<T>& memory, int& iterations, Observer&& accepted) {
-  const StepStart<T> from = step_start<T>(m, h, full_step, s, u, memory);
+  const StepStart<T> start = step_start<T>(m, h, full_step, s, u, memory);
   memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-  Status status = newton<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+  Status status = newton<T>(m, params, start, polish, memory.v_new, iterations, memory.work);
   memory.cache = CacheState::warm;
   if (status != Status::ok) {
     memory.v_new = Eigen::Map<const VX<T>>(s.v, m.nv);
-    status = newton_by_continuation<T>(m, params, from, polish, memory.v_new, iterations, memory.work);
+    status = newton_by_continuation<T>(m, params, start, polish, memory.v_new, iterations, memory.work);
   }
   if (status != Status::ok) return status;
-  accepted(from, memory);
-  advance_contact_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
-  advance_marker_anchors<T>(m, params, from.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  accepted(start, memory);
+  advance_contact_anchors<T>(m, params, start.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
+  advance_marker_anchors<T>(m, params, start.length(), s.anchors, s.anchored, memory.work, s.anchors, s.anchored);
   if (m.nh > 0) {
     std::fill(s.history, s.history + m.nh, T(0));
     if (full_step) {

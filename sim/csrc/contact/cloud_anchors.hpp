@@ -2,7 +2,7 @@
 // its vector-Jacobian product.
 #pragma once
 
-#include "contact/contact_points.hpp"
+#include "contact/contact_point_loops.hpp"
 
 namespace gelflow {
 
@@ -14,7 +14,7 @@ void advance_anchors(const PairFrame<T>& frame, const CandidatePoints<T>& candid
   for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
     PointForce<Pack<T>> force;
     point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
-    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.h), force, t.x, t.anchor, t.has_anchor);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.step_length), force, t.x, t.anchor, t.has_anchor);
     t.for_each_active([&](int k, int i) {
       next[i] = lane3<T>(anchor, k);
       next_set[i] = 1;
@@ -32,7 +32,7 @@ void anchors_vjp(const PairFrame<T>& frame, const Points& points, const ContactS
   for_contact_points<true, T>(frame, points, settings, [&](const ContactPack<T>& t) {
     Vec3<P> lambda = zero3<P>();
     t.for_each_active([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
-    const PointGradient<P> g = next_anchor_vjp(t.law, P(settings.h), t.at, t.v, t.e, t.has_anchor, lambda);
+    const PointGradient<P> g = next_anchor_vjp(t.law, P(settings.step_length), t.at, t.v, t.e, t.has_anchor, lambda);
     const Vec3<P> by_point = g.x - cross(broadcast<P>(frame.angular), g.v);
     rotation += cross(t.center, by_point);
     translation += by_point;
