@@ -22,6 +22,7 @@ from gelflow.session.recorder import SessionRecorder
 from gelflow.task import InsertionTask
 
 _SEARCHES = 3  # contacts on the way to one start pose after which the search of the rim ends
+_CLEARANCE = 0.5e-3  # of a fast motion above the range in which the rim is searched [m]
 _AT_DEPTH = 0.02e-3  # distance from its end at which a descent is complete [m]
 
 
@@ -86,25 +87,37 @@ class HeldPart:
     def go_to_start(self, planar_pose: PlanarPose, phase: Phase) -> None:
         """Move to the start of an attempt; contact on the way shows the height of the rim.
 
-        Raises HoleNotFound when the rim is further from its taught height than `hole.height_error`.
+        Above the range in which the rim is searched the motion is fast. Raises HoleNotFound when the rim is further
+        from its taught height than `hole.height_error`.
         """
+        self._motion.supervisor.phases.enter(phase)
+        search_height = self._task.rim_height + self._lab.hole.height_error + _CLEARANCE
+        if self._lower_face() > search_height:
+            self._move_to(planar_pose, search_height, speed=self._guard.free_speed)
         for _ in range(_SEARCHES):
-            self._motion.supervisor.phases.enter(phase)
-            target = self._pose(planar_pose, self.start_height)
-            contact = self._guard.move(
-                target, threshold=self.thresholds.contact, baseline=self._baseline, measure=in_any_direction
-            )
-            if contact is None:
+            if self._move_to(planar_pose, self.start_height):
                 return
-            height = self._lower_face()
-            self._event("contact during the approach", contact, height=height)
-            self._set_rim(height)
             self.retreat(self.start_height)
             self.set_baseline()
-            phase = Phase.CORRECT
+            self._motion.supervisor.phases.enter(Phase.CORRECT)
         raise HoleNotFound(
             f"contact {_SEARCHES} times on the way to the start of an attempt; check the taught hole and the grasp"
         )
+
+    def _move_to(self, planar_pose: PlanarPose, height: float, *, speed: float | None = None) -> bool:
+        """Move towards a start pose; False after contact, whose height is then that of the rim."""
+        contact = self._guard.move(
+            self._pose(planar_pose, height),
+            threshold=self.thresholds.contact,
+            measure=in_any_direction,
+            baseline=self._baseline,
+            speed=speed,
+        )
+        if contact is not None:
+            found = self._lower_face()
+            self._event("contact during the approach", contact, height=found)
+            self._set_rim(found)
+        return contact is None
 
     def descend(self, planar_pose: PlanarPose, observer: TactileObserver, *, deadline: float) -> Descent:
         """Descend from the start while `observer`, whose reference was taken there, keeps the readings."""

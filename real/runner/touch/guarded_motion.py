@@ -21,7 +21,7 @@ from gelflow.time_sync import RUNNER
 # From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
 _REACTION_TIME = 0.05
 _REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
-_SIDEWAYS_OVERSHOOT = 0.5e-3  # of motions that lead away from the hole or sideways [m]
+_FREE_OVERSHOOT = 0.5e-3  # after contact in motions up, sideways and above the range in which the rim is searched [m]
 _DOWNWARD = 0.05e-3  # a target further below the arm than this is a motion towards contact [m]
 
 Array = NDArray[np.float64]
@@ -73,14 +73,18 @@ class GuardedMotion:
         """Set the robot time [s] after which every motion ends with PeerTimeout."""
         self._deadline = deadline
 
-    def speed_towards(self, target: Pose) -> float:
-        """Largest speed of a motion to `target` [m/s].
+    @property
+    def free_speed(self) -> float:
+        """Largest speed where contact is not expected [m/s]: the arm is at rest 0.5 mm after contact."""
+        return self._speed(_FREE_OVERSHOOT)
 
-        Downward it is limited so that the arm is at rest at most `descent.max_overshoot` after contact: within one
-        period of the images and the reaction time.
-        """
+    def speed_towards(self, target: Pose) -> float:
+        """Largest speed of a motion to `target` [m/s]; downward, at rest `descent.max_overshoot` after contact."""
         downward_motion = self._motion.pose().position[2] - target.position[2] > _DOWNWARD
-        overshoot = self._lab.descent.max_overshoot if downward_motion else _SIDEWAYS_OVERSHOOT
+        return self._speed(self._lab.descent.max_overshoot) if downward_motion else self.free_speed
+
+    def _speed(self, overshoot: float) -> float:
+        """Speed at which one period of the images and the reaction time are `overshoot` [m] long."""
         return min(self._lab.arm.max_speed, overshoot / (self.observer.image_period + _REACTION_TIME))
 
     def move(
