@@ -4,6 +4,7 @@ from .cycle_log import MessageCounts as MessageCounts
 from .driver import EgmArm as EgmArm
 from .reference_generator import EgmEvent as EgmEvent
 from .reference_generator import EgmFlag as EgmFlag
+from .timing import EgmTiming as EgmTiming
 
 __all__ = [
     "EgmArm",
@@ -11,5 +12,6 @@ __all__ = [
     "EgmCycle",
     "EgmEvent",
     "EgmFlag",
+    "EgmTiming",
     "MessageCounts",
 ]

@@ -13,11 +13,12 @@ from typing import NamedTuple
 from gelflow.errors import UsageError
 from gelflow.geometry import PoseTuple
 from gelflow.real.egm.reference_generator import EgmFlag
+from gelflow.real.egm.timing import WORDS, EgmTiming, TimingCounters
 from gelflow.real.kinematics import Joints
 
 _RECORD = struct.Struct("@32d")
-_HEADER = 64  # bytes: counts of written and read records and of ignored messages
-_WRITTEN, _READ, _FOREIGN, _MALFORMED, _DUPLICATES = range(5)
+_WRITTEN, _READ, _FOREIGN, _MALFORMED, _DUPLICATES, _TIMING = range(6)
+_HEADER = 8 * (_TIMING + WORDS)  # bytes: counts of written and read records, of ignored messages, and of times
 _NAN7 = (float("nan"),) * 7
 
 
@@ -50,6 +51,7 @@ class EgmCycleLog:
         self._map = mmap.mmap(descriptor, _HEADER + capacity * _RECORD.size)
         # Native 8-byte words are stored atomically, so the other process never reads a partial count.
         self._words = memoryview(self._map)[:_HEADER].cast("q")
+        self._timing = TimingCounters(self._words[_TIMING:])
         self._capacity = capacity
 
     @staticmethod
@@ -67,6 +69,7 @@ class EgmCycleLog:
 
     def close(self) -> None:
         """Unmap the memory."""
+        del self._timing
         self._words.release()
         self._map.close()
 
@@ -79,6 +82,11 @@ class EgmCycleLog:
     def counts(self) -> MessageCounts:
         """Ignored messages so far."""
         return MessageCounts(self._words[_FOREIGN], self._words[_MALFORMED], self._words[_DUPLICATES])
+
+    @property
+    def timing(self) -> EgmTiming:
+        """Statistics of all cycles so far."""
+        return self._timing.read(self._words[_WRITTEN])
 
     def count(self, *, foreign: int = 0, malformed: int = 0, duplicates: int = 0) -> None:
         """Add to the counts of ignored messages. Writer only."""
@@ -100,6 +108,9 @@ class EgmCycleLog:
             *(record.flags, record.sequence, record.controller_time, record.answered),
         )
         self._words[_WRITTEN] = written + 1
+        self._timing.add(record.sequence, record.stamp, record.controller_time, record.answered)
+        if EgmFlag.UNANSWERED in record.flags:
+            self._timing.count_unanswered()
         return True
 
     def latest(self) -> EgmCycle | None:

@@ -27,6 +27,7 @@ from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog, MessageCounts
 from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag
 from gelflow.real.egm.target import Target, check_target, tool_frame
+from gelflow.real.egm.timing import EgmTiming
 
 # Time-outs of the helper process, independent of the robot's clock [s, wall].
 _START_TIMEOUT = 30.0
@@ -225,6 +226,11 @@ class EgmArm:
     def counts(self) -> MessageCounts:
         """Counts of ignored messages."""
         return self._opened().counts
+
+    @property
+    def timing(self) -> EgmTiming:
+        """Missed cycles, jitter of the messages and times of the answers since `connect`."""
+        return self._opened().timing
 
     @property
     def pid(self) -> int | None:

@@ -61,7 +61,7 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder))
         right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder))
         gripper = stack.enter_context(gripper_of(lab, clock, recorder, dry_run=dry_run))
-        controller = stack.enter_context(_controller(lab, clock)) if lab.arm.web_services else None
+        controller = stack.enter_context(controller_monitor(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
         stack.callback(arm.close)
         arm.connect()
@@ -115,7 +115,7 @@ def gripper_of(lab: Lab, clock: ScaledClock, recorder: SessionRecorder | None, *
     )
 
 
-def _controller(lab: Lab, clock: ScaledClock) -> ControllerMonitor:
+def controller_monitor(lab: Lab, clock: ScaledClock) -> ControllerMonitor:
     """The monitor of the controller's mode and program, not yet opened."""
     client = WebServicesClient(lab.arm.web_services)
     return ControllerMonitor(client, clock, stale=LIMITS.controller_age * _time_scale(lab))

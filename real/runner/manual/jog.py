@@ -14,7 +14,7 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.limits import LIMITS
-from gelflow.real.runner.cell import StopArm, connect_camera, egm_config, gripper_of
+from gelflow.real.runner.cell import StopArm, connect_camera, controller_monitor, egm_config, gripper_of
 from gelflow.real.runner.manual.question import Result, Session
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.phases import Phase
@@ -22,6 +22,7 @@ from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
 from gelflow.real.runner.touch.grasp_check import nominal_thresholds
 from gelflow.real.runner.touch.guarded_motion import GuardedMotion, in_any_direction
 from gelflow.real.runner.touch.observer import TactileObserver
+from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.real.wsg.checks import may_hold_part
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
@@ -63,6 +64,7 @@ class _Devices:
     arm: EgmArm
     gripper: WsgGripper
     cameras: list[StreamCamera]
+    controller: ControllerMonitor | None
     blind: str  # why the pads cannot be observed; empty when they can
 
 
@@ -78,7 +80,7 @@ def jog(session: Session, wanted: Jog) -> Result:
         devices = stack.enter_context(_open(session))
         supervisor = Supervisor(lab)
         held = _check_gripper(devices.gripper)
-        before = _arm_pose(session, devices.arm)
+        before = _arm_pose(session, devices)
         steps = _steps(session, supervisor, before, wanted)
         if not steps:
             session.say("the gripper is there already")
@@ -125,6 +127,7 @@ def _open(session: Session) -> Iterator[_Devices]:
                 cameras.append(camera)
             except GelflowError as error:
                 blind = blind or str(error)
+        controller = stack.enter_context(controller_monitor(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=session.dry_run), clock=clock)
         stack.callback(arm.close)
         arm.connect()
@@ -132,7 +135,7 @@ def _open(session: Session) -> Iterator[_Devices]:
             stack.enter_context(StopArm(arm, session.recorder))
         interrupts.resume()
         stack.callback(interrupts.defer)
-        yield _Devices(arm, gripper, [] if blind else cameras, blind)
+        yield _Devices(arm, gripper, [] if blind else cameras, controller, blind)
 
 
 def _check_gripper(gripper: WsgGripper) -> bool:
@@ -143,8 +146,11 @@ def _check_gripper(gripper: WsgGripper) -> bool:
     return may_hold_part(state, grasped=False)
 
 
-def _arm_pose(session: Session, arm: EgmArm) -> Pose:
-    """Pose of the gripper frame. Raises PeerTimeout or SafetyError when the arm is not ready to move."""
+def _arm_pose(session: Session, devices: _Devices) -> Pose:
+    """Pose of the gripper frame. Raises PeerError or SafetyError when the arm is not ready to move."""
+    arm = devices.arm
+    if devices.controller is not None:
+        devices.controller.approve()
     if not session.dry_run:
         arm.wait_following(_FOLLOW_TIMEOUT)
     state = arm.state()
@@ -216,6 +222,7 @@ def _executor(session: Session, devices: _Devices, supervisor: Supervisor, recor
         clock=session.clock,
         supervisor=supervisor,
         recorder=recorder,
+        controller=devices.controller,
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.real.egm.driver import EgmArm
-from gelflow.real.runner.cell import connect_camera, egm_config, gripper_of
+from gelflow.real.runner.cell import connect_camera, controller_monitor, egm_config, gripper_of
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
 
@@ -17,7 +17,8 @@ _OBSERVED = 1.0  # time over which the rate of a camera is measured [s]
 def read_status(lab: Lab) -> dict[str, dict[str, Any]]:
     """State of "arm", "gripper", "left camera" and "right camera", each with "ready" and "text".
 
-    A device that does not answer has an "error" instead of its values. References, motions and stops are not sent.
+    With `arm.web_services` in the lab file also "controller": its operating mode and program. A device that does not
+    answer has an "error" instead of its values. References, motions and stops are not sent.
     """
     clock = lab.clock
     readers: dict[str, Callable[[], dict[str, Any]]] = {
@@ -26,6 +27,8 @@ def read_status(lab: Lab) -> dict[str, dict[str, Any]]:
         "left camera": lambda: _camera(lab, clock, "left"),
         "right camera": lambda: _camera(lab, clock, "right"),
     }
+    if lab.arm.web_services:
+        readers["controller"] = lambda: _controller(lab, clock)
     return {name: _read(reader) for name, reader in readers.items()}
 
 
@@ -56,6 +59,11 @@ def _arm(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
         "yaw_deg": math.degrees(yaw),
         "joints_deg": [math.degrees(angle) for angle in state.joints],
     }
+
+
+def _controller(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
+    with controller_monitor(lab, clock) as monitor:
+        return {"ready": True, "text": monitor.approve(), "operating_mode": monitor.operating_mode}
 
 
 def _gripper(lab: Lab, clock: ScaledClock) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
     from gelflow.real.runner.motion_executor import MotionExecutor
+    from gelflow.real.runner.preflight import PreflightItem
     from gelflow.real.runner.run_plan import RunPlan
 
 
@@ -64,24 +65,24 @@ def run(args: argparse.Namespace) -> int:
         checkpoint=checkpoint,
         insertions=args.insertions,
         operator=(lambda motion: _Prompt(output.console, motion)) if lab.part.presentation == "prompt" else None,
-        on_preflight=lambda items: output.console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n"),
         on_attempt=lambda number, attempt: output.text(attempt_line(number, attempt)),
     )
     if args.dry_run:
         with interruptible():
             return _dry_run(output, plan)
-    moved = False
+    passed = False
 
-    def on_motion(motion: "MotionExecutor") -> None:
-        nonlocal moved
-        moved = True
-        at_once.append(motion.hold)
+    def on_preflight(items: "list[PreflightItem]") -> None:
+        nonlocal passed
+        passed = True
+        output.console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n")
 
     with interruptible() as at_once:
         try:
-            results = run_insertions(dataclasses.replace(plan, on_motion=on_motion))
+            plan = dataclasses.replace(plan, on_motion=lambda motion: at_once.append(motion.hold))
+            results = run_insertions(dataclasses.replace(plan, on_preflight=on_preflight))
         except GelflowError as error:
-            if hint := way_out(str(error), args.lab, moved=moved):
+            if hint := way_out(str(error), args.lab, moved=passed):
                 error.add_note(hint)
             raise
     output.console.print(insertion_table(results))
