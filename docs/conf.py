@@ -18,6 +18,7 @@ extensions = [
     "external_links",
     "phases",
     "plain_docstrings",
+    "promises",
     "public_names",
 ]
 exclude_patterns = ["extensions", "**/.ipynb_checkpoints"]

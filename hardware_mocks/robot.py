@@ -47,6 +47,7 @@ class MockRobotConfig:
     tcp_port: int = 0  # of the gripper, in addition to its pty; 0 takes a free port
     truth_port: int = 0  # of the HTTP server of the ground truth; 0 takes a free port
     faults: FaultPlan = field(default_factory=FaultPlan)
+    time_sync: bool = True  # robot time waits for a late simulation; False: it is the scaled wall time, as on a robot
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
 
     def view(self, finger: int) -> tuple[GelAppearance, Lens]:
@@ -74,8 +75,9 @@ class MockRobot:
     def __init__(self, factor: float = 1.0, config: MockRobotConfig | None = None) -> None:
         self.config = config = config or MockRobotConfig()
         self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-")
-        time_sync = f"{self._folder.name}/time_sync"
-        TimeSync.create(time_sync)
+        time_sync = f"{self._folder.name}/time_sync" if config.time_sync else ""
+        if time_sync:
+            TimeSync.create(time_sync)
         self.clock = clock = ScaledClock(factor, time_sync)
         self.cell = SimulatedCellProcess(clock, config.cell)
         # CommTimeout is 0.4 s in wall time, because the computer's jitter does not scale with the clock.

@@ -190,7 +190,7 @@ class ReferenceGenerator:
         elif age > self._config.silence:
             self.latch(f"no EGM message for {age:.3f} s, at most {self._config.silence} s is allowed", now)
         elif age > self._config.stale:
-            self.hold(now, f"no EGM message for {age:.3f} s")
+            self.hold(now, f"no EGM message for {age:.4f} s")
 
     def _restarted(self, last: EgmFeedback, feedback: EgmFeedback, now: float) -> None:
         text = f"EGM was restarted: the message count went back from {last.sequence} to {feedback.sequence}"

@@ -9,7 +9,7 @@ from types import TracebackType
 
 import numpy as np
 
-from gelflow.clock import Clock
+from gelflow.clock import Clock, raise_priority
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
 from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState, Camera, Gripper, GripperState
@@ -27,6 +27,8 @@ ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a mov
 _PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of ARRIVED
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _BLOCKED_AFTER = 3.0  # without progress [s]
+_WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
+_LEAST_WAIT = 0.004  # between two checks, for clocks faster than real time [s, wall]
 
 
 class PartLost(PeerError):
@@ -68,6 +70,7 @@ class MotionExecutor:
         self._heights: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
         self._cycles = 0
         self._flags = EgmFlag(0)
+        self.on_cycles: Callable[[Sequence[EgmCycle]], None] = lambda cycles: None  # called with every cycle of EGM
         self.failure: GelflowError | None = None
         self._thread = threading.Thread(target=self._run, name="motion executor", daemon=True)
 
@@ -176,19 +179,24 @@ class MotionExecutor:
     # Thread
 
     def _run(self) -> None:
+        raise_priority()
         period = self._lab.limits.target_lifetime / 4
+        wait = max(self._clock.wall(_WATCH_PERIOD), _LEAST_WAIT)
+        due = -math.inf  # of the next renewal of the target [s]
         while not self._ending.is_set():
             try:
                 self._watch()
+                now = self._clock.now()
                 with self._lock:
                     goal, speeds = self._goal, self._speeds
-                    if goal is not None:
+                    if goal is not None and now >= due:
                         self._post(goal, speeds)
+                        due = now + period
                 self._log()
             except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it
                 self._fail(error)
                 return
-            self._ending.wait(self._clock.wall(period))
+            self._ending.wait(wait)
 
     def _post(self, goal: Pose, speeds: tuple[float, float]) -> None:
         state = self._arm.state()
@@ -199,11 +207,12 @@ class MotionExecutor:
 
     def _watch(self) -> None:
         """Raise when data that motion relies on is stale, or a device reports a fault."""
+        now = self._clock.now()  # before the state is read: a delay of this thread in between is no age
         state = self._arm.state()
         self.supervisor.watch(state)
         if self._controller is not None:
             self._controller.check()
-        self._check_age("pose", state, self._lab.limits.stale_pose)
+        self._check_age("pose", now - state.stamp, self._lab.limits.stale_pose)
         self._recorder.check()
         for camera in self._cameras:
             camera.latest()
@@ -224,13 +233,14 @@ class MotionExecutor:
             self.hold()
             self._recorder.event("part lost", {"grasp": gripper.grasp, "width": gripper.width})
 
-    def _check_age(self, what: str, state: ArmState, limit: float) -> None:
-        age = self._clock.now() - state.stamp
+    @staticmethod
+    def _check_age(what: str, age: float, limit: float) -> None:
         if age > limit:
             raise PeerTimeout(f"the arm's {what} is {1e3 * age:.0f} ms old, at most {1e3 * limit:.0f} ms is allowed")
 
     def _log(self) -> None:
         records = self._arm.drain_log()
+        self.on_cycles(records)
         with self._lock:
             self._heights.extend(zip((r.stamp for r in records), self._gripper_heights(records), strict=True))
         for record in records:

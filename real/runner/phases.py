@@ -70,6 +70,7 @@ class PhaseMachine:
 
     def __init__(self, on_change: Callable[[Phase], None] = lambda phase: None) -> None:
         self._phase = Phase.IDLE
+        self.latched = ""  # the reason why motion is forbidden; empty while it is allowed
         self._on_change = on_change
         self._lock = threading.Lock()
 
@@ -84,6 +85,8 @@ class PhaseMachine:
             present = self._phase
             if phase == present:
                 return
+            if present == Phase.LATCHED:
+                raise SafetyError(f"motion is latched: {self.latched}; inspect the robot, then start a new run")
             allowed = phase in PHASES[present].following or phase == Phase.LATCHED
             if not allowed and not (phase == Phase.HOLD and present in HOLDABLE):
                 raise SafetyError(f"phase {phase} may not follow phase {present}; start a new run")

@@ -25,17 +25,16 @@ class Supervisor:
     def __init__(self, lab: Lab, *, on_phase: Callable[[Phase], None] = lambda phase: None) -> None:
         self._lab = lab
         self._base_to_hole = lab.hole.pose.inverse()
-        self._latched = ""
         self.phases = PhaseMachine(on_phase)
 
     @property
     def latched(self) -> str:
         """The reason why motion is forbidden; empty while motion is allowed."""
-        return self._latched
+        return self.phases.latched
 
     def latch(self, reason: str) -> None:
         """Forbid motion for the rest of the run. The first reason is kept."""
-        self._latched = self._latched or reason
+        self.phases.latched = self.phases.latched or reason
         self.phases.enter(Phase.LATCHED)
 
     def watch(self, state: ArmState) -> None:
@@ -57,8 +56,8 @@ class Supervisor:
         Raises SafetyError when the target is not finite, outside the workspace, too far from the present pose or too
         fast, and always after a latch. The arm's driver checks joint ranges, because it knows the controller's tool.
         """
-        if self._latched:
-            raise SafetyError(f"motion is latched: {self._latched}; inspect the robot, then start a new run")
+        if self.latched:
+            raise SafetyError(f"motion is latched: {self.latched}; inspect the robot, then start a new run")
         self._check_numbers(target)
         self._check_workspace(target)
         self._check_change(target, previous, speed, turn_speed)

@@ -217,4 +217,9 @@ class HeldPart:
         return self._motion.supervisor.hole_coordinates(self._motion.pose())[3]
 
     def _event(self, name: str, contact: Contact, **values: Any) -> None:
-        self._recorder.event(name, {"shear_mm": contact.reading.shear, "change_mm": contact.change, **values})
+        values |= {
+            "shear_mm": contact.reading.shear,
+            "change_mm": contact.change,
+            "image_at": contact.reading.frame.stamp,
+        }
+        self._recorder.event(name, values)

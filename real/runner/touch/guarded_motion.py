@@ -20,6 +20,8 @@ from gelflow.time_sync import RUNNER
 
 # From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
 _REACTION_TIME = 0.05
+# Without a readable image, after which the arm holds: 250 ms less the longest wait of the observer and tracking [s].
+_BLIND_TIME = LIMITS.image_age - 0.03
 _REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
 _FREE_OVERSHOOT = 0.5e-3  # after contact in motions up, sideways and above the range in which the rim is searched [m]
 _DOWNWARD = 0.05e-3  # a target further below the arm than this is a motion towards contact [m]
@@ -111,7 +113,7 @@ class GuardedMotion:
         on_reading: called with every reading; its return value True ends the motion as at contact
 
         Raises TouchLost when a pad is not readable for `limits.stale_frame`, PeerTimeout when the arm does not arrive.
-        When a pad is not readable for 250 ms the arm holds.
+        The arm holds before a pad was unreadable for 250 ms.
         """
         zero = np.zeros((2, 2)) if baseline is None else baseline
         speed = self.speed_towards(target) if speed is None else speed
@@ -127,7 +129,7 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                blind = self.observer.blind_time() > LIMITS.image_age
+                blind = self.observer.blind_time() >= _BLIND_TIME
                 if blind:
                     self._motion.hold()
             if blind:
@@ -150,7 +152,7 @@ class GuardedMotion:
         phases.enter(Phase.HOLD)
         values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
         self._recorder.event("pad not readable", values)
-        while (seconds := self.observer.blind_time()) > LIMITS.image_age:
+        while (seconds := self.observer.blind_time()) >= _BLIND_TIME:
             if seconds > self._lab.limits.stale_frame:
                 raise TouchLost(
                     f"camera {self.observer.blind_camera}: no readable image for {seconds:.2f} s with a part held, "

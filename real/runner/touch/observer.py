@@ -19,7 +19,7 @@ from gelflow.time_sync import MAX_LEAD, RUNNER
 
 _VISIBLE_FRACTION = 0.6  # of a pad's markers; an image with fewer visible markers is not readable
 _LEAST_NOISE = 1e-4  # largest change of a marker between two images, below which the camera repeats one image [px]
-_LONGEST_WAIT = 0.05  # for an image, before a caller can react to a pad that is not readable [s]
+_LONGEST_WAIT = 0.01  # for an image, before a caller can react to a pad that is not readable [s]
 _POLL = 1e-3  # period of the check for new images [s, wall]
 _READINGS_AT_REST = 5  # averaged to compare the pads before and after an event
 _PERIODS = 20  # intervals between images from which the period is taken
@@ -96,7 +96,7 @@ class TactileObserver:
         return self.reference
 
     def update(self) -> TactileReading | None:
-        """Wait for the next image of any camera, for at most 50 ms, and track all new ones.
+        """Wait for the next image of any camera, for at most 10 ms, and track all new ones.
 
         Returns the reading of the newest images, with depth 0; None without a new image, and when the newest image of a
         pad is not readable.

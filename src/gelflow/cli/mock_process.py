@@ -26,7 +26,7 @@ def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: o
     `more` are further options of `gelflow mock`, by name; None omits one.
     Raises PeerError with the process's last line of standard error when it does not start.
     """
-    truth_port = _free_port(socket.SOCK_STREAM)
+    truth_port = free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as errors:
         lab = Path(folder) / "lab.toml"
         options: dict[str, object] = {
@@ -34,7 +34,7 @@ def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: o
             "--factor": factor,
             "--seed": seed,
             "--truth-port": truth_port,
-            "--egm-port": _free_port(socket.SOCK_DGRAM),
+            "--egm-port": free_port(socket.SOCK_DGRAM),
         }
         options |= {f"--{name}": value for name, value in {"preset": preset, **more}.items() if value is not None}
         code = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
@@ -84,7 +84,7 @@ def _await_file(path: Path, process: subprocess.Popen[bytes], errors: IO[bytes])
         time.sleep(0.05)
 
 
-def _free_port(kind: socket.SocketKind) -> int:
+def free_port(kind: socket.SocketKind) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,4 +1,4 @@
-"""`gelflow soak`: insertions with the mock robot under random fault plans and worlds, checked by fixed rules."""
+"""`gelflow soak`: the runner with the mock robot: random fault plans, its promises one by one, endurance of EGM."""
 
 import argparse
 import statistics
@@ -11,7 +11,8 @@ from rich.table import Table
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_json, add_out, add_preset, add_seed, check_at_least
 from gelflow.cli.output import Output, progress_bar
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, UsageError
+from gelflow.toml_tables import suggestion
 
 if TYPE_CHECKING:
     from gelflow.cli.soak_case import SoakCase
@@ -23,7 +24,9 @@ _FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--plans", type=int, default=20, metavar="N", help="number of plans (default %(default)s)")
-    parser.add_argument("--only", type=int, metavar="SEED", help="run the plan of this seed alone, and keep its files")
+    parser.add_argument("--promises", action="store_true", help="measure the runner's promises instead, in real time")
+    parser.add_argument("--egm", type=float, metavar="MINUTES", help="run EGM, cameras, tracking and recording instead")
+    parser.add_argument("--only", metavar="WHICH", help="the plan of this seed alone, or this promise alone")
     parser.add_argument("--factor", type=float, default=4.0, metavar="X", help="robot time over wall time (default 4)")
     parser.add_argument(
         "--jitter",
@@ -40,25 +43,83 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the plans that the folder does not contain yet, then print all counts. Negative: a rule was violated."""
+    """Run what the options name. Negative: a rule was violated, or a promise or a bound did not hold."""
+    if args.promises:
+        return _run_promises(args)
+    if args.egm is not None:
+        return _run_endurance(args)
+    return _run_plans(args)
+
+
+def _run_promises(args: argparse.Namespace) -> int:
+    """Measure the promises one after the other."""
+    from gelflow.cli.promises.outcome import Row, measure
+    from gelflow.cli.promises.report import remarks, table, to_json, write_json
+    from gelflow.cli.promises.table import PROMISES
+
+    output = Output(args.json)
+    if args.only is not None and args.only not in PROMISES:
+        raise UsageError(f"there is no promise {args.only!r}; {suggestion(args.only, PROMISES)}")
+    chosen = [PROMISES[args.only]] if args.only is not None else list(PROMISES.values())
+    rows: list[Row] = []
+    with progress_bar(count=True) as progress:
+        bar = progress.add_task("promises", total=len(chosen))
+        for promise in chosen:
+            rows.append(measure(promise))
+            progress.advance(bar)
+    output.console.print(table(rows))
+    for line in remarks(rows):
+        output.text(line)
+    result = to_json(rows)
+    output.text(f"{sum(row.held for row in rows)} of {len(rows)} promises held; load {result['load']}")
+    write_json(args.out / "promises.json", result)
+    output.result(result)
+    return SUCCESS if all(row.held for row in rows) else NEGATIVE_RESULT
+
+
+def _run_endurance(args: argparse.Namespace) -> int:
+    """Run EGM with cameras, tracking and recording for some minutes."""
+    from gelflow.cli.promises.endurance import BOUND, measure_endurance
+    from gelflow.cli.promises.report import write_json
+
+    if not 0 < args.egm <= 1440:
+        raise UsageError(f"--egm must be above 0 and at most 1440 minutes, got {args.egm:g}")
+    output = Output(args.json)
+    result = measure_endurance(60 * args.egm)
+    for line in result.lines():
+        output.text(line)
+    write_json(args.out / "egm.json", result.to_json())
+    output.result(result.to_json())
+    return SUCCESS if result.missed <= BOUND else NEGATIVE_RESULT
+
+
+def _run_plans(args: argparse.Namespace) -> int:
+    """Run the plans that the folder does not contain yet, then print all counts."""
     from gelflow.cli.soak_case import SoakCase
     from gelflow.real.soak.ledger import Ledger
 
-    check_at_least(args, plans=1, seed=0, only=0, jobs=1)
+    check_at_least(args, plans=1, seed=0, jobs=1)
+    only = None if args.only is None else _seed(args.only)
     output = Output(args.json)
     ledger = Ledger(args.out / "soak.jsonl")
-    seeds = [args.only] if args.only is not None else range(args.seed, args.seed + args.plans)
-    left = [seed for seed in seeds if args.only is not None or seed not in ledger.rows]
+    seeds = [only] if only is not None else range(args.seed, args.seed + args.plans)
+    left = [seed for seed in seeds if only is not None or seed not in ledger.rows]
     if len(left) < len(seeds):
         output.text(f"{len(seeds) - len(left)} of {len(seeds)} plans are in {args.out} already.")
     cases = [SoakCase.of(seed, factor=args.factor, jitter=args.jitter, preset=args.preset) for seed in left]
     _run_all(cases, ledger, output, args)
-    if args.only is not None:
-        output.result({"rows": [ledger.rows[args.only]]})
-        return NEGATIVE_RESULT if ledger.rows[args.only]["violations"] else SUCCESS
+    if only is not None:
+        output.result({"rows": [ledger.rows[only]]})
+        return NEGATIVE_RESULT if ledger.rows[only]["violations"] else SUCCESS
     _show(output, ledger)
     output.result({"plans": len(ledger.rows), "failing": ledger.failing(), **ledger.counts()})
     return NEGATIVE_RESULT if ledger.failing() else SUCCESS
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise UsageError(f"--only is the seed of a plan, or with --promises the name of one; got {text!r}")
+    return int(text)
 
 
 def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: argparse.Namespace) -> None:
