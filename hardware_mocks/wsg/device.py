@@ -1,6 +1,7 @@
 """Mock WSG-50 on the wire: one device behind a pty, a TCP port, or both."""
 
 import contextlib
+import math
 import os
 import selectors
 import socket
@@ -8,12 +9,13 @@ import threading
 import tty
 from typing import Any
 
-from gelflow.clock import Clock
+from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.message_faults import MessageFault, MessageFaults
 from gelflow.hardware_mocks.plant import GripperPlant
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.hardware_mocks.wsg.protocol import WsgDevice, WsgSession
+from gelflow.time_sync import GRIPPER, MAX_LEAD
 
 _TICK = 0.005  # period of the device [s]; half the shortest period of updates
 _SHORTEST_WAIT = 0.0005  # lower bound of the wait for any clock factor [s, wall]
@@ -205,6 +207,7 @@ class MockWsgGripper:
         assert self._selector is not None
         wait = max(self._clock.wall(_TICK), _SHORTEST_WAIT)
         while not self._ending.wait(0):
+            self._allow(self._clock.now() + _TICK + MAX_LEAD)  # robot time waits for late answers
             for key, _ in self._selector.select(wait):
                 key.data()
             self._device.poll()
@@ -221,6 +224,12 @@ class MockWsgGripper:
                 self._network.deliver(self._client_session, now)
                 self._unsent += b"".join(self._network.send(self._client_session.tick(), now))
                 self._flush()
+
+        self._allow(math.inf)
+
+    def _allow(self, until: float) -> None:
+        if isinstance(self._clock, ScaledClock):
+            self._clock.grant(GRIPPER, until)
 
     def _read_line(self) -> None:
         assert self._line_session is not None

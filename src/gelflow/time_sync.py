@@ -12,8 +12,8 @@ from array import array
 
 from gelflow.errors import UsageError
 
-_SLOTS = 5  # the last slot belongs to the runner, which may have to stop the arm after a camera frame
-SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, RUNNER = range(_SLOTS)
+_SLOTS = 6  # the last slot belongs to the runner, which may have to stop the arm after a camera frame
+SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, GRIPPER, RUNNER = range(_SLOTS)
 MAX_LEAD = 0.02  # lead of robot time over the last finished step, at most [s]
 MIN_WAIT = 2e-4  # shortest sleep while robot time stands still [s, wall]
 _WORDS = 1 + 2 * _SLOTS  # delay [s], then for each slot: wall time of its last grant [s], its limit [s, robot time]
