@@ -14,6 +14,8 @@ from gelflow.real.runner import lab
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
+_DISK = 4  # the limit of a recording's delay relative to a robot's: a test of the runner is none of the disk
+
 
 def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
     """Addresses, calibration, taught poses and time limits of `robot`.
@@ -49,7 +51,9 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
         part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
-        limits=_limits(MOCK_TIME_SCALE * factor) if jitter is None else _limits(1.0, jitter * factor, disk=factor),
+        limits=_limits(MOCK_TIME_SCALE * factor)
+        if jitter is None
+        else _limits(1.0, jitter * factor, disk=_DISK * factor),
         clock_factor=factor,
         time_sync=time_sync,
     )
