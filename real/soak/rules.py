@@ -16,7 +16,7 @@ _BEYOND = 2.1e-3  # a reference less outside the workspace is within the driver'
 class RunFacts:
     """One run under one plan."""
 
-    outcome: str  # of the part as the runner reports it; "error" when the run ended by an error
+    outcome: str  # of the part as the runner reports it, or how the run ended without one
     exit_code: int | None  # None: the run was ended from outside, because it did not end
     errors: str  # standard error of the run
     idle: float  # longest time without any motion [s]
@@ -32,7 +32,7 @@ RULES: Mapping[str, Callable[[RunFacts], bool]] = MappingProxyType(
         "motion after a latch": lambda run: run.session.moved_after_latch > _MOVED,
         "target outside was not refused": lambda run: run.session.outside > _BEYOND,
         "hang": lambda run: run.exit_code is None or run.idle > run.allowed_idle,
-        "unexpected exception": lambda run: "Traceback" in run.errors or run.exit_code not in (0, 1, 2, None),
+        "unexpected exception": lambda run: "Traceback" in run.errors or run.exit_code not in (0, 1, 2, 143, None),
         "no stop was sent": lambda run: run.session.moved and not run.session.stop_recorded,
         "recording not readable": lambda run: run.session.readable == "no",
     }

@@ -1,6 +1,7 @@
 """One case of a soak test: a mock robot with a random world and fault plan in one process, the runner in another."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from gelflow.toml_tables import toml_text
 _POLL = 0.25  # of the true state [s, wall]
 _STILL = 1e-6  # change of a position that is no motion [m]
 _WALL_LIMIT = 240.0  # of a run, in which robot time may have stopped [s, wall]
+_OUTCOME_LENGTH = 60  # characters; the message of the row is longer
 _END_LIMIT = 10.0  # from SIGTERM to the end of the runner [s, wall]
 
 
@@ -76,7 +78,7 @@ class SoakCase:
         session = read_session(folder / "run" / "session.mcap", lab)
         part = (watch.truth.get("parts") or [{}])[0]
         run = RunFacts(
-            outcome=_outcome((folder / "stdout.txt").read_text(errors="replace")),
+            outcome=_outcome((folder / "stdout.txt").read_text(errors="replace"), errors),
             exit_code=watch.exit_code,
             errors=errors,
             idle=watch.idle,
@@ -155,12 +157,13 @@ def _end(runner: "subprocess.Popen[bytes]") -> None:
             runner.wait()
 
 
-def _outcome(output: str) -> str:
-    """The outcome of the part in the result of `gelflow run --json`; "error" when there is none."""
+def _outcome(output: str, errors: str) -> str:
+    """The outcome of the part in the result of `gelflow run --json`, without numbers; else that of the run."""
     try:
-        return str(json.loads(output)["insertions"][0]["outcome"])
+        text = str(json.loads(output)["insertions"][0]["outcome"])
+        return re.sub(r"\d+(\.\d+)?", "N", text)[:_OUTCOME_LENGTH]
     except (ValueError, KeyError, IndexError, TypeError):
-        return "error"
+        return "refused at preflight" if "preflight failed" in errors else "stopped by an error"
 
 
 def try_case(case: SoakCase, keep: Path | None) -> dict[str, Any] | str:
