@@ -19,6 +19,7 @@ from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingRes
 TOLERANCE = 0.1
 _ROW_TOLERANCE = 0.4  # of the distance of a marker from its calibrated position / pitch; at 0.5 rows are exchanged
 _MIN_VISIBLE = 0.8  # fraction of valid markers of the visible part, at rest
+_MIN_PART = 0.4  # smallest visible part of the printed grid for which the success of the policy was measured
 _MAX_CHOICES = 4  # possible ranges that a message lists
 
 Floats = NDArray[np.float64]
@@ -138,9 +139,14 @@ def find_visible_part(
 def start_at_rest(mount: CameraMount, image: NDArray[np.uint8]) -> TrackingResult:
     """The markers in `image` (B G R) of the gel at rest, found as `mount` describes them.
 
-    Raises PeerError when fewer than 80 % of the markers are visible, with the lines for the lab file where the image
-    shows another part of the printed grid, UsageError when the scale does not fit.
+    Raises PeerError when the visible part is less than 40 % of the printed grid, or fewer than 80 % of its markers are
+    measured, with the lines for the lab file where the image shows another part. Raises UsageError for a wrong scale.
     """
+    count, printed = mount.visible_count, mount.rows * mount.cols
+    if count < _MIN_PART * printed:
+        raise PeerError(
+            f"the image shows {count} of {printed} markers, at least {_MIN_PART:.0%} are required: move the camera"
+        )
     try:
         rest = MarkerTracker(mount.tracker_config()).start(image)
     except TrackerInitError as error:

@@ -199,6 +199,8 @@ def test_the_error_of_preflight_names_the_lines_to_write() -> None:
     near, *_ = shown(view(zoom=1.2))
     with pytest.raises(PeerError, match=r"does not tell which lines .* visible_cols = \[2, 13\], or "):
         start_at_rest(CameraMount(pixels_per_mm=1.2 * SCALE), near.image)
+    with pytest.raises(PeerError, match="shows 90 of 252 markers, at least 40% are required"):
+        start_at_rest(CameraMount(pixels_per_mm=SCALE, visible_rows=(1, 9), visible_cols=(5, 14)), frame.image)
     with pytest.raises(PeerError, match="which is no part of 12 rows of 9"):
         start_at_rest(CameraMount(12, 9, pixels_per_mm=SCALE), frame.image)
 
