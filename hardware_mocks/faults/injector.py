@@ -4,11 +4,11 @@ import math
 import random
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, PeerError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
@@ -18,6 +18,7 @@ from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.task import INSERTION
 from gelflow.time_sync import MIN_WAIT
 
+_STOPS = ("emergency_stop", "motors_off", "rapid_stop")  # of the arm
 _PERIOD = 0.002  # of the checks for events [s]
 # Heights of the lower face at which descent and lowering begin, without `below` [m]: 0.1 mm after the begin.
 _DESCENT_BELOW = INSERTION.start_height - 0.1e-3
@@ -26,31 +27,33 @@ _LOWERING_BELOW = INSERTION.start_height - INSERTION.descent - 0.1e-3
 
 @dataclass(frozen=True)
 class Devices:
-    """The devices of a mock robot."""
+    """The devices of a mock robot, and the faults that are active on them."""
 
     arm: MockEgmArm
     gripper: MockWsgGripper
     cameras: tuple[MockMjpegCamera, ...]
     cell: SimulatedCellProcess
+    _active: dict[int, Fault] = field(default_factory=dict)
 
     def begin(self, number: int, fault: Fault) -> None:
         """Begin a fault under this number."""
+        self._active[number] = fault
         if fault.device == "arm":
             self._begin_arm(number, fault)
         elif fault.device == "gripper":
             self._begin_gripper(number, fault)
         elif fault.device == "world":
-            self._change_world(fault, fault.values["factor"])
+            self._set_world()
         else:
             for camera in self._chosen(fault.device):
                 camera.begin_fault(number, fault.kind, fault.values)
 
     def end(self, number: int, fault: Fault) -> None:
         """End a fault; an emergency stop is released, and the controller may start EGM again."""
+        self._active.pop(number, None)
         if fault.device == "arm":
-            if fault.kind in ("emergency_stop", "motors_off", "rapid_stop"):
-                self.arm.motors(True)
-                self.arm.rapid(True)
+            if fault.kind in _STOPS:
+                self._set_stops()
             elif fault.kind == "disconnect":
                 self.arm.silence(0.0)
             else:
@@ -58,7 +61,7 @@ class Devices:
         elif fault.device == "gripper":
             self.gripper.end_fault(number)  # FAST STOP remains until it is acknowledged
         elif fault.device == "world":
-            self._change_world(fault, 1.0)
+            self._set_world()
         else:
             for camera in self._chosen(fault.device):
                 camera.end_fault(number)
@@ -68,11 +71,8 @@ class Devices:
             self.arm.restart_sequence()
         elif fault.kind == "disconnect":
             self.arm.silence(min(fault.duration, 1e9))
-        elif fault.kind in ("emergency_stop", "motors_off", "rapid_stop"):
-            if fault.kind != "rapid_stop":
-                self.arm.motors(False)
-            if fault.kind != "motors_off":
-                self.arm.rapid(False)
+        elif fault.kind in _STOPS:
+            self._set_stops()
         else:
             self.arm.begin_fault(number, fault.kind, fault.direction, fault.values)
 
@@ -84,9 +84,18 @@ class Devices:
         else:
             self.gripper.begin_fault(number, fault.kind, fault.direction, fault.values)
 
-    def _change_world(self, fault: Fault, factor: float) -> None:
-        stiff = fault.kind == "stiff_gel"
-        self.cell.change_world(gel_stiffness=factor if stiff else 1.0, pad_friction=1.0 if stiff else factor)
+    def _set_stops(self) -> None:
+        """Motors and program run unless an active fault stops them."""
+        kinds = {fault.kind for fault in self._active.values() if fault.device == "arm"}
+        self.arm.motors(not kinds & {"emergency_stop", "motors_off"})
+        self.arm.rapid(not kinds & {"emergency_stop", "rapid_stop"})
+
+    def _set_world(self) -> None:
+        factors = {"stiff_gel": 1.0, "slip": 1.0}
+        for fault in self._active.values():
+            if fault.device == "world":
+                factors[fault.kind] *= fault.values["factor"]
+        self.cell.change_world(gel_stiffness=factors["stiff_gel"], pad_friction=factors["slip"])
 
     def _chosen(self, device: str) -> tuple[MockMjpegCamera, ...]:
         return self.cameras if device == "cameras" else (self.cameras[device == "right_camera"],)
@@ -155,6 +164,7 @@ class FaultInjector:
         self._occurrences = [_Occurrence(number, fault) for number, fault in enumerate(plan.faults)]
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
         self.log: list[dict[str, Any]] = []  # begins and ends: time [s], fault, what
 
     def start(self) -> None:
@@ -163,12 +173,20 @@ class FaultInjector:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop; active faults stay active."""
+        """Stop; active faults stay active. Raises PeerError when the injector has failed."""
         self._ending.set()
         if self._thread is not None:
             self._thread.join()
+        if self._failure is not None:
+            raise PeerError(f"a fault could not be injected: {self._failure}") from self._failure
 
     def _run(self) -> None:
+        try:
+            self._watch()
+        except Exception as error:  # noqa: BLE001 - `stop` raises it
+            self._failure = error
+
+    def _watch(self) -> None:
         wait = max(self._clock.wall(_PERIOD), MIN_WAIT)
         while not self._ending.wait(wait):
             now, progress = self._clock.now(), self._devices.cell.progress()

@@ -6,11 +6,13 @@ import struct
 import time
 import urllib.request
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 
 from gelflow.clock import ScaledClock
+from gelflow.hardware_mocks.faults.injector import Devices
 from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
@@ -84,3 +86,31 @@ def test_grip_friction_and_gel_stiffness_change_while_the_cell_runs() -> None:
     cell.change_world(gel_stiffness=1.0, pad_friction=0.001)
     cell.advance(50)
     assert cell.truth()["part"]["largest_slip"] > 5e-3  # the part falls
+
+
+class RecordingDevice:
+    """Notes the calls of its methods."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *values, **named: self.calls.append((name, values, named))
+
+
+def test_overlapping_faults_end_one_by_one() -> None:
+    arm, cell = RecordingDevice(), RecordingDevice()
+    devices = Devices(arm, RecordingDevice(), (), cell)  # type: ignore[arg-type]
+    emergency, program = Fault("arm", "emergency_stop", at=1), Fault("arm", "rapid_stop", at=1)
+    stiff, slip = Fault("world", "stiff_gel", at=1), Fault("world", "slip", at=1)
+    devices.begin(0, emergency)
+    devices.begin(1, program)
+    devices.end(0, emergency)
+    assert arm.calls[-2:] == [("motors", (True,), {}), ("rapid", (False,), {})]
+    devices.end(1, program)
+    assert arm.calls[-2:] == [("motors", (True,), {}), ("rapid", (True,), {})]
+    devices.begin(2, stiff)
+    devices.begin(3, slip)
+    assert cell.calls[-1] == ("change_world", (), {"gel_stiffness": 5.0, "pad_friction": 0.2})
+    devices.end(2, stiff)
+    assert cell.calls[-1] == ("change_world", (), {"gel_stiffness": 1.0, "pad_friction": 0.2})
