@@ -4,12 +4,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 
 _RISE = 0.1  # of the final change: a signal above this has changed, one below half of it is at rest
 _NOISE = 5.0  # standard deviations of the noise that a change exceeds as well
+_BURST = 1e-3  # between samples that were received together [s]
 _VISIBLE = 0.5  # of the final change: the largest level that a noisy signal may need
 
 
@@ -46,7 +47,9 @@ def estimate_latency(
     Each signal changes between two of its samples, so the result is an interval as wide as both sampling periods
     together: ±38 ms for images every 33 ms and gripper states every 40 ms. `combine_latencies` narrows it, to ±15 ms
     with 20 grasps. A noise above 3 % of the change makes it less reliable. The delay of the gripper's own measurement
-    counts as a negative latency of the camera. Add the result to the key `latency` of the camera in the lab file.
+    counts as a negative latency of the camera. Samples that were received in a burst widen the interval. Add the result
+    to the key `latency` of the camera in the lab file.
+
     Raises UsageError for series of different lengths or unordered times.
     """
     contact = _onset(force_times, force, "force")
@@ -88,6 +91,21 @@ def _onset(times: ArrayLike, values: ArrayLike, name: str) -> tuple[float, float
         return None
     start = int(at_rest[-1])
     end = start + int(np.argmax(change[start:] > level))
+    first = float(_earliest(t)[start])
     # A rise that began just before the sample at `start` is within the noise there: extrapolate it back to zero.
-    before = (t[end] - t[start]) * change[start] / (change[end] - change[start])
-    return float(t[start] - before), float(t[end])
+    before = (t[end] - first) * change[start] / (change[end] - change[start])
+    return float(first - before), float(t[end])
+
+
+def _earliest(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The earliest times at which samples with these times of reception may have been measured [s].
+
+    Samples in a burst were received late, because the receiver was stopped: they may be as old as the last sample that
+    is as far from its neighbours as usual.
+    """
+    gaps = np.diff(times)
+    usual = np.median(gaps[gaps > _BURST]) if (gaps > _BURST).any() else np.inf
+    alone = np.concatenate([[True], gaps > usual / 2]) & np.concatenate([gaps > usual / 2, [True]])
+    alone[0] = True
+    last = np.maximum.accumulate(np.where(alone, np.arange(times.size), 0))
+    return times[last]
