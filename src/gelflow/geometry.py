@@ -129,8 +129,9 @@ class Pose:
         return np.array(list(zip(*rotation_columns(self.quaternion.tolist()), strict=True)))
 
     def apply(self, points: Array) -> Array:
-        """Points of this frame, expressed in the parent frame [m], shape (n, 3)."""
-        return np.asarray(points @ self.matrix().T + self.position)
+        """Points of this frame, expressed in the parent frame [m], shape (n, 3); not finite where an input is not."""
+        with np.errstate(invalid="ignore"):  # the product of 0 and an infinite coordinate, which the caller refuses
+            return np.asarray(points @ self.matrix().T + self.position)
 
     def __matmul__(self, other: "Pose") -> "Pose":
         quaternion = multiply(self.quaternion.tolist(), other.quaternion.tolist())

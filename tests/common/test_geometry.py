@@ -65,3 +65,10 @@ def test_yaw_and_is_near() -> None:
     other = Pose(np.array([1.0, 2.0, 3.001]), yaw_quaternion(-0.31))
     assert pose.is_near(other, 2e-3, 0.02)
     assert not pose.is_near(other, 0.5e-3, 0.02) and not pose.is_near(other, 2e-3, 0.005)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_pose_that_is_not_finite_gives_no_warning() -> None:
+    far = Pose(np.array([0.0, np.inf, np.nan]), np.array([1.0, 0.0, 0.0, 0.0]))
+    turned = Pose(np.zeros(3), yaw_quaternion(0.3))
+    assert not np.isfinite((turned @ far).position).any()
