@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _DISK = 4  # the limit of a recording's delay relative to a robot's: a test of the runner is none of the disk
 
+_VISIBLE_LINE = 0.3  # fraction of the dots of a visible line that are inside the image
+
 
 def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
     """Addresses, calibration, taught poses and time limits of `robot`.
@@ -62,7 +64,8 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
 def _camera(robot: "MockRobot", finger: int) -> lab.CameraSettings:
     grid, view = robot.config.cell.grid, robot.config.cell.world.cameras[finger]
     scale: dict[str, Any] = {"pixels_per_mm": view.pixels_per_mm}
-    if view.calibrated and not view.lens.ideal:
+    visible = _visible_lines(robot, finger)
+    if view.calibrated and (visible or not view.lens.ideal):
         scale = {"calibration": str(_write_calibration(robot, finger))}
     return lab.CameraSettings(
         source=robot.cameras[finger].url,
@@ -73,7 +76,21 @@ def _camera(robot: "MockRobot", finger: int) -> lab.CameraSettings:
         rotation_deg=robot.config.rotations[finger],
         mirrored=True,
         **scale,
+        **visible,
     )
+
+
+def _visible_lines(robot: "MockRobot", finger: int) -> dict[str, Any]:
+    """The visible rows and columns of a grid that the image border cuts; empty for a grid that is entirely visible."""
+    appearance, lens = robot.config.view(finger)
+    grid = robot.config.cell.grid
+    in_image = lens.apply(appearance.to_pixels(grid.positions()), appearance)
+    limit = np.array([appearance.width, appearance.height]) - 1 - appearance.radius
+    inside = np.all((in_image >= appearance.radius) & (in_image <= limit), axis=1).reshape(grid.rows, grid.cols)
+    rows, cols = (np.flatnonzero(inside.mean(axis=axis) >= _VISIBLE_LINE) + 1 for axis in (1, 0))
+    if (len(rows) == grid.rows and len(cols) == grid.cols) or min(len(rows), len(cols)) < 3:
+        return {}
+    return {"visible_rows": (int(rows[0]), int(rows[-1])), "visible_cols": (int(cols[0]), int(cols[-1]))}
 
 
 def _write_calibration(robot: "MockRobot", finger: int) -> Path:
