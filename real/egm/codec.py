@@ -114,6 +114,9 @@ def decode_robot(data: bytes) -> EgmFeedback:
             f"{len(measured.joints.joints)} joints and {'a' if measured.HasField('cartesian') else 'no'} pose; "
             "set EGM up with EGMSetupUC \\Pose and EGMActPose"
         )
+    # The front part of a message may be a valid message, too.
+    if not (header.HasField("seqno") and message.HasField("motorState") and message.HasField("mciState")):
+        raise PeerError("expected EGM feedback with a count and the states of motors and motion control; it is cut off")
     position, quaternion = _pose(measured.cartesian, measured.cartesian.HasField("orient"))
     a, b, c, d, e, f = measured.joints.joints
     radian = math.pi / 180

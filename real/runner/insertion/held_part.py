@@ -1,5 +1,6 @@
 """Motions of a held part about the hole, each of them guarded, and the search of the rim's height by touch."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -67,6 +68,7 @@ class HeldPart:
         self.thresholds = check.thresholds
         self.height_offset = 0.0
         self._slip = 0.0
+        self._deadline = math.inf
         self._baseline: NDArray[np.float64] = np.zeros((2, 2))
         self.observe(observer)
 
@@ -74,6 +76,10 @@ class HeldPart:
         """Use `observer` from now on, at rest at its reference."""
         self._guard = GuardedMotion(self._motion, observer, self._lab, self._clock, self._recorder)
         self._baseline = np.zeros((2, 2))
+
+    def limit(self, deadline: float) -> None:
+        """Set the robot time [s] after which approach, descent and lowering raise PeerTimeout; retreat goes on."""
+        self._deadline = deadline
 
     @property
     def start_height(self) -> float:
@@ -106,6 +112,7 @@ class HeldPart:
 
     def _move_to(self, planar_pose: PlanarPose, height: float, *, speed: float | None = None) -> bool:
         """Move towards a start pose; False after contact, whose height is then that of the rim."""
+        self._guard.limit(self._deadline)
         contact = self._guard.move(
             self._pose(planar_pose, height),
             threshold=self.thresholds.contact,
@@ -119,10 +126,10 @@ class HeldPart:
             self._set_rim(found)
         return contact is None
 
-    def descend(self, planar_pose: PlanarPose, observer: TactileObserver, *, deadline: float) -> Descent:
+    def descend(self, planar_pose: PlanarPose, observer: TactileObserver) -> Descent:
         """Descend from the start while `observer`, whose reference was taken there, keeps the readings."""
         self.observe(observer)
-        self._guard.limit(deadline)
+        self._guard.limit(self._deadline)
         start = self._motion.pose().position[2]
         slip = SlipMonitor(self.thresholds.contact)
 
@@ -160,6 +167,7 @@ class HeldPart:
         part, space = self._lab.part, self._lab.workspace
         end = max(part.insert_to + self.height_offset, space.height_min)
         self._motion.supervisor.phases.enter(Phase.LOWER)
+        self._guard.limit(self._deadline)
         contact = self._guard.move(
             self._pose(planar_pose, end), threshold=self.thresholds.contact, measure=along_finger
         )
@@ -182,6 +190,7 @@ class HeldPart:
         """
         supervisor = self._motion.supervisor
         supervisor.phases.enter(Phase.RETREAT)
+        self._guard.limit(math.inf)
         x, y, yaw, _ = supervisor.hole_coordinates(self._motion.pose())
         contact = self._guard.move(self._pose((x, y, yaw), height), threshold=self.thresholds.stuck, measure=downward)
         if contact is not None:

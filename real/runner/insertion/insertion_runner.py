@@ -196,11 +196,12 @@ class InsertionRunner:
     def _attempt(self, number: int, index: int, part: HeldPart) -> Attempt:
         begun = self._clock.now()
         planar_pose = self._planar_pose
+        part.limit(begun + self._lab.limits.attempt_time)
         part.go_to_start(planar_pose, Phase.CORRECT if index else Phase.APPROACH)
         self._motion.supervisor.phases.enter(Phase.DESCEND)
         self._motion.wait(self._lab.descent.settle)
         observer = self._observer()
-        descent = part.descend(planar_pose, observer, deadline=begun + self._lab.limits.attempt_time)
+        descent = part.descend(planar_pose, observer)
         last, frames = descent.last, observer.chosen(self._task.frame_depths)
         contact = last.shear > part.thresholds.contact
         reached = self._task.start_height - last.depth < self._task.success_height

@@ -114,6 +114,8 @@ def _message(change: str) -> bytes:
         del message.feedBack.joints.joints[5]
     elif change == "no position":
         message.feedBack.cartesian.ClearField("pos")
+    elif change == "no motion control":
+        message.ClearField("mciState")
     return message.SerializeToString()  # type: ignore[no-any-return]
 
 
@@ -127,6 +129,7 @@ def _message(change: str) -> bytes:
         ("no pose", "no pose; set EGM up with"),
         ("five joints", "got 5 joints"),
         ("no position", "got an incomplete pose"),
+        ("no motion control", "it is cut off"),
     ],
 )
 def test_invalid_feedback_is_refused(change: str, text: str) -> None:
@@ -159,3 +162,13 @@ def test_arbitrary_bytes_raise_only_peer_errors(noise: bytes, position: int, val
                 decode(data)
             except PeerError as error:
                 assert "\n" not in str(error)
+
+
+def test_front_part_of_a_feedback_message_is_no_feedback() -> None:
+    data = encode_robot(FEEDBACK)
+    for size in range(len(data)):
+        try:
+            feedback = decode_robot(data[:size])
+        except PeerError:
+            continue
+        assert feedback.stop_reason == "", f"{size} of {len(data)} bytes"

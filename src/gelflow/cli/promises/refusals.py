@@ -111,9 +111,8 @@ def budget(folder: Path) -> Outcome:
     with Rig(folder, seed=near_seed()) as rig:
         lab = replace(rig.lab, limits=replace(rig.lab.limits, attempt_time=1.0))
         run = rig.run(lab=lab)
-        begun = next((e.time for e in run.events if e.values.get("state") == "descend"), math.inf)
-        # The time of the attempt is over when its descent begins: it holds at once.
-        return Outcome(1e3 * (run.stop(begun) - begun) - 1e3 * lab.descent.settle, _refused(run, "more than 1 s"))
+        begun = next((e.time for e in run.events if e.values.get("state") == "approach"), math.inf)
+        return Outcome(1e3 * (run.stop(begun) - begun - 1.0), _refused(run, "more than 1 s"))
 
 
 def largest_steps(folder: Path) -> Outcome:
@@ -149,7 +148,7 @@ def dry_run(folder: Path) -> Outcome:
         broken = conditions(
             exit_status_is_0=run.exit_code == 0,
             arm_did_not_move=_motion(rig) == 0.0,
-            fingers_did_not_move=width == rig.robot.config.cell.start_width,
+            fingers_did_not_move=abs(width - rig.robot.config.cell.start_width) < 1e-4,
         )
         return Outcome(float(rig.robot.arm.report.answers), broken)
 

@@ -69,7 +69,7 @@ class Run:
     errors: str
     events: tuple[Event, ...]
     images: tuple[tuple[CameraImage, ...], tuple[CameraImage, ...]]  # of both cameras
-    part: dict[str, Any]  # ground truth of the last part; empty without a part
+    part: dict[str, Any]  # ground truth of the part; empty without one
 
     @property
     def reason(self) -> str:
@@ -207,7 +207,7 @@ class Rig:
     def _finished(self, at: float, exit_code: int, process: "RunningRunner") -> Run:
         events, images = _read(self.folder / "run" / "session.mcap")
         parts = self.robot.cell.truth()["parts"]
-        return Run(at, exit_code, process.output, process.errors, events, images, parts[-1] if parts else {})
+        return Run(at, exit_code, process.output, process.errors, events, images, parts[0] if parts else {})
 
 
 class RunningRunner:
