@@ -1,6 +1,7 @@
 """Sphinx directives `phase-diagram` and `phase-table`: the phases of a run, from `gelflow.real.runner.phases`."""
 
 from docutils import nodes
+from markdown_table import markdown_table
 from phase_svg import svg
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
@@ -22,14 +23,11 @@ class PhaseTable(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """A table with one row for each phase."""
-        lines = [".. list-table::", "   :header-rows: 1", ""]
         rows = [("phase", "what happens", "the arm may move", "reaction to contact")]
         rows += [
             (str(phase), rule.action, "yes" if rule.moves else "no", rule.on_contact) for phase, rule in PHASES.items()
         ]
-        for row in rows:
-            lines += [f"   {'* -' if number == 0 else '  -'} {cell}" for number, cell in enumerate(row)]
-        return self.parse_text_to_nodes("\n".join(lines))
+        return self.parse_text_to_nodes(markdown_table(rows))
 
 
 def setup(app: Sphinx) -> ExtensionMetadata:

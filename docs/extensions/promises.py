@@ -1,6 +1,7 @@
 """Sphinx directive `promise-table`: the promises of the runner, from `gelflow.cli.promises.table`."""
 
 from docutils import nodes
+from markdown_table import markdown_table
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from sphinx.util.typing import ExtensionMetadata
@@ -13,12 +14,9 @@ class PromiseTable(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """A table with one row for each promise."""
-        lines = [".. list-table::", "   :header-rows: 1", ""]
         rows = [("name", "promise", "measured", "at most")]
-        rows += [(f"``{p.name}``", p.text, p.measured, f"{p.bound:g} {p.unit}".strip()) for p in PROMISES.values()]
-        for row in rows:
-            lines += [f"   {'* -' if number == 0 else '  -'} {cell}" for number, cell in enumerate(row)]
-        return self.parse_text_to_nodes("\n".join(lines))
+        rows += [(f"`{p.name}`", p.text, p.measured, f"{p.bound:g} {p.unit}".strip()) for p in PROMISES.values()]
+        return self.parse_text_to_nodes(markdown_table(rows))
 
 
 def setup(app: Sphinx) -> ExtensionMetadata:
