@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gelflow.cli.promises.outcome import Outcome, conditions
-from gelflow.cli.promises.rig import Rig, Run, RunningRunner, far_seed, gripped, in_descent, near_seed
+from gelflow.cli.promises.rig import Rig, Run, RunningRunner, end_after, far_seed, gripped, in_descent, near_seed
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.hardware_mocks.simulated_cell.progress import Progress
 from gelflow.hardware_mocks.simulated_cell.world import TaughtError, World
@@ -87,14 +87,14 @@ def lost_packets(folder: Path) -> Outcome:
 def contact_in_descent(folder: Path) -> Outcome:
     """Time from the reception of the image that exceeds the threshold to the hold [ms]."""
     with Rig(folder, seed=far_seed()) as rig:
-        run = rig.run(lambda process: _end_after(process.signal, 5.0), when=in_descent)
+        run = rig.run(lambda process: end_after(process.signal, 5.0), when=in_descent)
         return Outcome(*_contact(run, "stopped by contact"))
 
 
 def contact_in_approach(folder: Path) -> Outcome:
     """The same, while a part approaches a hole that is taught 1.5 mm too low [ms]."""
     with Rig(folder, seed=far_seed(), world=World(taught_error=TaughtError(z=-1.5e-3))) as rig:
-        run = rig.run(lambda process: _end_after(process.signal, 10.0), when=lambda progress: progress.approaching)
+        run = rig.run(lambda process: end_after(process.signal, 10.0), when=lambda progress: progress.approaching)
         return Outcome(*_contact(run, "contact during the approach"))
 
 
@@ -187,8 +187,8 @@ def slip(folder: Path) -> Outcome:
     with Rig(folder, seed=far_seed()) as rig:
 
         def fault(process: RunningRunner) -> None:
-            rig.robot.cell.change_world(gel_stiffness=1.0, pad_friction=0.05)
-            _end_after(process.signal, 15.0)
+            rig.robot.cell.change_world(gel_stiffness=1.0, pad_friction=0.2)
+            end_after(process.signal, 15.0)
 
         run = rig.run(fault, when=in_descent)
         broken = conditions(
@@ -262,11 +262,6 @@ def _contact(run: Run, name: str) -> tuple[float, tuple[str, ...]]:
         return math.inf, conditions(contact_stopped_the_motion=False)
     image = float(event.values["image_at"])
     return 1e3 * (run.stop(image) - image), ()
-
-
-def _end_after(send: Callable[[signal.Signals], None], seconds: float) -> None:
-    time.sleep(seconds)
-    send(signal.SIGTERM)
 
 
 def _crossing(rig: Rig, begin: float, end: float, threshold: float) -> float:

@@ -1,6 +1,8 @@
 """Scenarios without a fault of a device: what is refused, what an undisturbed run does, and what is not believed."""
 
 import math
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gelflow.cli.promises.outcome import Outcome, conditions
-from gelflow.cli.promises.rig import Rig, Run, near_seed, while_lowering
+from gelflow.cli.promises.rig import Rig, Run, end_after, far_seed, in_descent, near_seed, while_lowering
 from gelflow.errors import SafetyError, UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.real.egm import driver as driver_module
@@ -130,14 +132,16 @@ def largest_steps(folder: Path) -> Outcome:
 
 
 def replayed(folder: Path) -> Outcome:
-    """Decisions that differ in a replay of an undisturbed run [1]."""
-    from gelflow.cli.main import main
-
-    with Rig(folder, seed=near_seed()) as rig:
-        run = rig.run(limit=120.0)
+    """Replays that differ from the recorded decisions of a run with contact [1]."""
+    with Rig(folder, seed=far_seed()) as rig:
+        run = rig.run(lambda process: end_after(process.signal, 8.0), when=in_descent)
+    if run.first("stopped by contact") is None:
         run.require_no_false_stop()
-    code = main(["replay", str(folder / "run" / "session.mcap")])
-    return Outcome(float(code != 0), conditions(part_is_inserted=run.exit_code == 0))
+    command = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    session = str(folder / "run" / "session.mcap")
+    replay = subprocess.run([sys.executable, "-c", command, "replay", session], capture_output=True, check=False)
+    broken = conditions(contact_led_to_a_decision=run.first("stopped by contact") is not None)
+    return Outcome(float(replay.returncode != 0), broken, replay.stderr.decode(errors="replace").strip())
 
 
 def dry_run(folder: Path) -> Outcome:

@@ -16,12 +16,14 @@ from gelflow.session.records import to_plain
 
 def table(rows: Sequence[Row]) -> Table:
     """One line for each promise."""
-    shown = Table(title="Promises of the runner", show_lines=False)
-    for column in ("promise", "held", "measured", "bound", "quantity"):
-        shown.add_column(column, justify="right" if column in ("measured", "bound") else "left", no_wrap=True)
+    shown = Table(title="Promises of the runner")
+    for column in ("promise", "held", "measured", "at most"):
+        shown.add_column(column, justify="right" if column in ("measured", "at most") else "left", no_wrap=True)
+    shown.add_column("quantity")
     for row in rows:
         promise = row.promise
-        measured, bound = (f"{value:.3g} {promise.unit}".strip() for value in (row.outcome.value, promise.bound))
+        values = row.outcome.value, promise.bound
+        measured, bound = (f"{round(value, 3):.4g} {promise.unit}".strip() for value in values)
         shown.add_row(promise.name, "yes" if row.held else "NO", measured, bound, promise.measured)
     return shown
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -26,7 +26,7 @@ from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
 from gelflow.hardware_mocks.simulated_cell.world import World
 from gelflow.protocols import CameraImage
-from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.lab import Lab, LimitsSettings
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
@@ -35,7 +35,13 @@ _POLL = 0.002  # of the progress of the cell [s]
 _SAMPLE = 0.004  # of the true state [s]
 _START_LIMIT = 90.0  # until the awaited moment of a run [s]
 _END_LIMIT = 60.0  # of a run after its fault [s]
-_MAIN = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
+# A shell lets its background processes ignore Ctrl-C; the runner keeps what it inherits.
+_MAIN = """
+import signal, sys
+from gelflow.cli.main import main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 class FalseStop(PeerError):
@@ -153,7 +159,7 @@ class Rig:
     @property
     def lab(self) -> Lab:
         """The lab file's content: the time limits are those of the example."""
-        return lab_for(self.robot, jitter=0.0)
+        return replace(lab_for(self.robot, jitter=0.0), limits=LimitsSettings())
 
     def samples_between(self, first: float, last: float) -> list[Sample]:
         """True states between two times [s]."""
@@ -260,6 +266,12 @@ class RunningRunner:
         """End the process at once."""
         self._process.kill()
         self._process.wait()
+
+
+def end_after(send: Callable[[signal.Signals], None], seconds: float) -> None:
+    """Wait, then end a run by SIGTERM."""
+    time.sleep(seconds)
+    send(signal.SIGTERM)
 
 
 def _read(path: Path) -> tuple[tuple[Event, ...], tuple[tuple[CameraImage, ...], tuple[CameraImage, ...]]]:
