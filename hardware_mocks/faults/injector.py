@@ -11,7 +11,7 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError, PeerError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.hardware_mocks.egm.device import MockEgmArm
-from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
+from gelflow.hardware_mocks.faults.plan import KINDS, Fault, FaultPlan
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
@@ -118,7 +118,7 @@ def event_has_come(fault: Fault, progress: Progress) -> bool:
     return progress.height < (default if fault.below is None else fault.below)
 
 
-class _Occurrence:
+class Occurrence:
     """The state of one fault of the plan: when it begins next, and when it ends."""
 
     def __init__(self, number: int, fault: Fault) -> None:
@@ -143,7 +143,7 @@ class _Occurrence:
                 self._due = now + fault.after
         if self._due is None or now < self._due:
             return False
-        self.active, self._due = True, None
+        self.active, self._due = not KINDS[fault.kind].momentary, None
         self._end = now + fault.duration
         self._done = fault.rate == 0
         return True
@@ -161,7 +161,7 @@ class FaultInjector:
 
     def __init__(self, plan: FaultPlan, devices: Devices, clock: ScaledClock) -> None:
         self._devices, self._clock = devices, clock
-        self._occurrences = [_Occurrence(number, fault) for number, fault in enumerate(plan.faults)]
+        self._occurrences = [Occurrence(number, fault) for number, fault in enumerate(plan.faults)]
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None
@@ -196,7 +196,7 @@ class FaultInjector:
                 elif occurrence.begins(now, progress):
                     self._do("begin", occurrence, self._devices.begin)
 
-    def _do(self, what: str, occurrence: _Occurrence, action: Callable[[int, Fault], None]) -> None:
+    def _do(self, what: str, occurrence: Occurrence, action: Callable[[int, Fault], None]) -> None:
         entry = {"time": self._clock.now(), "fault": str(occurrence.fault), "what": what}
         try:
             action(occurrence.number, occurrence.fault)

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 
 from gelflow.clock import ScaledClock
-from gelflow.hardware_mocks.faults.injector import Devices
+from gelflow.hardware_mocks.faults.injector import Devices, Occurrence
 from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
+from gelflow.hardware_mocks.simulated_cell.progress import Progress
 from gelflow.real.wsg.codec import Packet
 from gelflow.real.wsg.constants import Command
 
@@ -86,6 +87,19 @@ def test_grip_friction_and_gel_stiffness_change_while_the_cell_runs() -> None:
     cell.change_world(gel_stiffness=1.0, pad_friction=0.001)
     cell.advance(50)
     assert cell.truth()["part"]["largest_slip"] > 5e-3  # the part falls
+
+
+def test_a_momentary_fault_at_random_times_occurs_again_and_again() -> None:
+    occurrence = Occurrence(0, Fault("gripper", "lose_part", rate=2.0, seed=1))
+    progress = Progress(started=0.0)
+    times = [step / 100 for step in range(1000) if occurrence.begins(step / 100, progress)]
+    assert 10 < len(times) < 35 and not occurrence.active
+    lasting = Occurrence(0, Fault("gripper", "stall", rate=2.0, seed=1, duration=0.5))
+    begins, ends = 0, 0
+    for step in range(1000):
+        ends += lasting.ends(step / 100)
+        begins += lasting.begins(step / 100, progress)
+    assert 5 < begins <= ends + 1 <= begins + 1
 
 
 class RecordingDevice:
