@@ -27,11 +27,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--promises", action="store_true", help="measure the runner's promises instead, in real time")
     parser.add_argument("--egm", type=float, metavar="MINUTES", help="run EGM, cameras, tracking and recording instead")
     parser.add_argument("--only", metavar="WHICH", help="the plan of this seed alone, or this promise alone")
-    parser.add_argument("--factor", type=float, default=4.0, metavar="X", help="robot time over wall time (default 4)")
+    parser.add_argument("--factor", type=float, default=2.0, metavar="X", help="robot time over wall time (default 2)")
     parser.add_argument(
         "--jitter",
         type=float,
-        default=0.05,
+        default=0.1,
         metavar="S",
         help="added to a robot's time limits, for a computer with load (default %(default)s s)",
     )
