@@ -70,12 +70,15 @@ class HeldPart:
         self._slip = 0.0
         self._deadline = math.inf
         self._baseline: NDArray[np.float64] = np.zeros((2, 2))
-        self.observe(observer)
+        self._grasp_observer = observer  # its reference is before the grasp
+        self._guard = GuardedMotion(motion, observer, lab, clock, recorder)
+        self.set_baseline()
 
     def observe(self, observer: TactileObserver) -> None:
-        """Use `observer` from now on, at rest at its reference."""
+        """Use `observer` from now on, at rest at its reference. Raises PartSlipped as `set_baseline` does."""
         self._guard = GuardedMotion(self._motion, observer, self._lab, self._clock, self._recorder)
         self._baseline = np.zeros((2, 2))
+        self._check_weight()
 
     def limit(self, deadline: float) -> None:
         """Set the robot time [s] after which approach, descent and lowering raise PeerTimeout; retreat goes on."""
@@ -87,8 +90,22 @@ class HeldPart:
         return self._task.start_height + self.height_offset
 
     def set_baseline(self) -> None:
-        """Compare the pads with their present state from now on; the arm is at rest."""
+        """Compare the pads with their present state from now on; the arm is at rest, and nothing touches the part.
+
+        Raises PartSlipped when the pads do not show the part's weight.
+        """
         self._baseline = self._guard.observer.mean_at_rest(self._clock.now())
+        self._check_weight()
+
+    def _check_weight(self) -> None:
+        change = self._baseline + self._guard.observer.reference_change(self._grasp_observer)
+        if self._lab.descent.weight_check and not self._check.shows_weight(change):
+            values = {"weight_mm": self._check.weight, "change_mm": change}
+            self._recorder.event("weight not shown", values)
+            raise PartSlipped(
+                "the pads no longer show the part's weight: it slipped or rests on something; check part.load_height, "
+                "gripper.grasp_force and the gels"
+            )
 
     def go_to_start(self, planar_pose: PlanarPose, phase: Phase) -> None:
         """Move to the start of an attempt; contact on the way shows the height of the rim.

@@ -151,12 +151,10 @@ class InsertionRunner:
             raise NotGrasped(str(error)) from error
         self._motion.expect_part(True)
         check = self._check_grasp(observer, before)
-        part = HeldPart(
+        return HeldPart(
             self._motion, observer, check, self.pose,
             lab=lab, clock=self._clock, task=self._task, recorder=self._recorder,
         )  # fmt: skip
-        part.set_baseline()
-        return part
 
     def _observer(self) -> TactileObserver:
         """A new observer; the pads are at rest, and its reference is the first pair of images from now on.

@@ -46,6 +46,13 @@ class GraspCheck:
     noise: float  # standard deviation of the mean change of a pad between readings at rest [mm]
     thresholds: TouchThresholds
 
+    def shows_weight(self, change: Array) -> bool:
+        """Whether the pads still show the weight; `change` is that of each pad since before the grasp [mm].
+
+        False when something supports the part, or when it slips in a grip that no longer holds it.
+        """
+        return bool(self.weight[:, 0].mean() - change[:, 0].mean() < self.thresholds.contact)
+
 
 def nominal_thresholds(settings: DescentSettings) -> TouchThresholds:
     """The thresholds of the lab file."""

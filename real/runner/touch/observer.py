@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,6 +164,19 @@ class TactileObserver:
     def image_period(self) -> float:
         """Largest recent interval between two images of a camera [s]; `stale` before any is known."""
         return max(self._intervals, default=self._stale)
+
+    def reference_change(self, earlier: "TactileObserver") -> Array:
+        """Mean change of each pad from the reference of `earlier` to this one [mm], shape (sensors, 2).
+
+        Positions in the images are compared, so the two references need no images between them.
+        """
+        still, moved = [], []
+        for tracker, before, result in zip(self._trackers, earlier._trackers, self._results, strict=True):
+            displacement = tracker.rest - before.rest
+            still.append(replace(result, position=before.rest, displacement=np.zeros_like(displacement)))
+            moved.append(replace(result, position=before.rest, displacement=displacement))
+        frames = [tactile_frame(results, self._mounts, 0.0) for results in (moved, still)]
+        return mean_change(*frames)
 
     def keep(self, reading: TactileReading) -> None:
         """Add a reading, with its depth, to those that `chosen` selects from."""

@@ -159,3 +159,14 @@ def test_held_part_is_moved_only_under_touch(robot: MockRobot, tmp_path: Path) -
         if name == "move" and held:
             phases.append(phase)
     assert set(phases) <= {"load", "approach", "descend", "lower", "correct", "retreat"} and "lower" in phases
+
+
+@pytest.mark.slow
+def test_part_that_slides_out_of_a_slippery_grip_is_not_called_inserted(robot: MockRobot, tmp_path: Path) -> None:
+    """The friction of the pads falls so far that the grip no longer carries the weight of the part."""
+    finish = in_background(lambda: insert(robot, tmp_path))
+    wait_for(lambda: lowered_to(robot, 25.2e-3), 280)
+    robot.cell.change_world(gel_stiffness=1.0, pad_friction=0.05)
+    result = finish()
+    assert not result.inserted and not part(robot)["inserted"]
+    assert part(robot)["largest_push"] < MOST_PUSHED
