@@ -1,12 +1,17 @@
-"""Shared test set-up: pictures without a display, reproducible examples, a separate cache."""
+"""Shared test set-up: pictures without a display, reproducible examples, a separate cache, Ctrl-C."""
 
 import os
+import signal
 from collections.abc import Iterator
 
 import pytest
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+
+# A shell ignores SIGINT for background jobs, and child processes inherit that: tests of Ctrl-C need the default.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No deadline: tests do not depend on the speed of the machine. Derandomized: a failed run is reproducible.
 settings.register_profile("gelflow", deadline=None, derandomize=True)
