@@ -19,7 +19,7 @@ from gelflow.session.recorder import SessionRecorder
 from gelflow.time_sync import RUNNER
 
 # From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
-_REACTION_TIME = 0.05
+_REACTION_TIME = 0.03
 # Without a readable image, after which the arm holds: 250 ms less the longest wait of the observer and tracking [s].
 _BLIND_TIME = LIMITS.image_age - 0.03
 _REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]

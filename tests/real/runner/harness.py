@@ -27,7 +27,7 @@ def free_port(kind: socket.SocketKind) -> int:
 
 
 class OraclePolicy:
-    """A policy that reads the ground truth and corrects two thirds of the misalignment."""
+    """A policy that reads the ground truth and corrects the misalignment."""
 
     def __init__(self, robot: MockRobot, *, answer: Callable[[], None] = lambda: None) -> None:
         self._robot, self._answer = robot, answer
@@ -45,7 +45,7 @@ class OraclePolicy:
         wanted = np.array([-np.cos(back) * x + np.sin(back) * y, -np.sin(back) * x - np.cos(back) * y, -yaw])
         dx, dy, turn = wanted - self._planar_pose
         local = [np.cos(here) * dx - np.sin(here) * dy, np.sin(here) * dx + np.cos(here) * dy, turn]
-        correction = np.array(local) * 2 / 3
+        correction = np.array(local)
         self._planar_pose = INSERTION.corrected(self._planar_pose, correction)
         return correction
 

@@ -56,7 +56,6 @@ def lowered_to(robot: MockRobot, height: float) -> bool:
 
 
 Fault = tuple[str, dict[str, Any]]  # kind and parameters
-FROZEN: Fault = ("freeze", {"loop": 1})
 LOOP: Fault = ("freeze", {"loop": 3})
 BLACK: Fault = ("blacken", {})
 DESCENT, LOWERING = 24.2e-3, 20e-3  # heights of the part at which the fault begins [m]
@@ -65,9 +64,7 @@ DESCENT, LOWERING = 24.2e-3, 20e-3  # heights of the part at which the fault beg
 @pytest.mark.parametrize(
     ("fault", "height"),
     [
-        pytest.param(FROZEN, LOWERING, id="frozen, lowering"),
         pytest.param(BLACK, DESCENT, id="black, descent"),
-        pytest.param(FROZEN, DESCENT, id="frozen, descent", marks=pytest.mark.slow),
         pytest.param(BLACK, LOWERING, id="black, lowering", marks=pytest.mark.slow),
         pytest.param(LOOP, LOWERING, id="loop, lowering", marks=pytest.mark.slow),
     ],
