@@ -146,17 +146,21 @@ class GuardedMotion:
         return self.observer.update_pair(self._clock.now())
 
     def _wait_until_readable(self) -> None:
-        """Hold until both pads are readable again. Raises TouchLost after `limits.stale_frame`."""
+        """Hold until both pads are readable again. Raises TouchLost after `limits.stale_frame`.
+
+        Images that all arrive late are readable, but never young enough: the time of the hold is limited too.
+        """
         phases = self._motion.supervisor.phases
         before = phases.phase
         phases.enter(Phase.HOLD)
         values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
         self._recorder.event("pad not readable", values)
-        while (seconds := self.observer.blind_time()) >= _BLIND_TIME:
-            if seconds > self._lab.limits.stale_frame:
+        begun = self._clock.now() - self.observer.blind_time()
+        while self.observer.blind_time() >= _BLIND_TIME:
+            if (seconds := self._clock.now() - begun) > self._lab.limits.stale_frame:
                 raise TouchLost(
-                    f"camera {self.observer.blind_camera}: no readable image for {seconds:.2f} s with a part held, "
-                    "which is longer than limits.stale_frame; check the gel, its light and the camera"
+                    f"camera {self.observer.blind_camera}: no readable image in time for {seconds:.2f} s with a part "
+                    "held, which is longer than limits.stale_frame; check the gel, its light and the camera"
                 )
             self._motion.wait(0.0)
             with self._clock.bounded(RUNNER):
