@@ -110,7 +110,7 @@ __attribute__((noinline)) void flush(ForceBuffer<T>& buffer, const T& center_hei
 
 // Adds the terms −[f]× and Σ c fᵀ − f·c of the forces to K.
 template <class T>
-GELFLOW_INLINE void add_force_stiffness(const T& center_height, ContactSums<T>& sums) {
+GELFLOW_INLINE void add_force_stiffness(T center_height, ContactSums<T>& sums) {
   const T* const f = sums.wrench() + 3;
   const T trace = sums.outer(0, 0) + sums.outer(1, 1) + sums.outer(2, 2) + center_height * f[2];  // Σ f·c
   for (int i = 0; i < 3; ++i) {

@@ -45,22 +45,24 @@ CenterVelocity<T> previous_center_velocity(const StepStart<T>& start, int nv, in
   return {inverse, inverse * velocity};
 }
 
-// A free body's dynamics at the trial state: the terms that the residual and its derivatives share.
+// Views of the terms of a free body's dynamics that its residual and the derivatives share. References: copies would be
+// stored to memory in evaluations without derivatives too.
 template <class T>
 struct FreeBodyTerms {
-  int k;  // first dof
-  T mass;
-  M3<T> rotation, inertia;
-  V3<T> c, spin, acceleration;  // spin: ω; acceleration: a
-  V3<T> weight, turn;           // weight: −m Rᵀ g; turn: θ
-  V3<T> angular_momentum, y;
+  int k;          // first dof
   bool centered;  // c is zero, and no derivatives by c are wanted
-  CenterVelocity<T> before;
+  const T& mass;
+  const M3<T>&rotation, &inertia;
+  const V3<T>&c, &spin, &acceleration;  // spin: ω; acceleration: a
+  const V3<T>&weight, &turn;            // weight: −m Rᵀ g; turn: θ
+  const V3<T>&angular_momentum, &y;
+  const CenterVelocity<T>& before;
 };
 
 // Derivatives of a free body's force and moment. `start`: see add_inverse_dynamics.
 template <class T>
-void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& beta_h, const StepStart<T>* start, Workspace<T>& w) {
+GELFLOW_INLINE void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& beta_h, const StepStart<T>* start,
+                                              Workspace<T>& w) {
   const int k = b.k;
   for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = b.mass;
   w.by_v.template block<3, 3>(k + 3, k + 3) +=
@@ -93,36 +95,38 @@ void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& beta_h, const
 template <bool derivatives, class T>
 void add_free_body(const Model& m, const Body& body, const T* params, const T& beta_h, const T* v,
                    const StepStart<T>* start, Workspace<T>& w) {
+  const int k = m.joints[body.joint_begin].v;
   const BodyParams<T>& own = body.params.in(params);
-  const V3<T> gravity = m.gravity.in(params).acceleration;
-  FreeBodyTerms<T> b;
-  const int k = b.k = m.joints[body.joint_begin].v;
-  b.mass = own.mass;
-  b.rotation = as<T>(w.rotation[&body - m.bodies.data()]);
-  b.inertia = own.inertia();
-  b.c = own.com;
-  b.spin = vec3(v + k + 3);
-  b.acceleration = vec3(w.generalized_acceleration.data() + k) - gravity;
-  b.turn = vec3(w.increment.data() + k + 3);
-  b.angular_momentum = b.inertia * b.spin;
-  b.centered = std::is_floating_point_v<T> && b.c == V3<T>::Zero();
-  const V3<T> spin_rate = vec3(w.generalized_acceleration.data() + k + 3);
-  V3<T> force = b.mass * b.acceleration, moment = b.inertia * spin_rate + cross<T>(b.spin, b.angular_momentum);
-  b.weight = -b.mass * (b.rotation.transpose() * gravity);
-  if (!b.centered) {
-    if (start) b.before = previous_center_velocity<T>(*start, m.nv, k + 3, b.c, w);
-    b.y = start ? V3<T>((cross<T>(b.spin, b.c) - b.before.u) / beta_h)
-                : V3<T>(cross<T>(spin_rate, b.c) + cross<T>(b.spin, cross<T>(b.spin, b.c)));
-    force += b.mass * (b.rotation * b.y);
-    moment += cross<T>(b.c, b.rotation.transpose() * force);
-    const bool uses_arc_correction = start && start->history == nullptr;
-    if (uses_arc_correction) moment += cross<T>(MomentArmCorrection<T>(b.turn, false).value * b.c, b.weight);
+  const T mass = own.mass;
+  const M3<T>& rotation = as<T>(w.rotation[&body - m.bodies.data()]);
+  const M3<T> inertia = own.inertia();
+  const V3<T> c = own.com, gravity = m.gravity.in(params).acceleration;
+  const V3<T> spin = vec3(v + k + 3), spin_rate = vec3(w.generalized_acceleration.data() + k + 3);
+  const V3<T> acceleration = vec3(w.generalized_acceleration.data() + k) - gravity;
+  const V3<T> angular_momentum = inertia * spin;
+  V3<T> force = mass * acceleration, moment = inertia * spin_rate + cross<T>(spin, angular_momentum);
+  const bool centered = std::is_floating_point_v<T> && c == V3<T>::Zero();
+  CenterVelocity<T> before;
+  V3<T> y;
+  if (!centered) {
+    if (start) before = previous_center_velocity<T>(*start, m.nv, k + 3, c, w);
+    y = start ? V3<T>((cross<T>(spin, c) - before.u) / beta_h)
+              : V3<T>(cross<T>(spin_rate, c) + cross<T>(spin, cross<T>(spin, c)));
+    force += mass * (rotation * y);
+    moment += cross<T>(c, rotation.transpose() * force);
   }
+  const V3<T> weight = -mass * (rotation.transpose() * gravity), turn = vec3(w.increment.data() + k + 3);
+  const bool uses_arc_correction = !centered && start && start->history == nullptr;
+  if (uses_arc_correction) moment += cross<T>(MomentArmCorrection<T>(turn, false).value * c, weight);
   for (int i = 0; i < 3; ++i) {
     w.residual[k + i] += beta_h * force[i];
     w.residual[k + 3 + i] += beta_h * moment[i];
   }
-  if constexpr (derivatives) add_free_body_derivatives<T>(b, beta_h, start, w);
+  if constexpr (derivatives) {
+    const FreeBodyTerms<T> terms{k,    centered,         mass, rotation, inertia, c, spin, acceleration, weight,
+                                 turn, angular_momentum, y,    before};
+    add_free_body_derivatives<T>(terms, beta_h, start, w);
+  }
 }
 
 // The terms of −(∂g/∂v*)ᵀ, −(∂g/∂(γ δ))ᵀ and −(∂g/∂v_{t-2})ᵀ times the multipliers that M does not contain: g depends

@@ -31,12 +31,6 @@ PositionScalar<T> position_with_rounding(const T* q, const T* q_rounding, int i)
   return T(sum) == q[i] ? sum : PositionScalar<T>(q[i]);
 }
 
-template <class Scalar>
-struct FramePose {
-  M3<Scalar> rotation;
-  V3<Scalar> position;
-};
-
 // Sets the axis S_k from its angular and linear parts.
 template <class T, class Scalar>
 GELFLOW_INLINE void set_axis(Workspace<T>& w, int k, const V3<Scalar>& angular, const V3<Scalar>& linear) {
@@ -52,11 +46,10 @@ GELFLOW_INLINE void set_rotation_axes(Workspace<T>& w, int k, const M3<Scalar>& 
   }
 }
 
-// Moves the body frame by one joint, with positions `value`, and sets the joint's axes.
+// Moves the body frame (r, p) by one joint, with positions `value`, and sets the joint's axes.
 template <class T, class Scalar>
-GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, FramePose<Scalar>& frame, Workspace<T>& w) {
-  M3<Scalar>& r = frame.rotation;
-  V3<Scalar>& p = frame.position;
+GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, M3<Scalar>& r, V3<Scalar>& p,
+                                Workspace<T>& w) {
   if (joint.type == JointType::free) {
     p = vec3(value);
     r = rotation_of<Scalar>(V4<Scalar>(value[3], value[4], value[5], value[6]));
@@ -64,8 +57,8 @@ GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, FramePo
     set_rotation_axes<T, Scalar>(w, joint.v + 3, r, p);
     return;
   }
-  const V3<Scalar> offset = joint.pos.template cast<Scalar>();
   if (joint.type == JointType::ball) {
+    const V3<Scalar> offset = joint.pos.template cast<Scalar>();
     const V3<Scalar> anchor = p + r * offset;
     r = (r * rotation_of<Scalar>(V4<Scalar>(value[0], value[1], value[2], value[3]))).eval();
     p = anchor - r * offset;
@@ -79,6 +72,7 @@ GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, FramePo
     p += direction * (value[0] - Scalar(joint.ref));
     return;
   }
+  const V3<Scalar> offset = joint.pos.template cast<Scalar>();
   const V3<Scalar> anchor = p + r * offset;
   set_axis<T, Scalar>(w, joint.v, direction, cross<Scalar>(anchor, direction));
   r = (r * axis_rotation<Scalar>(local, value[0] - Scalar(joint.ref))).eval();
@@ -91,16 +85,17 @@ void forward_positions(const Model& m, const T* params, const PositionScalar<T>*
   using Scalar = PositionScalar<T>;
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
-    FramePose<Scalar> frame{body.rotation.template cast<Scalar>(), as<Scalar>(body.params.in(params).pos)};
+    M3<Scalar> r = body.rotation.template cast<Scalar>();
+    V3<Scalar> p = as<Scalar>(body.params.in(params).pos);
     if (body.parent != world) {
-      frame.position = (w.position[body.parent] + w.rotation[body.parent] * frame.position).eval();
-      frame.rotation = (w.rotation[body.parent] * frame.rotation).eval();
+      p = (w.position[body.parent] + w.rotation[body.parent] * p).eval();
+      r = (w.rotation[body.parent] * r).eval();
     }
     for (int j = body.joint_begin; j < body.joint_end; ++j) {
-      apply_joint<T, Scalar>(m.joints[j], q + m.joints[j].q, frame, w);
+      apply_joint<T, Scalar>(m.joints[j], q + m.joints[j].q, r, p, w);
     }
-    w.rotation[i] = frame.rotation;
-    w.position[i] = frame.position;
+    w.rotation[i] = r;
+    w.position[i] = p;
   }
 }
 
