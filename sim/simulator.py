@@ -375,8 +375,8 @@ class Simulator:
             if value is None:
                 return np.zeros(like.shape, self.dtype)
             array = np.asarray(value, self.dtype)
-            if array.shape != like.shape:  # broadcast_to is slow
-                array = np.broadcast_to(array, like.shape)
+            if array.shape != like.shape:  # np.broadcast_to is slower
+                array = np.full(like.shape, array)
             return np.ascontiguousarray(array)
 
         cotangent = _core.TrajectoryCotangent(

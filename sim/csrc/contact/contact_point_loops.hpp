@@ -60,12 +60,13 @@ struct GeometryBatch {
     Mat3<P> hessian;
   };
   Curvature curved[with_hessian ? capacity : 1];
-  HessianForm form{};
 
-  // Sets the points begin … end of the cloud.
-  GELFLOW_INLINE void compute(const PairFrame<T>& frame, const PairConstants<T>& pair, const CloudArrays<T>& arrays,
-                              int begin, int end) {
+  // Sets the points begin … end of the cloud. Returns the form of the shape's Hessian.
+  GELFLOW_INLINE HessianForm compute(const PairFrame<T>& frame, const PairConstants<T>& pair,
+                                     const CloudArrays<T>& arrays, int begin, int end) {
+    HessianForm form{};
     with_distance<with_hessian, P, T>(frame.kind, frame.size, frame.grid, [&](auto&& distance_at) GELFLOW_LOOP_BODY {
+      HessianForm shape_form{};  // a local variable of the loop stays in a register
       for (int i = begin, n = 0; i < end; i += pack_width<T>, ++n) {
         Entry& p = entry[n];
         Distance<P> at;
@@ -75,7 +76,7 @@ struct GeometryBatch {
         p.d = at.d;
         p.n.x = at.n.x, p.n.y = at.n.y, p.n.z = at.n.z;
         p.weight = select(at.d < P(0.0), load<P>(arrays.weights + i), P(0.0));
-        form = at.form;
+        shape_form = at.form;
         if constexpr (with_hessian) {
           if (at.form == HessianForm::isotropic) {
             curved[n].curvature = at.curvature;
@@ -84,7 +85,9 @@ struct GeometryBatch {
           }
         }
       }
+      form = shape_form;
     });
+    return form;
   }
 
   // Replaces the weights of active points by those at the body's scale.
@@ -96,7 +99,7 @@ struct GeometryBatch {
     }
   }
 
-  GELFLOW_INLINE void copy_to(int n, const P& center_height, ContactPack<T>& t) const {
+  GELFLOW_INLINE void copy_to(int n, HessianForm form, const P& center_height, ContactPack<T>& t) const {
     const Entry& p = entry[n];
     t.x = p.x;
     t.center = {p.x.x, p.x.y, p.x.z + center_height};
@@ -138,6 +141,7 @@ GELFLOW_INLINE void for_contact_points(const PairFrame<T>& frame, const PointClo
   using Batch = GeometryBatch<with_hessian, T>;
   constexpr int width = pack_width<T>;
   Batch batch;
+  HessianForm form{};
   const PairConstants<T> pair(frame, settings);
   const bool scales_weights = frame.scaled && !cloud.areas.empty();
   const CloudArrays<T> arrays(cloud);
@@ -148,7 +152,7 @@ GELFLOW_INLINE void for_contact_points(const PairFrame<T>& frame, const PointClo
     t.has_anchor = first_lanes<P>(0);
     if constexpr (elastic) load_anchors<T>(settings, i, cloud.size(), t);
     t.first = i;
-    batch.copy_to(n, pair.center_height, t);
+    batch.copy_to(n, form, pair.center_height, t);
     eval_contact<elastic, T>(pair, batch.entry[n].weight, t);
     f(static_cast<const ContactPack<T>&>(t));
   };
@@ -158,7 +162,7 @@ GELFLOW_INLINE void for_contact_points(const PairFrame<T>& frame, const PointClo
     visited = last;
     for (int begin = first; begin < last; begin += Batch::capacity * width) {
       const int end = std::min(begin + Batch::capacity * width, last);
-      batch.compute(frame, pair, arrays, begin, end);
+      form = batch.compute(frame, pair, arrays, begin, end);
       if (scales_weights) batch.scale_weights(frame, cloud, begin, end);
       for (int i = begin, n = 0; i < end; i += width, ++n) visit_pack(i, n);
     }
