@@ -146,7 +146,7 @@ GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& beta_h, int j, 
 template <bool derivatives, class T>
 void add_inverse_dynamics(const Model& m, const T* params, const T& beta_h, const T* v, const StepStart<T>* start,
                           Workspace<T>& w) {
-  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
+  for (std::size_t i = 0, bodies = m.bodies.size(); i < bodies; ++i) {
     if (m.bodies[i].is_free) {
       add_free_body<derivatives, T>(m, m.bodies[i], params, beta_h, v, start, w);
       continue;

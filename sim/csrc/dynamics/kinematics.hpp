@@ -83,7 +83,7 @@ GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, M3<Scal
 template <class T>
 void forward_positions(const Model& m, const T* params, const PositionScalar<T>* q, Workspace<T>& w) {
   using Scalar = PositionScalar<T>;
-  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
+  for (std::size_t i = 0, bodies = m.bodies.size(); i < bodies; ++i) {
     const Body& body = m.bodies[i];
     M3<Scalar> r = body.rotation.template cast<Scalar>();
     V3<Scalar> p = as<Scalar>(body.params.in(params).pos);
@@ -139,7 +139,7 @@ GELFLOW_INLINE void add_group_velocity(int k, int end, const T* v, const T* a, V
 template <bool store_before, class T>
 void forward_velocities(const Model& m, const T* params, const T* v, const T* a, Workspace<T>& w) {
   const V6<T> base = stack<T>(V3<T>::Zero(), -m.gravity.in(params).acceleration);
-  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
+  for (std::size_t i = 0, bodies = m.bodies.size(); i < bodies; ++i) {
     const Body& body = m.bodies[i];
     if (body.is_free) {
       free_body_velocity<store_before, T>(m, i, v, w);
