@@ -172,7 +172,7 @@ class ContactDef:
     points: int
     shape: int
     law: str  # viscous or elastic
-    damping: str  # depth or plain
+    damping: str  # hunt-crossley (k_d scaled by depth) or linear
     kn: float
     kt: float
     mu: float
@@ -185,7 +185,7 @@ class ContactDef:
         points: int,
         shape: int,
         law: str = "viscous",
-        damping: str = "depth",
+        damping: str = "hunt-crossley",
         kn: float,
         kt: float,
         mu: float,
@@ -327,7 +327,7 @@ class Model:
     @property
     def nh(self) -> int: ...  # numbers in the history of BDF2
     @property
-    def markers(self) -> int: ...
+    def num_markers(self) -> int: ...
     @property
     def step(self) -> float: ...  # [s]
     @property

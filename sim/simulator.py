@@ -216,8 +216,8 @@ class Simulator:
         values = self.tactile() if forces is None else forces
         if not hasattr(values, "requires_grad"):
             values = np.asarray(values, self.dtype)
-        if values.ndim < 2 or tuple(values.shape[-2:]) != (self.model.markers, 3):
-            raise UsageError(f"forces must have shape (…, {self.model.markers}, 3), got {tuple(values.shape)}")
+        if values.ndim < 2 or tuple(values.shape[-2:]) != (self.model.num_markers, 3):
+            raise UsageError(f"forces must have shape (…, {self.model.num_markers}, 3), got {tuple(values.shape)}")
         displacements = [pad.gel.displacement(values[..., self.marker_slice(pad.name), :]) for pad in pads]
         if isinstance(values, np.ndarray):
             return np.concatenate(displacements, axis=-2)
@@ -318,7 +318,7 @@ class Simulator:
             return array
 
         read_steps = np.asarray(read_after, dtype=np.int32)
-        tactile_shape = (len(read_steps), n, self.model.markers, 3)
+        tactile_shape = (len(read_steps), n, self.model.num_markers, 3)
         result = Trajectory(
             q=along_time("q", q),
             v=along_time("v", v),

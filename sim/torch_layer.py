@@ -94,8 +94,8 @@ def torch_step(
     sim: Simulator, state: TorchState, u: torch.Tensor, *, params: Mapping[str, torch.Tensor] | None = None
 ) -> tuple[TorchState, torch.Tensor]:
     """One step with controls u (N, nu): the new state and its marker forces, (N, markers, 3) [N]."""
-    result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.markers else (), params=params)
-    tactile = result.tactile[0] if sim.model.markers else result.q.new_zeros((sim.num_envs, 0, 3))
+    result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.num_markers else (), params=params)
+    tactile = result.tactile[0] if sim.model.num_markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
 
 

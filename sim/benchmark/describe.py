@@ -318,7 +318,7 @@ def _size(scene: Scene) -> Size:
     after = _allocated()
     state = (sim.q, sim.v, sim.anchors, sim.anchored, sim.status, sim.iterations, sim.halved)
     state_bytes = sum(array.nbytes for array in state)
-    reading_bytes = int(model.markers) * 3 * sim.q.itemsize
+    reading_bytes = int(model.num_markers) * 3 * sim.q.itemsize
     known = state_bytes + sim.params.nbytes + reading_bytes
     sizes = {p.name: len(p.points) for p in scene.points}
     colliding = [pad for pad in scene.pads if pad.collides]
@@ -330,7 +330,7 @@ def _size(scene: Scene) -> Size:
         candidate_points=sum(sizes[c.points] for c in scene.contacts)
         + sum(len(pad.positions) * len(pad.against) for pad in colliding),
         anchors=model.na,
-        markers=model.markers,
+        markers=model.num_markers,
         parameters=len(model.param_names),
         state_bytes=state_bytes,
         parameter_bytes=sim.params.nbytes,

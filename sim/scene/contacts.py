@@ -24,6 +24,8 @@ from gelflow.toml_tables import TomlTable
 Array = NDArray[np.float64]
 
 FRICTION_LAWS = ("viscous", "elastic")
+DAMPING_LAWS = ("hunt-crossley", "linear")  # the first is the default
+_RENAMED_DAMPING = {"depth": "hunt-crossley", "plain": "linear"}
 CONTACT_PARAMS = ("kn", "kt", "mu", "kd", "ks")  # parameters of the contact law (docs/reference/physics.md)
 _STIFFNESS_UNITS = ("per point", "per area")
 
@@ -52,7 +54,7 @@ class ContactDef:
     points: str
     shape: str
     law: str  # friction law: "viscous" or "elastic"
-    damping: str  # "depth" (scaled by penetration depth, eq. 8 of Xu et al., CoRL 2022) or "plain"
+    damping: str  # "hunt-crossley" (scaled by penetration depth, eq. 8 of Xu et al., CoRL 2022) or "linear"
     params: Mapping[str, float]  # kn, kt, mu, kd, ks
 
 
@@ -75,7 +77,7 @@ def read_contacts(
         table.check_keys(("points", "against", "damping", "law", *FRICTION_LAWS, *CONTACT_PARAMS))
         sampled = table.lookup(points, table.string("points"), "points")
         law = table.string("law", friction, choices=FRICTION_LAWS)
-        damping = table.string("damping", "depth", choices=("depth", "plain"))
+        damping = table.string("damping", DAMPING_LAWS[0], choices=DAMPING_LAWS, renamed=_RENAMED_DAMPING)
         params = read_contact_params(table, law)
         against = table.strings("against")
         for shape in against:

@@ -100,7 +100,7 @@ class RolloutLoss:
     @classmethod
     def random(cls, sim: Simulator, u: NDArray[np.float64], output: Output, rng: np.random.Generator) -> "RolloutLoss":
         """A loss with normally distributed weights."""
-        shape = (sim.model.markers, 3) if output == "tactile" else (sim.model.nv,)
+        shape = (sim.model.num_markers, 3) if output == "tactile" else (sim.model.nv,)
         return cls(sim, u, output, rng.normal(size=shape))
 
     @property

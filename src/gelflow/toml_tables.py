@@ -126,13 +126,22 @@ class TomlTable:
             raise UsageError(f"{self.location}: {key} must be an integer{bound}, got {value!r}")
         return value
 
-    def string(self, key: str, default: str | None = None, *, choices: Collection[str] | None = None) -> str:
-        """A string; one of `choices`, if given."""
+    def string(
+        self,
+        key: str,
+        default: str | None = None,
+        *,
+        choices: Collection[str] | None = None,
+        renamed: Mapping[str, str] | None = None,
+    ) -> str:
+        """A string; one of `choices`, if given. `renamed` maps former choices to present ones, for error messages."""
         value = self._get(key, default)
         if not isinstance(value, str):
             raise UsageError(f"{self.location}: {key} must be a string, got {value!r}")
         if choices is not None and value not in choices:
-            raise UsageError(f"{self.location}: {key} is {value!r}; {suggestion(value, choices)}")
+            new_value = (renamed or {}).get(value)
+            hint = f"it is now called {new_value!r}" if new_value else suggestion(value, choices)
+            raise UsageError(f"{self.location}: {key} is {value!r}; {hint}")
         return value
 
     def boolean(self, key: str, default: bool | None = None) -> bool:

@@ -29,7 +29,7 @@ def test_a_simulator_of_a_named_scene_takes_a_step() -> None:
     sim.q[:] = sim.scene.q0
     sim.step([0.0] * sim.model.nu)
     sim.check()
-    assert sim.tactile().shape == (3, sim.model.markers, 3)
+    assert sim.tactile().shape == (3, sim.model.num_markers, 3)
 
 
 @pytest.mark.parametrize("package", ["gelflow", "gelflow.sim", "gelflow.sim.scene"])

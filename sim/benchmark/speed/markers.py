@@ -96,7 +96,7 @@ class _PressedPad:
         return np.concatenate([found.q[0], found.v[0]]).astype(float)
 
     def workloads(self) -> Iterator[Workload]:
-        markers = int(self.sim.model.markers)
+        markers = int(self.sim.model.num_markers)
         yield Workload(self.sim.tactile, markers)
         yield Workload(self.gradient, markers)
 

@@ -145,7 +145,7 @@ void Batch<T>::tactile(T* out) {
 template <class T>
 void Batch<T>::update_readings() {
   if (nonzero_.empty()) {
-    readings.resize(static_cast<std::size_t>(n) * model->markers * 3);
+    readings.resize(static_cast<std::size_t>(n) * model->num_markers * 3);
     nonzero_.resize(n);
   }
   read(readings.data(), nonzero_.data());
@@ -158,7 +158,8 @@ void Batch<T>::read(T* out, NonzeroMarkers* nonzero) {
     Workspace<T>& w = memory_[thread].work;
     forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
     read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
-                    out + static_cast<std::size_t>(e) * model->markers * 3, nonzero == nullptr ? nullptr : nonzero + e);
+                    out + static_cast<std::size_t>(e) * model->num_markers * 3,
+                    nonzero == nullptr ? nullptr : nonzero + e);
   });
 }
 
@@ -306,7 +307,7 @@ struct DoubleTrajectory {
     by_v = copy(cotangent.v, rows * m.nv);
     by_anchors_end = copy(cotangent.anchors_end, n * m.na * 3);
     by_history_end = copy(cotangent.history_end, n * m.nh);
-    by_tactile = copy(cotangent.tactile, r.row(reads, 0) * m.markers * 3);
+    by_tactile = copy(cotangent.tactile, r.row(reads, 0) * m.num_markers * 3);
     by_u.resize(u.size());
     by_anchors0.resize(by_anchors_end.size());
     by_history0.resize(by_history_end.size());

@@ -73,7 +73,7 @@ DirectionalRollout directional_rollout(const Model& m, int steps, const RolloutI
     out.status = static_cast<std::int32_t>(report.status);
     if (report.status != Status::ok) break;
   }
-  std::vector<Dual> tactile(static_cast<std::size_t>(m.markers) * 3);
+  std::vector<Dual> tactile(static_cast<std::size_t>(m.num_markers) * 3);
   forward_state<false, Dual>(m, params.data(), q.data(), nullptr, v.data(), memory.work);
   read_markers<Dual>(m, params.data(), anchors.data(), anchored.data(), memory.work, tactile.data(), nullptr);
 

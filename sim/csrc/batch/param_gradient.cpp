@@ -68,7 +68,7 @@ void add_reading_param_gradient(const Model& m, const double* params, const Para
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
   forward_state<false, Taped>(m, t.params.data(), t.q0.data(), nullptr, t.v0.data(), w);
-  std::vector<Taped> readings(static_cast<std::size_t>(m.markers) * 3);
+  std::vector<Taped> readings(static_cast<std::size_t>(m.num_markers) * 3);
   read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (std::size_t i = 0; i < readings.size(); ++i) set_weight(weights, readings[i], by_reading[i]);

@@ -28,7 +28,7 @@ struct Trajectory {
   // Controls of the step that starts after `step` steps.
   const T* controls(const Model& m, int step, std::size_t e) const { return u + row(step, e) * m.actuators.size(); }
   // Offset of an environment's markers in `tactile`.
-  std::size_t reading(const Model& m, int read, std::size_t e) const { return row(read, e) * m.markers * 3; }
+  std::size_t reading(const Model& m, int read, std::size_t e) const { return row(read, e) * m.num_markers * 3; }
 };
 
 // Gradient of a scalar by the results of a rollout: the input of the reverse pass.

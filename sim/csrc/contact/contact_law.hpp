@@ -6,8 +6,8 @@
 //
 // In the shape's frame, x the point, X its anchor, e = x − X (0 at a new contact point), v its velocity relative to the
 // shape, d, n, H the distance there (d < 0 inside) with its gradient and Hessian, ḋ = n·v, v_t = v − ḋ n:
-//     normal      N = max(k_n − k_d ḋ, 0) (−d)          damping scaled by depth (eq. 8 has no max and can pull)
-//                 N = max(−k_n d − r k_d ḋ, 0)          plain damping, for grounds; r = min(−d / 1 µm, 1), since a
+//     normal      N = max(k_n − k_d ḋ, 0) (−d)          Hunt-Crossley: scaled by depth (eq. 8 has no max and can pull)
+//                 N = max(−k_n d − r k_d ḋ, 0)          linear damping, for grounds; r = min(−d / 1 µm, 1), since a
 //                                                       light body that arrives fast has no solution without the ramp
 //     trial       f* = −k_t v_t                         viscous friction
 //                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
@@ -60,7 +60,7 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
   const P zero(0.0), one(1.0);
   const Vec3<P>& n = at.n;
   p.rate = dot(n, v);
-  if (law.damping == DampingLaw::depth) {
+  if (law.damping == DampingLaw::hunt_crossley) {
     const P unclipped = law.kn - law.kd * p.rate;
     const Mask<P> positive = unclipped > zero;
     const P stiffness = select(positive, unclipped, zero);

@@ -33,7 +33,8 @@ template <class T>
 ContactSettings<T> contact_settings(const Pad& pad, std::size_t s, const T* params, const V3<T>* anchors,
                                     const std::uint8_t* anchored, const T& step_length = T(0)) {
   const std::size_t slot = pad.anchor < 0 ? 0 : pad.anchor + s * pad.cloud.size();
-  return {pad.params.in(params), pad.law, DampingLaw::depth, T(0), anchors + slot, anchored + slot, 1, step_length};
+  return {
+      pad.params.in(params), pad.law, DampingLaw::hunt_crossley, T(0), anchors + slot, anchored + slot, 1, step_length};
 }
 
 }  // namespace gelflow

@@ -154,7 +154,7 @@ template <class T>
 class NonzeroTracker {
  public:
   NonzeroTracker(const Model& m, T* out, NonzeroMarkers* nonzero)
-      : nonzero_(nonzero), track_(nonzero != nullptr && nonzero->track), max_tracked_(m.markers / 8) {
+      : nonzero_(nonzero), track_(nonzero != nullptr && nonzero->track), max_tracked_(m.num_markers / 8) {
     if (nonzero == nullptr) return;
     for (const int marker : nonzero->markers) std::fill_n(out + 3 * static_cast<std::size_t>(marker), 3, T(0));
     nonzero->markers.clear();

@@ -40,9 +40,9 @@ FrictionLaw friction_law(const std::string& owner, const std::string& name) {
 }
 
 DampingLaw damping_law(const std::string& owner, const std::string& name) {
-  if (name == "depth") return DampingLaw::depth;
-  if (name == "plain") return DampingLaw::plain;
-  reject(owner + ": damping '" + name + "' is not depth or plain");
+  if (name == "hunt-crossley") return DampingLaw::hunt_crossley;
+  if (name == "linear") return DampingLaw::linear;
+  reject(owner + ": damping '" + name + "' is not one of hunt-crossley, linear");
 }
 
 ActuatorKind actuator_kind(const std::string& owner, const std::string& name) {

@@ -63,8 +63,8 @@ struct PointsDef {
 struct ContactDef {
   std::string name;
   int points = 0, shape = 0;
-  std::string law = "viscous";    // friction: viscous or elastic
-  std::string damping = "depth";  // depth (k_d scaled by depth) or plain
+  std::string law = "viscous";            // friction: viscous or elastic
+  std::string damping = "hunt-crossley";  // hunt-crossley (k_d scaled by depth) or linear
   ContactParams<double> params{0, 0, 0, 0, 0};
 };
 

@@ -27,7 +27,7 @@ enum class ShapeKind : std::uint8_t {
   grid
 };
 enum class FrictionLaw : std::uint8_t { viscous, elastic };
-enum class DampingLaw : std::uint8_t { depth, plain };  // k_d scaled by depth, or not (contact_law.hpp)
+enum class DampingLaw : std::uint8_t { hunt_crossley, linear };  // contact_law.hpp
 enum class ActuatorKind : std::uint8_t { motor, position, velocity, general };
 
 struct Body {
@@ -164,10 +164,10 @@ struct Model : SolverOptions {
   std::vector<double> param_defaults;
   ParamBlock<GravityParams> gravity;
 
-  int nq = 0, nv = 0, na = 0, markers = 0;  // positions, velocities, anchors, markers
-  int nh = 0;                               // numbers in the history of BDF2, 2 nv + 1 (step.hpp); 0 under BDF1
-  int jacobian_columns = 0;                 // the most columns of a pair (PackedDofs)
-  std::vector<double> q0;                   // reference positions
+  int nq = 0, nv = 0, na = 0, num_markers = 0;  // positions, velocities, anchors, markers
+  int nh = 0;                                   // numbers in the history of BDF2, 2 nv + 1 (step.hpp); 0 under BDF1
+  int jacobian_columns = 0;                     // the most columns of a pair (PackedDofs)
+  std::vector<double> q0;                       // reference positions
 
   // Per dof: its body, its joint; its group, the three rotational dofs of a ball or free joint, else itself; whether it
   // is a rotation; whether it and all its ancestors are translations.

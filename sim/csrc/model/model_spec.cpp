@@ -226,8 +226,8 @@ int ModelSpec::add_pad(const PadDef& def) {
   pad.params = add_params(def.name, def.params);
   pad.mount.pose = add_pose(def.name + ".markers", def.pose.pos);
   pad.anchor = add_anchors(pad.law, pad.cloud.size() * count(def.shapes));
-  pad.first_marker = model_.markers;
-  model_.markers += pad.cloud.size();
+  pad.first_marker = model_.num_markers;
+  model_.num_markers += pad.cloud.size();
   pad.collides = def.collides;
   if (pad.collides) add_pad_contacts(pad);
   model_.pads.push_back(pad);
@@ -245,7 +245,7 @@ void ModelSpec::add_pad_contacts(const Pad& pad) {
     contact.points = count(model_.point_sets) - 1;
     contact.shape = pad.shapes[s];
     contact.law = pad.law;
-    contact.damping = DampingLaw::depth;
+    contact.damping = DampingLaw::hunt_crossley;
     contact.params = pad.params;
     contact.anchor = pad.anchor < 0 ? -1 : pad.anchor + static_cast<int>(s) * pad.cloud.size();
     model_.contacts.push_back(contact);

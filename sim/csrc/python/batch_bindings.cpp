@@ -50,7 +50,7 @@ Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t) {
   r.halvings = writable<std::int8_t>(t.halvings, {steps, n}, "halvings");
   r.status = writable<std::int32_t>(t.status, {n}, "status");
   r.read_after = read_after;
-  r.tactile = writable<T>(t.tactile, {reads, n, m.markers, 3}, "tactile");
+  r.tactile = writable<T>(t.tactile, {reads, n, m.num_markers, 3}, "tactile");
   return r;
 }
 
@@ -60,7 +60,7 @@ TrajectoryCotangent<T> checked(const Batch<T>& b, const Trajectory<T>& r, const 
   const py::ssize_t n = b.n;
   return {readable<T>(c.q, {r.steps + 1, n, m.nq}, "q"), readable<T>(c.v, {r.steps + 1, n, m.nv}, "v"),
           readable<T>(c.anchors_end, {n, m.na, 3}, "anchors_end"), readable<T>(c.history_end, {n, m.nh}, "history_end"),
-          readable<T>(c.tactile, {r.reads, n, m.markers, 3}, "tactile")};
+          readable<T>(c.tactile, {r.reads, n, m.num_markers, 3}, "tactile")};
 }
 
 // Controls (N, nu), or (nu,) for all environments.
@@ -160,7 +160,7 @@ void bind_state(py::class_<Batch<T>>& type) {
                              })
       .def_property_readonly("readings", [](const py::object& self) {
         B& b = self.cast<B&>();
-        py::array readings = view(b.readings.data(), {b.n, b.model->markers, 3}, self);
+        py::array readings = view(b.readings.data(), {b.n, b.model->num_markers, 3}, self);
         readings.attr("flags").attr("writeable") = false;
         return readings;
       });
@@ -237,7 +237,7 @@ void bind_outputs(py::class_<Batch<T>>& type) {
   type.def(
           "tactile",
           [](B& b, py::array out) {
-            T* data = writable<T>(out, {b.n, b.model->markers, 3}, "out");
+            T* data = writable<T>(out, {b.n, b.model->num_markers, 3}, "out");
             const py::gil_scoped_release release;
             b.tactile(data);
           },

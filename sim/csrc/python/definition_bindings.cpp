@@ -163,7 +163,8 @@ void bind_contact(py::module_& module) {
                        const std::string& damping, double kn, double kt, double mu, double kd,
                        double ks) { return ContactDef{name, points, shape, law, damping, {kn, kt, mu, kd, ks}}; }),
            py::kw_only(), py::arg("name"), py::arg("points"), py::arg("shape"), py::arg("law") = "viscous",
-           py::arg("damping") = "depth", py::arg("kn"), py::arg("kt"), py::arg("mu"), py::arg("kd"), py::arg("ks") = 0.)
+           py::arg("damping") = "hunt-crossley", py::arg("kn"), py::arg("kt"), py::arg("mu"), py::arg("kd"),
+           py::arg("ks") = 0.)
       .def_readwrite("name", &ContactDef::name)
       .def_readwrite("points", &ContactDef::points)
       .def_readwrite("shape", &ContactDef::shape)

@@ -103,7 +103,7 @@ void bind_model(py::module_& module) {
       .def_property_readonly("nu", [](const Model& m) { return m.actuators.size(); })
       .def_readonly("na", &Model::na)
       .def_readonly("nh", &Model::nh)
-      .def_readonly("markers", &Model::markers)
+      .def_readonly("num_markers", &Model::num_markers)
       .def_property_readonly("step", [](const Model& m) { return m.step; })
       .def_readonly("q0", &Model::q0)
       .def_readonly("param_names", &Model::param_names)

@@ -23,7 +23,7 @@ SCENE_STEPS = (1e-3, 5e-3, 2e-2)  # [s]
 BODIES, STEPS_TAKEN = 16, 200
 CENTERS = ((0.0, 0.0, 0.0), (4e-3, -3e-3, 5e-3))  # of mass, in the body's frame [m]
 ALLOWED = 1e-8  # ten times Newton's tolerance
-MATERIALS = (("depth", 0.0), ("depth", 3e3), ("plain", 0.0), ("plain", 3.0))  # damping and its k_d
+MATERIALS = (("hunt-crossley", 0.0), ("hunt-crossley", 3e3), ("linear", 0.0), ("linear", 3.0))  # damping and its k_d
 BODY_SETUPS: tuple[tuple[Kind, str, float], ...] = (  # body, law, k_t
     ("sphere", "viscous", 5.0),
     ("box", "viscous", 5.0),

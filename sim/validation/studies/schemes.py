@@ -1,7 +1,7 @@
 """Implicit integration schemes compared on a reduced example in NumPy, and on scenes where the core supports it.
 
-In the example a ball (x, z, angle) is thrown on a plane with penalty contact, depth damping and viscous friction, and
-bounces until it rolls. All schemes solve systems of the form
+In the example a ball (x, z, angle) is thrown on a plane with penalty contact, Hunt-Crossley damping and viscous
+friction, and bounces until it rolls. All schemes solve systems of the form
 
     Y = base + γ h F(Y),
 

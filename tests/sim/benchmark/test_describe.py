@@ -103,7 +103,7 @@ def test_tree_shows_parameters_of_contacts_and_joints(capsys: pytest.CaptureFixt
     assert "range -0.055 to 0 m (stop 500 N/m), damping 20 N s/m" in text
     assert "actuator arm_yaw: position, k_p 10, k_d 0.1, force -100 to 100 N m" in text
     assert "elastic per point: k_n 8000 N/m, k_s 250 N/m, k_t 2.5 N s/m, k_d 1000 N s/m², µ 1.5" in text
-    assert "elastic per point, plain damping: k_n 1000 N/m, k_s 500 N/m, k_t 1 N s/m, k_d 0.003 N s/m, µ 0.8" in text
+    assert "elastic per point, linear damping: k_n 1000 N/m, k_s 500 N/m, k_t 1 N s/m, k_d 0.003 N s/m, µ 0.8" in text
 
 
 @pytest.mark.parametrize("law", FRICTION_LAWS)
@@ -115,7 +115,7 @@ def test_json_output_agrees_with_the_model(name: str, law: str, capsys: pytest.C
     size = description["size"]
     for key in ("nq", "nv", "nu"):
         assert size[key] == getattr(sim.model, key) == getattr(scene, key)
-    assert size["markers"] == sim.model.markers == scene.num_markers
+    assert size["markers"] == sim.model.num_markers == scene.num_markers
     assert size["anchors"] == sim.model.na
     assert (size["anchors"] > 0) == (law == "elastic")
     assert size["parameters"] == len(sim.model.param_names)

@@ -35,7 +35,7 @@ def block(spec: Any, name: str, pos: Any = ORIGIN, mass: float = MASS) -> int:
     return body
 
 
-def block_on_plane(law: str, *, slope: float = 0.0, damping: str = "depth", **numbers: float) -> Simulator:
+def block_on_plane(law: str, *, slope: float = 0.0, damping: str = "hunt-crossley", **numbers: float) -> Simulator:
     """A block on a plane, with markers of the same law at its corners; gravity is inclined by `slope` [rad]."""
     spec = _core.ModelSpec()
     spec.step, spec.tolerance = 2e-3, 1e-12
@@ -71,10 +71,10 @@ def settle(sim: Simulator, seconds: float) -> None:
     sim.check()
 
 
-@pytest.mark.parametrize("damping", ["depth", "plain"])
+@pytest.mark.parametrize("damping", ["hunt-crossley", "linear"])
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 def test_contact_forces_of_a_resting_block_carry_its_weight(law: str, damping: str) -> None:
-    sim = block_on_plane(law, damping=damping, kd=20.0 if damping == "plain" else 2e4)
+    sim = block_on_plane(law, damping=damping, kd=20.0 if damping == "linear" else 2e4)
     settle(sim, 2.0)
     wrench = sim.wrenches()[0, 0]
     np.testing.assert_allclose(wrench[3:], [0, 0, MASS * G], atol=1e-9)
@@ -209,7 +209,9 @@ def ball_on_plane(step: float = 1e-3) -> Simulator:
     plane = spec.add_shape(_core.ShapeDef(name="plane", kind="plane", size=(1, 1, 1)))
     points = spec.add_points(_core.PointsDef(name="centre", body=ball, points=[ORIGIN], radius=radius))
     spec.add_contact(
-        _core.ContactDef(name="contact", points=points, shape=plane, damping="plain", kn=5e4, kt=200.0, mu=0.3, kd=50.0)
+        _core.ContactDef(
+            name="contact", points=points, shape=plane, damping="linear", kn=5e4, kt=200.0, mu=0.3, kd=50.0
+        )
     )
     return Simulator(_core.Model(spec))
 

@@ -39,12 +39,12 @@ def throws(kind: Kind, law: str) -> st.SearchStrategy[ThrownBody]:
     def build(
         damping: str, kd: float, step: float, numbers: dict[str, float], turns: bool, center: tuple[float, float, float]
     ) -> ThrownBody:
-        scaled = kd * (1e3 if damping == "depth" else 1)
+        scaled = kd * (1e3 if damping == "hunt-crossley" else 1)
         return ThrownBody(kind, law, damping, step, {**numbers, "kd": scaled}, has_rotation=turns, center=center)
 
     turning = st.sampled_from([True, True, True, False])
     return st.builds(
-        build, st.sampled_from(["depth", "plain"]), damped, logarithmic(1e-4, 2e-2), numbers, turning, centers
+        build, st.sampled_from(["hunt-crossley", "linear"]), damped, logarithmic(1e-4, 2e-2), numbers, turning, centers
     )
 
 
@@ -70,7 +70,7 @@ def test_fast_spinning_bodies_with_long_steps_never_gain_energy() -> None:
     """Points move along long arcs within a step, without friction springs; the body frame is off the centre of mass."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
     for kind in ("box", "cylinder"):
-        throw = ThrownBody(kind, "viscous", "depth", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
+        throw = ThrownBody(kind, "viscous", "hunt-crossley", 2e-2, numbers, center=(4e-3, -3e-3, 5e-3))
         growth = throw_bodies(throw, np.random.default_rng(1), bodies=24, steps=150)
         assert (growth.change <= TOLERANCE * growth.scale).all()
 
@@ -81,7 +81,7 @@ def test_friction_energy_of_a_slipping_block(integrator: str, step: float, withi
 
     BDF2 computes the slip of a step to first order."""
     numbers = {"kn": 2e3, "kt": 5.0, "mu": 0.3, "kd": 0.0, "ks": 1e3}
-    throw = ThrownBody("box", "elastic", "depth", step, numbers, integrator=integrator, has_rotation=False)
+    throw = ThrownBody("box", "elastic", "hunt-crossley", step, numbers, integrator=integrator, has_rotation=False)
     sim, gauge = Simulator(_core.Model(throw.model_spec())), EnergyGauge(throw)
     points = 9  # of the lower face
     sim.q[0, 2] = 0.6 * SIZE - MASS * GRAVITY / (points * numbers["kn"])
@@ -95,7 +95,7 @@ def test_friction_energy_of_a_slipping_block(integrator: str, step: float, withi
 def test_energy_terms_equal_their_formulas() -> None:
     """A resting block, and the springs of a scene."""
     numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.5, "kd": 0.0, "ks": 1e3}
-    throw = ThrownBody("box", "elastic", "depth", 1e-3, numbers)
+    throw = ThrownBody("box", "elastic", "hunt-crossley", 1e-3, numbers)
     sim, gauge = (
         Simulator(_core.Model(throw.model_spec()), num_envs=2),
         EnergyGauge(throw, num_envs=2),

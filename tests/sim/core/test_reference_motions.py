@@ -26,7 +26,7 @@ def test_sliding_distance_of_a_block_is_v_squared_over_2_mu_g(law: str, integrat
     are far below 1e-3: creep below µ m g / (n k_t) = 0.5 mm/s, or compliance of µ m g / (n k_s) = 0.01 mm."""
     mu, speed, step = 0.3, 0.8, 1e-3
     numbers = {"kn": 2e3, "kt": 200.0 if law == "viscous" else 5.0, "mu": mu, "kd": 1e4, "ks": 1e4 * (law == "elastic")}
-    throw = ThrownBody("box", law, "depth", step, numbers, integrator=integrator, has_rotation=False)
+    throw = ThrownBody("box", law, "hunt-crossley", step, numbers, integrator=integrator, has_rotation=False)
     sim = Simulator(_core.Model(throw.model_spec()))
     sim.q[0, 0], sim.q[0, 2] = (
         -10,

@@ -281,6 +281,8 @@ INVALID_TOML = [
     ('model = "s.xml"', 'modell = "s.xml"', "unknown key 'modell'; did you mean 'model'"),
     ("[contacts.block_ground]", "[contact.block_ground]", "unknown key 'contact'; did you mean 'contacts'"),
     ("kn = 1.0", "kn = 1.0\nknn = 2", "unknown key 'knn'; did you mean 'kn'"),
+    ("kn = 1.0", 'kn = 1.0\ndamping = "depth"', "damping is 'depth'; it is now called 'hunt-crossley'"),
+    ("kn = 1.0", 'kn = 1.0\ndamping = "plain"', "damping is 'plain'; it is now called 'linear'"),
     ("format = 1", "format = 2", "format is 2; this gelflow reads format 1"),
     ("step = 0.005", "", "step is missing"),
     ("step = 0.005", 'step = "5 ms"', "step must be a finite number"),

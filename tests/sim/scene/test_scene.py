@@ -32,7 +32,7 @@ def ball_on_ground() -> Scene:
         q0=np.array([0.0, 0.0, RADIUS, 1.0, 0.0, 0.0, 0.0]),
         shapes=(ShapeDef("ground", WORLD, "plane", Pose(), np.ones(3)),),
         points=(PointsDef("ball", "ball", 0, np.zeros((1, 3)), np.ones((1, 3)), np.ones(1), radius=RADIUS),),
-        contacts=(ContactDef("rest", "rest", "ball", "ground", "viscous", "depth", PARAMS),),
+        contacts=(ContactDef("rest", "rest", "ball", "ground", "viscous", "hunt-crossley", PARAMS),),
         pads=(
             PadDef(
                 name="pad",

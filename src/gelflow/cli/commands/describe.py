@@ -150,8 +150,10 @@ def _add_contact(at: Tree, contact: "ContactPart") -> None:
     count = "one exact point" if contact.unit == "one exact point" else f"{contact.candidates} points"
     text = f"{count} on {contact.points} against {', '.join(contact.against)}"
     branch = at.add(f"[cyan]{escape(contact.name)}[/cyan]: {escape(text)}")
-    plain = ", plain damping" if contact.damping == "plain" else ""
-    branch.add(_law(contact.law, contact.unit, contact.numbers, plain, damped_by_depth=contact.damping == "depth"))
+    linear = ", linear damping" if contact.damping == "linear" else ""
+    branch.add(
+        _law(contact.law, contact.unit, contact.numbers, linear, damped_by_depth=contact.damping == "hunt-crossley")
+    )
 
 
 def _add_pad(at: Tree, pad: "PadPart") -> None:
@@ -172,7 +174,7 @@ def _add_pad(at: Tree, pad: "PadPart") -> None:
 
 
 def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_by_depth: bool) -> str:
-    """Text of a force law; units as in docs/reference/conventions.md, plain damping has that of k_t."""
+    """Text of a force law; units as in docs/reference/conventions.md, linear damping has that of k_t."""
     stiffness, friction, by_depth = ("N/m³", "N s/m³", "N s/m⁴") if unit == "per area" else ("N/m", "N s/m", "N s/m²")
     words = [f"k_n {numbers['kn']:g} {stiffness}"]
     if law == "elastic":
