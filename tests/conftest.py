@@ -1,4 +1,4 @@
-"""Shared test set-up: pictures without a display, reproducible examples, a separate cache, Ctrl-C."""
+"""Shared test set-up: pictures without a display, reproducible examples, a separate cache, signals."""
 
 import os
 import signal
@@ -9,9 +9,11 @@ from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
-# A shell ignores SIGINT for background jobs, and child processes inherit that: tests of Ctrl-C need the default.
-if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell ignores SIGINT for background jobs, nohup ignores SIGHUP, and child processes inherit that: tests of signals
+# need the defaults.
+for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) == signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 # No deadline: tests do not depend on the speed of the machine. Derandomized: a failed run is reproducible.
 settings.register_profile("gelflow", deadline=None, derandomize=True)
