@@ -1,7 +1,7 @@
 # make demo and make test do all set-up themselves: Python 3.11 or newer, a C++20 compiler and make are enough.
 #   make demo    the main job on the mock robot
 #   make test    all tests except the slow ones
-#   make test-slow  the slow tests, which continuous integration runs too
+#   make test-slow  the slow tests: several insertions on the mock robot
 #   make check   lint, format, types, import rules
 #   make docs    the documentation site, in build/docs
 #   make core    rebuild the C++ parts after a change
