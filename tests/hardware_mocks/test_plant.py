@@ -1,29 +1,13 @@
 """Kinematic plants against closed forms."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from tests.common.manual_clock import ManualClock
 
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.plant import ArmPlant, GripperPlant, KinematicArm, KinematicGripper
-
-
-@dataclass
-class ManualClock:
-    """A clock that the test advances."""
-
-    time: float = 0.0
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds
-
-    def wall(self, seconds: float) -> float:
-        return seconds
 
 
 def test_fingers_move_at_their_speed_and_stop_at_target_part_and_end() -> None:

@@ -10,25 +10,16 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from tests.hardware_mocks.wsg.harness import checksum
 
 from gelflow.clock import ScaledClock
 from gelflow.hardware_mocks.plant import KinematicGripper
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 
 CLOCK = ScaledClock(1.0)
-WIDTH_EVERY_20_MS = bytes.fromhex("aaaaaa4303000114003 68d".replace(" ", ""))
+WIDTH_EVERY_20_MS = bytes.fromhex("aaaaaa430300011400368d")
 WIDTH_ONCE = 0x43
 PREAMBLE = b"\xaa\xaa\xaa"
-
-
-def checksum(data: bytes) -> int:
-    crc = 0xFFFF
-    for byte in data:
-        value = ((crc ^ byte) & 0xFF) << 8
-        for _ in range(8):
-            value = ((value << 1) ^ 0x1021) & 0xFFFF if value & 0x8000 else (value << 1) & 0xFFFF
-        crc = value ^ (crc >> 8)
-    return crc
 
 
 class Client:

@@ -9,49 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.hardware_mocks.simulated_cell.harness import aligned_pose, go, grasped
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError, UsageError
-from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.task import INSERTION
 from gelflow.time_sync import TimeSync
 
-PlanarPose = tuple[float, float, float]
-
 
 def simulated_cell(seed: int = 0) -> SimulatedCell:
     return SimulatedCell(ScaledClock(), SimulatedCellConfig(seed=seed))
-
-
-def go(cell: SimulatedCell, target: PlanarPose, height: float, *, steps: int) -> None:
-    """Move the gripper at constant speed to a planar pose about the taught hole, the lower face at `height` [m]."""
-    config = cell.config
-    x, y, yaw = target
-    local = Pose(np.array([x, y, height + config.grasp_height]), yaw_quaternion(yaw))
-    now = config.hole.inverse() @ (Pose(*cell.arm_pose()) @ config.tool)
-    for share in np.linspace(0, 1, steps + 1)[1:]:
-        position = now.position + share * (local.position - now.position)
-        turn = now.yaw + share * (yaw - now.yaw)
-        pose = config.hole @ Pose(position, yaw_quaternion(turn)) @ config.tool.inverse()
-        cell.command_arm(pose.position, pose.quaternion)
-        cell.advance(1)
-
-
-def grasped(seed: int = 0) -> SimulatedCell:
-    cell = simulated_cell(seed)
-    cell.advance(100)
-    cell.command_gripper(width=0.032, speed=0.1, force=12.0)
-    cell.advance(120)
-    return cell
-
-
-def aligned_pose(truth: dict[str, Any]) -> PlanarPose:
-    """Planar pose relative to the taught hole at which the gripper is aligned with the true hole."""
-    x, y, yaw = truth["part"]["misalignment"]
-    pose = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)).inverse()
-    return float(pose.position[0]), float(pose.position[1]), pose.yaw
 
 
 def test_operator_presents_a_part_and_the_gripper_grasps_it() -> None:
@@ -70,14 +39,14 @@ def test_operator_presents_a_part_and_the_gripper_grasps_it() -> None:
 
 
 def test_held_part_does_not_creep() -> None:
-    cell = grasped()
+    cell = grasped(SimulatedCellConfig())
     before = cell.truth()["part"]["height"]
     cell.advance(2500)  # ten seconds, in which a grip with viscous friction loses millimetres
     assert abs(cell.truth()["part"]["height"] - before) < 5e-6
 
 
 def test_rim_displaces_the_markers_towards_the_fingers_base_and_the_hole_does_not() -> None:
-    cell = grasped()
+    cell = grasped(SimulatedCellConfig())
     go(cell, (0.0, 0.0, 0.0), 0.0255, steps=400)
     rest = np.stack([cell.marker_displacement(finger) for finger in (0, 1)])
     go(cell, (0.0, 0.0, 0.0), 0.0248, steps=350)
@@ -86,7 +55,7 @@ def test_rim_displaces_the_markers_towards_the_fingers_base_and_the_hole_does_no
     assert not cell.truth()["part"]["inserted"]
 
     go(cell, (0.0, 0.0, 0.0), 0.0255, steps=200)
-    pose = aligned_pose(cell.truth())
+    pose = aligned_pose(cell.truth()["part"])
     go(cell, pose, 0.0255, steps=400)
     rest = np.stack([cell.marker_displacement(finger) for finger in (0, 1)])
     go(cell, pose, 0.0240, steps=400)
@@ -97,8 +66,8 @@ def test_rim_displaces_the_markers_towards_the_fingers_base_and_the_hole_does_no
 
 
 def test_ground_truth_at_the_release_is_kept() -> None:
-    cell = grasped(5)
-    pose = aligned_pose(cell.truth())
+    cell = grasped(SimulatedCellConfig(seed=5))
+    pose = aligned_pose(cell.truth()["part"])
     go(cell, pose, 0.0255, steps=400)
     go(cell, pose, 0.002, steps=800)
     cell.command_gripper(width=0.06, speed=0.1, force=50.0)
@@ -113,7 +82,7 @@ def test_ground_truth_at_the_release_is_kept() -> None:
 
 def test_same_seed_gives_bit_identical_results() -> None:
     def run(seed: int) -> tuple[Any, Any]:
-        cell = grasped(seed)
+        cell = grasped(SimulatedCellConfig(seed=seed))
         go(cell, (0.0, 0.0, 0.0), 0.0248, steps=400)
         return cell.truth()["part"], cell.marker_displacement(0)
 

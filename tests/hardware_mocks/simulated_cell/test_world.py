@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.hardware_mocks.simulated_cell.harness import PlanarPose, aligned_pose, go, grasped
 
-from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.robot import MockRobotConfig
@@ -34,38 +34,17 @@ from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.synthetic.lens import Lens
 from gelflow.perception.tracker import MarkerTracker
 
-PlanarPose = tuple[float, float, float]
-
 
 def gripped(world: World) -> SimulatedCell:
-    cell = SimulatedCell(ScaledClock(), SimulatedCellConfig(seed=3, world=world))
-    cell.advance(100)
-    cell.command_gripper(width=0.032, speed=0.1, force=12.0)
-    cell.advance(120)
-    return cell
+    return grasped(SimulatedCellConfig(seed=3, world=world))
 
 
 def lower(cell: SimulatedCell, target: PlanarPose, height: float, *, steps: int) -> dict[str, Any]:
     """Move to a planar pose about the taught hole, the lower face at `height` [m] above it; returns the truth."""
-    config = cell.config
-    x, y, yaw = target
-    goal = Pose(np.array([x, y, height + config.grasp_height]), yaw_quaternion(yaw))
-    now = config.taught_hole.inverse() @ (Pose(*cell.arm_pose()) @ config.tool)
-    for share in np.linspace(0, 1, steps + 1)[1:]:
-        position = now.position + share * (goal.position - now.position)
-        turned = yaw_quaternion(now.yaw + share * (yaw - now.yaw))
-        pose = config.taught_hole @ Pose(position, turned) @ config.tool.inverse()
-        cell.command_arm(pose.position, pose.quaternion)
-        cell.advance(1)
+    go(cell, target, height, steps=steps)
     cell.advance(20)
     part: dict[str, Any] = cell.truth()["part"]
     return part
-
-
-def aligned(part: dict[str, Any]) -> PlanarPose:
-    x, y, yaw = part["misalignment"]
-    pose = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)).inverse()
-    return float(pose.position[0]), float(pose.position[1]), pose.yaw
 
 
 def mean_shear(cell: SimulatedCell) -> float:
@@ -146,7 +125,7 @@ def test_a_hole_that_is_taught_too_low_pushes_the_part_through_the_grip() -> Non
 
 def test_a_part_that_is_lowered_onto_the_floor_slips_in_the_grip() -> None:
     cell = gripped(World(taught_error=TaughtError(z=-6e-3), hole=Hole(stiffness=10.0)))
-    pose = aligned(cell.truth()["part"])
+    pose = aligned_pose(cell.truth()["part"])
     lower(cell, (0.0, 0.0, 0.0), 0.033, steps=100)
     lower(cell, pose, 0.033, steps=400)
     assert cell.truth()["part"]["largest_force"] == 0.0
@@ -160,7 +139,7 @@ def test_misalignment_contains_the_error_of_the_taught_pose() -> None:
     x, y, yaw = exact.truth()["part"]["misalignment"]
     moved = Pose(np.array([x, y, 0.0]), yaw_quaternion(yaw)) @ TaughtError(x=2e-3, yaw_deg=3.0).pose
     assert wrong.truth()["part"]["misalignment"] == pytest.approx([*moved.position[:2], moved.yaw])
-    pose = aligned(wrong.truth()["part"])
+    pose = aligned_pose(wrong.truth()["part"])
     lower(wrong, pose, 0.0255, steps=400)
     assert lower(wrong, pose, 0.0240, steps=300)["inserted"]
 
@@ -183,7 +162,7 @@ def test_slippery_pads_let_the_part_slip_further() -> None:
 def test_clearance_sets_the_opening_of_the_hole() -> None:
     for clearance, inserted in ((4.5e-3, True), (0.2e-3, False)):
         cell = gripped(World(hole=Hole((clearance, clearance))))
-        x, y, yaw = aligned(cell.truth()["part"])
+        x, y, yaw = aligned_pose(cell.truth()["part"])
         pose = (x + 1e-3, y, yaw)  # beside the centre by less than half of the wide clearance
         lower(cell, pose, 0.0255, steps=400)
         assert lower(cell, pose, 0.0240, steps=300)["inserted"] is inserted

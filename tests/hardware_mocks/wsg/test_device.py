@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 import pytest
+from tests.hardware_mocks.wsg.harness import checksum
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
@@ -20,17 +21,6 @@ CLOCK = ScaledClock(5.0)
 PATIENT = 10.0  # time-out that only a failing test reaches [s, wall]
 HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE = range(0x20, 0x27)
 SUCCESS, PENDING, DENIED, FAILED, BLOCKED, RANGE = 0, 26, 16, 18, 29, 28
-
-
-def checksum(data: bytes) -> int:
-    """Bitwise computation of the checksum, with polynomial 0x1021, independent of the table."""
-    crc = 0xFFFF
-    for byte in data:
-        value = ((crc ^ byte) & 0xFF) << 8
-        for _ in range(8):
-            value = ((value << 1) ^ 0x1021) & 0xFFFF if value & 0x8000 else (value << 1) & 0xFFFF
-        crc = value ^ (crc >> 8)
-    return crc
 
 
 def packet(command: int, layout: str = "<", *values: float | bytes) -> bytes:

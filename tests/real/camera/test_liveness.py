@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from tests.common.manual_clock import ManualClock
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerTimeout, UsageError
@@ -42,27 +43,11 @@ class Server:
         return self.loop[self.made % len(self.loop)] if self.loop else jpeg(self.made)
 
 
-class ManualClock:
-    """Robot time that the test sets."""
-
-    def __init__(self) -> None:
-        self.time = 100.0
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.time += seconds
-
-    def wall(self, seconds: float) -> float:
-        return seconds
-
-
 class TimedStream:
     """An MJPEG server on a socket that sends X-Timestamp, and a camera on it; each `send` waits for the reception."""
 
     def __init__(self, **settings: Any) -> None:
-        self.clock = ManualClock()
+        self.clock = ManualClock(100.0)
         self.seen: list[CameraImage] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{self._listener.getsockname()[1]}/?action=stream"

@@ -5,30 +5,20 @@ import socket
 import urllib.request
 from pathlib import Path
 
-import numpy as np
 import pytest
+from tests.real.runner.harness import untrained_checkpoint
 
 from gelflow.cli.main import main
 from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.errors import PeerError
-from gelflow.policies.checkpoint import save_checkpoint
-from gelflow.policies.networks import Architecture, tensor_shapes
 from gelflow.real.runner.lab_file import load_lab
-from gelflow.task import INSERTION
 
 FACTOR = 4.0
 
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    """An untrained policy."""
-    rng = np.random.default_rng(0)
-    architecture = Architecture(hidden=(8, 8))
-    shapes = tensor_shapes(architecture, INSERTION)
-    tensors = {name: 0.1 * rng.standard_normal(shape) for name, shape in shapes.items()}
-    path = tmp_path / "untrained.safetensors"
-    save_checkpoint(path, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "none"})
-    return path
+    return untrained_checkpoint(tmp_path)
 
 
 def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,16 +12,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from tests.real.runner.harness import events, moving, wait_for
+from tests.real.runner.harness import events, moving, untrained_checkpoint, wait_for
 
 from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
-from gelflow.policies.checkpoint import save_checkpoint
-from gelflow.policies.networks import Architecture, tensor_shapes
 from gelflow.real.runner.lab_file import save_lab
-from gelflow.task import INSERTION
 
 SOURCE = str(Path(__file__).resolve().parents[3] / "src")
 MAIN = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
@@ -29,12 +25,7 @@ MAIN = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:
 
 def command(robot: MockRobot, folder: Path, **part: Any) -> list[str]:
     """`gelflow run` with an untrained policy; over TCP the gripper notices a disconnect that was not announced."""
-    rng = np.random.default_rng(0)
-    architecture = Architecture(hidden=(8, 8))
-    shapes = tensor_shapes(architecture, INSERTION)
-    tensors = {name: 0.1 * rng.standard_normal(shape) for name, shape in shapes.items()}
-    checkpoint = folder / "untrained.safetensors"
-    save_checkpoint(checkpoint, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "no"})
+    checkpoint = untrained_checkpoint(folder)
     lab = lab_for(robot)
     gripper = dataclasses.replace(lab.gripper, address=robot.gripper.addresses[1])
     lab = dataclasses.replace(lab, gripper=gripper, part=dataclasses.replace(lab.part, **part))
