@@ -267,7 +267,7 @@ class LimitsSettings:
     gripper_motion: float = LIMITS.gripper_motion_time  # for the end of a gripper motion
     attempt_time: float = 60.0  # for one attempt
     recording_delay: float = LIMITS.recording_delay  # a record that is not stored after this time ends the run
-    retries: int = 1  # repetitions of an attempt whose images could not be tracked
+    retries: int = 1  # repetitions of a reference whose markers are not readable
 
     def __post_init__(self) -> None:
         _check_ranges(self, "limits.")

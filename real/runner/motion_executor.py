@@ -138,13 +138,11 @@ class MotionExecutor:
             return False
         return self.pose().is_near(goal, within, ARRIVED[1])
 
-    def move(self, target: Pose, *, speed: float | None = None, while_moving: Callable[[], None] | None = None) -> None:
+    def move(self, target: Pose, *, speed: float | None = None) -> None:
         """Move to `target` and wait for the arrival. Raises PeerTimeout when the arm comes no closer for 3 s."""
         self.go(target, speed=speed)
         progress = self.progress(target)
         while not self.arrived():
-            if while_moving is not None:
-                while_moving()
             progress.check()
             self.wait(0.02)
 

@@ -30,39 +30,60 @@ class PhaseRule:
     """One row of the table: rights of a phase, and the phases that may follow it. `LATCHED` may follow every phase."""
 
     action: str
-    moves: bool  # targets are accepted; a held part is moved only while both pads are observed
-    on_contact: str  # reaction to contact above the threshold; empty where nothing can touch
-    following: tuple[Phase, ...]
+    moves: bool = False  # targets are accepted; a held part is moved only while both pads are observed
+    on_contact: str = ""  # reaction to contact above the threshold; empty where nothing can touch
+    following: tuple[Phase, ...] = ()
 
 
-P = Phase
 PHASES: Mapping[Phase, PhaseRule] = MappingProxyType(
     {
-        P.IDLE: PhaseRule("no run, or between two parts", False, "", (P.PREFLIGHT, P.LOAD)),
-        P.PREFLIGHT: PhaseRule("checks of all devices", False, "", (P.LOAD, P.IDLE)),
-        P.LOAD: PhaseRule(
+        Phase.IDLE: PhaseRule("no run, or between two parts", following=(Phase.PREFLIGHT, Phase.LOAD)),
+        Phase.PREFLIGHT: PhaseRule("checks of all devices", following=(Phase.LOAD, Phase.IDLE)),
+        Phase.LOAD: PhaseRule(
             "without a part to the hand-over; grasp; comparison of the pads before and after it",
-            *(True, "", (P.APPROACH, P.RETREAT)),
+            moves=True,
+            following=(Phase.APPROACH, Phase.RETREAT),
         ),
-        P.APPROACH: PhaseRule(
-            "with the part down to the start height", True, "hold, retreat; the rim is there", (P.DESCEND, P.RETREAT)
+        Phase.APPROACH: PhaseRule(
+            "with the part down to the start height",
+            moves=True,
+            on_contact="hold, retreat; the rim is there",
+            following=(Phase.DESCEND, Phase.RETREAT),
         ),
-        P.DESCEND: PhaseRule(
-            "reference at rest, then the descent of an attempt", True, "hold, observe", (P.LOWER, P.RETREAT)
+        Phase.DESCEND: PhaseRule(
+            "reference at rest, then the descent of an attempt",
+            moves=True,
+            on_contact="hold, observe",
+            following=(Phase.LOWER, Phase.RETREAT),
         ),
-        P.LOWER: PhaseRule("into the hole", True, "hold, observe; near the floor: release", (P.RELEASE, P.RETREAT)),
-        P.RETREAT: PhaseRule("straight up", True, "hold, end: the part is stuck", (P.CORRECT, P.RELEASE, P.IDLE)),
-        P.CORRECT: PhaseRule("to the corrected pose", True, "hold, retreat; the rim is there", (P.DESCEND, P.RETREAT)),
-        P.RELEASE: PhaseRule("the fingers open; comparison of the pads", False, "", (P.RETREAT, P.IDLE)),
-        P.HOLD: PhaseRule(
+        Phase.LOWER: PhaseRule(
+            "into the hole",
+            moves=True,
+            on_contact="hold, observe; near the floor: release",
+            following=(Phase.RELEASE, Phase.RETREAT),
+        ),
+        Phase.RETREAT: PhaseRule(
+            "straight up",
+            moves=True,
+            on_contact="hold, end: the part is stuck",
+            following=(Phase.CORRECT, Phase.RELEASE, Phase.IDLE),
+        ),
+        Phase.CORRECT: PhaseRule(
+            "to the corrected pose",
+            moves=True,
+            on_contact="hold, retreat; the rim is there",
+            following=(Phase.DESCEND, Phase.RETREAT),
+        ),
+        Phase.RELEASE: PhaseRule("the fingers open; comparison of the pads", following=(Phase.RETREAT, Phase.IDLE)),
+        Phase.HOLD: PhaseRule(
             "the reference is frozen while a pad is not readable, for at most stale_frame",
-            *(False, "", (P.APPROACH, P.DESCEND, P.LOWER, P.RETREAT, P.CORRECT)),
+            following=(Phase.APPROACH, Phase.DESCEND, Phase.LOWER, Phase.RETREAT, Phase.CORRECT),
         ),
-        P.LATCHED: PhaseRule("no motion until a new run", False, "", ()),
+        Phase.LATCHED: PhaseRule("no motion until a new run"),
     }
 )
 # The reference may be frozen in every phase in which a part is moved.
-HOLDABLE = PHASES[P.HOLD].following
+HOLDABLE = PHASES[Phase.HOLD].following
 
 
 class PhaseMachine:

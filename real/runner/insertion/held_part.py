@@ -69,16 +69,14 @@ class HeldPart:
         self.height_offset = 0.0
         self._slip = 0.0
         self._deadline = math.inf
-        self._baseline: NDArray[np.float64] = np.zeros((2, 2))
         self._grasp_observer = observer  # its reference is before the grasp
-        self._guard = GuardedMotion(motion, observer, lab, clock, recorder)
+        self._observe(observer)
         self.set_baseline()
 
-    def observe(self, observer: TactileObserver) -> None:
-        """Use `observer` from now on, at rest at its reference. Raises PartSlipped as `set_baseline` does."""
+    def _observe(self, observer: TactileObserver) -> None:
+        """Observe the pads relative to the reference of `observer` from now on."""
         self._guard = GuardedMotion(self._motion, observer, self._lab, self._clock, self._recorder)
-        self._baseline = np.zeros((2, 2))
-        self._check_weight()
+        self._baseline: NDArray[np.float64] = np.zeros((2, 2))
 
     def limit(self, deadline: float) -> None:
         """Set the robot time [s] after which approach, descent and lowering raise PeerTimeout; retreat goes on."""
@@ -129,13 +127,13 @@ class HeldPart:
 
     def _move_to(self, planar_pose: PlanarPose, height: float, *, speed: float | None = None) -> bool:
         """Move towards a start pose; False after contact, whose height is then that of the rim."""
-        self._guard.limit(self._deadline)
         contact = self._guard.move(
             self._pose(planar_pose, height),
             threshold=self.thresholds.contact,
             measure=in_any_direction,
             baseline=self._baseline,
             speed=speed,
+            deadline=self._deadline,
         )
         if contact is not None:
             found = self._lower_face()
@@ -144,9 +142,12 @@ class HeldPart:
         return contact is None
 
     def descend(self, planar_pose: PlanarPose, observer: TactileObserver) -> Descent:
-        """Descend from the start while `observer`, whose reference was taken there, keeps the readings."""
-        self.observe(observer)
-        self._guard.limit(self._deadline)
+        """Descend from the start while `observer`, whose reference was taken there, keeps the readings.
+
+        Raises PartSlipped when the pads do not show the part's weight at the start, or the part slips by too much.
+        """
+        self._observe(observer)
+        self._check_weight()
         start = self._motion.pose().position[2]
         slip = SlipMonitor(self.thresholds.contact)
 
@@ -162,11 +163,12 @@ class HeldPart:
             measure=along_finger,
             speed=self._lab.descent.speed,
             within=_AT_DEPTH,
+            deadline=self._deadline,
             on_reading=on_reading,
         )
         if contact is not None:
-            depth = observer.readings[-1].depth if observer.readings else 0.0
-            self._event("slip in the grip" if slip.slipped else "stopped by contact", contact, depth=depth)
+            name = "slip in the grip" if slip.slipped else "stopped by contact"
+            self._event(name, contact, depth=observer.readings[-1].depth)
         # A stopped descent, like a complete one, ends with a pair of images at rest: the cameras are not synchronized.
         reading = self._guard.rest() if contact is not None else observer.update_pair(self._clock.now())
         if reading is not None:
@@ -179,14 +181,17 @@ class HeldPart:
     def lower(self, planar_pose: PlanarPose) -> TactileReading | None:
         """Lower the part into the hole; None when it arrived, or stands on the floor.
 
-        After contact above the floor returns the reading at rest; the rim is then searched at that height.
+        After contact above the floor returns the reading at rest; near the taught rim, its height becomes that of the
+        rim.
         """
         part, space = self._lab.part, self._lab.workspace
         end = max(part.insert_to + self.height_offset, space.height_min)
         self._motion.supervisor.phases.enter(Phase.LOWER)
-        self._guard.limit(self._deadline)
         contact = self._guard.move(
-            self._pose(planar_pose, end), threshold=self.thresholds.contact, measure=along_finger
+            self._pose(planar_pose, end),
+            threshold=self.thresholds.contact,
+            measure=along_finger,
+            deadline=self._deadline,
         )
         if contact is None:
             return None
@@ -207,7 +212,6 @@ class HeldPart:
         """
         supervisor = self._motion.supervisor
         supervisor.phases.enter(Phase.RETREAT)
-        self._guard.limit(math.inf)
         x, y, yaw, _ = supervisor.hole_coordinates(self._motion.pose())
         contact = self._guard.move(self._pose((x, y, yaw), height), threshold=self.thresholds.stuck, measure=downward)
         if contact is not None:

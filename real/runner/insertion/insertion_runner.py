@@ -161,17 +161,17 @@ class InsertionRunner:
 
         Raises MarkersUnreadable after `limits.retries` repetitions.
         """
-        for left in reversed(range(self._lab.limits.retries + 1)):
-            stale = self._lab.limits.stale_frame
-            observer = TactileObserver(self._cell.cameras, self.mounts, clock=self._clock, stale=stale)
+        limits, failures = self._lab.limits, 0
+        while True:
+            observer = TactileObserver(self._cell.cameras, self.mounts, clock=self._clock, stale=limits.stale_frame)
             try:
                 observer.start(self._clock.now())
                 return observer
             except MarkersUnreadable as error:
-                if not left:
+                failures += 1
+                if failures > limits.retries:
                     raise
                 self._recorder.event("reference repeated", {"reason": str(error)})
-        raise AssertionError("the loop returns or raises")
 
     def _check_grasp(self, observer: TactileObserver, before: list[TactileReading]) -> GraspCheck:
         """Compare the pads before and after the grasp, until both show the part's weight or the time is over."""

@@ -69,11 +69,6 @@ class GuardedMotion:
     ) -> None:
         self._motion, self.observer = motion, observer
         self._lab, self._clock, self._recorder = lab, clock, recorder
-        self._deadline = math.inf
-
-    def limit(self, deadline: float) -> None:
-        """Set the robot time [s] after which every motion ends with PeerTimeout."""
-        self._deadline = deadline
 
     @property
     def free_speed(self) -> float:
@@ -98,6 +93,7 @@ class GuardedMotion:
         baseline: Array | None = None,
         speed: float | None = None,
         within: float = ARRIVED[0],
+        deadline: float = math.inf,
         on_reading: Callable[[TactileReading], bool] = lambda reading: False,
     ) -> Contact | None:
         """Move to `target`; returns the contact that ended the motion, or None at the target.
@@ -110,6 +106,7 @@ class GuardedMotion:
         baseline: mean change of each pad that is no contact [mm], shape (sensors, 2); None: zero
         speed: [m/s]; None: `speed_towards` the target
         within: distance from the target at which the motion has ended [m]
+        deadline: robot time after which the motion ends with PeerTimeout [s]
         on_reading: called with every reading; its return value True ends the motion as at contact
 
         Raises TouchLost when a pad is not readable for `limits.stale_frame`, PeerTimeout when the arm does not arrive.
@@ -137,7 +134,7 @@ class GuardedMotion:
                 self._motion.go(target, speed=speed, guarded=True)
                 progress = self._motion.progress(target)
             progress.check()
-            self._check_deadline()
+            self._check_deadline(deadline)
         return None
 
     def rest(self) -> TactileReading | None:
@@ -167,7 +164,7 @@ class GuardedMotion:
                 self.observer.update()
         phases.enter(before)
 
-    def _check_deadline(self) -> None:
-        if self._clock.now() > self._deadline:
+    def _check_deadline(self, deadline: float) -> None:
+        if self._clock.now() > deadline:
             self._motion.hold()
             raise PeerTimeout(f"an attempt took more than {self._lab.limits.attempt_time:g} s; does the arm follow?")
