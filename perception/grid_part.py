@@ -181,7 +181,7 @@ def select_part(
     part = _part(lattice, top_best, left_best, *size)
     occupied = part.dots >= 0
     outer = min(float(line.mean()) for line in (occupied[0], occupied[-1], occupied[:, 0], occupied[:, -1]))
-    if outer < _PARTLY_COMPLETE:  # a line of few dots may be dirt beside a grid of which another line is missing
+    if outer < _PARTLY_COMPLETE:  # dirt may look like a line of few dots and stand in for a missing line
         return f"{found}: an outer line has {outer:.0%} of its markers; correct rows and columns", None
     return "", part
 

@@ -1,4 +1,4 @@
-"""Grids of which the image shows a part: the visible lines are found or told, and no marker is exchanged."""
+"""Partly visible grids: the visible rows and columns are detected or given, and no marker is exchanged."""
 
 from dataclasses import dataclass, field, replace
 

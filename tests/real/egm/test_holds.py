@@ -141,7 +141,7 @@ def test_travel_after_a_hold_on_the_wire(speed: float, allowed: float, ending: s
                 time.sleep(0.001)
             tries.append((farthest - here, farthest - cell.plant.arm_pose()[0][0]))
             assert here > START[0] + 0.3 * 0.45 * speed
-        # The arm passes the reference by what it moved while the feedback was under way, and returns.
+        # The arm overshoots the reference by its travel during the feedback delay, then returns.
         if tries[-1][0] <= allowed and tries[-1][1] <= 0.3 * allowed:
             return
     pytest.fail(f"travel and return [m]: {tries}")

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 def _start(
     image: NDArray[np.uint8], args: argparse.Namespace
 ) -> tuple[MarkerTracker, TrackingResult, VisiblePart | None]:
-    """A started tracker, its result, and the visible part of a printed grid of which the image shows a part."""
+    """A tracker started with `image`, its result, and the visible part of the printed grid (None: the whole grid)."""
     told = [lines for lines in (args.visible_rows, args.visible_cols) if lines is not None]
     if told and (args.rows is None or args.cols is None):
         raise UsageError("--visible-rows and --visible-cols need --rows and --cols, the numbers of printed lines")

@@ -1,4 +1,4 @@
-"""Scenarios without a fault of a device: what is refused, what an undisturbed run does, and what is not believed."""
+"""Scenarios without a device fault: refused input, an undisturbed run, and an insertion without tactile evidence."""
 
 import math
 import subprocess
