@@ -57,6 +57,21 @@ def test_part_is_inserted_and_the_run_is_recorded(robot: MockRobot, tmp_path: Pa
     assert report.largest_step < 5e-3 * 0.004 * 1.5  # no cycle moved faster than the lab allows
     assert not robot.gripper.fast_stopped  # the disconnect was announced
 
+    # Every motion with a held part has a phase in which the pads are observed.
+    phases = phases_of_moves_with_a_part(plan.session)
+    assert phases <= {"load", "approach", "descend", "lower", "correct", "retreat"} and "lower" in phases
+
+
+def phases_of_moves_with_a_part(session: Path) -> set[str]:
+    held, phase, phases = False, "", set()
+    for name, values in events(session):
+        if name == "state":
+            phase = values["state"]
+        held = {"grasp checked": True, "insertion ended": False}.get(name, held) and phase != "release"
+        if name == "move" and held:
+            phases.add(phase)
+    return phases
+
 
 def test_lost_part_ends_its_insertion_and_the_next_one_starts(robot: MockRobot, tmp_path: Path) -> None:
     lost: list[bool] = []

@@ -145,19 +145,6 @@ def test_pads_with_little_friction_let_no_part_slip_unnoticed(tmp_path: Path) ->
     assert truth["largest_push"] < MOST_PUSHED
 
 
-def test_held_part_is_moved_only_under_touch(robot: MockRobot, tmp_path: Path) -> None:
-    """Every motion of the recorded run with a held part has a phase in which the pads are observed."""
-    assert insert(robot, tmp_path).inserted
-    held, phase, phases = False, "", []
-    for name, values in events(tmp_path / "session.mcap"):
-        if name == "state":
-            phase = values["state"]
-        held = {"grasp checked": True, "insertion ended": False}.get(name, held) and phase != "release"
-        if name == "move" and held:
-            phases.append(phase)
-    assert set(phases) <= {"load", "approach", "descend", "lower", "correct", "retreat"} and "lower" in phases
-
-
 @pytest.mark.slow
 def test_part_that_slides_out_of_a_slippery_grip_is_not_called_inserted(robot: MockRobot, tmp_path: Path) -> None:
     """The friction of the pads falls so far that the grip no longer carries the weight of the part."""
