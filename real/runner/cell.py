@@ -14,13 +14,14 @@ from gelflow import interrupts
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.protocols import CameraImage, Gripper
+from gelflow.protocols import CameraImage, Gripper, GripperState
 from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.limits import LIMITS, MOCK_TIME_SCALE
 from gelflow.real.runner.lab import CameraSettings, Lab
+from gelflow.real.runner.touch.grasp_latency import LatencyMonitor
 from gelflow.real.transport import transport_for
 from gelflow.real.web_services.client import WebServicesClient
 from gelflow.real.web_services.monitor import ControllerMonitor
@@ -42,6 +43,7 @@ class Cell:
     gripper: Gripper
     cameras: tuple[StreamCamera, StreamCamera]  # of the left and of the right finger
     recorder: SessionRecorder
+    latency: LatencyMonitor
     dry_run: bool
     controller: ControllerMonitor | None = None  # with `arm.web_services` in the lab file
 
@@ -58,9 +60,11 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         # A signal between the opening of a device and its registration would leave the device open.
         stack.callback(interrupts.resume)
         interrupts.defer()
-        left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder))
-        right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder))
-        gripper = stack.enter_context(gripper_of(lab, clock, recorder, dry_run=dry_run))
+        mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
+        latency = LatencyMonitor(("left", "right"), [mount.tracker_config() for mount in mounts])
+        left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder, latency))
+        right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder, latency))
+        gripper = stack.enter_context(gripper_of(lab, clock, recorder, latency, dry_run=dry_run))
         controller = stack.enter_context(controller_monitor(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
         stack.callback(arm.close)
@@ -68,19 +72,26 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         stack.enter_context(StopArm(arm, recorder))
         interrupts.resume()
         stack.callback(interrupts.defer)
-        yield Cell(lab, clock, arm, gripper, (left, right), recorder, dry_run, controller)
+        yield Cell(lab, clock, arm, gripper, (left, right), recorder, latency, dry_run, controller)
 
 
 def connect_camera(
-    lab: Lab, clock: ScaledClock, name: Literal["left", "right"], sensor: int, recorder: SessionRecorder | None
+    lab: Lab,
+    clock: ScaledClock,
+    name: Literal["left", "right"],
+    sensor: int,
+    recorder: SessionRecorder | None,
+    latency: LatencyMonitor | None = None,
 ) -> StreamCamera:
-    """A connected camera; `recorder`, if any, records every image."""
+    """A connected camera; `recorder` and `latency`, if any, receive every image."""
     settings: CameraSettings = getattr(lab.cameras, name)
     stale = lab.limits.stale_frame
 
     def record(image: CameraImage) -> None:
         if recorder is not None:
             recorder.image(sensor, image)
+        if latency is not None:
+            latency.image(sensor, image)
 
     return open_camera(
         settings.source,
@@ -93,12 +104,25 @@ def connect_camera(
     )
 
 
-def gripper_of(lab: Lab, clock: ScaledClock, recorder: SessionRecorder | None, *, dry_run: bool) -> WsgGripper:
+def gripper_of(
+    lab: Lab,
+    clock: ScaledClock,
+    recorder: SessionRecorder | None,
+    latency: LatencyMonitor | None = None,
+    *,
+    dry_run: bool,
+) -> WsgGripper:
     """The gripper of the lab file, not yet connected. Another driver is created here, with the same two callbacks."""
 
     def record(name: str, values: Mapping[str, float]) -> None:
         if recorder is not None:
             recorder.gripper_command(clock.now(), name, values)
+
+    def measured(state: GripperState) -> None:
+        if recorder is not None:
+            recorder.gripper_state(state)
+        if latency is not None:
+            latency.gripper_state(state)
 
     return WsgGripper(
         transport_for(lab.gripper.address, clock=clock),
@@ -111,7 +135,7 @@ def gripper_of(lab: Lab, clock: ScaledClock, recorder: SessionRecorder | None, *
             dry_run=dry_run,
         ),
         on_command=record,
-        on_measurement=None if recorder is None else recorder.gripper_state,
+        on_measurement=measured,
     )
 
 

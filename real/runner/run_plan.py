@@ -40,6 +40,7 @@ class RunPlan:
     on_preflight: Callable[[list[PreflightItem]], None] = lambda items: None
     on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
     on_insertion: Callable[[Insertion], None] = lambda insertion: None
+    on_warning: Callable[[str], None] = lambda line: None  # at the end of the run
     before_insertion: Callable[[int], None] = lambda number: None
     on_motion: Callable[[MotionExecutor], None] = lambda motion: None  # before anything moves
 
@@ -84,6 +85,8 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
                 plan.before_insertion(number)
                 results.append(runner.insert(number))
                 plan.on_insertion(results[-1])
+        for line in cell.latency.warnings():
+            plan.on_warning(line)
     return results
 
 

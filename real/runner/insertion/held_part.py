@@ -47,7 +47,8 @@ class Descent:
 class HeldPart:
     """One held part. The planar pose of the gripper is an argument of every motion; the height is relative to the rim.
 
-    `height_offset` is the height of the rim found by touch above the taught one [m].
+    `height_offset` is the height of the rim found by touch above the taught one [m], `excess_latency` the measured time
+    by which images are later than the lab file says [s].
     """
 
     def __init__(
@@ -61,10 +62,11 @@ class HeldPart:
         clock: ScaledClock,
         task: InsertionTask,
         recorder: SessionRecorder,
+        excess_latency: float,
     ) -> None:
         self._motion, self._pose, self._lab, self._clock = motion, pose, lab, clock
         self._task, self._recorder = task, recorder
-        self._check = check
+        self._check, self._excess_latency = check, excess_latency
         self.thresholds = check.thresholds
         self.height_offset = 0.0
         self._slip = 0.0
@@ -75,7 +77,9 @@ class HeldPart:
 
     def _observe(self, observer: TactileObserver) -> None:
         """Observe the pads relative to the reference of `observer` from now on."""
-        self._guard = GuardedMotion(self._motion, observer, self._lab, self._clock, self._recorder)
+        self._guard = GuardedMotion(
+            self._motion, observer, self._lab, self._clock, self._recorder, excess_latency=self._excess_latency
+        )
         self._baseline: NDArray[np.float64] = np.zeros((2, 2))
 
     def limit(self, deadline: float) -> None:

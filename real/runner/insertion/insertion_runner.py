@@ -143,17 +143,21 @@ class InsertionRunner:
         self._motion.wait(0.0)
         observer = self._observer()
         before = observer.at_rest(self._clock.now())
-        try:
-            self._cell.gripper.grasp(
-                width=lab.gripper.part_width, speed=lab.gripper.speed, force=lab.gripper.grasp_force
-            )
-        except PeerRefused as error:
-            raise NotGrasped(str(error)) from error
-        self._motion.expect_part(True)
-        check = self._check_grasp(observer, before)
+        latency = self._cell.latency
+        with latency.grasp():
+            try:
+                self._cell.gripper.grasp(
+                    width=lab.gripper.part_width, speed=lab.gripper.speed, force=lab.gripper.grasp_force
+                )
+            except PeerRefused as error:
+                raise NotGrasped(str(error)) from error
+            self._motion.expect_part(True)
+            check = self._check_grasp(observer, before)
+        for line in latency.warnings():
+            self._recorder.event("camera latency", {"warning": line})
         return HeldPart(
             self._motion, observer, check, self.pose,
-            lab=lab, clock=self._clock, task=self._task, recorder=self._recorder,
+            lab=lab, clock=self._clock, task=self._task, recorder=self._recorder, excess_latency=latency.excess,
         )  # fmt: skip
 
     def _observer(self) -> TactileObserver:

@@ -57,7 +57,10 @@ def in_any_direction(change: Array) -> float:
 
 
 class GuardedMotion:
-    """Moves a held part while both pads are observed."""
+    """Moves a held part while both pads are observed.
+
+    `excess_latency` is the measured time by which images are later than the lab file says [s].
+    """
 
     def __init__(
         self,
@@ -66,9 +69,12 @@ class GuardedMotion:
         lab: Lab,
         clock: ScaledClock,
         recorder: SessionRecorder,
+        *,
+        excess_latency: float = 0.0,
     ) -> None:
         self._motion, self.observer = motion, observer
         self._lab, self._clock, self._recorder = lab, clock, recorder
+        self._latency = max(lab.cameras.left.latency, lab.cameras.right.latency) + excess_latency
 
     @property
     def free_speed(self) -> float:
@@ -81,8 +87,9 @@ class GuardedMotion:
         return self._speed(self._lab.descent.max_overshoot) if downward_motion else self.free_speed
 
     def _speed(self, overshoot: float) -> float:
-        """Speed at which one period of the images and the reaction time are `overshoot` [m] long."""
-        return min(self._lab.arm.max_speed, overshoot / (self.observer.image_period + _REACTION_TIME))
+        """Speed at which the latency and the period of the images and the reaction time are `overshoot` [m] long."""
+        delay = self._latency + self.observer.image_period + _REACTION_TIME
+        return min(self._lab.arm.max_speed, overshoot / delay)
 
     def move(
         self,

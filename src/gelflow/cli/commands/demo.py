@@ -162,6 +162,7 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
             insertions=series.count,
             on_attempt=observer.on_attempt,
             on_insertion=observer.on_insertion,
+            on_warning=lambda line: output.text(f"warning: {line}"),
         )
         error = None
         with interruptible() as at_once:

@@ -57,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     policy = load_policy(checkpoint, task=INSERTION)
     out = args.out or Path("sessions") / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     session = out / "session.mcap"
+    warnings: list[str] = []
     plan = RunPlan(
         lab=lab,
         policy=policy,
@@ -66,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         insertions=args.insertions,
         operator=(lambda motion: _Prompt(output.console, motion)) if lab.part.presentation == "prompt" else None,
         on_attempt=lambda number, attempt: output.text(attempt_line(number, attempt)),
+        on_warning=warnings.append,
     )
     if args.dry_run:
         with interruptible():
@@ -86,8 +88,11 @@ def run(args: argparse.Namespace) -> int:
                 error.add_note(hint)
             raise
     output.console.print(insertion_table(results))
+    for line in warnings:
+        output.text(f"warning: {line}")
     output.text(f"recorded: {session}; replay it with: gelflow replay {session}")
-    output.result({"session": session, "insertions": [insertion_to_json(result) for result in results]})
+    insertions = [insertion_to_json(result) for result in results]
+    output.result({"session": session, "insertions": insertions, "warnings": warnings})
     return SUCCESS if all(result.inserted for result in results) else NEGATIVE_RESULT
 
 
