@@ -11,15 +11,19 @@ from .evaluation import NetworkActor as NetworkActor
 from .evaluation import RandomActor as RandomActor
 from .evaluation import evaluate as evaluate
 from .learning_curve import LearningCurvePoint as LearningCurvePoint
-from .networks import Architecture as Architecture
-from .networks import Network as Network
-from .networks import NetworkPolicy as NetworkPolicy
+from .networks.base import Architecture as Architecture
+from .networks.base import BatchPolicy as BatchPolicy
+from .networks.base import Network as Network
+from .networks.polynomial_mlp import NetworkPolicy as NetworkPolicy
+from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
+from .networks.polynomial_mlp import PolynomialNetwork as PolynomialNetwork
 from .ppo import PPOSettings as PPOSettings
 from .ppo import TrainingResult as TrainingResult
 from .ppo import train as train
 
 __all__ = [
     "Architecture",
+    "BatchPolicy",
     "Checkpoint",
     "EvaluationResult",
     "FlowMapNoise",
@@ -29,6 +33,8 @@ __all__ = [
     "NetworkPolicy",
     "PPOSettings",
     "PolicyEnv",
+    "PolynomialMLP",
+    "PolynomialNetwork",
     "RandomActor",
     "TrainingResult",
     "default_checkpoint",

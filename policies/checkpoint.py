@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from gelflow import __version__
 from gelflow.errors import UsageError
-from gelflow.policies.networks import Architecture, Network, NetworkPolicy
+from gelflow.policies.networks.base import Architecture
+from gelflow.policies.networks.polynomial_mlp import NetworkPolicy, PolynomialNetwork
+from gelflow.policies.networks.registry import architecture_from_json
 from gelflow.task import INSERTION, InsertionTask
 
 FORMAT = 1
@@ -56,7 +58,7 @@ def save_checkpoint(
     Raises UsageError when the tensors do not fit the architecture or the file would exceed 2 MB.
     """
     stored = {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in tensors.items()}
-    Network(architecture, task, stored)
+    architecture.network(task, stored)
     header = {
         "format": FORMAT,
         "task": task.to_json(),
@@ -90,7 +92,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             raise ValueError("checksum mismatch of the tensors")
         return Checkpoint(
             task=dict(header["task"]),
-            architecture=Architecture.from_json(header["architecture"]),
+            architecture=architecture_from_json(header["architecture"]),
             tensors=tensors,
             training=dict(header["training"]),
             versions=dict(header["versions"]),
@@ -115,7 +117,9 @@ def load_policy(path: str | Path, *, task: InsertionTask = INSERTION) -> Network
             f"{path} was trained for another task: {different}; train a policy for this task, or use that task"
         )
     try:
-        return NetworkPolicy(Network(checkpoint.architecture, task, checkpoint.tensors))
+        network = checkpoint.architecture.network(task, checkpoint.tensors)
+        assert isinstance(network, PolynomialNetwork)
+        return NetworkPolicy(network)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from error
 

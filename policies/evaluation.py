@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.environment import PolicyEnv
-from gelflow.policies.networks import Network
+from gelflow.policies.networks.polynomial_mlp import PolynomialNetwork
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class EvaluationResult:
 class NetworkActor:
     """A network that acts in `count` environments."""
 
-    def __init__(self, network: Network, count: int) -> None:
+    def __init__(self, network: PolynomialNetwork, count: int) -> None:
         self._network = network
         self._history = network.history(count)
 

@@ -29,7 +29,7 @@ from gelflow.policies import learning_curve as curve
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
 from gelflow.policies.learning_curve import LearningCurvePoint
-from gelflow.policies.networks import Architecture, Network, polynomial_basis, reduce_maps, tensor_shapes
+from gelflow.policies.networks.polynomial_mlp import PolynomialMLP, PolynomialNetwork, polynomial_basis, reduce_maps
 
 Array = NDArray[np.float64]
 
@@ -75,12 +75,12 @@ class TrainingResult:
 class HistoryVecEnv(VecEnv):
     """`PolicyEnv` as an environment of stable-baselines3.
 
-    Observations are canonical inputs of the network, actions of ±1 correspond to `Architecture.reach`.
+    Observations are canonical inputs of the network, actions of ±1 correspond to `PolynomialMLP.reach`.
     """
 
     render_mode = None
 
-    def __init__(self, env: PolicyEnv, architecture: Architecture, basis: Array, scale: Array, *, seed: int) -> None:
+    def __init__(self, env: PolicyEnv, architecture: PolynomialMLP, basis: Array, scale: Array, *, seed: int) -> None:
         size = architecture.inputs(env.task)
         super().__init__(
             env.count,
@@ -89,7 +89,7 @@ class HistoryVecEnv(VecEnv):
         )
         tensors = _zero_tensors(architecture, env) | {"basis": basis, "scale": scale}
         self._env = env
-        self._network = Network(architecture, env.task, tensors)
+        self._network = PolynomialNetwork(architecture, env.task, tensors)
         self._history = self._network.history(env.count)
         self._reach = np.asarray(architecture.reach)
         self._seed = seed
@@ -141,7 +141,7 @@ class _Run:
 
     env: HistoryVecEnv
     validation: PolicyEnv
-    architecture: Architecture
+    architecture: PolynomialMLP
     basis: Array
     scale: Array
     settings: PPOSettings
@@ -156,7 +156,7 @@ def train(
     validation: PolicyEnv,
     *,
     out: Path,
-    architecture: Architecture | None = None,
+    architecture: PolynomialMLP | None = None,
     settings: PPOSettings | None = None,
     command: Sequence[str] = (),
     report: Callable[[LearningCurvePoint], None] | None = None,
@@ -175,7 +175,7 @@ def train(
 
     Raises UsageError for inconsistent settings, and when `out` already contains a trained policy.
     """
-    architecture = architecture or Architecture()
+    architecture = architecture or PolynomialMLP()
     settings = settings or PPOSettings()
     _check_settings(settings, env)
     if (out / CHECKPOINT).exists():  # never overwrite the result of another run
@@ -196,7 +196,7 @@ def train(
     return callback.finish()
 
 
-def _make_model(env: HistoryVecEnv, architecture: Architecture, settings: PPOSettings) -> PPO:
+def _make_model(env: HistoryVecEnv, architecture: PolynomialMLP, settings: PPOSettings) -> PPO:
     return PPO(
         "MlpPolicy",
         env,
@@ -220,8 +220,8 @@ def _make_model(env: HistoryVecEnv, architecture: Architecture, settings: PPOSet
     )
 
 
-def export_actor(model: PPO, architecture: Architecture, basis: Array, scale: Array) -> dict[str, NDArray[Any]]:
-    """The tensors of a `Network` from the actor of a PPO model."""
+def export_actor(model: PPO, architecture: PolynomialMLP, basis: Array, scale: Array) -> dict[str, NDArray[Any]]:
+    """The tensors of a `PolynomialNetwork` from the actor of a PPO model."""
     modules = [*model.policy.mlp_extractor.policy_net.modules(), model.policy.action_net]
     linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
     tensors: dict[str, NDArray[Any]] = {"basis": basis, "scale": scale}
@@ -231,7 +231,7 @@ def export_actor(model: PPO, architecture: Architecture, basis: Array, scale: Ar
     return tensors
 
 
-def feature_scale(env: PolicyEnv, architecture: Architecture, basis: Array, settings: PPOSettings) -> Array:
+def feature_scale(env: PolicyEnv, architecture: PolynomialMLP, basis: Array, settings: PPOSettings) -> Array:
     """Root mean square of each feature over random attempts with noise, the divisor of the features.
 
     It is common to both pads and at least 1e-3, so that features without signal stay small.
@@ -293,7 +293,7 @@ class _TrainingCallback(BaseCallback):
         assert isinstance(self.model, PPO)
         tensors = export_actor(self.model, run.architecture, run.basis, run.scale)
         task = run.validation.task
-        actor = NetworkActor(Network(run.architecture, task, tensors), run.validation.count)
+        actor = NetworkActor(PolynomialNetwork(run.architecture, task, tensors), run.validation.count)
         seed = settings.seed + 1_000_003  # differs from the seed of the training
         episodes = min(settings.evaluate_episodes, settings.attempts)  # limits the evaluations of short runs
         result = evaluate("validation", actor, run.validation, episodes=episodes, seed=seed)
@@ -327,8 +327,8 @@ def _to_json(settings: PPOSettings) -> dict[str, Any]:
     return {key: None if value == float("inf") else value for key, value in dataclasses.asdict(settings).items()}
 
 
-def _zero_tensors(architecture: Architecture, env: PolicyEnv) -> dict[str, NDArray[Any]]:
-    return {name: np.zeros(shape) for name, shape in tensor_shapes(architecture, env.task).items()}
+def _zero_tensors(architecture: PolynomialMLP, env: PolicyEnv) -> dict[str, NDArray[Any]]:
+    return {name: np.zeros(shape) for name, shape in architecture.tensor_shapes(env.task).items()}
 
 
 def _check_settings(settings: PPOSettings, env: PolicyEnv) -> None:

@@ -40,7 +40,7 @@ class InsertionTask:
     success_height: float = 24.7e-3
     attempts: int = 15
     # Correction in x, y, yaw for an action of ±1 of the Gymnasium environments. The output ±1 of a trained network has
-    # its own scale, `Architecture.reach` in `policies/networks.py`.
+    # its own scale, `reach` of its architecture in `policies/networks/`.
     action_scale: tuple[float, float, float] = (20e-3, 20e-3, np.pi / 18)
     workspace: tuple[float, float, float] = (15e-3, 15e-3, np.pi / 12)  # largest |x|, |y|, |yaw| of the gripper
     misalignment: tuple[float, float, float] = (6e-3, 6e-3, np.pi / 18)  # at the start: uniform within ± these

@@ -19,19 +19,18 @@ from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
-from gelflow.policies.networks import (
-    Architecture,
+from gelflow.policies.networks.polynomial_mlp import (
     History,
-    Network,
+    PolynomialMLP,
+    PolynomialNetwork,
     polynomial_basis,
     reduce_maps,
-    tensor_shapes,
 )
 from gelflow.policies.ppo import PPOSettings, train
 from gelflow.protocols import Policy
 from gelflow.task import INSERTION
 
-SMALL = Architecture(hidden=(16, 16))
+SMALL = PolynomialMLP(hidden=(16, 16))
 
 
 class Toy(VectorEnv[Any, Any, Any]):
@@ -76,10 +75,10 @@ class Toy(VectorEnv[Any, Any, Any]):
         return np.asarray(flow / np.abs(flow).max(axis=(1, 2, 3), keepdims=True), dtype=np.float32)
 
 
-def tensors(architecture: Architecture = SMALL, seed: int = 0) -> dict[str, NDArray[Any]]:
+def tensors(architecture: PolynomialMLP = SMALL, seed: int = 0) -> dict[str, NDArray[Any]]:
     """A network with random weights."""
     rng = np.random.default_rng(seed)
-    values = {name: rng.normal(0, 0.3, shape) for name, shape in tensor_shapes(architecture, INSERTION).items()}
+    values = {name: rng.normal(0, 0.3, shape) for name, shape in architecture.tensor_shapes(INSERTION).items()}
     return values | {
         "basis": polynomial_basis(INSERTION.grid, architecture.degree),
         "scale": np.ones(architecture.features(INSERTION)),
@@ -105,7 +104,9 @@ def stored(tmp_path: Path) -> Path:
 
 
 def test_a_saved_policy_acts_identically_after_loading_and_reset(stored: Path) -> None:
-    before = NetworkActor(Network(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1)
+    before = NetworkActor(
+        PolynomialNetwork(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1
+    )
     expected = [before.act(image[None])[0] for image in images(5)]
     policy = load_policy(stored)
     assert isinstance(load_checkpoint(stored).digest, str) and load_checkpoint(stored).training["command"] == [
@@ -212,7 +213,7 @@ def test_missing_files_folders_and_too_large_files_are_rejected(tmp_path: Path) 
     with pytest.raises(UsageError, match="cannot read"):
         load_policy(tmp_path)
     with pytest.raises(UsageError, match="more than 2000000"):
-        wide = Architecture(hidden=(800, 800))
+        wide = PolynomialMLP(hidden=(800, 800))
         save_checkpoint(tmp_path / "giant", task=INSERTION, architecture=wide, tensors=tensors(wide), training={})
     (tmp_path / "giant").write_bytes(b"\0" * 2_000_001)
     with pytest.raises(UsageError, match="the limit of a gelflow checkpoint"):
@@ -231,7 +232,7 @@ def test_features_reproduce_low_polynomials_and_average_noise() -> None:
 
 
 def test_history_layout_and_displacement_in_the_gripper_frame() -> None:
-    one = Architecture(degree=0, history=2, reach=(1e-3, 1e-3, 0.1))
+    one = PolynomialMLP(degree=0, history=2, reach=(1e-3, 1e-3, 0.1))
     history = History(one, INSERTION)
     first = history.observe(np.array([[1.0, 2, 3, 4]]))[0]
     assert first.tolist() == [1, 2, 3, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1 / 15]
@@ -246,7 +247,7 @@ def test_history_layout_and_displacement_in_the_gripper_frame() -> None:
 
 
 def test_parallel_histories_are_independent() -> None:
-    network = Network(SMALL, INSERTION, tensors())
+    network = PolynomialNetwork(SMALL, INSERTION, tensors())
     together, alone = NetworkActor(network, 3), NetworkActor(network, 1)
     for i in range(6):
         if i == 2:
@@ -268,7 +269,7 @@ def mirrored(image: NDArray[Any], in_x: bool, in_y: bool) -> NDArray[Any]:
 
 @pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
 def test_mirrored_flow_maps_give_mirrored_corrections(in_x: bool, in_y: bool) -> None:
-    network = Network(SMALL, INSERTION, tensors())
+    network = PolynomialNetwork(SMALL, INSERTION, tensors())
     one, other = NetworkActor(network, 8), NetworkActor(network, 8)
     signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
     for i in range(5):
@@ -339,7 +340,8 @@ def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Pa
     )
     random = evaluate("random", RandomActor(SMALL.reach, 32, 0), PolicyEnv(Toy(32), INSERTION), episodes=256, seed=1)
     checkpoint = load_checkpoint(result.checkpoint)
-    actor = NetworkActor(Network(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
+    assert isinstance(checkpoint.architecture, PolynomialMLP)
+    actor = NetworkActor(PolynomialNetwork(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
     policy = evaluate("policy", actor, PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), episodes=256, seed=1)
     assert policy.success > 0.9 and policy.success > random.success + 0.2
     assert policy.attempts < random.attempts

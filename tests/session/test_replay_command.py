@@ -19,7 +19,7 @@ from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.policies import checkpoint
-from gelflow.policies.networks import Architecture, NetworkPolicy, tensor_shapes
+from gelflow.policies.networks.polynomial_mlp import NetworkPolicy, PolynomialMLP
 from gelflow.protocols import CameraImage, GripperState
 from gelflow.session.decision_picture import draw_comparisons
 from gelflow.session.decision_replay import Comparison
@@ -36,8 +36,8 @@ MOUNT = CameraMount(pixels_per_mm=LOOK.pixels_per_mm)
 def untrained(path: Path, seed: int) -> Path:
     """A checkpoint with random weights."""
     rng = np.random.default_rng(seed)
-    shape = Architecture(hidden=(8,))
-    tensors = {name: 0.1 * rng.normal(size=size) for name, size in tensor_shapes(shape, INSERTION).items()}
+    shape = PolynomialMLP(hidden=(8,))
+    tensors = {name: 0.1 * rng.normal(size=size) for name, size in shape.tensor_shapes(INSERTION).items()}
     tensors["scale"] = np.ones_like(tensors["scale"])
     checkpoint.save_checkpoint(path, task=INSERTION, architecture=shape, tensors=tensors, training={})
     return path

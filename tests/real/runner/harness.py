@@ -14,7 +14,7 @@ from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import save_checkpoint
-from gelflow.policies.networks import Architecture, tensor_shapes
+from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 from gelflow.real.runner.run_plan import RunPlan
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
@@ -55,8 +55,8 @@ class OraclePolicy:
 def untrained_checkpoint(folder: Path) -> Path:
     """The file of an untrained policy."""
     rng = np.random.default_rng(0)
-    architecture = Architecture(hidden=(8, 8))
-    shapes = tensor_shapes(architecture, INSERTION)
+    architecture = PolynomialMLP(hidden=(8, 8))
+    shapes = architecture.tensor_shapes(INSERTION)
     tensors = {name: 0.1 * rng.standard_normal(shape) for name, shape in shapes.items()}
     path = folder / "untrained.safetensors"
     save_checkpoint(path, task=INSERTION, architecture=architecture, tensors=tensors, training={"command": "none"})

@@ -29,7 +29,7 @@ from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
-    from gelflow.policies.networks import NetworkPolicy
+    from gelflow.policies.networks.polynomial_mlp import NetworkPolicy
     from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.lab import Lab
 

@@ -8,29 +8,27 @@ One attempt does not determine both yaw and translation, since both may load the
 therefore contains the previous attempts and the corrections between them; `History` builds it in training and in use.
 """
 
-import dataclasses
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap, Grid
-from gelflow.policies.symmetry import MirrorSymmetry, exponents
+from gelflow.policies.networks.base import Architecture, BatchPolicy, Network, Tensors, check_tensors
+from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry, exponents
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
-KIND = "polynomial-mlp"
 
 
 @dataclass(frozen=True)
-class Architecture:
-    """The architecture of a network, stored in checkpoints."""
+class PolynomialMLP(Architecture):
+    """Polynomial features of the last attempts and a perceptron; for the flow maps of the insertion."""
 
-    kind: str = KIND
+    kind: ClassVar[str] = "polynomial-mlp"
     degree: int = 1  # of the polynomials in row and column
     history: int = 5  # attempts in the input, including the latest
     hidden: tuple[int, ...] = (64, 64)  # units of each hidden layer (tanh)
@@ -39,27 +37,10 @@ class Architecture:
     reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)
 
     def __post_init__(self) -> None:
-        if self.kind != KIND:
-            raise UsageError(f"network is of kind {self.kind!r}; this gelflow supports {KIND!r}")
         if self.degree < 0 or self.history < 1 or not self.hidden or min(self.hidden) < 1:
             raise UsageError(f"a network requires degree ≥ 0, history ≥ 1 and hidden layers, got {self}")
         if len(self.reach) != 3 or min(self.reach) <= 0:
             raise UsageError(f"reach must be three positive numbers, got {self.reach}")
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON data for the header of a checkpoint."""
-        return {key: list(value) if isinstance(value, tuple) else value for key, value in vars(self).items()}
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> "Architecture":
-        """Inverse of `to_json`. Raises UsageError for unknown keys."""
-        known = {field.name for field in dataclasses.fields(cls)}
-        if unknown := set(data) - known:
-            raise UsageError(f"network has unknown keys {sorted(unknown)}; known are {sorted(known)}")
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        return cls(**values)
 
     def features(self, task: InsertionTask) -> int:
         """Number of features of one flow map."""
@@ -68,6 +49,20 @@ class Architecture:
     def inputs(self, task: InsertionTask) -> int:
         """Length of the perceptron input, see `History.observe`."""
         return self.history * self.features(task) + (self.history - 1) * 4 + 4
+
+    def tensor_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
+        """Name and shape of each tensor of a network for `task`."""
+        features = self.features(task)
+        terms = features // task.observation_shape[0]
+        sizes = [self.inputs(task), *self.hidden, 3]
+        shapes: dict[str, tuple[int, ...]] = {"basis": (task.grid.rows * task.grid.cols, terms), "scale": (features,)}
+        for i, (wide, narrow) in enumerate(itertools.pairwise(sizes)):
+            shapes |= {f"{i}.weight": (narrow, wide), f"{i}.bias": (narrow,)}
+        return shapes
+
+    def network(self, task: InsertionTask, tensors: Tensors) -> "PolynomialNetwork":
+        """The network with the given tensors. Raises UsageError when they do not fit."""
+        return PolynomialNetwork(self, task, tensors)
 
 
 def polynomial_basis(grid: Grid, degree: int) -> Array:
@@ -92,7 +87,7 @@ def reduce_maps(images: NDArray[Any], basis: Array) -> Array:
 class History:
     """The last attempts of `count` parallel parts, and the perceptron input built from them."""
 
-    def __init__(self, architecture: Architecture, task: InsertionTask, *, count: int = 1) -> None:
+    def __init__(self, architecture: PolynomialMLP, task: InsertionTask, *, count: int = 1) -> None:
         self._max_attempts = task.attempts
         self._features: Array = np.zeros((count, architecture.history, architecture.features(task)))
         self._corrections: Array = np.zeros((count, architecture.history - 1, 3))
@@ -111,7 +106,7 @@ class History:
 
         Per part: features of the latest and the previous attempts (zero if missing); corrections between them, latest
         first; flags of the existing previous attempts; displacement from the start in the current gripper frame;
-        fraction of the attempts made. Corrections and displacement are in units of `Architecture.reach`.
+        fraction of the attempts made. Corrections and displacement are in units of `PolynomialMLP.reach`.
         """
         self._features = np.roll(self._features, 1, axis=1)
         self._features[:, 0] = features
@@ -135,25 +130,18 @@ class History:
         self._pose += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
 
 
-class Network:
+class PolynomialNetwork(Network):
     """The network of a checkpoint: corrections from flow maps and history.
 
     `einsum` uses NumPy's own loops instead of a threaded BLAS, so that results are bit-identical for any number of
     threads, as replay requires.
     """
 
-    def __init__(self, architecture: Architecture, task: InsertionTask, tensors: Mapping[str, NDArray[Any]]) -> None:
+    def __init__(self, architecture: PolynomialMLP, task: InsertionTask, tensors: Tensors) -> None:
         """Raises UsageError for missing tensors, wrong shapes and values that are not finite."""
-        self.architecture = architecture
+        self.architecture: PolynomialMLP = architecture
         self.task = task
-        expected = tensor_shapes(architecture, task)
-        if set(tensors) != set(expected):
-            raise UsageError(f"network has tensors {sorted(tensors)}; expected {sorted(expected)}")
-        for name, shape in expected.items():
-            if tensors[name].shape != shape:
-                raise UsageError(f"tensor {name} has shape {tensors[name].shape}; expected {shape}")
-            if not np.isfinite(tensors[name]).all():
-                raise UsageError(f"tensor {name} has values that are not finite")
+        check_tensors(tensors, architecture.tensor_shapes(task))
         self._symmetry = MirrorSymmetry(architecture.degree, architecture.history, task)
         self._basis: Array = tensors["basis"].astype(float)
         self._scale: Array = tensors["scale"].astype(float)
@@ -161,6 +149,10 @@ class Network:
         self._layers = [
             (tensors[f"{i}.weight"].astype(float), tensors[f"{i}.bias"].astype(float)) for i in range(depth)
         ]
+
+    def batch_policy(self, count: int) -> "PolynomialPolicy":
+        """A policy for `count` parallel parts."""
+        return PolynomialPolicy(self, count)
 
     def history(self, count: int = 1) -> History:
         """An empty history for `count` parts."""
@@ -184,21 +176,10 @@ class Network:
         return np.asarray(out * signs * np.asarray(self.architecture.reach))
 
 
-def tensor_shapes(architecture: Architecture, task: InsertionTask) -> dict[str, tuple[int, ...]]:
-    """Name and shape of each tensor of a network."""
-    features = architecture.features(task)
-    terms = features // task.observation_shape[0]
-    sizes = [architecture.inputs(task), *architecture.hidden, 3]
-    shapes: dict[str, tuple[int, ...]] = {"basis": (task.grid.rows * task.grid.cols, terms), "scale": (features,)}
-    for i, (wide, narrow) in enumerate(itertools.pairwise(sizes)):
-        shapes |= {f"{i}.weight": (narrow, wide), f"{i}.bias": (narrow,)}
-    return shapes
-
-
 class NetworkPolicy:
     """A network with the history of one part. Implements `gelflow.protocols.Policy`."""
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: PolynomialNetwork) -> None:
         self.network = network
         self._history = network.history()
 
@@ -220,3 +201,21 @@ class NetworkPolicy:
         correction = self.network.corrections(inputs)
         self._history.record(correction)
         return np.asarray(correction[0])
+
+
+class PolynomialPolicy(BatchPolicy):
+    """A network that acts in `count` environments."""
+
+    def __init__(self, network: PolynomialNetwork, count: int) -> None:
+        self._network = network
+        self._history = network.history(count)
+
+    def reset(self, which: NDArray[np.bool_]) -> None:
+        """Clears the history of the environments marked in `which`."""
+        self._history.reset(which)
+
+    def act(self, observations: NDArray[Any]) -> Array:
+        """Actions (count, 3) in ±1 for the latest flow maps; an action of ±1 is `InsertionTask.action_scale`."""
+        corrections = self._network.corrections(self._history.observe(self._network.encode(observations)))
+        self._history.record(corrections)
+        return np.asarray(corrections / np.asarray(self._network.task.action_scale))

@@ -1,0 +1,1 @@
+"""Architectures of policy networks, one per file: settings, inference in NumPy, and training in torch."""

@@ -1,0 +1,18 @@
+"""The architectures that checkpoints may hold, by their `kind`."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from gelflow.errors import UsageError
+from gelflow.policies.networks.base import Architecture
+from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
+
+_ARCHITECTURES: dict[str, type[Architecture]] = {architecture.kind: architecture for architecture in (PolynomialMLP,)}
+
+
+def architecture_from_json(data: Mapping[str, Any]) -> Architecture:
+    """The architecture in the header of a checkpoint. Raises UsageError for an unknown kind and unknown keys."""
+    kind = data.get("kind")
+    if kind not in _ARCHITECTURES:
+        raise UsageError(f"network is of kind {kind!r}; this gelflow supports {', '.join(sorted(_ARCHITECTURES))}")
+    return _ARCHITECTURES[kind].from_json(data)
