@@ -19,7 +19,7 @@ _TOLERATED = 5e-3  # of the latency of the lab file: what its rounding and the g
 
 @dataclass
 class GraspSignals:
-    """What gripper and cameras measured during one grasp."""
+    """The measurements of gripper and cameras during one grasp."""
 
     force: list[tuple[float, float]] = field(default_factory=list)  # stamp [s], measured force [N]
     images: dict[int, list[CameraImage]] = field(default_factory=dict)  # by sensor
