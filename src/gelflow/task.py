@@ -1,4 +1,4 @@
-"""Description of the insertion task, shared by the simulated environment and the robot's runner.
+"""Descriptions of tasks: the base, and the insertion task, which the simulation and the robot's runner share.
 
 Every checkpoint contains the description of its task; a policy cannot be loaded for another description.
 Equation numbers are those of Xu et al., Efficient Tactile Simulation with Differentiability for Robotic Manipulation,
@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,45 @@ _POLICY_GRID = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))
 
 
 @dataclass(frozen=True)
-class InsertionTask:
-    """Insertion of a cuboid into a hole with tactile corrections. Lengths in metres, angles in radians."""
+class TaskDescription:
+    """Description of a task: a frozen dataclass of numbers, strings, tuples and marker grids; a subclass per task.
+
+    Lengths in metres, angles in radians.
+    """
 
     format: int = 1
+    name: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain data, for checkpoints and recordings."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[no-any-return]
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
+        """Inverse of `to_json`. Raises UsageError on unknown keys, another task or a newer format."""
+        if data.get("format", 0) > 1:
+            raise UsageError(f"task description has format {data['format']}; this gelflow reads format 1")
+        known = {field.name: field.default for field in dataclasses.fields(cls)}
+        if unknown := set(data) - set(known):
+            raise UsageError(f"task description has unknown keys {sorted(unknown)}; known are {sorted(known)}")
+        if known["name"] and data.get("name", known["name"]) != known["name"]:
+            raise UsageError(f"task description is of {data['name']!r}, expected {known['name']!r}")
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        if isinstance(grid := values.get("grid"), dict):
+            values["grid"] = Grid(**{**grid, "center": tuple(grid["center"])})
+        return cls(**values)
+
+    def digest(self) -> str:
+        """A short hash: equal for equal descriptions."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class InsertionTask(TaskDescription):
+    """Insertion of a cuboid into a hole with tactile corrections. Lengths in metres, angles in radians."""
+
     name: str = "insertion"
     sensors: int = 2  # tactile pads; 0 is the left finger
     grid: Grid = _POLICY_GRID  # grid of the flow map on each pad [mm]
@@ -44,29 +79,6 @@ class InsertionTask:
     action_scale: tuple[float, float, float] = (20e-3, 20e-3, np.pi / 18)
     workspace: tuple[float, float, float] = (15e-3, 15e-3, np.pi / 12)  # largest |x|, |y|, |yaw| of the gripper
     misalignment: tuple[float, float, float] = (6e-3, 6e-3, np.pi / 18)  # at the start: uniform within ± these
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain data, for checkpoints and recordings."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[no-any-return]
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "InsertionTask":
-        """Inverse of `to_json`. Raises UsageError on unknown keys or a newer format."""
-        if data.get("format", 0) > 1:
-            raise UsageError(f"task description has format {data['format']}; this gelflow reads format 1")
-        known = {field.name for field in dataclasses.fields(cls)}
-        if unknown := set(data) - known:
-            raise UsageError(f"task description has unknown keys {sorted(unknown)}; known are {sorted(known)}")
-        values: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
-        }
-        if isinstance(grid := values.get("grid"), dict):
-            values["grid"] = Grid(**{**grid, "center": tuple(grid["center"])})
-        return cls(**values)
-
-    def digest(self) -> str:
-        """A short hash: equal for equal descriptions."""
-        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:

@@ -1,0 +1,107 @@
+"""Base of the tasks of control: each step of an episode holds the controls for one control period."""
+
+import dataclasses
+import math
+import warnings
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+
+from gelflow.sim.scene import Scene
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.task_batch import Array, Mask, TaskBatch
+from gelflow.task import TaskDescription
+
+_STATE = ("q", "v", "anchors", "anchored", "history", "status")
+
+
+def adapt_step(scene: Scene, period: float) -> Scene:
+    """The scene with a step that divides the control period [s]: its own, or the next smaller one, with a warning."""
+    steps = period / scene.step
+    if abs(steps - round(steps)) < 1e-6 * steps:
+        return scene
+    step = period / math.ceil(steps)
+    warnings.warn(
+        f"scene {scene.name}: its step of {scene.step * 1e3:g} ms does not divide the control period of "
+        f"{period * 1e3:g} ms; the task takes steps of {step * 1e3:g} ms",
+        stacklevel=3,
+    )
+    return dataclasses.replace(scene, step=step)
+
+
+class ControlTask(TaskBatch):
+    """A task of control: each `step` simulates one control period.
+
+    Parameters
+    ----------
+    scene: its step is adapted to the control period, see `adapt_step`
+    control_period: [s]
+    max_steps: control periods of an episode, after which it is truncated
+    threads: of the simulator; None uses all available cores. Results do not depend on it.
+
+    A subclass starts episodes (`_draw`), converts actions to controls (`_controls`), and reads the state after a period
+    (`_observe`): observation, reward, `terminated`, `info["success"]`. The episode is truncated after `max_steps` or
+    when the simulation fails.
+    """
+
+    def __init__(
+        self,
+        description: TaskDescription,
+        num_envs: int,
+        *,
+        scene: Scene,
+        control_period: float,
+        max_steps: int,
+        observation_space: Box,
+        action_space: Box,
+        privileged: int,
+        threads: int | None = None,
+    ) -> None:
+        super().__init__(
+            description, num_envs, observation_space=observation_space, action_space=action_space, privileged=privileged
+        )
+        self.scene = adapt_step(scene, control_period)
+        self.sim = Simulator(self.scene, num_envs=num_envs, threads=threads)
+        self.frames_per_second = 1 / control_period
+        self._steps_per_period = round(control_period / self.scene.step)
+        self._max_steps = max_steps
+        self.info["steps"] = np.zeros(num_envs, dtype=np.int64)
+
+    @abstractmethod
+    def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Set parameters and state of new episodes in the environments `which`."""
+
+    @abstractmethod
+    def _controls(self, actions: Array, rng: np.random.Generator, active: Mask) -> Array:
+        """Controls (N, nu) of one control period for actions (N, k) in ±1."""
+
+    @abstractmethod
+    def _observe(self, active: Mask, rng: np.random.Generator) -> None:
+        """Write the rows `active` of observation, reward, terminated and info from the present state."""
+
+    def _reset(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        self._draw(which, rng, options)
+        self.info["steps"][which] = 0
+        self.terminated[which] = False
+        self._observe(which, rng)
+        self.reward[which] = 0
+        self._end_episodes(which)
+
+    def _step(self, actions: Array, rng: np.random.Generator, active: Mask) -> None:
+        controls = self._controls(actions, rng, active)
+        kept = {name: getattr(self.sim, name)[~active] for name in _STATE}
+        self.sim.step(controls, self._steps_per_period)
+        for name, values in kept.items():
+            getattr(self.sim, name)[~active] = values
+        self.info["steps"][active] += 1
+        self._observe(active, rng)
+        self._end_episodes(active)
+
+    def _end_episodes(self, active: Mask) -> None:
+        self.info["failed"][active] = (self.sim.status != 0)[active]
+        over = self.info["failed"] | (self.info["steps"] >= self._max_steps)
+        self.terminated[active] &= ~self.info["failed"][active]
+        self.truncated[active] = (over & ~self.terminated)[active]

@@ -1,0 +1,150 @@
+"""A batch of environments of one task, stepped together; base of the attempt tasks and the control tasks."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import ArrayLike, NDArray
+
+from gelflow.errors import SimulationError, UsageError
+from gelflow.task import TaskDescription
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Rounds of sampling until an episode does not end at once; one or two are nearly always enough.
+_MAX_RESET_ROUNDS = 100
+
+
+class TaskBatch(ABC):
+    """`num_envs` environments of one task in one simulation batch.
+
+    Parameters
+    ----------
+    description: of the task; checkpoints contain it
+    num_envs: number of environments N
+    observation_space, action_space: of ONE environment; actions are in ±1
+    privileged: number p of true quantities in `info["privileged"]`
+
+    Attributes
+    ----------
+    The following hold the results of the last `reset` or `step`; both overwrite them in place.
+    observation: (N, …) float32
+    reward: (N,); 0 after `reset`
+    terminated, truncated: (N,) bool; true after `reset` only where the episode ended at once, see `reset`
+    info: arrays with first axis N: "success" and "failed" (bool; failed: the simulation stopped), "privileged" (N, p)
+        (the true quantities that an oracle or a teacher may use), and those of the task
+    """
+
+    def __init__(
+        self,
+        description: TaskDescription,
+        num_envs: int,
+        *,
+        observation_space: Box,
+        action_space: Box,
+        privileged: int,
+    ) -> None:
+        if num_envs < 1:
+            raise UsageError(f"num_envs must be at least 1, got {num_envs}")
+        self.description = description
+        self.num_envs = num_envs
+        self.frames_per_second = 1.0  # of a video with one picture a step
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.observation: NDArray[np.float32] = np.zeros((num_envs, *observation_space.shape), np.float32)
+        self.reward: Array = np.zeros(num_envs)
+        self.terminated: Mask = np.zeros(num_envs, dtype=bool)
+        self.truncated: Mask = np.zeros(num_envs, dtype=bool)
+        self.info: dict[str, NDArray[Any]] = {
+            "success": np.zeros(num_envs, dtype=bool),
+            "failed": np.zeros(num_envs, dtype=bool),
+            "privileged": np.zeros((num_envs, privileged)),
+        }
+
+    @property
+    def all(self) -> Mask:
+        """A mask of all environments."""
+        return np.ones(self.num_envs, dtype=bool)
+
+    def reset(
+        self,
+        which: ArrayLike,
+        rng: np.random.Generator,
+        *,
+        options: Mapping[str, Any] | None = None,
+        keep_ended: bool = False,
+    ) -> None:
+        """Start new episodes in the environments `which` (N,); the others keep their state and cost nothing.
+
+        An episode that ends at once, because its first attempt succeeds or its simulation fails, is drawn again unless
+        `keep_ended` is set (an evaluation counts it) or `options` fix the start. Raises UsageError for unknown options,
+        SimulationError when every draw ends at once.
+        """
+        rows = self._mask(which)
+        self._reset(rows, rng, options or {})
+        if options or keep_ended:
+            return
+        for _ in range(_MAX_RESET_ROUNDS):
+            ended = rows & (self.terminated | self.truncated)
+            if not ended.any():
+                return
+            self._reset(ended, rng, {})
+        raise SimulationError(
+            f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode succeeded or failed "
+            "at once"
+        )
+
+    def step(self, actions: ArrayLike, rng: np.random.Generator, *, active: ArrayLike | None = None) -> None:
+        """One attempt or one control period with `actions` (N, k), which are clipped to ±1.
+
+        Environments that are not `active` (N,) keep their state and results, and cost nothing; None steps all. Raises
+        UsageError when an action has the wrong shape or is not finite.
+        """
+        wanted = np.asarray(actions, dtype=float)
+        shape = (self.num_envs, *self.action_space.shape)
+        if wanted.shape != shape:
+            raise UsageError(f"actions must have shape {shape}, got {wanted.shape}")
+        if not np.isfinite(wanted).all():
+            raise UsageError(f"actions must be finite, got {wanted[~np.isfinite(wanted)][0]}")
+        self._step(np.clip(wanted, -1, 1), rng, self.all if active is None else self._mask(active))
+
+    @abstractmethod
+    def _reset(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Start new episodes in `which` and write their results; `options` hold for all environments in `which`."""
+
+    @abstractmethod
+    def _step(self, actions: Array, rng: np.random.Generator, active: Mask) -> None:
+        """Step the environments `active` with actions (N, k) in ±1 and write their results."""
+
+    @abstractmethod
+    def render(self, index: int = 0) -> NDArray[np.uint8]:
+        """A picture of environment `index`, scene and pads; shape (height, width, 3)."""
+
+    def _mask(self, which: ArrayLike) -> Mask:
+        mask = np.asarray(which)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise UsageError(f"a mask of environments must be ({self.num_envs},) bool, got {mask.shape} {mask.dtype}")
+        return mask
+
+
+def check_options(task: str, options: Mapping[str, Any], known: Mapping[str, str]) -> None:
+    """Raises UsageError when `options` of `reset` has a key that is not in `known` (name → meaning)."""
+    for name in options:
+        if name not in known:
+            there = ", ".join(f"{key!r}: {meaning}" for key, meaning in known.items()) or "none"
+            raise UsageError(f"{task}: reset has no option {name!r}; there are {there}")
+
+
+def option_rows(name: str, value: Any, which: Mask, shape: tuple[int, ...] = ()) -> Array:
+    """Values of an option for the environments `which`: (n, *shape), n the number of environments in `which`.
+
+    `value` is one value of `shape`, or one for each environment of the batch, (N, *shape). Raises UsageError otherwise.
+    """
+    given = np.asarray(value, dtype=float)
+    full = (len(which), *shape)
+    if given.shape not in (shape, full) or not np.isfinite(given).all():
+        raise UsageError(f"reset: {name} must be finite, of shape {shape} or {full}, got {given.tolist()}")
+    return np.array(np.broadcast_to(given, full)[which])
