@@ -14,7 +14,9 @@ from .learning_curve import LearningCurvePoint as LearningCurvePoint
 from .networks.base import Architecture as Architecture
 from .networks.base import BatchPolicy as BatchPolicy
 from .networks.base import Network as Network
-from .networks.polynomial_mlp import NetworkPolicy as NetworkPolicy
+from .networks.flow_map_policy import NetworkPolicy as NetworkPolicy
+from .networks.polynomial_gru import PolynomialGRU as PolynomialGRU
+from .networks.polynomial_gru import PolynomialGRUNetwork as PolynomialGRUNetwork
 from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
 from .networks.polynomial_mlp import PolynomialNetwork as PolynomialNetwork
 from .ppo import PPOSettings as PPOSettings
@@ -33,6 +35,8 @@ __all__ = [
     "NetworkPolicy",
     "PPOSettings",
     "PolicyEnv",
+    "PolynomialGRU",
+    "PolynomialGRUNetwork",
     "PolynomialMLP",
     "PolynomialNetwork",
     "RandomActor",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gelflow import __version__
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture
-from gelflow.policies.networks.polynomial_mlp import NetworkPolicy, PolynomialNetwork
+from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
 from gelflow.policies.networks.registry import architecture_from_json
 from gelflow.task import INSERTION, InsertionTask
 
@@ -118,7 +118,7 @@ def load_policy(path: str | Path, *, task: InsertionTask = INSERTION) -> Network
         )
     try:
         network = checkpoint.architecture.network(task, checkpoint.tensors)
-        assert isinstance(network, PolynomialNetwork)
+        assert isinstance(network, FlowMapNetwork)
         return NetworkPolicy(network)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from error

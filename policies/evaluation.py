@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.environment import PolicyEnv
-from gelflow.policies.networks.polynomial_mlp import PolynomialNetwork
+from gelflow.policies.networks.flow_map_policy import FlowMapNetwork
 
 Array = NDArray[np.float64]
 
@@ -38,19 +38,16 @@ class EvaluationResult:
 class NetworkActor:
     """A network that acts in `count` environments."""
 
-    def __init__(self, network: PolynomialNetwork, count: int) -> None:
-        self._network = network
-        self._history = network.history(count)
+    def __init__(self, network: FlowMapNetwork, count: int) -> None:
+        self._policy = network.batch_policy(count)
 
     def act(self, images: NDArray[np.float32]) -> Array:
         """Corrections (count, 3) [m, m, rad] for the latest flow maps."""
-        corrections = self._network.corrections(self._history.observe(self._network.encode(images)))
-        self._history.record(corrections)
-        return corrections
+        return self._policy.corrections(images)
 
     def reset(self, done: NDArray[np.bool_]) -> None:
         """Clears the history of the environments marked in `done`."""
-        self._history.reset(done)
+        self._policy.reset(done)
 
 
 class RandomActor:

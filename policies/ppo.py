@@ -29,7 +29,8 @@ from gelflow.policies import learning_curve as curve
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
 from gelflow.policies.learning_curve import LearningCurvePoint
-from gelflow.policies.networks.polynomial_mlp import PolynomialMLP, PolynomialNetwork, polynomial_basis, reduce_maps
+from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
+from gelflow.policies.networks.polynomial_mlp import PolynomialMLP, PolynomialNetwork
 
 Array = NDArray[np.float64]
 

@@ -6,6 +6,8 @@ and training needs about a quarter of the attempts.
 """
 
 import itertools
+from collections.abc import Collection
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,42 +22,63 @@ def exponents(degree: int) -> list[tuple[int, int]]:
     return [(i, total - i) for total in range(degree + 1) for i in range(total, -1, -1)]
 
 
-class MirrorSymmetry:
-    """Maps network inputs to the canonical side. The pads are at ∓x of the gripper, so mirroring in x swaps them.
+@dataclass(frozen=True)
+class Reflections:
+    """The reflections of the features of a flow map and of corrections, by side = 2 (in x) + (in y).
 
-    Within a pad, mirroring in x or y reverses the columns and negates the y component of the shear, because the y axes
-    of the pads are opposite.
+    The pads are at ∓x of the gripper, so mirroring in x swaps them. Within a pad, mirroring in x or y reverses the
+    columns and negates the y component of the shear, because the y axes of the pads are opposite.
     """
 
+    order: NDArray[np.int64]  # of the features, shape (4, features)
+    sign: Array  # of the features, shape (4, features)
+    correction: Array  # signs of a correction, shape (4, 3)
+    left: NDArray[np.int64]  # the features that are the mean shear (x, y) of the left pad in the last frame, shape (2,)
+    right: NDArray[np.int64]  # of the right pad
+
+    def side(self, features: Array, axes: Collection[str] = ("x", "y")) -> NDArray[np.int64]:
+        """The side (n,) of features (n, …) on which reflections in `axes` make it canonical.
+
+        The sign of the mean shear, left minus right, decides: its x component changes sign with x, its y with y.
+        """
+        x, y = (features[:, self.left] - features[:, self.right]).T
+        return np.asarray(2 * ((x < 0) & ("x" in axes)) + ((y < 0) & ("y" in axes)))
+
+
+def reflections(degree: int, task: InsertionTask) -> Reflections:
+    """The reflections of the polynomial features up to `degree` of the task's flow maps."""
+    terms = exponents(degree)
+    frames, sensors = len(task.frame_depths), task.sensors
+    shape = (frames, sensors, 2, len(terms))
+    component, column = np.arange(2)[:, None], np.array([power for _, power in terms])
+    flipped = np.broadcast_to((-1.0) ** (component + column), shape).reshape(-1)
+    index = np.arange(flipped.size).reshape(shape)
+    swapped = index[:, ::-1].reshape(-1)
+    order, sign, correction = [], [], []
+    for in_x, in_y in itertools.product((False, True), repeat=2):
+        order.append(swapped if in_x else index.reshape(-1))
+        sign.append(flipped if in_x != in_y else np.ones(flipped.size))
+        correction.append([-1.0 if in_x else 1.0, -1.0 if in_y else 1.0, -1.0 if in_x != in_y else 1.0])
+    last = index[-1]
+    return Reflections(np.array(order), np.array(sign), np.array(correction), last[0, :, 0], last[1, :, 0])
+
+
+class MirrorSymmetry:
+    """Maps the inputs of a network with a history of attempts to the canonical side of the latest attempt."""
+
     def __init__(self, degree: int, history: int, task: InsertionTask) -> None:
-        terms = exponents(degree)
-        frames, sensors = len(task.frame_depths), task.sensors
-        shape = (frames, sensors, 2, len(terms))
-        component, column = np.arange(2)[:, None], np.array([power for _, power in terms])
-        flipped = np.broadcast_to((-1.0) ** (component + column), shape).reshape(-1)
-        index = np.arange(flipped.size).reshape(shape)
-        swapped = index[:, ::-1].reshape(-1)
+        self._reflections = table = reflections(degree, task)
         self._order: list[NDArray[np.int64]] = []
         self._sign: list[Array] = []
-        self._correction: list[Array] = []
-        for in_x, in_y in itertools.product((False, True), repeat=2):
-            reflected = in_x != in_y
-            correction = np.array([-1.0 if in_x else 1.0, -1.0 if in_y else 1.0, -1.0 if reflected else 1.0])
-            features = flipped if reflected else np.ones(flipped.size)
-            permutation = swapped if in_x else index.reshape(-1)
+        for features, permutation, correction in zip(table.sign, table.order, table.correction, strict=True):
             order = np.concatenate([i * permutation.size + permutation for i in range(history)])
             moves = np.tile(correction, history - 1)
             sign = np.concatenate([np.tile(features, history), moves, np.ones(history - 1), correction, [1.0]])
             self._order.append(np.concatenate([order, np.arange(order.size, sign.size)]))
             self._sign.append(sign)
-            self._correction.append(correction)
-        # Mean shear of the latest frame, left minus right: its x component changes sign with x, its y component with y.
-        newest = index[-1]
-        self._left, self._right = newest[0, :, 0], newest[1, :, 0]
 
     def canonical(self, inputs: Array) -> tuple[Array, Array]:
         """Inputs (n, inputs) mirrored to the canonical side, and the signs (n, 3) of the corrections."""
-        x, y = (inputs[:, self._left] - inputs[:, self._right]).T
-        which = 2 * (x < 0) + (y < 0)
-        mirrored = np.take_along_axis(inputs, np.asarray(self._order)[which], axis=1) * np.asarray(self._sign)[which]
-        return mirrored, np.asarray(self._correction)[which]
+        side = self._reflections.side(inputs)
+        mirrored = np.take_along_axis(inputs, np.asarray(self._order)[side], axis=1) * np.asarray(self._sign)[side]
+        return mirrored, self._reflections.correction[side]

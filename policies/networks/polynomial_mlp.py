@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.observation import FlowMap, Grid
-from gelflow.policies.networks.base import Architecture, BatchPolicy, Network, Tensors, check_tensors
-from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry, exponents
+from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
+from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork
+from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
+from gelflow.policies.networks.polynomial_features import reduce_maps
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -63,25 +64,6 @@ class PolynomialMLP(Architecture):
     def network(self, task: InsertionTask, tensors: Tensors) -> "PolynomialNetwork":
         """The network with the given tensors. Raises UsageError when they do not fit."""
         return PolynomialNetwork(self, task, tensors)
-
-
-def polynomial_basis(grid: Grid, degree: int) -> Array:
-    """Orthogonal polynomials in row and column up to `degree`, sampled on `grid`, shape (rows * cols, terms).
-
-    The scale is such that `map @ basis` is 1 for a map equal to the polynomial of unit mean square.
-    """
-    positions = grid.positions()
-    half = np.maximum(np.abs(positions - positions.mean(0)).max(0), grid.pitch / 2)
-    x, y = ((positions - positions.mean(0)) / half).T
-    q, r = np.linalg.qr(np.stack([x**i * y**j for i, j in exponents(degree)], axis=1))
-    return np.asarray(q * np.sign(np.diag(r)) / np.sqrt(len(positions)))
-
-
-def reduce_maps(images: NDArray[Any], basis: Array) -> Array:
-    """Polynomial features (n, channels * terms) of flow maps (n, channels, rows, cols)."""
-    n, channels = images.shape[:2]
-    flat = images.reshape(n, channels, -1).astype(float)
-    return np.asarray(np.einsum("ncp,pk->nck", flat, basis).reshape(n, -1))
 
 
 class History:
@@ -130,7 +112,7 @@ class History:
         self._pose += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
 
 
-class PolynomialNetwork(Network):
+class PolynomialNetwork(FlowMapNetwork):
     """The network of a checkpoint: corrections from flow maps and history.
 
     `einsum` uses NumPy's own loops instead of a threaded BLAS, so that results are bit-identical for any number of
@@ -141,6 +123,7 @@ class PolynomialNetwork(Network):
         """Raises UsageError for missing tensors, wrong shapes and values that are not finite."""
         self.architecture: PolynomialMLP = architecture
         self.task = task
+        self.reach = architecture.reach
         check_tensors(tensors, architecture.tensor_shapes(task))
         self._symmetry = MirrorSymmetry(architecture.degree, architecture.history, task)
         self._basis: Array = tensors["basis"].astype(float)
@@ -176,46 +159,20 @@ class PolynomialNetwork(Network):
         return np.asarray(out * signs * np.asarray(self.architecture.reach))
 
 
-class NetworkPolicy:
-    """A network with the history of one part. Implements `gelflow.protocols.Policy`."""
-
-    def __init__(self, network: PolynomialNetwork) -> None:
-        self.network = network
-        self._history = network.history()
-
-    def reset(self) -> None:
-        """Clears the history before a new part."""
-        self._history.reset()
-
-    def act(self, observation: FlowMap) -> Array:
-        """The correction (dx [m], dy [m], dyaw [rad]) in the gripper frame; deterministic.
-
-        Raises UsageError when the flow map does not have the shape of the task or has values that are not finite.
-        """
-        image, shape = observation.image, self.network.task.observation_shape
-        if image.shape != shape:
-            raise UsageError(f"flow map has shape {image.shape}; the policy takes {shape}")
-        if not np.isfinite(image).all():
-            raise UsageError("flow map has values that are not finite")
-        inputs = self._history.observe(self.network.encode(image[None]))
-        correction = self.network.corrections(inputs)
-        self._history.record(correction)
-        return np.asarray(correction[0])
-
-
-class PolynomialPolicy(BatchPolicy):
-    """A network that acts in `count` environments."""
+class PolynomialPolicy(CorrectionPolicy):
+    """A network with the history of `count` parts."""
 
     def __init__(self, network: PolynomialNetwork, count: int) -> None:
+        super().__init__(network.task)
         self._network = network
         self._history = network.history(count)
 
     def reset(self, which: NDArray[np.bool_]) -> None:
-        """Clears the history of the environments marked in `which`."""
+        """Clears the history of the parts marked in `which`."""
         self._history.reset(which)
 
-    def act(self, observations: NDArray[Any]) -> Array:
-        """Actions (count, 3) in ±1 for the latest flow maps; an action of ±1 is `InsertionTask.action_scale`."""
-        corrections = self._network.corrections(self._history.observe(self._network.encode(observations)))
+    def corrections(self, images: NDArray[Any]) -> Array:
+        """Corrections (count, 3) [m, m, rad] in the gripper frame for the latest flow maps; deterministic."""
+        corrections = self._network.corrections(self._history.observe(self._network.encode(images)))
         self._history.record(corrections)
-        return np.asarray(corrections / np.asarray(self._network.task.action_scale))
+        return corrections

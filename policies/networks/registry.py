@@ -5,9 +5,12 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture
+from gelflow.policies.networks.polynomial_gru import PolynomialGRU
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 
-_ARCHITECTURES: dict[str, type[Architecture]] = {architecture.kind: architecture for architecture in (PolynomialMLP,)}
+_ARCHITECTURES: dict[str, type[Architecture]] = {
+    architecture.kind: architecture for architecture in (PolynomialMLP, PolynomialGRU)
+}
 
 
 def architecture_from_json(data: Mapping[str, Any]) -> Architecture:

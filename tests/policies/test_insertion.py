@@ -19,13 +19,8 @@ from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
-from gelflow.policies.networks.polynomial_mlp import (
-    History,
-    PolynomialMLP,
-    PolynomialNetwork,
-    polynomial_basis,
-    reduce_maps,
-)
+from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
+from gelflow.policies.networks.polynomial_mlp import History, PolynomialMLP, PolynomialNetwork
 from gelflow.policies.ppo import PPOSettings, train
 from gelflow.protocols import Policy
 from gelflow.task import INSERTION

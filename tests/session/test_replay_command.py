@@ -19,7 +19,8 @@ from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker
 from gelflow.policies import checkpoint
-from gelflow.policies.networks.polynomial_mlp import NetworkPolicy, PolynomialMLP
+from gelflow.policies.networks.flow_map_policy import NetworkPolicy
+from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 from gelflow.protocols import CameraImage, GripperState
 from gelflow.session.decision_picture import draw_comparisons
 from gelflow.session.decision_replay import Comparison

@@ -29,7 +29,7 @@ from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
-    from gelflow.policies.networks.polynomial_mlp import NetworkPolicy
+    from gelflow.policies.networks.flow_map_policy import NetworkPolicy
     from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.lab import Lab
 
@@ -221,7 +221,7 @@ def _in_simulation(output: Output, policy: "NetworkPolicy", *, preset: str | Non
     env = make_insertion_env(_EPISODES, preset=preset)
     actors: dict[str, NetworkActor | RandomActor] = {
         "policy": NetworkActor(policy.network, _EPISODES),
-        "random": RandomActor(policy.network.architecture.reach, _EPISODES, 0),
+        "random": RandomActor(policy.network.reach, _EPISODES, 0),
     }
     results = []
     with progress_bar() as progress:

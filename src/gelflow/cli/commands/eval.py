@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json)
     count = min(args.envs, args.episodes)
     plain, noisy = (make_insertion_env(count, noise=noise, preset=args.preset) for noise in (None, FlowMapNoise()))
-    reach = network.architecture.reach
+    reach = network.reach
     cases: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
         ("policy", NetworkActor(network, count), plain),
         ("policy, noisy flow maps", NetworkActor(network, count), noisy),

@@ -1,0 +1,61 @@
+"""Policies that map flow maps to corrections of the gripper's pose, for one part and for many."""
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import FlowMap
+from gelflow.policies.networks.base import Array, BatchPolicy, Network
+from gelflow.task import InsertionTask
+
+
+class CorrectionPolicy(BatchPolicy):
+    """A network that corrects the poses of several parts and remembers their attempts."""
+
+    def __init__(self, task: InsertionTask) -> None:
+        self._task = task
+
+    @abstractmethod
+    def corrections(self, images: NDArray[Any]) -> Array:
+        """Corrections (n, 3) [m, m, rad] in the gripper frame for the latest flow maps; deterministic."""
+
+    def act(self, observations: NDArray[Any]) -> Array:
+        """Actions (n, 3) for the latest flow maps; ±1 is `InsertionTask.action_scale`."""
+        return np.asarray(self.corrections(observations) / np.asarray(self._task.action_scale))
+
+
+class FlowMapNetwork(Network):
+    """A network whose observations are the flow maps of the insertion."""
+
+    reach: tuple[float, float, float]  # largest correction [m, m, rad]
+
+    @abstractmethod
+    def batch_policy(self, count: int) -> CorrectionPolicy:
+        """A policy for `count` parallel parts."""
+
+
+class NetworkPolicy:
+    """A network with the memory of one part. Implements `gelflow.protocols.Policy`."""
+
+    def __init__(self, network: FlowMapNetwork) -> None:
+        self.network = network
+        self._policy = network.batch_policy(1)
+
+    def reset(self) -> None:
+        """Clears the memory before a new part."""
+        self._policy.reset(np.ones(1, dtype=bool))
+
+    def act(self, observation: FlowMap) -> Array:
+        """The correction (dx [m], dy [m], dyaw [rad]) in the gripper frame; deterministic.
+
+        Raises UsageError when the flow map does not have the shape of the task or has values that are not finite.
+        """
+        image, shape = observation.image, self.network.task.observation_shape
+        if image.shape != shape:
+            raise UsageError(f"flow map has shape {image.shape}; the policy takes {shape}")
+        if not np.isfinite(image).all():
+            raise UsageError("flow map has values that are not finite")
+        return np.asarray(self._policy.corrections(image[None])[0])

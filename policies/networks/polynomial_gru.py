@@ -1,0 +1,182 @@
+"""The recurrent policy of the insertion: polynomial features of the flow maps and a gated recurrent unit, in NumPy.
+
+One attempt does not determine both yaw and translation, since both may load the same corner of the hole. The recurrent
+unit combines all attempts of a part with the corrections between them. The first attempt of a part decides how the part
+is mirrored (`Reflections`); all its attempts are mirrored alike, so the policy is exactly symmetric.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
+from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork
+from gelflow.policies.networks.mirror_symmetry import reflections
+from gelflow.policies.networks.polynomial_features import reduce_maps
+from gelflow.task import InsertionTask
+
+_MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start
+
+
+@dataclass(frozen=True)
+class PolynomialGRU(Architecture):
+    """A linear layer (tanh), a gated recurrent unit (GRU), a linear layer (tanh) and a linear output."""
+
+    kind: ClassVar[str] = "polynomial-gru"
+    degree: int = 2  # of the polynomials in row and column
+    units: int = 96  # of the first layer and of the GRU
+    head: int = 64  # units between GRU and output
+    reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)  # correction for an output of ±1 [m, m, rad]
+    mirror: tuple[str, ...] = ("x", "y")  # axes in which part and hole are symmetric: "x", "y", both or none
+
+    def __post_init__(self) -> None:
+        if self.degree < 0 or self.units < 1 or self.head < 1:
+            raise UsageError(f"a network requires degree ≥ 0, units ≥ 1 and head ≥ 1, got {self}")
+        if len(self.reach) != 3 or min(self.reach) <= 0:
+            raise UsageError(f"reach must be three positive numbers, got {self.reach}")
+        if not set(self.mirror) <= {"x", "y"}:
+            raise UsageError(f"mirror may contain 'x' and 'y', got {self.mirror}")
+
+    def features(self, task: InsertionTask) -> int:
+        """Number of features of one flow map."""
+        return task.observation_shape[0] * (self.degree + 1) * (self.degree + 2) // 2
+
+    def inputs(self, task: InsertionTask) -> int:
+        """Number of inputs of the first layer."""
+        return self.features(task) + _MOTION
+
+    def layer_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
+        """Name and shape of each trained tensor; names are those of the torch modules in `polynomial_gru_torch`."""
+        units, head = self.units, self.head
+        return {
+            "first.weight": (units, self.inputs(task)),
+            "first.bias": (units,),
+            "gru.weight_ih": (3 * units, units),
+            "gru.weight_hh": (3 * units, units),
+            "gru.bias_ih": (3 * units,),
+            "gru.bias_hh": (3 * units,),
+            "head.weight": (head, units),
+            "head.bias": (head,),
+            "output.weight": (3, head),
+            "output.bias": (3,),
+        }
+
+    def tensor_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
+        """Name and shape of each tensor of a network for `task`."""
+        features = self.features(task)
+        terms = features // task.observation_shape[0]
+        fixed: dict[str, tuple[int, ...]] = {"basis": (task.grid.rows * task.grid.cols, terms), "scale": (features,)}
+        return fixed | self.layer_shapes(task)
+
+    def network(self, task: InsertionTask, tensors: Tensors) -> "PolynomialGRUNetwork":
+        """The network with the given tensors. Raises UsageError when they do not fit."""
+        return PolynomialGRUNetwork(self, task, tensors)
+
+
+class PolynomialGRUNetwork(FlowMapNetwork):
+    """The network of a checkpoint, without memory.
+
+    `einsum` uses NumPy's own loops instead of a threaded BLAS, so that results are bit-identical for any number of
+    threads, as replay requires.
+    """
+
+    def __init__(self, architecture: PolynomialGRU, task: InsertionTask, tensors: Tensors) -> None:
+        """Raises UsageError for missing tensors, wrong shapes and values that are not finite."""
+        check_tensors(tensors, architecture.tensor_shapes(task))
+        self.architecture: PolynomialGRU = architecture
+        self.task = task
+        self.reach = architecture.reach
+        self.reflections = reflections(architecture.degree, task)
+        self._tensors: dict[str, Array] = {name: values.astype(float) for name, values in tensors.items()}
+
+    def batch_policy(self, count: int) -> "PolynomialGRUPolicy":
+        """A policy for `count` parallel parts."""
+        return PolynomialGRUPolicy(self, count)
+
+    def encode(self, images: NDArray[Any]) -> Array:
+        """Features of flow maps (n, channels, rows, cols), divided by their root mean square in training."""
+        return reduce_maps(images, self._tensors["basis"]) / self._tensors["scale"]
+
+    def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
+        """Outputs (n, 3) and next states (n, units) for inputs (n, inputs); equations of the GRU as in torch."""
+        first = np.tanh(self._linear("first", inputs))
+        from_input = self._linear("gru", first, "_ih").reshape(len(inputs), 3, -1)
+        from_state = self._linear("gru", state, "_hh").reshape(len(inputs), 3, -1)
+        reset, update = (_sigmoid(from_input[:, i] + from_state[:, i]) for i in (0, 1))
+        candidate = np.tanh(from_input[:, 2] + reset * from_state[:, 2])
+        state = (1 - update) * candidate + update * state
+        return self._linear("output", np.tanh(self._linear("head", state))), state
+
+    def _linear(self, name: str, values: Array, suffix: str = "") -> Array:
+        weight, bias = self._tensors[f"{name}.weight{suffix}"], self._tensors[f"{name}.bias{suffix}"]
+        return np.asarray(np.einsum("ni,oi->no", values, weight) + bias)
+
+
+class PolynomialGRUPolicy(CorrectionPolicy):
+    """A network with the memory of `count` parts.
+
+    `corrections` calls `observe`, the network, and `correct`; the training calls them itself, to record the inputs and
+    to explore.
+    """
+
+    def __init__(self, network: PolynomialGRUNetwork, count: int) -> None:
+        super().__init__(network.task)
+        self.network = network
+        self._reach = np.asarray(network.architecture.reach)
+        self._state: Array = np.zeros((count, network.architecture.units))
+        self._side: NDArray[np.int64] = np.zeros(count, dtype=np.int64)
+        self._correction: Array = np.zeros((count, 3))  # the latest, in units of the reach
+        self._displacement: Array = np.zeros((count, 3))  # from the start, in the frame of the start [m, m, rad]
+        self.new: NDArray[np.bool_] = np.ones(count, dtype=bool)  # parts without an attempt in the memory
+
+    @property
+    def signs(self) -> Array:
+        """Signs (count, 3) between a correction and the output of the network, which sees mirrored parts."""
+        return self.network.reflections.correction[self._side]
+
+    def reset(self, which: NDArray[np.bool_]) -> None:
+        """Clears the memory of the parts marked in `which`."""
+        for array in (self._state, self._correction, self._displacement):
+            array[which] = 0
+        self.new[which] = True
+
+    def observe(self, images: NDArray[Any]) -> Array:
+        """Inputs (count, inputs) of the network for the latest flow maps, mirrored.
+
+        They are the features, the latest correction, and the displacement from the start in the gripper frame, both in
+        units of the reach.
+        """
+        table, features = self.network.reflections, self.network.encode(images)
+        side = table.side(features, self.network.architecture.mirror)
+        self._side = np.where(self.new, side, self._side)
+        self.new[:] = False
+        mirrored = np.take_along_axis(features, table.order[self._side], axis=1) * table.sign[self._side]
+        x, y, yaw = self._displacement.T
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        displacement = np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1) / self._reach
+        return np.concatenate([mirrored, self._correction * self.signs, displacement * self.signs], axis=1)
+
+    def output(self, inputs: Array) -> Array:
+        """Output (count, 3) of the network for inputs from `observe`; updates the memory."""
+        output, self._state = self.network.step(inputs, self._state)
+        return output
+
+    def correct(self, output: Array) -> Array:
+        """The corrections (count, 3) [m, m, rad] of an output, which is limited to ±1; updates the memory."""
+        self._correction = np.clip(output, -1, 1) * self.signs
+        corrections = np.asarray(self._correction * self._reach)
+        dx, dy, dyaw = corrections.T
+        cos, sin = np.cos(self._displacement[:, 2]), np.sin(self._displacement[:, 2])
+        self._displacement += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
+        return corrections
+
+    def corrections(self, images: NDArray[Any]) -> Array:
+        """Corrections (count, 3) [m, m, rad] in the gripper frame for the latest flow maps; deterministic."""
+        return self.correct(self.output(self.observe(images)))
+
+
+def _sigmoid(values: Array) -> Array:
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * values))
