@@ -29,6 +29,8 @@ CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc,$(fo
 SANITIZE_BUILD := build/sanitize
 # It is fifty times slower there: one file goes through every part of the core, the others through batches and contact.
 SANITIZE_TESTS = $(patsubst %,tests/sim/core/test_%.py,every_part batch contact)
+# Tests run on all cores; a file's tests stay in order, so that they share what it sets up.
+PARALLEL := -n auto --dist worksteal
 # Random images that go through the marker tracker.
 FUZZ ?= 20000
 SANITIZE_PRELOAD = $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so))
@@ -39,10 +41,10 @@ demo: core
 	@.venv/bin/gelflow demo
 
 test: core
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest $(PARALLEL)
 
 test-slow: core
-	@.venv/bin/python -m pytest -m slow
+	@.venv/bin/python -m pytest $(PARALLEL) -m slow
 
 check: core
 	.venv/bin/ruff check .

@@ -90,7 +90,7 @@ def _run_endurance(args: argparse.Namespace) -> int:
         output.text(line)
     write_json(args.out / "egm.json", result.to_json())
     output.result(result.to_json())
-    return SUCCESS if result.missed <= BOUND else NEGATIVE_RESULT
+    return SUCCESS if result.missed <= BOUND and not result.stops else NEGATIVE_RESULT
 
 
 def _run_plans(args: argparse.Namespace) -> int:

@@ -17,12 +17,13 @@ import numpy as np
 
 from gelflow.cli.promises.report import load
 from gelflow.cli.promises.rig import Rig, near_seed
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, PeerTimeout
 from gelflow.geometry import Pose
 from gelflow.measurement.machine import processor
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.cell import Cell, open_cell
+from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.phases import Phase
@@ -60,6 +61,11 @@ class CycleStatistics:
                 self.latencies.append(cycle.answered - cycle.stamp)
             self._last = cycle
 
+    def stop(self, silence: float) -> None:
+        """Count a stop after `silence` [s] without a message: its cycles are lost, the next one is a new start."""
+        self.lost += round(silence / _PERIOD)
+        self._last = None
+
     def summary(self) -> dict[str, float]:
         """Fraction of missed cycles, and times in milliseconds."""
         jitter = 1e3 * np.abs(np.array(self.intervals or [math.nan]) - _PERIOD)
@@ -88,6 +94,7 @@ class Endurance:
     images: tuple[int, int]  # tracked of each camera
     recorded: int  # bytes
     late: int  # cycles that the mock controller skipped, because this computer was busy
+    stops: list[str]  # reasons why the arm was stopped; it was connected again each time
     load_before: float | None
     load_after: float | None
 
@@ -112,6 +119,7 @@ class Endurance:
             f"largest {c['latency_max_ms']:.1f} ms",
             f"tracked images: {self.images[0]} and {self.images[1]}; recorded {self.recorded / 1e6:.1f} MB; the mock "
             f"controller skipped {self.late} cycles; load before {self.load_before}, after {self.load_after}",
+            *(f"stopped, then connected again: {reason}" for reason in self.stops),
         ]
 
 
@@ -129,41 +137,57 @@ def measure_endurance(seconds: float) -> Endurance:
         values = json.loads(result.stdout)
         recorded = os.path.getsize(rig.folder / "session.mcap")
         late = rig.robot.arm.report.late - late
-    return Endurance(seconds, values["cycles"], tuple(values["images"]), recorded, late, before, load())
+    images = tuple(values["images"])
+    return Endurance(seconds, values["cycles"], images, recorded, late, values["stops"], before, load())
 
 
 def run_devices(folder: Path, seconds: float) -> dict[str, Any]:
-    """Connect, move up and down, track both cameras and record, for `seconds`; the counts of the cycles."""
+    """Connect, move up and down, track both cameras and record, for `seconds`; the counts of the cycles.
+
+    After a stop because of an old pose, image or gripper state, everything is connected again.
+    """
     lab = load_lab(folder / "lab.toml")
-    statistics = CycleStatistics()
+    statistics, images, stops = CycleStatistics(), [0, 0], []
+    end = time.monotonic() + seconds
     with SessionRecorder(folder / "session.mcap", lab.clock, max_delay=lab.limits.recording_delay).open() as recorder:
         recorder.metadata({})
-        with open_cell(lab, recorder) as cell:
-            cell.arm.wait_following(5.0)
-            supervisor, motion = create_motion(cell)
-            motion.on_cycles = statistics.add
-            supervisor.phases.enter(Phase.LOAD)
-            with motion:
-                images = _move_and_track(cell, motion, seconds)
-    return {"cycles": statistics.summary(), "images": images}
+        while time.monotonic() < end:
+            try:
+                _run_until(end, lab, recorder, statistics, images)
+            except PeerTimeout as error:
+                statistics.stop(lab.limits.stale_pose)
+                stops.append(str(error))
+    return {"cycles": statistics.summary(), "images": images, "stops": stops}
 
 
-def _move_and_track(cell: Cell, motion: MotionExecutor, seconds: float) -> list[int]:
-    """Move up and down while all images are tracked; the number of tracked images of each camera."""
+def _run_until(end: float, lab: Lab, recorder: SessionRecorder, statistics: CycleStatistics, images: list[int]) -> None:
+    """Connect and move until the time `end` [s, wall]; adds to the statistics and to the number of tracked images."""
+    with open_cell(lab, recorder) as cell:
+        cell.arm.wait_following(5.0)
+        supervisor, motion = create_motion(cell)
+        motion.on_cycles = statistics.add
+        supervisor.phases.enter(Phase.LOAD)
+        with motion:
+            _move_and_track(cell, motion, end, images)
+
+
+def _move_and_track(cell: Cell, motion: MotionExecutor, end: float, images: list[int]) -> None:
+    """Move up and down while all images are tracked; adds the number of tracked images of each camera to `images`."""
     mounts = (cell.lab.cameras.left.mount, cell.lab.cameras.right.mount)
     observer = TactileObserver(cell.cameras, mounts, clock=cell.clock, stale=cell.lab.limits.stale_frame)
     observer.start(cell.clock.now())
     start = motion.pose()
-    end = time.monotonic() + seconds
     for up in itertools.cycle((True, False)):
         target = Pose(start.position + np.array([0.0, 0.0, _STROKE if up else 0.0]), start.quaternion)
         motion.go(target, speed=_SPEED)
         while not motion.arrived():
             motion.wait(0.0)
+            before = [len(tracked) for tracked in observer.tracked]
             observer.update()
+            for sensor, tracked in enumerate(observer.tracked):
+                images[sensor] += len(tracked) - before[sensor]
             if time.monotonic() > end:
-                return [len(tracked) for tracked in observer.tracked]
-    raise AssertionError("the cycle does not end")
+                return
 
 
 def main(arguments: Sequence[str]) -> int:
