@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim.scene import Scene
-from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
+from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION, AttemptResult, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import INSERTION, InsertionTask
 
 Observation = NDArray[np.float32]

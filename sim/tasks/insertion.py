@@ -6,6 +6,7 @@ simulated: each attempt starts from the grasp at rest, placed above the hole at 
 not depend on that pose, so it is simulated once per part.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,8 @@ from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, Randomization
+from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
@@ -30,6 +32,63 @@ ARM_JOINTS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 PADS = ("left", "right")
 _CLEAR_HEIGHT = 0.1  # [m] height of the part while the gripper closes, clear of the hole
 _OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
+
+# Relaxation times k_t / k_s of the elastic law: long enough to damp vibration, short enough that a frame of the fast
+# simulated descent equals one of the slow descent of the robot.
+CONTACT_RELAXATION = 10e-3  # [s]
+MARKER_RELAXATION = 5e-3  # [s]
+
+# The ranges of contact, pad and grasp parameters are published (paper, appendix, Table 7). Quantities that the
+# published simulator does not have are chosen here.
+DEFAULT_RANDOMIZATION = Randomization(
+    {
+        "pad_kn": Quantity(Uniform(2e3, 1.4e4), "N/m", "contact of pad and part, per point"),
+        "pad_mu": Quantity(Uniform(0.5, 2.5), "", "friction of pad and part"),
+        "marker_kn": Quantity(Uniform(50.0, 450.0), "N/m", "normal stiffness of a marker"),
+        "marker_mu": Quantity(Uniform(0.5, 2.5), "", "friction of a marker"),
+        "marker_kd": Quantity(Uniform(0.0, 100.0), "N s/m²", "normal damping of a marker"),
+        "hole_kn": Quantity(LogUniform(2.5e3, 2e4), "N/m", "contact of part and hole, per point"),
+        "hole_mu": Quantity(Uniform(0.3, 1.5), "", "friction of part and hole, down to printed plastic"),
+        "pad_ks": Quantity(LogUniform(100.0, 1000.0), "N/m", "shear stiffness of the pads, soft to stiff", "elastic"),
+        "marker_ks": Quantity(LogUniform(50.0, 450.0), "N/m", "shear stiffness of a marker", "elastic"),
+        "pad_kt": Quantity(Uniform(20.0, 140.0), "N s/m", "shear damping of the pads", "viscous"),
+        "marker_kt": Quantity(Uniform(0.2, 2.3), "N s/m", "shear damping of a marker", "viscous"),
+        "arm_stiffness": Quantity(LogUniform(200.0, 3e5), "N/m", "of the arm, published servo to industrial arm"),
+        "grasp_force": Quantity(Uniform(2.5, 16.0), "N", "of each finger"),
+        "grasp_height": Quantity(Uniform(-10e-3, 5e-3), "m", "of the pad centres above the part's centre"),
+        # The robot stops at a marker displacement; the force at that displacement depends on the gel.
+        "stop_shear": Quantity(LogUniform(5e-3, 0.1), "N", "mean shear of the markers at which a descent stops"),
+        **NO_SENSOR_EFFECTS,
+        # From the published 1e-5 N to the noise of image tracking.
+        "noise": SENSOR_QUANTITIES["noise"],
+        "start_height": Quantity(Fixed(0.2e-3), "m", "half-range of the lower face's start height, per attempt"),
+    }
+)
+
+# As the default, with the deviations of real pads.
+FULL_RANDOMIZATION = Randomization({**DEFAULT_RANDOMIZATION.quantities, **SENSOR_QUANTITIES})
+
+# Fixed parameters of the scene file, with the arm stiffness of a robot; for tests and pictures.
+NOMINAL = DEFAULT_RANDOMIZATION.replace(
+    pad_kn=8e3,
+    pad_mu=1.5,
+    marker_kn=250.0,
+    marker_mu=1.5,
+    marker_kd=25.0,
+    hole_kn=5e3,
+    hole_mu=1.5,
+    pad_ks=250.0,
+    marker_ks=150.0,
+    pad_kt=80.0,
+    marker_kt=1.25,
+    arm_stiffness=1e5,
+    grasp_force=12.0,
+    grasp_height=0.0,
+    stop_shear=0.1,
+    noise=1e-5,
+    start_height=0.0,
+)
+RANDOMIZATIONS = {"nominal": NOMINAL, "default": DEFAULT_RANDOMIZATION, "full": FULL_RANDOMIZATION}
 
 
 @dataclass(frozen=True)
@@ -110,7 +169,8 @@ class InsertionAttempts:
         right, back = shapes["wall_right"], shapes["wall_back"]
         self._outline = np.array([right.pose.position[0] - right.size[0], back.pose.position[1] - back.size[1]])
         self.pose: Array = np.zeros((num_envs, 3))
-        self._noise: Array = np.zeros(num_envs)  # standard deviation of a marker force [N]
+        self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
+        self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
         self._stop_shear: Array = np.full(num_envs, np.inf)
         # The grasp at rest: controls, state and shear forces.
         self._u: Array = np.zeros((num_envs, self.scene.nu))
@@ -135,14 +195,15 @@ class InsertionAttempts:
 
         Physics and grasp come from the randomization, `pose` from the task unless `misalignment` (N, 3) is given.
         """
-        sampled = self.randomization.sample(rng, self.num_envs, elastic=self.scene.friction == "elastic")
-        for name, values in sampled.params.items():
+        sampled = self.randomization.sample(rng, self.num_envs, friction=self.scene.friction)
+        for name, values in simulator_parameters(sampled, elastic=self.scene.friction == "elastic").items():
             self.sim.param(name)[:] = values
-        self._noise, self._stop_shear = sampled.noise, sampled.stop_shear
+        self._stop_shear, self._start_height = sampled["stop_shear"], sampled["start_height"]
         self.pose = self.task.draw_misalignment(rng, self.num_envs)
         if misalignment is not None:
             self.pose = np.array(np.broadcast_to(misalignment, self.pose.shape), dtype=float)
-        self._close(sampled.grasp_force, sampled.grasp_height)
+        self._close(sampled["grasp_force"], sampled["grasp_height"])
+        self._sensors.draw(np.ones(self.num_envs, dtype=bool), sampled, rng)
 
     def _close(self, force: Array, height: Array) -> None:
         """Close the grippers on their parts, far above the holes, and store the state at rest."""
@@ -191,9 +252,9 @@ class InsertionAttempts:
                 frames[step][:] = shear
             if step > self._reference_at:
                 stopped |= self._mean_shear(shear - frames[self._reference_at]) > self._stop_shear
-        noisy = {step: self._with_noise(frames[step], rng) for step in sorted({self._reference_at, *self._frames})}
-        stack = np.stack([noisy[step] for step in self._frames], axis=1)
-        image, divisor = normalize(stack, noisy[self._reference_at], min_divisor=MIN_DIVISORS["N"])
+        readings = self._readings(frames, rng)
+        stack = np.stack([readings[step] for step in self._frames], axis=1)
+        image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
         height, inserted = self._outcome()
         failed = sim.status != 0
         inserted &= ~failed & ~stopped
@@ -210,7 +271,7 @@ class InsertionAttempts:
         grasp = self._grasp["q"]
         sim.reset()
         part = grasp[:, at : at + 7]
-        jitter = rng.uniform(-1, 1, self.num_envs) * self.randomization.start_height
+        jitter = rng.uniform(-1, 1, self.num_envs) * self._start_height
         lift = self.task.start_height + jitter - (part[:, 2] - self._face)
         x, y, yaw = self.pose.T
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -226,10 +287,16 @@ class InsertionAttempts:
         u[:, self._arm_u] = np.column_stack([x, y, u[:, self._arm_u[2]] + lift, yaw])
         return u
 
-    def _with_noise(self, shear: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
-        noisy = shear + self._noise[:, None, None] * rng.standard_normal(shear.shape)
-        grid = self.task.grid
-        return noisy.reshape(self.num_envs, len(PADS), grid.rows, grid.cols, 2)
+    def _readings(self, frames: Mapping[int, Array], rng: np.random.Generator) -> dict[int, Array]:
+        """Readings of the pads after the given numbers of steps, (N, pads, rows, cols, 2) each."""
+        everyone, grid = np.ones(self.num_envs, dtype=bool), self.task.grid
+        self._sensors.clear(everyone)
+        readings, last = {}, 0
+        for step in sorted(frames):
+            reading = self._sensors.read(frames[step], everyone, rng, interval=(step - last) * self.scene.step)
+            readings[step] = reading.reshape(self.num_envs, len(PADS), grid.rows, grid.cols, 2)
+            last = step
+        return readings
 
     def _outcome(self) -> tuple[Array, NDArray[np.bool_]]:
         """Height of the highest corner of the part's lower face [m], and whether the face is inside the hole."""
@@ -247,7 +314,8 @@ class InsertionAttempts:
         """Copy parts (physics, grasp and pose) from `other_rows` of another batch to `rows`."""
         self.sim.params[rows] = other.sim.params[other_rows]
         self.pose[rows] = other.pose[other_rows]
-        self._noise[rows] = other._noise[other_rows]
+        self._start_height[rows] = other._start_height[other_rows]
+        self._sensors.copy(rows, other._sensors, other_rows)
         self._stop_shear[rows] = other._stop_shear[other_rows]
         self._u[rows] = other._u[other_rows]
         for name, values in self._grasp.items():
@@ -259,3 +327,24 @@ def _rotated_z(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
     cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
     w, x, y, z = quat.T
     return np.column_stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
+
+
+def simulator_parameters(sampled: Mapping[str, Array], *, elastic: bool) -> dict[str, Array]:
+    """Parameters of the simulator, name → (n,), for sampled quantities."""
+    pad = {"kn": sampled["pad_kn"], "mu": sampled["pad_mu"]}
+    marker = {"kn": sampled["marker_kn"], "mu": sampled["marker_mu"], "kd": sampled["marker_kd"]}
+    hole = {"kn": sampled["hole_kn"], "mu": sampled["hole_mu"]}
+    if elastic:
+        pad["ks"], marker["ks"], hole["ks"] = sampled["pad_ks"], sampled["marker_ks"], hole["kn"] / 2
+        pad["kt"], marker["kt"] = CONTACT_RELAXATION * pad["ks"], MARKER_RELAXATION * marker["ks"]
+    else:
+        pad["kt"], marker["kt"] = sampled["pad_kt"], sampled["marker_kt"]
+    params = {f"pad_{side}.{key}": values for side in PADS for key, values in pad.items()}
+    params |= {f"{side}.{key}": values for side in PADS for key, values in marker.items()}
+    walls = ("left", "right", "front", "back")
+    params |= {f"part_hole/wall_{wall}.{key}": values for wall in walls for key, values in hole.items()}
+    # Published ratios to the stiffness: damping 1/200 s, yaw servo 0.05 m².
+    for arm, scale in zip(ARM_JOINTS, (1.0, 1.0, 1.0, 0.05), strict=True):
+        params[f"{arm}.kp"] = sampled["arm_stiffness"] * scale
+        params[f"{arm}.kd"] = sampled["arm_stiffness"] * scale / 200
+    return params

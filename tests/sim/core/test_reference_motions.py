@@ -9,8 +9,7 @@ from scipy.special import ellipk
 
 from gelflow.sim import _core
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.randomization import NOMINAL
+from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
 from gelflow.sim.validation.thrown_bodies import GRAVITY, MASS, ThrownBody
 
 Array = NDArray[np.float64]

@@ -12,8 +12,7 @@ from gymnasium.vector import AutoresetMode
 
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
-from gelflow.sim.tasks.insertion import InsertionAttempts
-from gelflow.sim.tasks.randomization import NOMINAL
+from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
 from gelflow.task import INSERTION
 
 STAY = np.zeros(3, dtype=np.float32)
@@ -71,7 +70,7 @@ def test_episode_is_truncated_after_the_last_attempt() -> None:
 
 
 def test_simulation_failure_truncates_the_episode() -> None:
-    env = InsertionEnv(randomization=dataclasses.replace(NOMINAL, hole_kn=(1e300, 1e300)))
+    env = InsertionEnv(randomization=NOMINAL.replace(hole_kn=(1e300, 1e300)))
     observation, info = env.reset(seed=0, options={"misalignment": (6e-3, 6e-3, 0)})
     assert info["failed"] and not info["inserted"]
     assert np.isfinite(observation).all()
@@ -129,7 +128,7 @@ def test_a_seed_determines_all_results() -> None:
 
 def test_vector_environment_equals_single_environments() -> None:
     cases = np.array([[4e-3, 1e-3, 0.1], [-2e-3, 5e-3, -0.1]])
-    silent = dataclasses.replace(NOMINAL, noise=(1e-30, 1e-30))
+    silent = NOMINAL.replace(noise=(1e-30, 1e-30))
     actions = np.array([[0.1, -0.05, 0.2], [0.0, -0.1, 0.3]], dtype=np.float32)
     envs = vector(2, randomization=silent)
     first, _ = envs.reset(options={"misalignment": cases})

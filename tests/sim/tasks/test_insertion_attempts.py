@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, TactileFrame, flow_map
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.randomization import DEFAULT_RANDOMIZATION, NOMINAL, Randomization
+from gelflow.sim.tasks.insertion import (
+    DEFAULT_RANDOMIZATION,
+    NOMINAL,
+    InsertionAttempts,
+    insertion_scene,
+    simulator_parameters,
+)
 from gelflow.task import INSERTION
 
 WEIGHT = 0.063 * 9.8  # of the part [N]
-SILENT = dataclasses.replace(NOMINAL, noise=(1e-30, 1e-30))
+SILENT = NOMINAL.replace(noise=(1e-30, 1e-30))
 
 
 def poses(*millimetres_degrees: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -166,9 +171,9 @@ def test_contact_stops_the_descent() -> None:
     """The frame is the one at the stop: weaker than at full depth, with the same pattern."""
     caught, through = (3e-3, 2e-3, 0.05), (0.0, 0.0, 0.0)
     misalignment = np.array([caught, through])
-    gentle = dataclasses.replace(SILENT, stop_shear=(5e-3, 5e-3))
+    gentle = SILENT.replace(stop_shear=5e-3)
     _, stopped = attempted(misalignment, randomization=gentle)
-    _, full = attempted(misalignment, randomization=dataclasses.replace(SILENT, stop_shear=(9.0, 9.0)))
+    _, full = attempted(misalignment, randomization=SILENT.replace(stop_shear=9.0))
     assert 5e-3 < stopped.divisor[0] < 0.7 * full.divisor[0]
     assert np.abs(stopped.image[0] - full.image[0]).mean() < 0.15
     np.testing.assert_array_equal(stopped.inserted, [False, True])
@@ -193,12 +198,10 @@ def test_results_depend_neither_on_the_batch_nor_on_threads() -> None:
 
 def test_parts_can_be_copied_to_another_batch() -> None:
     rng = np.random.default_rng(5)
-    source, target = InsertionAttempts(3), InsertionAttempts(2)
+    quiet = DEFAULT_RANDOMIZATION.replace(start_height=0.0, noise=1e-30)
+    source, target = InsertionAttempts(3, randomization=quiet), InsertionAttempts(2, randomization=quiet)
     source.draw(rng)
     target.draw(rng)
-    source._noise[:] = 0
-    source.randomization = dataclasses.replace(DEFAULT_RANDOMIZATION, start_height=0.0)
-    target.randomization = source.randomization
     expected = source.attempt(rng)
     target.copy_parts(np.array([1]), source, np.array([2]))
     moved = target.attempt(rng)
@@ -208,21 +211,23 @@ def test_parts_can_be_copied_to_another_batch() -> None:
 
 @pytest.mark.parametrize("elastic", [True, False])
 def test_sampled_parameters_lie_within_their_ranges(elastic: bool) -> None:
-    sampled = DEFAULT_RANDOMIZATION.sample(np.random.default_rng(0), 500, elastic=elastic)
+    friction = "elastic" if elastic else "viscous"
+    sampled = DEFAULT_RANDOMIZATION.sample(np.random.default_rng(0), 500, friction=friction)
+    params = simulator_parameters(sampled, elastic=elastic)
     for name, limits in {
         "pad_left.kn": (2e3, 1.4e4),
         "right.kd": (0, 100),
         "arm_z.kp": (200, 3e5),
         "part_hole/wall_back.kn": (2.5e3, 2e4),
     }.items():
-        values = sampled.params[name]
+        values = params[name]
         assert limits[0] <= values.min() and values.max() <= limits[1]
         assert values.max() - values.min() > 0.9 * (limits[1] - limits[0])
-    assert ("pad_left.ks" in sampled.params) == elastic
-    np.testing.assert_array_equal(sampled.params["pad_left.mu"], sampled.params["pad_right.mu"])
-    assert sampled.grasp_force.min() >= 2.5 and sampled.grasp_force.max() <= 16
-    with pytest.raises(UsageError, match=r"pad_mu must be \(low, high\)"):
-        Randomization(pad_mu=(2.0, 1.0))
+    assert ("pad_left.ks" in params) == elastic
+    np.testing.assert_array_equal(params["pad_left.mu"], params["pad_right.mu"])
+    assert sampled["grasp_force"].min() >= 2.5 and sampled["grasp_force"].max() <= 16
+    with pytest.raises(UsageError, match=r"pad_mu: a range must be \(low, high\)"):
+        NOMINAL.replace(pad_mu=(2.0, 1.0))
 
 
 def test_sampled_parameters_exist_under_both_friction_laws() -> None:
