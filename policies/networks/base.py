@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.task import InsertionTask
+from gelflow.task import TaskDescription
 
 Array = NDArray[np.float64]
 Tensors = Mapping[str, NDArray[Any]]
@@ -37,11 +37,11 @@ class Architecture(ABC):
         return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in given.items()})
 
     @abstractmethod
-    def tensor_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
+    def tensor_shapes(self, task: TaskDescription) -> dict[str, tuple[int, ...]]:
         """Name and shape of each tensor of a network for `task`."""
 
     @abstractmethod
-    def network(self, task: InsertionTask, tensors: Tensors) -> "Network":
+    def network(self, task: TaskDescription, tensors: Tensors) -> "Network":
         """The network with the given tensors. Raises UsageError when they do not fit, see `check_tensors`."""
 
 
@@ -61,7 +61,7 @@ class Network(ABC):
     """A network for inference in NumPy. Its results are bit-identical for any number of threads, as replay requires."""
 
     architecture: Architecture
-    task: InsertionTask
+    task: TaskDescription
 
     @abstractmethod
     def batch_policy(self, count: int) -> BatchPolicy:

@@ -20,7 +20,7 @@ from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
 from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import reduce_maps
-from gelflow.task import InsertionTask
+from gelflow.task import InsertionTask, TaskDescription
 
 Array = NDArray[np.float64]
 
@@ -51,8 +51,10 @@ class PolynomialMLP(Architecture):
         """Length of the perceptron input, see `History.observe`."""
         return self.history * self.features(task) + (self.history - 1) * 4 + 4
 
-    def tensor_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
-        """Name and shape of each tensor of a network for `task`."""
+    def tensor_shapes(self, task: TaskDescription) -> dict[str, tuple[int, ...]]:
+        """Name and shape of each tensor of a network for `task`. Raises UsageError for another task than insertion."""
+        if not isinstance(task, InsertionTask):
+            raise UsageError(f"network {self.kind} is for the insertion, not for {task.name}")
         features = self.features(task)
         terms = features // task.observation_shape[0]
         sizes = [self.inputs(task), *self.hidden, 3]
@@ -61,8 +63,10 @@ class PolynomialMLP(Architecture):
             shapes |= {f"{i}.weight": (narrow, wide), f"{i}.bias": (narrow,)}
         return shapes
 
-    def network(self, task: InsertionTask, tensors: Tensors) -> "PolynomialNetwork":
-        """The network with the given tensors. Raises UsageError when they do not fit."""
+    def network(self, task: TaskDescription, tensors: Tensors) -> "PolynomialNetwork":
+        """The network with the given tensors. Raises UsageError when they do not fit, or for another task."""
+        if not isinstance(task, InsertionTask):
+            raise UsageError(f"network {self.kind} is for the insertion, not for {task.name}")
         return PolynomialNetwork(self, task, tensors)
 
 
@@ -122,7 +126,7 @@ class PolynomialNetwork(FlowMapNetwork):
     def __init__(self, architecture: PolynomialMLP, task: InsertionTask, tensors: Tensors) -> None:
         """Raises UsageError for missing tensors, wrong shapes and values that are not finite."""
         self.architecture: PolynomialMLP = architecture
-        self.task = task
+        self.task: InsertionTask = task
         self.reach = architecture.reach
         check_tensors(tensors, architecture.tensor_shapes(task))
         self._symmetry = MirrorSymmetry(architecture.degree, architecture.history, task)

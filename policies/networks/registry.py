@@ -5,12 +5,13 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture
+from gelflow.policies.networks.cnn import CNN
+from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 
-_ARCHITECTURES: dict[str, type[Architecture]] = {
-    architecture.kind: architecture for architecture in (PolynomialMLP, PolynomialGRU)
-}
+_KINDS: tuple[type[Architecture], ...] = (CNN, MLP, PolynomialGRU, PolynomialMLP)
+_ARCHITECTURES = {architecture.kind: architecture for architecture in _KINDS}
 
 
 def architecture_from_json(data: Mapping[str, Any]) -> Architecture:
