@@ -1,6 +1,6 @@
 """Actors: an encoder of the observation, an optional recurrent layer (GRU), and a linear layer to the actions.
 
-The tensors of a checkpoint are the `state_dict` of the torch twin, `torch_actor.TorchActor`.
+The tensors of a checkpoint are the `state_dict` of the network in training, `torch_actor.TorchActor`.
 """
 
 from abc import abstractmethod
