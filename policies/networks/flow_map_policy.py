@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.policies.networks.base import Array, BatchPolicy, Network
-from gelflow.task import InsertionTask
+from gelflow.task import InsertionTask, TaskDescription
 
 
 class CorrectionPolicy(BatchPolicy):
@@ -30,11 +30,19 @@ class CorrectionPolicy(BatchPolicy):
 class FlowMapNetwork(Network):
     """A network whose observations are the flow maps of the insertion."""
 
+    task: InsertionTask
     reach: tuple[float, float, float]  # largest correction [m, m, rad]
 
     @abstractmethod
     def batch_policy(self, count: int) -> CorrectionPolicy:
         """A policy for `count` parallel parts."""
+
+
+def insertion_task(task: TaskDescription, kind: str) -> InsertionTask:
+    """`task`, for a network of `kind` that is for the insertion. Raises UsageError for another task."""
+    if not isinstance(task, InsertionTask):
+        raise UsageError(f"network {kind} is for the insertion, not for {task.name}")
+    return task
 
 
 class NetworkPolicy:

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
-from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork
+from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import reduce_maps
-from gelflow.task import InsertionTask
+from gelflow.task import InsertionTask, TaskDescription
 
 _MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start
 
@@ -64,16 +64,17 @@ class PolynomialGRU(Architecture):
             "output.bias": (3,),
         }
 
-    def tensor_shapes(self, task: InsertionTask) -> dict[str, tuple[int, ...]]:
+    def tensor_shapes(self, task: TaskDescription) -> dict[str, tuple[int, ...]]:
         """Name and shape of each tensor of a network for `task`."""
+        task = insertion_task(task, self.kind)
         features = self.features(task)
         terms = features // task.observation_shape[0]
         fixed: dict[str, tuple[int, ...]] = {"basis": (task.grid.rows * task.grid.cols, terms), "scale": (features,)}
         return fixed | self.layer_shapes(task)
 
-    def network(self, task: InsertionTask, tensors: Tensors) -> "PolynomialGRUNetwork":
+    def network(self, task: TaskDescription, tensors: Tensors) -> "PolynomialGRUNetwork":
         """The network with the given tensors. Raises UsageError when they do not fit."""
-        return PolynomialGRUNetwork(self, task, tensors)
+        return PolynomialGRUNetwork(self, insertion_task(task, self.kind), tensors)
 
 
 class PolynomialGRUNetwork(FlowMapNetwork):

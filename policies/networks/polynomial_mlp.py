@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
-from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork
+from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import reduce_maps
 from gelflow.task import InsertionTask, TaskDescription
@@ -52,9 +52,8 @@ class PolynomialMLP(Architecture):
         return self.history * self.features(task) + (self.history - 1) * 4 + 4
 
     def tensor_shapes(self, task: TaskDescription) -> dict[str, tuple[int, ...]]:
-        """Name and shape of each tensor of a network for `task`. Raises UsageError for another task than insertion."""
-        if not isinstance(task, InsertionTask):
-            raise UsageError(f"network {self.kind} is for the insertion, not for {task.name}")
+        """Name and shape of each tensor of a network for `task`."""
+        task = insertion_task(task, self.kind)
         features = self.features(task)
         terms = features // task.observation_shape[0]
         sizes = [self.inputs(task), *self.hidden, 3]
@@ -65,9 +64,7 @@ class PolynomialMLP(Architecture):
 
     def network(self, task: TaskDescription, tensors: Tensors) -> "PolynomialNetwork":
         """The network with the given tensors. Raises UsageError when they do not fit, or for another task."""
-        if not isinstance(task, InsertionTask):
-            raise UsageError(f"network {self.kind} is for the insertion, not for {task.name}")
-        return PolynomialNetwork(self, task, tensors)
+        return PolynomialNetwork(self, insertion_task(task, self.kind), tensors)
 
 
 class History:
