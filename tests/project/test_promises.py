@@ -18,7 +18,7 @@ def functions(file: str) -> set[str]:
     return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
 
 
-@pytest.mark.parametrize("promise", PROMISES.values(), ids=str)
+@pytest.mark.parametrize("promise", PROMISES.values(), ids=lambda promise: promise.name)
 def test_every_promise_names_tests_that_exist(promise: Promise) -> None:
     assert promise.tests
     for test in promise.tests:

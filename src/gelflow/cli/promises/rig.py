@@ -40,6 +40,7 @@ _MAIN = """
 import signal, sys
 from gelflow.cli.main import main
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it
 sys.exit(main(sys.argv[1:]))
 """
 
