@@ -68,6 +68,7 @@ class MirrorSymmetry:
 
     def __init__(self, degree: int, history: int, task: InsertionTask) -> None:
         self._reflections = table = reflections(degree, task)
+        self._axes = task.part.mirror
         self._order: list[NDArray[np.int64]] = []
         self._sign: list[Array] = []
         for features, permutation, correction in zip(table.sign, table.order, table.correction, strict=True):
@@ -79,6 +80,6 @@ class MirrorSymmetry:
 
     def canonical(self, inputs: Array) -> tuple[Array, Array]:
         """Inputs (n, inputs) mirrored to the canonical side, and the signs (n, 3) of the corrections."""
-        side = self._reflections.side(inputs)
+        side = self._reflections.side(inputs, self._axes)
         mirrored = np.take_along_axis(inputs, np.asarray(self._order)[side], axis=1) * np.asarray(self._sign)[side]
         return mirrored, self._reflections.correction[side]

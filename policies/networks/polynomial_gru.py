@@ -167,7 +167,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
 
     def correct(self, output: Array) -> Array:
         """The corrections (count, 3) [m, m, rad] of an output, which is limited to ±1; updates the memory."""
-        self._correction = np.clip(output, -1, 1) * self.signs
+        self._correction = np.clip(output, -1, 1) * self.signs * self.network.task.corrected_axes
         corrections = np.asarray(self._correction * self._reach)
         dx, dy, dyaw = corrections.T
         cos, sin = np.cos(self._displacement[:, 2]), np.sin(self._displacement[:, 2])

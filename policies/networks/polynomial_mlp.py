@@ -157,7 +157,7 @@ class PolynomialNetwork(FlowMapNetwork):
             values = np.tanh(np.einsum("ni,oi->no", values, weight) + bias)
         weight, bias = self._layers[-1]
         out = np.clip(np.einsum("ni,oi->no", values, weight) + bias, -1, 1)
-        return np.asarray(out * signs * np.asarray(self.architecture.reach))
+        return np.asarray(out * signs * self.task.corrected_axes * np.asarray(self.architecture.reach))
 
 
 class PolynomialPolicy(CorrectionPolicy):

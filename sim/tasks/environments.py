@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim.scene import Scene
-from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION, AttemptResult, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import AttemptResult, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import INSERTION, InsertionTask
 
@@ -78,7 +78,7 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     task: task description
     scene: scene to simulate; None takes `insertion_scene(task, preset=preset)`
     preset: accuracy preset of the task's scene
-    randomization: distribution of the physical parameters
+    randomization: distribution of the physical parameters; None: the default of the task's part
     threads: of the simulator
 
     `reset(options={"misalignment": (x, y, yaw)})` starts at the given gripper pose [m, m, rad]; this start is kept even
@@ -93,7 +93,7 @@ class InsertionEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
         preset: str | None = None,
-        randomization: Randomization = DEFAULT_RANDOMIZATION,
+        randomization: Randomization | None = None,
         threads: int | None = 1,
     ) -> None:
         self.task = task
@@ -151,7 +151,7 @@ class InsertionVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
         preset: str | None = None,
-        randomization: Randomization = DEFAULT_RANDOMIZATION,
+        randomization: Randomization | None = None,
         threads: int | None = None,
     ) -> None:
         self.task = task

@@ -18,6 +18,9 @@ from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.parts.geometry import part_geometry
+from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
+from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.task import INSERTION, InsertionTask
@@ -105,9 +108,9 @@ class AttemptResult:
 
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
-    """The insertion scene with the marker grid of the task's observations; presets do not change the grid."""
+    """The insertion scene with the task's part and the marker grid of its observations, which presets do not change."""
     grid = task.grid
-    return load_scene(
+    scene = load_scene(
         "insertion",
         preset=preset,
         friction=friction,
@@ -118,6 +121,7 @@ def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = Non
             "pads.*.center": [grid.center[0] * 1e-3, grid.center[1] * 1e-3],
         },
     )
+    return with_part(scene, task.part)
 
 
 class InsertionAttempts:
@@ -128,7 +132,7 @@ class InsertionAttempts:
     num_envs: number of environments
     task: task description
     scene: `insertion_scene(task)`, or a scene with the same bodies, actuators and pads
-    randomization: distribution of the physical parameters
+    randomization: distribution of the physical parameters; None: the default, with the grasp height of the task's part
     threads: of the simulator; None uses all available cores. Results do not depend on it.
     steps: simulation steps of a descent; None gives 225 ms
 
@@ -142,7 +146,7 @@ class InsertionAttempts:
         *,
         task: InsertionTask = INSERTION,
         scene: Scene | None = None,
-        randomization: Randomization = DEFAULT_RANDOMIZATION,
+        randomization: Randomization | None = None,
         threads: int | None = None,
         steps: int | None = None,
     ) -> None:
@@ -152,6 +156,8 @@ class InsertionAttempts:
         self.scene = insertion_scene(task) if scene is None else scene
         self._steps = max(1, round(DESCENT_TIME / self.scene.step)) if steps is None else steps
         self._settle_steps = max(1, round(SETTLE_TIME / self.scene.step))
+        if randomization is None:
+            randomization = DEFAULT_RANDOMIZATION.replace(grasp_height=task.part.grasp_height)
         self.randomization = randomization
         if [p.name for p in self.scene.pads] != list(PADS) or any(g != task.grid for g in self.scene.grids):
             raise UsageError(f"the scene's pads must be {', '.join(PADS)} with the task's markers {task.grid}")
@@ -162,12 +168,10 @@ class InsertionAttempts:
         self._part_q = self.scene.q("part").start
         self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
         self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
-        shapes = {shape.name: shape for shape in self.scene.shapes}
-        half = shapes["part"].size
-        self._corners = half * np.array([[x, y, -1.0] for x in (-1, 1) for y in (-1, 1)])
-        self._face = half[2]
-        right, back = shapes["wall_right"], shapes["wall_back"]
-        self._outline = np.array([right.pose.position[0] - right.size[0], back.pose.position[1] - back.size[1]])
+        self._geometry = part_geometry(task.part)
+        self._corners = self._geometry.lower_face
+        self._hole = self._geometry.hole
+        self._clear_height = max(_CLEAR_HEIGHT, task.part.depth + task.part.size[2])
         self.pose: Array = np.zeros((num_envs, 3))
         self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
@@ -196,7 +200,8 @@ class InsertionAttempts:
         Physics and grasp come from the randomization, `pose` from the task unless `misalignment` (N, 3) is given.
         """
         sampled = self.randomization.sample(rng, self.num_envs, friction=self.scene.friction)
-        for name, values in simulator_parameters(sampled, elastic=self.scene.friction == "elastic").items():
+        params = simulator_parameters(sampled, elastic=self.scene.friction == "elastic")
+        for name, values in hole_parameters(self.scene, params).items():
             self.sim.param(name)[:] = values
         self._stop_shear, self._start_height = sampled["stop_shear"], sampled["start_height"]
         self.pose = self.task.draw_misalignment(rng, self.num_envs)
@@ -210,12 +215,11 @@ class InsertionAttempts:
         sim, scene = self.sim, self.scene
         sim.reset()
         sim.q[:] = scene.q0
-        sim.q[:, self._part_q + 2] = _CLEAR_HEIGHT
-        sim.q[:, self._arm_q[2]] = _CLEAR_HEIGHT + height
-        # Finger positions at force equilibrium; a pad is a disc; half of its points are on the face in contact.
-        touching = {p.name: p.weights.sum() / 2 for p in scene.points}
+        sim.q[:, self._part_q + 2] = self._clear_height
+        sim.q[:, self._arm_q[2]] = self._clear_height + height
         for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
-            sim.q[:, scene.q(finger)] += (force / (sim.param(f"{pad}.kn") * touching[pad]))[:, None]
+            gaps = pad_gaps(scene, self._geometry, pad, height)
+            sim.q[:, scene.q(finger)] += indentation(gaps, force, sim.param(f"{pad}.kn"))[:, None]
             self._u[:, scene.u(finger)] = force
         # The left jaw holds its position; the right one is force controlled.
         self._u[:, scene.u("hold_left")] = sim.q[:, scene.q("finger_left").start]
@@ -272,7 +276,7 @@ class InsertionAttempts:
         sim.reset()
         part = grasp[:, at : at + 7]
         jitter = rng.uniform(-1, 1, self.num_envs) * self._start_height
-        lift = self.task.start_height + jitter - (part[:, 2] - self._face)
+        lift = self.task.start_height + jitter - (part[:, 2] - self.task.part.size[2] / 2)
         x, y, yaw = self.pose.T
         cos, sin = np.cos(yaw), np.sin(yaw)
         sim.q[:] = grasp
@@ -303,7 +307,7 @@ class InsertionAttempts:
         part = self.sim.q[:, self._part_q : self._part_q + 7]
         corners = part[:, None, :3] + np.einsum("nij,kj->nki", rotation_matrices(part[:, 3:]), self._corners)
         height = corners[..., 2].max(1)
-        inside = (np.abs(corners[..., :2]) < self._outline + _OUTLINE_TOLERANCE).all((1, 2))
+        inside = (self._hole.distance(corners[..., :2]) < _OUTLINE_TOLERANCE).all(1)
         return height, inside & (height < self.task.success_height)
 
     def reward(self) -> Array:

@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.part import CUBOID, Part
+
+_START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
+_SUCCESS_BELOW_RIM = 0.3e-3  # [m]
 
 _POLICY_GRID = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))
 
@@ -58,7 +62,7 @@ class TaskDescription:
 
 @dataclass(frozen=True)
 class InsertionTask(TaskDescription):
-    """Insertion of a cuboid into a hole with tactile corrections. Lengths in metres, angles in radians."""
+    """Insertion of a part into a hole with tactile corrections. Lengths in metres, angles in radians."""
 
     name: str = "insertion"
     sensors: int = 2  # tactile pads; 0 is the left finger
@@ -79,11 +83,29 @@ class InsertionTask(TaskDescription):
     action_scale: tuple[float, float, float] = (20e-3, 20e-3, np.pi / 18)
     workspace: tuple[float, float, float] = (15e-3, 15e-3, np.pi / 12)  # largest |x|, |y|, |yaw| of the gripper
     misalignment: tuple[float, float, float] = (6e-3, 6e-3, np.pi / 18)  # at the start: uniform within ± these
+    part: Part = CUBOID
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain data; the cuboid is omitted, so that its description is that of checkpoints without a part."""
+        values = super().to_json()
+        del values["part"]
+        return values if self.part == CUBOID else {**values, "part": self.part.to_json()}
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> Self:
+        """Inverse of `to_json`. Raises UsageError on unknown keys, another task or a newer format."""
+        part = data.get("part")
+        return super().from_json({**data, "part": Part.from_json(part)} if isinstance(part, dict) else data)
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:
         """Shape of the flow map's image: (frames * sensors * 2, rows, cols)."""
         return (len(self.frame_depths) * self.sensors * 2, self.grid.rows, self.grid.cols)
+
+    @property
+    def corrected_axes(self) -> NDArray[np.float64]:
+        """1 for each of x, y, yaw in which the gripper's pose is corrected, else 0; shape (3,)."""
+        return (np.asarray(self.workspace) > 0).astype(float)
 
     def correction(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
         """The correction (dx [m], dy [m], dyaw [rad]) in the gripper's frame for an environment's action in ±1.
@@ -113,9 +135,12 @@ class InsertionTask(TaskDescription):
         return np.asarray(np.clip(moved, -limit, limit))
 
     def reward(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Reward of gripper poses in the hole's frame, shape (…, 3) [m, m, rad]: −1e4 ‖(x, y)‖² − 20 yaw² (eq. 27)."""
+        """Reward of gripper poses in the hole's frame, shape (…, 3) [m, m, rad]: −1e4 ‖(x, y)‖² − 20 yaw² (eq. 27).
+
+        yaw is the rotation to the nearest orientation in which the part fits, see `Part.yaw_error`.
+        """
         pose = np.asarray(pose, dtype=float)
-        return np.asarray(-1e4 * (pose[..., :2] ** 2).sum(-1) - 20 * pose[..., 2] ** 2)
+        return np.asarray(-1e4 * (pose[..., :2] ** 2).sum(-1) - 20 * self.part.yaw_error(pose[..., 2]) ** 2)
 
     def draw_misalignment(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Random start poses (x [m], y [m], yaw [rad]) in the hole's frame, shape (count, 3)."""
@@ -124,3 +149,21 @@ class InsertionTask(TaskDescription):
 
 
 INSERTION = InsertionTask()
+
+
+def insertion_task(part: Part, *, misalignment: tuple[float, float, float] = INSERTION.misalignment) -> InsertionTask:
+    """The insertion of `part` from a misalignment uniform within ± `misalignment` [m, m, rad].
+
+    Heights follow from the depth of the hole. The gripper does not turn for a round part.
+    """
+    x, y, yaw = misalignment
+    room_x, room_y, room_yaw = INSERTION.workspace
+    return dataclasses.replace(
+        INSERTION,
+        part=part,
+        rim_height=part.depth,
+        start_height=round(part.depth + _START_ABOVE_RIM, 9),
+        success_height=round(part.depth - _SUCCESS_BELOW_RIM, 9),
+        misalignment=(x, y, 0.0 if part.is_round else yaw),
+        workspace=(room_x, room_y, 0.0 if part.is_round else room_yaw),
+    )

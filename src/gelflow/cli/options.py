@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from gelflow.errors import UsageError
+from gelflow.task import INSERTION, InsertionTask
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +51,24 @@ def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the polic
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help=f"checkpoint of the policy (default: {default})"
     )
+
+
+def add_part(parser: argparse.ArgumentParser) -> None:
+    """`--part`: the part to insert."""
+    parser.add_argument(
+        "--part",
+        metavar="PART",
+        help="part to insert: a part file, or the name of a part of gelflow, such as peg (default: the cuboid)",
+    )
+
+
+def part_task(part: str | None) -> InsertionTask:
+    """The insertion of the part that `--part` names. Raises UsageError when its file is missing or invalid."""
+    if part is None:
+        return INSERTION
+    from gelflow.sim.tasks.parts import load_part
+
+    return load_part(part)
 
 
 def check_at_least(args: argparse.Namespace, **limits: int) -> None:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_preset, add_seed, check_at_least
+from gelflow.cli.options import add_checkpoint, add_json, add_part, add_preset, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
-from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=["insertion"], help="task of the policy")
+    add_part(parser)
     add_checkpoint(parser)
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="parts to insert (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
@@ -32,20 +32,22 @@ def run(args: argparse.Namespace) -> int:
     check_at_least(args, envs=1, episodes=1, seed=0)
     from gelflow.policies.checkpoint import default_checkpoint, load_policy
 
-    path = args.checkpoint or default_checkpoint()
-    network = load_policy(path, task=INSERTION).network
+    path, task = args.checkpoint or default_checkpoint(), part_task(args.part)
+    network = load_policy(path, task=task).network
     from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 
     output = Output(args.json)
     count = min(args.envs, args.episodes)
-    plain, noisy = (make_insertion_env(count, noise=noise, preset=args.preset) for noise in (None, FlowMapNoise()))
+    plain, noisy = (
+        make_insertion_env(count, noise=noise, preset=args.preset, task=task) for noise in (None, FlowMapNoise())
+    )
     reach = network.reach
     cases: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
         ("policy", NetworkActor(network, count), plain),
         ("policy, noisy flow maps", NetworkActor(network, count), noisy),
         ("random, policy's reach", RandomActor(reach, count, args.seed), plain),
-        ("random, full range", RandomActor(INSERTION.action_scale, count, args.seed), plain),
+        ("random, full range", RandomActor(task.action_scale, count, args.seed), plain),
     ]
     results = []
     with progress_bar() as progress:

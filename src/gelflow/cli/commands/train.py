@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_preset, add_seed, check_at_least
+from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: docs/guide/training.md)")
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
+    add_part(parser)
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder for checkpoint and learning curve", default=Path("runs/insertion"), folder=True)
@@ -34,13 +35,14 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.policies.ppo import PPOSettings, train
 
     output = Output(args.json)
+    task = part_task(args.part)
     given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
     settings = PPOSettings(seed=args.seed, **given)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         bar = _TrainingProgress(progress, settings.attempts)
         made = train(
-            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
-            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset),
+            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task),
+            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task),
             out=args.out,
             settings=settings,
             command=_command(args, settings.attempts),
@@ -49,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
     best = made.best
     output.text(f"best on validation: {best.success:.1%} inserted in {best.attempts:.1f} attempts")
     output.text(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}")
-    output.text(f"evaluate it with: gelflow eval insertion --checkpoint {shlex.quote(str(made.checkpoint))}")
+    of_part = "" if args.part is None else f" --part {shlex.quote(args.part)}"
+    output.text(f"evaluate it with: gelflow eval insertion{of_part} --checkpoint {shlex.quote(str(made.checkpoint))}")
     output.result(
         {
             "checkpoint": made.checkpoint,
@@ -83,7 +86,7 @@ class _TrainingProgress:
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
-    names = ("minutes", "envs", "seed", "preset", "out")
+    names = ("part", "minutes", "envs", "seed", "preset", "out")
     values = {"attempts": attempts} | {name: getattr(args, name) for name in names}
     given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
     return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]

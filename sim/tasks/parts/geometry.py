@@ -1,0 +1,133 @@
+"""Geometry of a part and its hole, derived from the description: outlines, mass, contact points, grasped sides."""
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.part import Part
+from gelflow.sim.scene.contacts import PointsDef
+from gelflow.sim.scene.geometry.sampling import box_surface, cylinder
+from gelflow.sim.scene.mjcf.mechanics import BodyDef
+from gelflow.sim.scene.shapes import ShapeDef
+from gelflow.sim.tasks.parts.outline import Circle, Outline, Rectangle
+
+Array = NDArray[np.float64]
+
+_FACE_SPACING = 5e-3  # of contact points on the lower face and along edges [m]
+_HEIGHT_SPACING = 10e-3  # of contact points along the height [m]
+_RING_SPACING = 2.7e-3  # of contact points around a cylinder [m]: a misaligned one touches the rim with a short arc
+
+
+class PartGeometry(ABC):
+    """Geometry of one part. Lengths in metres, in the frame of the part."""
+
+    def __init__(self, part: Part) -> None:
+        self.part = part
+        self.half = np.array(part.size) / 2
+
+    @property
+    @abstractmethod
+    def outline(self) -> Outline:
+        """Outline of what enters the hole."""
+
+    @abstractmethod
+    def body(self, body: BodyDef) -> BodyDef:
+        """`body` with the mass and inertia of the part."""
+
+    @abstractmethod
+    def shape(self, shape: ShapeDef) -> ShapeDef:
+        """`shape` with the size of the part."""
+
+    @abstractmethod
+    def points(self, points: PointsDef) -> PointsDef:
+        """`points` replaced by contact points of the part against the hole: lower face and sides."""
+
+    @abstractmethod
+    def side_gaps(self, points: Array, side: int) -> Array:
+        """Distances along x from a pad to the part at (y, z) in the frame of the part, (…, 2) → (…).
+
+        The pads are `grasp_width` apart; `side` is −1 for the left one, 1 for the right one. Infinite where the pad
+        does not meet the part.
+        """
+
+    @property
+    def hole(self) -> Outline:
+        """Outline of the hole."""
+        x, y = self.part.clearance
+        return self.outline.enlarged((x / 2, y / 2))
+
+    @property
+    def lower_face(self) -> Array:
+        """Corners of the lower face, shape (n, 3)."""
+        corners = self.outline.corners()
+        return np.column_stack([corners, np.full(len(corners), -self.half[2])])
+
+
+class Box(PartGeometry):
+    """A box."""
+
+    @property
+    def outline(self) -> Outline:
+        return Rectangle((float(self.half[0]), float(self.half[1])))
+
+    def body(self, body: BodyDef) -> BodyDef:
+        x, y, z = self.part.size
+        mass = x * y * z * self.part.density
+        return _with_inertia(body, mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
+
+    def shape(self, shape: ShapeDef) -> ShapeDef:
+        return replace(shape, kind="box", size=self.half)
+
+    def points(self, points: PointsDef) -> PointsDef:
+        spacing = (_FACE_SPACING, _FACE_SPACING, _HEIGHT_SPACING)
+        counts = [max(2, round(size / step) + 1) for size, step in zip(self.part.size, spacing, strict=True)]
+        return _with_points(points, *box_surface(self.half.tolist(), counts, faces=("-z", "-x", "+x", "-y", "+y")))
+
+    def side_gaps(self, points: Array, side: int) -> Array:
+        on_side = (np.abs(points) <= self.half[1:]).all(-1)
+        return np.where(on_side, 0.0, np.inf)
+
+
+class Cylinder(PartGeometry):
+    """A cylinder with a vertical axis."""
+
+    @property
+    def outline(self) -> Outline:
+        return Circle(float(self.half[0]))
+
+    def body(self, body: BodyDef) -> BodyDef:
+        radius, height = self.half[0], self.part.size[2]
+        mass = np.pi * radius**2 * height * self.part.density
+        across = mass * (3 * radius**2 + height**2) / 12
+        return _with_inertia(body, mass, np.array([across, across, mass * radius**2 / 2]))
+
+    def shape(self, shape: ShapeDef) -> ShapeDef:
+        return replace(shape, kind="cylinder", size=np.array([self.half[0], self.half[2], 0.0]))
+
+    def points(self, points: PointsDef) -> PointsDef:
+        radius, height = float(self.half[0]), self.part.size[2]
+        angles = max(12, 4 * round(np.pi * radius / _RING_SPACING / 2))
+        radii, heights = max(1, round(radius / _FACE_SPACING)), max(2, round(height / _HEIGHT_SPACING) + 1)
+        surface = cylinder(radius, height / 2, angles=angles, radii=radii, heights=heights, faces=("-z", "wall"))
+        return _with_points(points, *surface)
+
+    def side_gaps(self, points: Array, side: int) -> Array:
+        y, z = np.abs(points[..., 0]), np.abs(points[..., 1])
+        radius = self.half[0]
+        depth = radius - np.sqrt(np.maximum(radius**2 - y**2, 0))
+        return np.where((y < radius) & (z <= self.half[2]), depth, np.inf)
+
+
+def _with_inertia(body: BodyDef, mass: float, diagonal: Array) -> BodyDef:
+    return replace(body, mass=float(mass), com=np.zeros(3), inertia=np.append(diagonal, [0.0, 0.0, 0.0]))
+
+
+def _with_points(points: PointsDef, local: Array, areas: Array) -> PointsDef:
+    return replace(points, points=local, areas=areas, weights=np.ones(len(local)))
+
+
+def part_geometry(part: Part) -> PartGeometry:
+    """The geometry of a part. Raises UsageError when the mesh of the part cannot be read."""
+    return {"box": Box, "cylinder": Cylinder}[part.shape](part)
