@@ -185,7 +185,7 @@ def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 0', "must be above 0"),
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n[grasp]\n'
          "height = [-0.03, 0]", "within ±0.025 m"),
-        ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n[misalignment]\nx = 0.1',
+        ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n[misalignment]\nx = 1',
          "at most 0.015"),
     ],
 )  # fmt: skip
