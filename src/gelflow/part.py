@@ -90,7 +90,10 @@ class Part:
         known = {field.name for field in dataclasses.fields(cls)}
         if unknown := set(data) - known:
             raise UsageError(f"part has unknown keys {sorted(unknown)}; known are {sorted(known)}")
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        return cls(**values)
 
     @property
     def is_round(self) -> bool:

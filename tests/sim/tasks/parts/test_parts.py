@@ -53,11 +53,11 @@ def test_a_box_of_the_same_size_gives_the_scene_of_the_cuboid() -> None:
     for mine, theirs in zip(other.bodies, scene.bodies, strict=True):
         assert mine.mass == theirs.mass
         np.testing.assert_allclose(mine.inertia, theirs.inertia, rtol=1e-14)
-    for mine, theirs in zip(other.shapes, scene.shapes, strict=True):
-        np.testing.assert_array_equal(mine.size, theirs.size)
-        np.testing.assert_array_equal(mine.pose.position, theirs.pose.position)
-    for mine, theirs in zip(other.points, scene.points, strict=True):
-        np.testing.assert_array_equal(mine.points, theirs.points)
+    for shape, its in zip(other.shapes, scene.shapes, strict=True):
+        np.testing.assert_array_equal(shape.size, its.size)
+        np.testing.assert_array_equal(shape.pose.position, its.pose.position)
+    for points, its_points in zip(other.points, scene.points, strict=True):
+        np.testing.assert_array_equal(points.points, its_points.points)
     np.testing.assert_array_equal(other.q0, scene.q0)
 
 
