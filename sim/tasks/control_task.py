@@ -66,7 +66,7 @@ class ControlTask(TaskBatch):
         self.scene = adapt_step(scene, control_period)
         self.sim = Simulator(self.scene, num_envs=num_envs, threads=threads)
         self.frames_per_second = 1 / control_period
-        self._steps_per_period = round(control_period / self.scene.step)
+        self.steps_per_period = round(control_period / self.scene.step)
         self._max_steps = max_steps
         self.info["steps"] = np.zeros(num_envs, dtype=np.int64)
 
@@ -93,7 +93,7 @@ class ControlTask(TaskBatch):
     def _step(self, actions: Array, rng: np.random.Generator, active: Mask) -> None:
         controls = self._controls(actions, rng, active)
         kept = {name: getattr(self.sim, name)[~active] for name in _STATE}
-        self.sim.step(controls, self._steps_per_period)
+        self.sim.step(controls, self.steps_per_period)
         for name, values in kept.items():
             getattr(self.sim, name)[~active] = values
         self.info["steps"][active] += 1

@@ -8,7 +8,10 @@ from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.toml_tables import suggestion
 
 # name → module and class of its batch
-_TASKS: dict[str, tuple[str, str]] = {}
+_TASKS: dict[str, tuple[str, str]] = {
+    "pushing": ("gelflow.sim.tasks.pushing", "Pushing"),
+    "cap": ("gelflow.sim.tasks.cap_rotation", "CapRotation"),
+}
 
 
 def task_names() -> tuple[str, ...]:

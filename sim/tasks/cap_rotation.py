@@ -1,0 +1,275 @@
+"""Cap rotation: three fingers turn a cap of unknown position, size and resistance by touch (paper, B.4).
+
+Action (9): change of the commanded joint angles, ±1 is `action_scale`. The fingers are position controlled.
+Observation: joint angles, fingertip positions; with touch the force, contact and centre of pressure of each fingertip;
+and, if the task has them, the commanded minus the measured angles. The last are a sense of touch too, because a servo
+lags where its finger is blocked.
+Terminated: the cap is turned by `goal_angle` (success), or a fingertip is above the cap. Truncated: after `max_steps`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.geometry import rotation_matrices
+from gelflow.sim.scene import load_scene
+from gelflow.sim.scene.pads import PadDef
+from gelflow.sim.tasks.control_task import ControlTask
+from gelflow.sim.tasks.randomization import Quantity, Randomization, Uniform
+from gelflow.sim.tasks.rendering import Mark, render_scene
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
+from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
+from gelflow.task import TaskDescription
+
+FINGERS = (1, 2, 3)
+JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "bend", "curl"))
+REWARDS = ("paper", "progress")
+_RESET_OPTIONS = {"center": "x, y of the cap [m]", "radius": "of the cap [m]", "damping": "of the cap [N m s]"}
+
+
+@dataclass(frozen=True)
+class CapRotationTask(TaskDescription):
+    """Rotation of a cap by three fingers. Lengths in metres, angles in radians, times in seconds."""
+
+    name: str = "cap"
+    touch: bool = True  # the observation has the readings of the fingertips
+    commanded: bool = False  # the observation has the commanded minus the measured joint angles
+    control_period: float = 0.025
+    max_steps: int = 100
+    goal_angle: float = np.pi / 4
+    reward: str = "paper"  # "paper", eq. 26, or "progress", see `CapRotationTask.rewards`
+    action_scale: float = 0.06  # change of the commanded joint angles for an action of ±1
+    # Joint angles (swing, bend, curl) of each finger at the start: the fingertips are 122 mm from the axis of the hand,
+    # outside of the largest cap at its largest distance from that axis, at half the height of the cap.
+    start_angles: tuple[float, float, float] = (0.0, -0.88568, 1.01035)
+    contact_force: float = 0.02  # smallest sum of the normal forces of a fingertip in contact [N], above the noise
+    # Units of the observation, so that its numbers are near 1.
+    length_unit: float = 0.1  # of fingertip positions
+    pressure_unit: float = 0.01  # of centres of pressure
+    force_unit: float = 1.0  # [N]
+    command_unit: float = 0.1  # of differences between commanded and measured angles
+
+    def __post_init__(self) -> None:
+        if self.reward not in REWARDS:
+            raise UsageError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}")
+
+    @property
+    def observation_size(self) -> int:
+        """Number of values of an observation."""
+        return 18 + (21 if self.touch else 0) + (9 if self.commanded else 0)
+
+    def rewards(self, angle: Array, last_angle: Array, touching: Mask, action: Array, above: Mask) -> Array:
+        """Rewards of a control period, shape (N,).
+
+        "paper" is eq. 26. It pays about −2 per period until the cap is turned, so that a policy which does not yet turn
+        caps earns more by lifting a finger above the cap at once (−50). "progress" replaces the cost of the remaining
+        angle by a gain for the angle turned in the period, and lowers the cost of fingers that do not touch.
+
+        Parameters
+        ----------
+        angle, last_angle: of the cap after and before the period [rad], (N,)
+        touching: fingertips that touch the cap, (N, 3)
+        action: in ±1, (N, 9)
+        above: a fingertip is above the cap, (N,)
+        """
+        goal = self.goal_angle
+        common = -0.005 * (action**2).sum(1) - 50.0 * above + 50.0 * (angle > goal)
+        if self.reward == "paper":
+            return np.asarray(common - 0.5 * (~touching).sum(1) - np.minimum(angle - goal, 0) ** 2)
+        gained = np.minimum(angle, goal) - np.minimum(last_angle, goal)
+        return np.asarray(common - 0.2 * (~touching).sum(1) + 200.0 * gained)
+
+
+CAP_ROTATION = CapRotationTask()
+
+# Ranges of the paper; its appendix prints a radius of 0.2 to 0.8 m, its released code has 0.02 to 0.08 m.
+DEFAULT_RANDOMIZATION = Randomization(
+    {
+        "center_x": Quantity(Uniform(-0.02, 0.02), "m", "cap's centre from the axis of the hand, along x"),
+        "center_y": Quantity(Uniform(-0.02, 0.02), "m", "cap's centre from the axis of the hand, along y"),
+        "radius": Quantity(Uniform(0.02, 0.08), "m", "of the cap"),
+        "damping": Quantity(Uniform(0.01, 0.7), "N m s", "of the cap's joint"),
+        **NO_SENSOR_EFFECTS,
+    }
+)
+
+# As the default, with the deviations of real pads.
+FULL_RANDOMIZATION = Randomization({**DEFAULT_RANDOMIZATION.quantities, **SENSOR_QUANTITIES})
+RANDOMIZATIONS = {"default": DEFAULT_RANDOMIZATION, "full": FULL_RANDOMIZATION}
+
+
+class CapRotation(ControlTask):
+    """A batch of hands, each with a cap; see the module.
+
+    Parameters
+    ----------
+    num_envs: number of environments
+    task: task description
+    preset, friction: of the scene "dclaw"
+    randomization: distributions of the cap
+    threads: of the simulator
+
+    Options of `reset`: "center" (2,) [m], "radius" [m] and "damping" [N m s] of the cap. Info, with first axis N:
+    "angle" [rad] and "rate" [rad/s] of the cap, "touching" (3) fingertips, "above": a fingertip is above the cap;
+    "privileged": centre (2), radius, damping, angle and rate of the cap, in the order and units given here.
+    """
+
+    description: CapRotationTask
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        task: CapRotationTask = CAP_ROTATION,
+        preset: str | None = None,
+        friction: str | None = None,
+        randomization: Randomization = DEFAULT_RANDOMIZATION,
+        threads: int | None = None,
+    ) -> None:
+        super().__init__(
+            task,
+            num_envs,
+            scene=load_scene("dclaw", preset=preset, friction=friction),
+            control_period=task.control_period,
+            max_steps=task.max_steps,
+            observation_space=Box(-np.inf, np.inf, (task.observation_size,), np.float32),
+            action_space=Box(-1, 1, (len(JOINTS),), np.float32),
+            privileged=6,
+            threads=threads,
+        )
+        self.randomization = randomization
+        self._find_indices()
+        self._sensors = SensorModel([pad.positions for pad in self._pads], num_envs)
+        self._commanded: Array = np.zeros((num_envs, len(JOINTS)))
+        self._action: Array = np.zeros((num_envs, len(JOINTS)))
+        self.info |= {
+            "angle": np.zeros(num_envs),
+            "rate": np.zeros(num_envs),
+            "touching": np.zeros((num_envs, len(FINGERS)), dtype=bool),
+            "above": np.zeros(num_envs, dtype=bool),
+        }
+
+    def _find_indices(self) -> None:
+        """Indices, limits and sizes of the scene's elements."""
+        scene = self.scene
+        self._joint_q = [scene.q(joint).start for joint in JOINTS]
+        self._joint_u = [scene.u(joint) for joint in JOINTS]
+        ranges = {joint.name: joint.range for joint in scene.joints}
+        limits = np.array([ranges[joint] or (-np.inf, np.inf) for joint in JOINTS])
+        self._lower, self._upper = limits[:, 0], limits[:, 1]
+        pads = {pad.name: pad for pad in scene.pads}
+        self._pads = [pads[f"tip{finger}"] for finger in FINGERS]
+        self._markers = [scene.marker_slice(pad.name) for pad in self._pads]
+        self._cap_q, self._cap_v = scene.q("cap").start, scene.v("cap").start
+        cap = next(shape for shape in scene.shapes if shape.name == "cap")
+        body = scene.bodies[scene.body("cap")]
+        self._top = body.pose.position[2] + cap.pose.position[2] + cap.size[1]
+        self._thickness = 2 * cap.size[1]
+        self._density = body.mass / (np.pi * cap.size[0] ** 2 * self._thickness)
+
+    def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        check_options(self.description.name, options, _RESET_OPTIONS)
+        sim, rows = self.sim, np.flatnonzero(which)
+        drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
+        self._sensors.draw(which, drawn, rng)
+        center = np.column_stack([drawn["center_x"], drawn["center_y"]])
+        center = option_rows("center", options["center"], which, (2,)) if "center" in options else center
+        radius = option_rows("radius", options["radius"], which) if "radius" in options else drawn["radius"]
+        damping = option_rows("damping", options["damping"], which) if "damping" in options else drawn["damping"]
+        mass = self._density * np.pi * radius**2 * self._thickness
+        across = mass * (3 * radius**2 + self._thickness**2) / 12
+        values = {
+            "cap.pos.x": center[:, 0],
+            "cap.pos.y": center[:, 1],
+            "cap.size.x": radius,
+            "cap.damping": damping,
+            "cap.mass": mass,
+            "cap.inertia.xx": across,
+            "cap.inertia.yy": across,
+            "cap.inertia.zz": mass * radius**2 / 2,
+        }
+        for name, value in values.items():
+            sim.param(name)[rows] = value
+        sim.reset(which)
+        start = np.tile(self.description.start_angles, len(FINGERS))
+        sim.q[np.ix_(rows, self._joint_q)] = start
+        self._commanded[rows] = start
+        self._action[rows] = 0
+        self.info["privileged"][rows, :4] = np.column_stack([center, radius, damping])
+
+    def _controls(self, actions: Array, rng: np.random.Generator, active: Mask) -> Array:
+        self._action[active] = actions[active]
+        change = self.description.action_scale * actions[active]
+        self._commanded[active] = np.clip(self._commanded[active] + change, self._lower, self._upper)
+        controls = np.zeros((self.num_envs, self.scene.nu))
+        controls[:, self._joint_u] = self._commanded
+        return controls
+
+    def _observe(self, active: Mask, rng: np.random.Generator) -> None:
+        task, info = self.description, self.info
+        forces = self.sim.tactile()[active]
+        tips = self.fingertips()[active]
+        last_angle = info["angle"].copy()
+        info["angle"][active] = self.sim.q[active, self._cap_q]
+        info["rate"][active] = self.sim.v[active, self._cap_v]
+        info["touching"][active] = np.column_stack([forces[:, markers, 2].any(1) for markers in self._markers])
+        info["above"][active] = (tips[..., 2] > self._top).any(1)
+        readings = self._sensors.read(forces, active, rng, interval=task.control_period) if task.touch else forces
+        info["privileged"][active, 4] = info["angle"][active]
+        info["privileged"][active, 5] = info["rate"][active]
+        info["success"][active] = (info["angle"] > task.goal_angle)[active]
+        rewards = task.rewards(info["angle"], last_angle, info["touching"], self._action, info["above"])
+        self.reward[active] = rewards[active]
+        self.terminated[active] = (info["success"] | info["above"])[active]
+        self.observation[active] = self._observation(active, tips, readings)
+
+    def _observation(self, active: Mask, tips: Array, readings: Array) -> Array:
+        """Observations of the environments `active` (n): fingertips (n, 3, 3) [m], readings (n, markers, 3) [N]."""
+        task = self.description
+        measured = self.sim.q[active][:, self._joint_q]
+        parts = [measured, tips.reshape(len(tips), -1) / task.length_unit]
+        if task.touch:
+            for pad, markers in zip(self._pads, self._markers, strict=True):
+                force, pressure, moment = reduced(pad, readings[:, markers])
+                center = moment / np.maximum(pressure, task.contact_force)[:, None]
+                parts += [
+                    force / task.force_unit,
+                    (pressure > task.contact_force)[:, None],
+                    center / task.pressure_unit,
+                ]
+        if task.commanded:
+            parts.append((self._commanded[active] - measured) / task.command_unit)
+        return np.concatenate(parts, axis=1)
+
+    def fingertips(self) -> Array:
+        """Positions of the fingertips in the world, (N, 3, 3) [m]."""
+        poses = self.sim.poses()[:, [pad.body for pad in self._pads]]
+        offsets = np.array([pad.pose.position for pad in self._pads])
+        return np.asarray(poses[..., :3] + np.einsum("nfij,fj->nfi", rotation_matrices(poses[..., 3:]), offsets))
+
+    def render(self, index: int = 0) -> NDArray[np.uint8]:
+        """A picture of environment `index`; a dashed line on the cap shows its rotation."""
+        x, y, radius = (float(self.sim.param(f"cap.{name}")[index]) for name in ("pos.x", "pos.y", "size.x"))
+        angle = float(self.info["angle"][index])
+        ends = [(x, y), (x + radius * np.cos(angle), y + radius * np.sin(angle))]
+        mark = Mark(np.array([(*end, self._top) for end in ends]), "cap")
+        goal = np.degrees(self.description.goal_angle)
+        title = f"Cap rotation: turned {np.degrees(angle):.0f}° of {goal:.0f}°"
+        return render_scene(self.sim, index, title=title, marks=[mark])
+
+
+def reduced(pad: PadDef, forces: Array) -> tuple[Array, Array, Array]:
+    """Force on a pad (n, 3) [N], sum of its normal forces (n,) [N] and their first moment (n, 3) [N m].
+
+    Vectors are in the frame of the pad's body, positions relative to the pad's site; moment / sum is the centre of
+    pressure. `forces` are marker forces, (n, markers, 3): shear x, shear y, normal.
+    """
+    columns = pad.axes * np.array([1.0, 1.0, -1.0])  # the normal force is positive in compression, along −z
+    force = np.einsum("mij,nmj->ni", columns, forces)
+    normal = forces[..., 2]
+    return force, normal.sum(1), normal @ (pad.positions - pad.pose.position)
