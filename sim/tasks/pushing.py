@@ -308,8 +308,8 @@ class Pushing(ControlTask):
         finger = [self._gripper_base[0] + cos * x - sin * y, self._gripper_base[1] + sin * x + cos * y, yaw]
         box = [q[:, index] for index in self._box_q]
         box = [self._box_base[0] + box[0], self._box_base[1] + box[1], box[2]]
-        episode = (xp.asarray(values) for values in (self.goal, self.half_size, self.mass))
-        return PushingState(xp.stack(finger, axis=1), xp.stack(box, axis=1), *episode, forces)
+        goal, half_size, mass = (xp.asarray(values) for values in (self.goal, self.half_size, self.mass))
+        return PushingState(xp.stack(finger, axis=1), xp.stack(box, axis=1), goal, half_size, mass, forces)
 
     def read(self, forces: Array, which: Mask, rng: np.random.Generator) -> Array:
         """Readings (N, markers, 3) of the pads in the environments `which` for marker forces; others are copied."""

@@ -9,6 +9,7 @@ from gelflow.toml_tables import suggestion
 
 # name → module and class of its batch
 _TASKS: dict[str, tuple[str, str]] = {
+    "rolling": ("gelflow.sim.tasks.rolling", "Rolling"),
     "pushing": ("gelflow.sim.tasks.pushing", "Pushing"),
     "cap": ("gelflow.sim.tasks.cap_rotation", "CapRotation"),
 }

@@ -41,8 +41,8 @@ def render_scene(sim: Simulator, index: int, *, title: str, marks: Sequence[Mark
     from matplotlib.figure import Figure
 
     scene: Scene = sim.scene
-    figure = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure: Any = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
+    canvas: Any = FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=11)
     rows = max(1, len(scene.pads))
     left, right = figure.subfigures(1, 2, width_ratios=(3, 1.4 if rows < 3 else 1))
@@ -75,10 +75,10 @@ def _draw_bodies(axes: Any, sim: Simulator, index: int, poses: list[Pose], plane
         elif plane[1] == 2:
             axes.axhline(1e3 * shape.pose.position[2], color=_WORLD_COLOR, linewidth=1)
     drawn = {shape.body for shape in scene.shapes}
-    parts += [(points.body, points.points) for points in scene.points if points.body not in drawn]
-    for body, points in parts:
-        color = _WORLD_COLOR if body < 0 else _BODY_COLORS[body % len(_BODY_COLORS)]
-        at = points if body < 0 else poses[body].apply(points)
+    parts += [(cloud.body, cloud.points) for cloud in scene.points if cloud.body not in drawn]
+    for owner, points in parts:
+        color = _WORLD_COLOR if owner < 0 else _BODY_COLORS[owner % len(_BODY_COLORS)]
+        at = points if owner < 0 else poses[owner].apply(points)
         axes.fill(*(1e3 * _hull(at[:, plane])).T, facecolor=color, edgecolor=color, alpha=0.35)
     for number, body in enumerate(scene.bodies):
         ends = [poses[number].apply(pad.pose.position[None])[0] for pad in scene.pads if pad.body == number]
@@ -104,9 +104,9 @@ def _surface(shape: ShapeDef, size: Array) -> Array:
         return np.concatenate([rim + np.array([0, 0, end * size[1]]) for end in (-1, 1)])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
     if shape.grid is None:
-        return corners * size
+        return np.asarray(corners * size)
     extent = shape.grid.spacing * np.array(shape.grid.cells)
-    return size * (shape.grid.origin + extent * (corners + 1) / 2)
+    return np.asarray(size * (shape.grid.origin + extent * (corners + 1) / 2))
 
 
 def _hull(points: Array) -> Array:
@@ -114,7 +114,7 @@ def _hull(points: Array) -> Array:
     from scipy.spatial import ConvexHull, QhullError  # deferred: slow to import
 
     try:
-        return points[ConvexHull(points).vertices]
+        return np.asarray(points[ConvexHull(points).vertices])
     except QhullError:  # all points are on a line
         return points[np.lexsort(points.T)]
 
