@@ -6,7 +6,13 @@ import torch
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.backpropagation import BackpropagationSettings, BackpropagationTrainer, evaluate, limited
+from gelflow.policies.backpropagation import (
+    BackpropagationSettings,
+    BackpropagationTrainer,
+    EpochResult,
+    evaluate,
+    limited,
+)
 from gelflow.policies.networks.mlp import MLP
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
 from gelflow.sim.tasks.pushing import Pushing, PushingTask
@@ -27,7 +33,7 @@ class Point:
 
     def step(self, actions: torch.Tensor) -> torch.Tensor:
         self.observation = self.observation + 0.2 * actions
-        self.errors: NDArray[np.float64] = self.observation.detach().numpy().__abs__()
+        self.errors: NDArray[np.float64] = np.abs(self.observation.detach().numpy()).astype(np.float64)
         return -(self.observation**2).sum(1)
 
     def detach(self) -> None:
@@ -57,7 +63,7 @@ def test_resumed_training_continues_bit_for_bit() -> None:
         first.run_epoch()
     second = trainer(epochs=6, seed=0)
     second.load_state_dict(first.state_dict())
-    results = []
+    results: list[EpochResult] = []
     second.run(results.append)
     assert [result.epoch for result in results] == [4, 5, 6]
     for name, values in whole.actor.tensors().items():
