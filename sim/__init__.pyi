@@ -1,11 +1,15 @@
 from .benchmark.describe import describe as describe
+from .reductions import TactileReduction as TactileReduction
+from .reductions import center_of_pressure as center_of_pressure
+from .reductions import mean_shear as mean_shear
+from .reductions import pad_forces as pad_forces
+from .reductions import pad_moments as pad_moments
+from .reductions import shear_features as shear_features
 from .scene.loader import load_scene as load_scene
 from .scene.loader import scene_names as scene_names
 from .scene.scene import Scene as Scene
 from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
-from .simulator import Trajectory as Trajectory
-from .simulator import TrajectoryGradient as TrajectoryGradient
 from .tasks.environments import InsertionEnv as InsertionEnv
 from .tasks.environments import InsertionVectorEnv as InsertionVectorEnv
 from .tasks.insertion import InsertionAttempts as InsertionAttempts
@@ -16,6 +20,9 @@ from .torch_layer import TorchState as TorchState
 from .torch_layer import torch_rollout as torch_rollout
 from .torch_layer import torch_state as torch_state
 from .torch_layer import torch_step as torch_step
+from .trajectory import TouchStop as TouchStop
+from .trajectory import Trajectory as Trajectory
+from .trajectory import TrajectoryGradient as TrajectoryGradient
 from .validation.energy import Energy as Energy
 from .validation.energy import EnergyGauge as EnergyGauge
 
@@ -29,14 +36,21 @@ __all__ = [
     "Randomization",
     "Scene",
     "Simulator",
+    "TactileReduction",
     "TorchRollout",
     "TorchState",
+    "TouchStop",
     "Trajectory",
     "TrajectoryGradient",
+    "center_of_pressure",
     "describe",
     "insertion_scene",
     "load_scene",
+    "mean_shear",
+    "pad_forces",
+    "pad_moments",
     "scene_names",
+    "shear_features",
     "torch_rollout",
     "torch_state",
     "torch_step",

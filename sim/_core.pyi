@@ -358,6 +358,26 @@ class Model:
 
 _Scalar = TypeVar("_Scalar", np.float64, np.float32)
 
+class TactileReduction:
+    """A linear function of the marker forces of a scene."""
+
+    def __init__(self, matrix: ArrayLike) -> None: ...  # (rows, markers, 3)
+    @property
+    def rows(self) -> int: ...
+    @property
+    def markers(self) -> int: ...
+
+class TouchStop:
+    """The condition that stops environments of a rollout, see gelflow.sim.TouchStop."""
+
+    def __init__(self, *, threshold: ArrayLike, reference_step: int, after_step: int) -> None: ...
+    @property
+    def threshold(self) -> Floats: ...  # (N,) [N]
+    @property
+    def reference_step(self) -> int: ...
+    @property
+    def after_step(self) -> int: ...  # evaluated after this step and all later ones
+
 class Trajectory:
     """The arrays of a rollout, without copies: C-contiguous, time first, then environment."""
 
@@ -374,6 +394,9 @@ class Trajectory:
         read_after: NDArray[np.int32],
         halvings: NDArray[np.int8],
         status: NDArray[np.int32],
+        active: NDArray[np.uint8],
+        stopped_at: NDArray[np.int32],
+        reduction: TactileReduction | None = None,
     ) -> None: ...
     @property
     def u(self) -> NDArray[np.floating]: ...  # (steps, N, nu)
@@ -388,13 +411,19 @@ class Trajectory:
     @property
     def history(self) -> NDArray[np.floating]: ...  # (steps + 1, N, nh)
     @property
-    def tactile(self) -> NDArray[np.floating]: ...  # (reads, N, markers, 3)
+    def tactile(self) -> NDArray[np.floating]: ...  # (reads, N, markers, 3), or (reads, N, rows) with a reduction
     @property
     def read_after(self) -> NDArray[np.int32]: ...  # (reads,)
     @property
     def halvings(self) -> NDArray[np.int8]: ...  # (steps, N)
     @property
     def status(self) -> NDArray[np.int32]: ...  # (N,)
+    @property
+    def active(self) -> NDArray[np.uint8]: ...  # (N,)
+    @property
+    def stopped_at(self) -> NDArray[np.int32]: ...  # (N,)
+    @property
+    def reduction(self) -> TactileReduction | None: ...
 
 class TrajectoryCotangent:
     """Gradient of a scalar by the results of a rollout; q, v and tactile are shaped as there."""
@@ -464,15 +493,18 @@ class _Batch(Generic[_Scalar]):
     @property
     def readings(self) -> NDArray[_Scalar]: ...  # (N, markers, 3), read-only, after `update_readings`
     def reset(self, which: NDArray[np.uint8] | None = None) -> None: ...
-    def step(self, u: NDArray[_Scalar], steps: int = 1) -> None: ...
+    def step(self, u: NDArray[_Scalar], steps: int = 1, active: NDArray[np.uint8] | None = None) -> None: ...
     def error_estimate(self, u: NDArray[_Scalar]) -> tuple[NDArray[_Scalar], NDArray[np.int32]]: ...
-    def rollout(self, trajectory: Trajectory) -> None: ...
+    def rollout(self, trajectory: Trajectory, stop: TouchStop | None = None) -> None: ...
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]: ...  # (steps, N)
     def rollout_vjp(
         self, trajectory: Trajectory, cotangent: TrajectoryCotangent, params: bool = False
     ) -> TrajectoryGradient: ...
-    def update_readings(self) -> None: ...
-    def tactile(self, out: NDArray[_Scalar]) -> None: ...  # (N, markers, 3)
+    def update_readings(self, active: NDArray[np.uint8] | None = None) -> None: ...
+    def tactile(self, out: NDArray[_Scalar], active: NDArray[np.uint8] | None = None) -> None: ...  # (N, markers, 3)
+    def reduced_tactile(
+        self, reduction: TactileReduction, out: NDArray[_Scalar], active: NDArray[np.uint8] | None = None
+    ) -> None: ...  # (N, rows)
     def wrenches(self, out: NDArray[_Scalar]) -> None: ...  # (N, contacts, 6)
     def contact_forces(self, out: NDArray[_Scalar]) -> None: ...  # (N, nv)
     def poses(self, out: NDArray[_Scalar]) -> None: ...  # (N, bodies, 7)

@@ -1,8 +1,7 @@
 """Batched simulation of one scene: state and parameters as NumPy arrays, steps, rollouts and their gradients."""
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
@@ -11,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
+from gelflow.sim.reductions import TactileReduction
+from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
 
 STATUS_MESSAGES = {
     0: "ok",
@@ -23,37 +24,6 @@ class Buildable(Protocol):
     """An object that builds a core model, such as `gelflow.sim.Scene`."""
 
     def build(self) -> Any: ...
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """A recorded rollout of N environments. The first axis is time, the second the environment.
-
-    Sizes: nq positions, nv velocities, nu controls, na friction anchors, nh values of the BDF2 history.
-    """
-
-    q: NDArray[Any]  # (steps + 1, N, nq)
-    v: NDArray[Any]  # (steps + 1, N, nv)
-    anchors: NDArray[Any]  # (steps + 1, N, na, 3), in the frame of the shape in contact [m]
-    anchored: NDArray[np.uint8]  # (steps + 1, N, na), 1 where the anchor is set
-    history: NDArray[Any]  # (steps + 1, N, nh): previous step of BDF2, see `Simulator`
-    u: NDArray[Any]  # (steps, N, nu)
-    tactile: NDArray[Any]  # (readings, N, markers, 3): shear x, shear y, normal [N]
-    read_after: NDArray[np.int32]  # (readings): number of steps taken before each reading of `tactile`
-    halvings: NDArray[np.int8]  # (steps, N): the step was split into 2^halvings substeps
-    status: NDArray[np.int32]  # (N): 0, or the reason of failure (`STATUS_MESSAGES`)
-
-
-@dataclass(frozen=True)
-class TrajectoryGradient:
-    """Gradient of a scalar with respect to the inputs of a rollout; for quaternions the tangent gradient."""
-
-    u: NDArray[Any]  # (steps, N, nu)
-    q: NDArray[Any]  # (N, nq)
-    v: NDArray[Any]  # (N, nv)
-    anchors: NDArray[Any]  # (N, na, 3)
-    history: NDArray[Any]  # (N, nh)
-    params: NDArray[np.float64]  # (N, parameters), in the order of `Model.param_names`; (N, 0) unless requested
 
 
 class Simulator:
@@ -138,7 +108,16 @@ class Simulator:
 
         Parameters keep their values.
         """
-        self._batch.reset(None if which is None else np.ascontiguousarray(which, dtype=np.uint8))
+        self._batch.reset(self._mask("which", which))
+
+    def _mask(self, name: str, mask: ArrayLike | None) -> NDArray[np.uint8] | None:
+        """Flags of the environments in `mask` for the core; None: all of them."""
+        if mask is None:
+            return None
+        flags = np.ascontiguousarray(mask, dtype=bool)
+        if flags.shape != (self.num_envs,):
+            raise UsageError(f"{name} must have shape ({self.num_envs},), got {flags.shape}")
+        return flags.view(np.uint8)
 
     def clear_history(self, which: ArrayLike | None = None) -> None:
         """Clear friction anchors and the BDF2 history; required after `q` or `v` were written directly."""
@@ -146,14 +125,16 @@ class Simulator:
         self.anchored[chosen] = 0
         self.history[chosen] = 0
 
-    def step(self, u: ArrayLike, steps: int = 1) -> None:
+    def step(self, u: ArrayLike, steps: int = 1, *, active: ArrayLike | None = None) -> None:
         """Take `steps` steps with controls u, shape (N, nu), or (nu,) for all environments.
+
+        With a mask `active` (N,), the other environments rest: they keep state and status, and cost nothing.
 
         An environment that fails keeps its last valid state, gets a nonzero `status` (see `STATUS_MESSAGES`) and does
         not move until `reset`. Raises UsageError when a control or the state is not finite.
         """
         try:
-            self._batch.step(self._controls(u), steps)
+            self._batch.step(self._controls(u), steps, self._mask("active", active))
         except ValueError as error:
             raise UsageError(str(error)) from None
 
@@ -165,6 +146,14 @@ class Simulator:
             return np.asarray(u, dtype=self.dtype)
         except (TypeError, ValueError) as error:
             raise UsageError(f"u must be numeric: {error}") from None
+
+    @staticmethod
+    def _checked(function: Callable[..., Any], *arguments: Any) -> Any:
+        """The result of a function of the core, whose ValueError becomes a UsageError."""
+        try:
+            return function(*arguments)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
 
     def check(self) -> None:
         """Raises SimulationError that names the first failed environment, if any."""
@@ -179,24 +168,34 @@ class Simulator:
         BDF2, whose half steps use BDF1, it is an upper estimate. A step that needs substeps is compared with substeps
         of half their length. Raises SimulationError when a step fails.
         """
-        try:
-            estimate, status = self._batch.error_estimate(self._controls(u))
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        estimate, status = self._checked(self._batch.error_estimate, self._controls(u))
         if failed := np.flatnonzero(status).tolist():
             raise SimulationError(f"environment {failed[0]}: {STATUS_MESSAGES[int(status[failed[0]])]}")
         return np.asarray(estimate)
 
-    def tactile(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+    def tactile(
+        self,
+        out: NDArray[Any] | None = None,
+        *,
+        active: ArrayLike | None = None,
+        reduction: TactileReduction | None = None,
+    ) -> NDArray[Any]:
         """Marker forces at the present state, (N, markers, 3): shear x, shear y, normal ≥ 0 in compression [N].
 
         Without `out` the result is the simulator's own array: read-only, and overwritten by the next call. Only changed
-        entries are written there, which is faster when few markers are in contact.
+        entries are written there, which is faster when few markers are in contact. With a mask `active` (N,), only
+        those environments are read; the others keep their values in the array. With a `reduction` the result is (N,
+        rows): `out`, or a new array.
         """
+        mask = self._mask("active", active)
+        if reduction is not None:
+            target = np.zeros((self.num_envs, len(reduction.names)), self.dtype) if out is None else out
+            self._checked(self._batch.reduced_tactile, reduction.core, target, mask)
+            return target
         if out is not None:
-            self._batch.tactile(out)
+            self._batch.tactile(out, mask)
             return out
-        self._batch.update_readings()
+        self._batch.update_readings(mask)
         if self._tactile is None:
             self._tactile = self._batch.readings
         return self._tactile
@@ -290,55 +289,67 @@ class Simulator:
         anchored: ArrayLike | None = None,
         history: ArrayLike | None = None,
         read_after: Sequence[int] = (),
+        reduction: TactileReduction | None = None,
+        active: ArrayLike | None = None,
+        stop: TouchStop | None = None,
         out: Trajectory | None = None,
     ) -> Trajectory:
         """Record steps with controls u (steps, N, nu), from the given or the present state; the state is not changed.
 
-        Marker forces are read after the numbers of steps in `read_after` (0 is the start). `out` is an earlier
-        trajectory of the same shape whose arrays are overwritten, which saves the allocation of large arrays. Raises
-        UsageError for wrong shapes and for values that are not finite.
+        Parameters
+        ----------
+        u: controls of each step
+        q, v, anchors, anchored, history: initial state; those of the simulator by default
+        read_after: numbers of steps after which marker forces are read (0 is the start)
+        reduction: record this function of the marker forces instead of the forces
+        active: mask (N,) of the environments that move; the others rest: they keep their state, cost nothing, and have
+            readings of zero, or with `out` those in `out`
+        stop: stops environments on touch
+        out: an earlier trajectory of the same shape whose arrays are overwritten, which saves the allocation of large
+            arrays
+
+        Raises UsageError for wrong shapes and for values that are not finite.
         """
         controls = np.ascontiguousarray(u, dtype=self.dtype)
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
             raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
+        if stop is not None and not self.model.num_markers:
+            raise UsageError("a touch stop needs a scene with pads")
         steps, n = controls.shape[0], self.num_envs
-        if out is not None and (out.u.shape != controls.shape or len(out.read_after) != len(read_after)):
-            raise UsageError(
-                f"out must be a trajectory with u of shape {controls.shape} and {len(read_after)} tactile readings, "
-                f"got {out.u.shape} and {len(out.read_after)}"
-            )
+        reading = (self.model.num_markers, 3) if reduction is None else (len(reduction.names),)
+        tactile_shape = (len(read_after), n, *reading)
+        if out is not None:
+            out.check_reusable(controls.shape, tactile_shape)
+        mask = self._mask("active", active)
 
-        def along_time(name: str, start: ArrayLike | None) -> NDArray[Any]:
-            present = getattr(self, name)
-            if out is None:  # zeros: the core writes only the anchors that are set
-                array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
-            else:
-                array = getattr(out, name)
-            array[0] = present if start is None else start
-            return array
-
-        read_steps = np.asarray(read_after, dtype=np.int32)
-        tactile_shape = (len(read_steps), n, self.model.num_markers, 3)
+        start = {"q": q, "v": v, "anchors": anchors, "anchored": anchored, "history": history}
         result = Trajectory(
-            q=along_time("q", q),
-            v=along_time("v", v),
-            anchors=along_time("anchors", anchors),
-            anchored=along_time("anchored", anchored),
-            history=along_time("history", history),
+            **{name: self._along_time(name, value, steps, out) for name, value in start.items()},
             u=controls,
-            tactile=np.empty(tactile_shape, self.dtype) if out is None else out.tactile,
-            read_after=read_steps,
+            tactile=np.zeros(tactile_shape, self.dtype) if out is None else out.tactile,
+            read_after=np.asarray(read_after, dtype=np.int32),
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),
+            active=np.ones(n, np.uint8) if mask is None else mask.copy(),
+            stopped_at=np.full(n, -1, np.int32),
+            reduction=reduction,
         )
-        for name, start in (("q", result.q[0]), ("v", result.v[0])):
-            if not np.isfinite(start).all():
-                raise UsageError(f"{name}{np.argwhere(~np.isfinite(start))[0].tolist()} is not finite")
-        try:
-            self._batch.rollout(_arrays(result))
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        for name in ("q", "v"):
+            bad = ~np.isfinite(getattr(result, name)[0]) & (result.active[:, None] == 1)
+            if bad.any():
+                raise UsageError(f"{name}{np.argwhere(bad)[0].tolist()} is not finite")
+        self._checked(self._batch.rollout, result.core(), None if stop is None else stop.core(n, steps))
         return result
+
+    def _along_time(self, name: str, start: ArrayLike | None, steps: int, out: Trajectory | None) -> NDArray[Any]:
+        """A part of the state over a rollout, in a new array or that of `out`, with its initial value."""
+        present = getattr(self, name)
+        if out is None:  # zeros: the core writes only the anchors that are set
+            array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
+        else:
+            array = getattr(out, name)
+        array[0] = present if start is None else start
+        return array
 
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:
         """Contact mode signature of each step (contact, slip and clipping of every point and actuator), (steps, N).
@@ -346,7 +357,7 @@ class Simulator:
         Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
         after which they were read.
         """
-        return self._batch.contact_modes(_arrays(trajectory))
+        return self._batch.contact_modes(trajectory.core())
 
     def rollout_gradient(
         self,
@@ -368,6 +379,7 @@ class Simulator:
         anchors_end, history_end: gradients with respect to the final `anchors` and `history`
         params: also compute the gradient with respect to all physical parameters, at many times the cost
 
+        An environment that stopped is differentiated as the steps that it took: the number of steps is a constant.
         Failed environments have gradient zero.
         """
 
@@ -386,9 +398,5 @@ class Simulator:
             history_end=shaped(history_end, trajectory.history[0]),
             tactile=shaped(tactile, trajectory.tactile),
         )
-        g = self._batch.rollout_vjp(_arrays(trajectory), cotangent, params)
+        g = self._batch.rollout_vjp(trajectory.core(), cotangent, params)
         return TrajectoryGradient(u=g.u, q=g.q, v=g.v, anchors=g.anchors, history=g.history, params=g.params)
-
-
-def _arrays(trajectory: Trajectory) -> _core.Trajectory:
-    return _core.Trajectory(**vars(trajectory))

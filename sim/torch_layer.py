@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch.autograd.function import once_differentiable
 
 from gelflow.errors import UsageError
-from gelflow.sim.simulator import Simulator, Trajectory
+from gelflow.sim.reductions import TactileReduction
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.trajectory import TouchStop, Trajectory
 
 
 @dataclass(frozen=True)
@@ -31,16 +33,27 @@ class TorchState:
     anchored: torch.Tensor  # (N, na) uint8; not differentiable
     history: torch.Tensor  # (N, nh); empty under BDF1
 
+    def detach(self) -> "TorchState":
+        """The same state without gradient: the start of the next window of truncated back-propagation."""
+        return TorchState(
+            self.q.detach(), self.v.detach(), self.anchors.detach(), self.anchored.detach(), self.history.detach()
+        )
+
 
 @dataclass(frozen=True)
 class TorchRollout:
-    """Result of `torch_rollout`. `ok` (N) is False for failed environments, whose gradient is zero."""
+    """Result of `torch_rollout`.
+
+    `ok` (N) is False for failed environments, whose gradient is zero. `stopped_at` (N) is the number of steps before
+    the touch stop, -1 without a stop.
+    """
 
     q: torch.Tensor  # (steps + 1, N, nq)
     v: torch.Tensor  # (steps + 1, N, nv)
-    tactile: torch.Tensor  # (readings, N, markers, 3) [N]
+    tactile: torch.Tensor  # (readings, N, markers, 3) [N], or (readings, N, rows) with a reduction
     end: TorchState
     ok: torch.Tensor
+    stopped_at: torch.Tensor
 
 
 def torch_state(sim: Simulator) -> TorchState:
@@ -55,15 +68,20 @@ def torch_rollout(
     u: torch.Tensor,
     *,
     read_after: Sequence[int] = (),
+    reduction: TactileReduction | None = None,
+    active: ArrayLike | None = None,
+    stop: TouchStop | None = None,
     params: Mapping[str, torch.Tensor] | None = None,
 ) -> TorchRollout:
     """Take steps with controls u (steps, N, nu) from `state`.
 
-    Marker forces are evaluated after the numbers of steps in `read_after`. `params` replaces parameters of the
-    simulator by name; each has shape (N,), or () for all environments.
+    Marker forces are evaluated after the numbers of steps in `read_after`. `reduction`, `active` and `stop` are those
+    of `Simulator.rollout`. `params` replaces parameters of the simulator by name; each has shape (N,), or () for all
+    environments.
 
-    Differentiable with respect to u, state.q, state.v, state.anchors, state.history and params. Raises UsageError for
-    wrong shapes, a precision other than the simulator's, unknown parameters, and values that are not finite.
+    Differentiable with respect to u, state.q, state.v, state.anchors, state.history and params; an environment that
+    stopped is differentiated as the steps that it took. Raises UsageError for wrong shapes, a precision other than the
+    simulator's, unknown parameters, and values that are not finite.
     """
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
@@ -72,9 +90,10 @@ def torch_rollout(
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
     numbers = None if params is None else _all_params(sim, params)
     inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
-    outputs = _Rollout.apply(*inputs, sim, tuple(read_after))  # type: ignore[no-untyped-call]
-    q, v, tactile, anchors, history, anchored, ok = outputs
-    return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok)
+    options = {"read_after": tuple(read_after), "reduction": reduction, "active": active, "stop": stop}
+    outputs = _Rollout.apply(*inputs, sim, options)  # type: ignore[no-untyped-call]
+    q, v, tactile, anchors, history, anchored, ok, stopped_at = outputs
+    return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok, stopped_at)
 
 
 def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -111,7 +130,7 @@ class _Rollout(torch.autograd.Function):
         params: torch.Tensor | None,
         anchored: torch.Tensor,
         sim: Simulator,
-        read_after: tuple[int, ...],
+        options: dict[str, Any],
     ) -> tuple[torch.Tensor, ...]:
         # The reverse pass needs the parameters of the forward pass, even if sim.params changes in between.
         ctx.params = sim.params.copy() if params is None else params.detach().numpy()
@@ -123,16 +142,17 @@ class _Rollout(torch.autograd.Function):
                 anchors=anchors.detach().numpy(),
                 anchored=anchored.numpy(),
                 history=history.detach().numpy(),
-                read_after=read_after,
+                **options,
             )
         ctx.sim = sim
         ctx.trajectory = trajectory
         ends = (torch.from_numpy(array[-1].copy()) for array in (trajectory.anchors, trajectory.history))
         set_at_end = torch.from_numpy(trajectory.anchored[-1].copy())
         ok = torch.from_numpy(trajectory.status == 0)
-        ctx.mark_non_differentiable(set_at_end, ok)
+        stopped_at = torch.from_numpy(trajectory.stopped_at.copy())
+        ctx.mark_non_differentiable(set_at_end, ok, stopped_at)
         arrays = (trajectory.q, trajectory.v, trajectory.tactile)
-        return (*(torch.from_numpy(array.copy()) for array in arrays), *ends, set_at_end, ok)
+        return (*(torch.from_numpy(array.copy()) for array in arrays), *ends, set_at_end, ok, stopped_at)
 
     @staticmethod
     @once_differentiable

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.sim import _core
-from gelflow.sim.simulator import Simulator, Trajectory
+from gelflow.sim.reductions import TactileReduction
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.trajectory import TouchStop, Trajectory
 
 Output = Literal["q", "v", "tactile"]
 
@@ -95,13 +97,18 @@ class RolloutLoss:
     sim: Simulator  # one environment, double precision
     u: NDArray[np.float64]  # (steps, nu)
     output: Output
-    weights: NDArray[np.float64]  # of the scalar: (nv,) for the tangent of q, (nv,) for v, or (markers, 3)
+    weights: NDArray[np.float64]  # of the scalar: (nv,) for the tangent of q, (nv,) for v, (markers, 3) or (rows,)
+    reduction: TactileReduction | None = None  # of the marker forces
+    stop: TouchStop | None = None
 
     @classmethod
-    def random(cls, sim: Simulator, u: NDArray[np.float64], output: Output, rng: np.random.Generator) -> "RolloutLoss":
-        """A loss with normally distributed weights."""
-        shape = (sim.model.num_markers, 3) if output == "tactile" else (sim.model.nv,)
-        return cls(sim, u, output, rng.normal(size=shape))
+    def random(
+        cls, sim: Simulator, u: NDArray[np.float64], output: Output, rng: np.random.Generator, **options: Any
+    ) -> "RolloutLoss":
+        """A loss with normally distributed weights; `options`: reduction, stop."""
+        reduction = options.get("reduction")
+        reading = (sim.model.num_markers, 3) if reduction is None else (len(reduction.names),)
+        return cls(sim, u, output, rng.normal(size=reading if output == "tactile" else sim.model.nv), **options)
 
     @property
     def reads(self) -> tuple[int, ...]:
@@ -116,7 +123,7 @@ def reverse_gradient(loss: RolloutLoss, *, params: bool = False) -> tuple[Trajec
     "params" (parameters,). Raises SimulationError when the rollout fails.
     """
     sim, model = loss.sim, loss.sim.model
-    trajectory = sim.rollout(loss.u[:, None], read_after=loss.reads)
+    trajectory = sim.rollout(loss.u[:, None], read_after=loss.reads, reduction=loss.reduction, stop=loss.stop)
     if trajectory.status[0]:
         raise SimulationError("the rollout of the gradient check failed")
     by: dict[str, NDArray[np.float64]] = {}
@@ -161,15 +168,9 @@ def compare_to_dual_numbers(
     differences: list[tuple[str, float, float]] = []  # input, difference, size
     tries = [(only, group == only) for only in np.unique(group)] if groups else []
     tries += [(only, np.ones(len(scale), bool)) for only in [*parts, "all"]] * directions
-    start = _core.RolloutInput(
-        params=sim.params[0],
-        q=sim.q[0],
-        v=sim.v[0],
-        anchors=sim.anchors[0],
-        anchored=sim.anchored[0],
-        history=sim.history[0],
-        u=loss.u,
-    )
+    taken = slice(trajectory.stopped_at[0] if trajectory.stopped_at[0] >= 0 else None)  # steps before a touch stop
+    now = {name: getattr(sim, name)[0] for name in ("params", "q", "v", "anchors", "anchored", "history")}
+    start = _core.RolloutInput(**now, u=loss.u[taken])
     for only, chosen in tries:
         d = {name: np.zeros_like(value) for name, value in gradient.items()}
         for name in parts if only == "all" else [only if only in parts else "params"]:
@@ -178,10 +179,12 @@ def compare_to_dual_numbers(
         d["params"] *= scale * chosen
         d["history"][-1:] = 0  # flag of an existing previous step
         direction = _core.RolloutInput(
-            params=d["params"], q=d["q"], v=d["v"], anchors=d["anchors"], history=d["history"], u=d["u"]
+            params=d["params"], q=d["q"], v=d["v"], anchors=d["anchors"], history=d["history"], u=d["u"][taken]
         )
         exact = _core.directional_rollout(model, start, direction)
         derivative = getattr(exact.derivative, loss.output)
+        if loss.output == "tactile" and loss.reduction is not None:
+            derivative = loss.reduction(derivative.reshape(-1, 3))
         along = loss.weights.ravel() @ derivative
         size = np.linalg.norm(loss.weights) * np.linalg.norm(derivative)
         ours = sum(float((gradient[name] * d[name]).sum()) for name in gradient)
@@ -365,13 +368,15 @@ def _slopes(
             anchored=np.repeat(sim.anchored, CHUNK, axis=0),
             history=np.repeat(sim.history, CHUNK, axis=0),
             read_after=loss.reads,
+            reduction=loss.reduction,
+            stop=loss.stop,
         )
         if loss.output == "q":
             value = np.array([difference(model, q, middle.q[-1, 0]) for q in run.q[-1]]) @ loss.weights
         elif loss.output == "v":
             value = (run.v[-1] - middle.v[-1]) @ loss.weights
         else:
-            value = ((run.tactile[0] - middle.tactile[0]) * loss.weights).sum((1, 2))
+            value = ((run.tactile[0] - middle.tactile[0]) * loss.weights).reshape(CHUNK, -1).sum(1)
         same_modes = (many.contact_modes(run) == reference).all(0) & (run.status == 0)
         ends[chunk], same[chunk] = value[: len(chunk)], same_modes[: len(chunk)]
     pairs = np.where(same, ends, np.nan).reshape(*sizes.shape, 2)

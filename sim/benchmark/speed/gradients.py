@@ -18,7 +18,8 @@ from gelflow.sim.benchmark.speed.timed_run import (
     simulator,
 )
 from gelflow.sim.scene import Scene, load_scene
-from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.trajectory import Trajectory, TrajectoryGradient
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,10 @@
 // or of environments: results are bit-identical.
 #pragma once
 
+#include <functional>
 #include <memory>
 
+#include "batch/rollout_readings.hpp"
 #include "batch/rollout_vjp.hpp"
 #include "batch/thread_pool.hpp"
 #include "batch/trajectory.hpp"
@@ -18,6 +20,7 @@ struct Controls {
   bool shared;
 };
 
+// Functions with an `active` mask, (N) flags or null for all, leave the other environments and their results untouched.
 template <class T>
 class Batch {
  public:
@@ -34,19 +37,20 @@ class Batch {
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
   int threads() const { return pool_.size(); }
-  void reset(const std::uint8_t* which);       // (N) flags, or null for all; parameters stay
-  void step(const Controls<T>& u, int steps);  // the controls are held for all steps
+  void reset(const std::uint8_t* which);  // (N) flags, or null for all; parameters stay
+  void step(const Controls<T>& u, int steps, const std::uint8_t* active);  // the controls are held for all steps
   // Difference between one step and two half steps under u, per dof (N, nv). A step that is halved is compared with
   // substeps half as long as its shortest. status (N) as in `status`. Changes nothing.
   void error_estimate(const Controls<T>& u, T* out, std::int32_t* status);
-  void tactile(T* out);         // (N, markers, 3)
-  void update_readings();       // the same into `readings`
-  void wrenches(T* out);        // (N, contacts, 6)
-  void contact_forces(T* out);  // (N, nv): joint forces of all contacts
-  void poses(T* out);           // (N, bodies, 7): position, quaternion
-  void mass_matrix(T* out);     // (N, nv, nv)
-  void bias(T* out);            // (N, nv): Coriolis and gravity forces
-  void rollout(const Trajectory<T>& r);
+  void tactile(T* out, const std::uint8_t* active);  // (N, markers, 3)
+  void update_readings(const std::uint8_t* active);  // the same into `readings`
+  void reduced_tactile(const TactileReduction& reduction, T* out, const std::uint8_t* active);  // (N, rows)
+  void wrenches(T* out);                                                                        // (N, contacts, 6)
+  void contact_forces(T* out);                                     // (N, nv): joint forces of all contacts
+  void poses(T* out);                                              // (N, bodies, 7): position, quaternion
+  void mass_matrix(T* out);                                        // (N, nv, nv)
+  void bias(T* out);                                               // (N, nv): Coriolis and gravity forces
+  void rollout(const Trajectory<T>& r, const TouchStop* stop);     // `stop` may be null
   void contact_modes(const Trajectory<T>& r, std::uint64_t* out);  // (steps, N): signatures, see contact_modes.hpp
   // The gradient of environments that failed is zero.
   void rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out);
@@ -60,15 +64,20 @@ class Batch {
     return u.u + (u.shared ? 0 : static_cast<std::size_t>(env) * model->actuators.size());
   }
   void kinematics(int env, Workspace<T>& w);
-  void read(T* out, NonzeroMarkers* nonzero);
-  void rollout_one(const Trajectory<T>& r, int env, StepMemory<T>& memory);
+  // Calls work(environment, thread) for the active environments.
+  void for_active(const std::uint8_t* active, const std::function<void(int, int)>& work);
+  void read(T* out, NonzeroMarkers* nonzero, const std::uint8_t* active);
+  void read_one(int env, int thread, T* out, NonzeroMarkers* nonzero);
+  void rollout_one(const Trajectory<T>& r, const TouchStop* stop, int env, int thread);
   void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q, double* by_v);
-  void check_state() const;
-  void check_controls(const T* u, int rows) const;
-  std::vector<StepMemory<T>> memory_;            // one per thread
-  std::vector<T> q_rounding_;                    // (N, nq) in single precision: rounding residual of q (StateView)
-  std::unique_ptr<Batch<double>> double_batch_;  // in single precision: computes the gradients
-  std::vector<NonzeroMarkers> nonzero_;          // per environment, of `readings`
+  void check_state(const std::uint8_t* active) const;
+  void check_controls(const T* u, int rows, const std::uint8_t* active) const;
+  std::vector<StepMemory<T>> memory_;             // one per thread
+  std::vector<ReadingMemory<T>> reading_memory_;  // one per thread
+  std::vector<int> active_;                       // active environments of the present call
+  std::vector<T> q_rounding_;                     // (N, nq) in single precision: rounding residual of q (StateView)
+  std::unique_ptr<Batch<double>> double_batch_;   // in single precision: computes the gradients
+  std::vector<NonzeroMarkers> nonzero_;           // per environment, of `readings`
   ThreadPool pool_;
 };
 

@@ -1,4 +1,4 @@
-#include "batch/batch_impl.hpp"
+#include "batch/rollout_impl.hpp"
 
 namespace gelflow {
 template class Batch<double>;

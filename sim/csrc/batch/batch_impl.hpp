@@ -4,7 +4,6 @@
 #include <stdexcept>
 
 #include "batch/batch.hpp"
-#include "contact/contact_modes.hpp"
 
 namespace gelflow {
 
@@ -24,6 +23,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
       pool_(threads) {
   if (!std::is_same_v<T, PositionScalar<T>>) q_rounding_.resize(q.size());
   for (int i = 0; i < pool_.size(); ++i) memory_.emplace_back(*model);
+  reading_memory_.resize(pool_.size());
   for (int e = 0; e < n; ++e) {
     std::copy(model->param_defaults.begin(), model->param_defaults.end(),
               params.begin() + static_cast<std::ptrdiff_t>(e * model->param_names.size()));
@@ -56,20 +56,32 @@ void Batch<T>::reset(const std::uint8_t* which) {
 }
 
 template <class T>
-void Batch<T>::check_controls(const T* u, int rows) const {
+void Batch<T>::for_active(const std::uint8_t* active, const std::function<void(int, int)>& work) {
+  if (active == nullptr) return pool_.run(n, work);
+  active_.clear();
+  for (int e = 0; e < n; ++e) {
+    if (active[e] != 0) active_.push_back(e);
+  }
+  pool_.run(static_cast<int>(active_.size()), [&](int i, int thread) { work(active_[i], thread); });
+}
+
+template <class T>
+void Batch<T>::check_controls(const T* u, int rows, const std::uint8_t* active) const {
   const int nu = static_cast<int>(model->actuators.size());
   for (std::ptrdiff_t i = 0; i < static_cast<std::ptrdiff_t>(rows) * nu; ++i) {
     if (is_finite(u[i])) continue;
+    const auto env = static_cast<int>(i / nu % n);
+    if (active != nullptr && active[env] == 0) continue;
     throw std::invalid_argument("control of actuator '" + model->actuators[i % nu].name + "' in environment " +
-                                std::to_string(i / nu % n) + " is not finite");
+                                std::to_string(env) + " is not finite");
   }
 }
 
 template <class T>
-void Batch<T>::check_state() const {
+void Batch<T>::check_state(const std::uint8_t* active) const {
   const auto check = [&](const std::vector<T>& values, const char* what, int width) {
     for (std::size_t i = 0; i < values.size(); ++i) {
-      if (is_finite(values[i])) continue;
+      if (is_finite(values[i]) || (active != nullptr && active[i / width] == 0)) continue;
       throw std::invalid_argument(std::string(what) + "[" + std::to_string(i / width) + ", " +
                                   std::to_string(i % width) + "] is not finite");
     }
@@ -79,10 +91,10 @@ void Batch<T>::check_state() const {
 }
 
 template <class T>
-void Batch<T>::step(const Controls<T>& u, int steps) {
-  check_controls(u.u, u.shared ? 1 : n);
-  check_state();
-  pool_.run(n, [&](int e, int thread) {
+void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active) {
+  check_controls(u.u, u.shared ? 1 : n, u.shared ? nullptr : active);
+  check_state(active);
+  for_active(active, [&](int e, int thread) {
     for (int i = 0; i < steps && status[e] == 0; ++i) {
       const StepReport report =
           gelflow::step<T>(*model, params_of(e), controls_of(u, e), model->polish, state(e), memory_[thread], i > 0);
@@ -110,8 +122,8 @@ void position_difference(const Model& m, const T* q0, const T* q1, T* out) {
 
 template <class T>
 void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
-  check_controls(u.u, u.shared ? 1 : n);
-  check_state();
+  check_controls(u.u, u.shared ? 1 : n, nullptr);
+  check_state(nullptr);
   const Model& m = *model;
   pool_.run(n, [&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
@@ -138,29 +150,43 @@ void Batch<T>::kinematics(int env, Workspace<T>& w) {
 }
 
 template <class T>
-void Batch<T>::tactile(T* out) {
-  read(out, nullptr);
+void Batch<T>::tactile(T* out, const std::uint8_t* active) {
+  read(out, nullptr, active);
 }
 
 template <class T>
-void Batch<T>::update_readings() {
+void Batch<T>::reduced_tactile(const TactileReduction& reduction, T* out, const std::uint8_t* active) {
+  for_active(active, [&](int e, int thread) {
+    ReadingMemory<T>& memory = reading_memory_[thread];
+    memory.forces.resize(static_cast<std::size_t>(model->num_markers) * 3);
+    read_one(e, thread, memory.forces.data(), &memory.nonzero);
+    reduction.apply(memory.forces.data(), memory.sums, out + static_cast<std::size_t>(e) * reduction.rows());
+  });
+}
+
+template <class T>
+void Batch<T>::update_readings(const std::uint8_t* active) {
   if (nonzero_.empty()) {
     readings.resize(static_cast<std::size_t>(n) * model->num_markers * 3);
     nonzero_.resize(n);
   }
-  read(readings.data(), nonzero_.data());
+  read(readings.data(), nonzero_.data(), active);
 }
 
 template <class T>
-void Batch<T>::read(T* out, NonzeroMarkers* nonzero) {
-  pool_.run(n, [&](int e, int thread) {
-    const StateView<T> s = state(e);
-    Workspace<T>& w = memory_[thread].work;
-    forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
-    read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w,
-                    out + static_cast<std::size_t>(e) * model->num_markers * 3,
-                    nonzero == nullptr ? nullptr : nonzero + e);
+void Batch<T>::read(T* out, NonzeroMarkers* nonzero, const std::uint8_t* active) {
+  for_active(active, [&](int e, int thread) {
+    read_one(e, thread, out + static_cast<std::size_t>(e) * model->num_markers * 3,
+             nonzero == nullptr ? nullptr : nonzero + e);
   });
+}
+
+template <class T>
+void Batch<T>::read_one(int e, int thread, T* out, NonzeroMarkers* nonzero) {
+  const StateView<T> s = state(e);
+  Workspace<T>& w = memory_[thread].work;
+  forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
+  read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w, out, nonzero);
 }
 
 template <class T>
@@ -225,154 +251,6 @@ void Batch<T>::bias(T* out) {
     w.residual.setZero();
     add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     std::copy_n(w.residual.data(), model->nv, out);
-  }
-}
-
-// Copies one state to the next row; of the anchors only those that are set.
-template <class T>
-void copy_state(const Model& m, const StateView<T>& from, const StateView<T>& to) {
-  std::copy_n(from.q, m.nq, to.q);
-  std::copy_n(from.v, m.nv, to.v);
-  std::copy_n(from.anchored, m.na, to.anchored);
-  for_each_set(from.anchored, m.na, [&](int i) { to.anchors[i] = from.anchors[i]; });
-  std::copy_n(from.history, m.nh, to.history);
-}
-
-template <class T>
-void Batch<T>::rollout_one(const Trajectory<T>& r, int env, StepMemory<T>& memory) {
-  const Model& m = *model;
-  const std::size_t e = env;
-  r.status[e] = 0;
-  int read = 0;
-  VX<T> rounding = VX<T>::Zero(std::is_same_v<T, PositionScalar<T>> ? 0 : m.nq);  // of q in the last state
-  T* const q_rounding = rounding.size() == 0 ? nullptr : rounding.data();
-  for (int t = 0;; ++t) {
-    const StateView<T> now = r.state(m, t, e, q_rounding);
-    for (; read < r.reads && r.read_after[read] == t; ++read) {
-      forward_state<false, T>(m, params_of(env), now.q, now.q_rounding, now.v, memory.work);
-      read_markers<T>(m, params_of(env), now.anchors, now.anchored, memory.work, r.tactile + r.reading(m, read, e),
-                      nullptr);
-    }
-    if (t == r.steps) break;
-    const StateView<T> next = r.state(m, t + 1, e, q_rounding);
-    copy_state<T>(m, now, next);
-    if (r.status[e] != 0) continue;
-    const StepReport report = gelflow::step<T>(m, params_of(env), r.controls(m, t, e), m.polish, next, memory, t > 0);
-    r.status[e] = static_cast<std::int32_t>(report.status);
-    r.halvings[r.row(t, e)] = static_cast<std::int8_t>(report.halvings);
-  }
-}
-
-template <class T>
-void Batch<T>::rollout(const Trajectory<T>& r) {
-  check_controls(r.u, r.steps * n);
-  pool_.run(n, [&](int env, int thread) { rollout_one(r, env, memory_[thread]); });
-}
-
-template <class T>
-void Batch<T>::contact_modes(const Trajectory<T>& r, std::uint64_t* out) {
-  const Model& m = *model;
-  pool_.run(n, [&](int env, int thread) {
-    const std::size_t e = env;
-    for (int t = 0; t < r.steps; ++t) {
-      const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
-      const StateView<T> before = r.state(m, t, e), after = r.state(m, t + 1, e);
-      ModeHash hash;
-      hash.add(contact_mode_signature<T>(m, params_of(env), after.q, after.v, before.anchors, before.anchored,
-                                         r.controls(m, t, e), read, memory_[thread].work));
-      hash.add(static_cast<std::uint64_t>(r.halvings[r.row(t, e)]));
-      out[r.row(t, e)] = hash.value();
-    }
-  });
-}
-
-// Double-precision copies of a trajectory and its cotangent, and memory for the gradient.
-template <class T>
-struct DoubleTrajectory {
-  std::vector<double> u, q, v, anchors, history;
-  std::vector<double> by_q, by_v, by_anchors_end, by_history_end, by_tactile;
-  std::vector<double> by_u, by_q0, by_v0, by_anchors0, by_history0;
-  Trajectory<double> trajectory;
-
-  DoubleTrajectory(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int reads)
-      : by_q0(r.row(1, 0) * m.nq), by_v0(r.row(1, 0) * m.nv) {
-    const std::size_t n = r.environments, rows = r.row(r.steps + 1, 0), nu = m.actuators.size();
-    const auto copy = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
-    u = copy(r.u, (rows - n) * nu);
-    q = copy(r.q, rows * m.nq);
-    v = copy(r.v, rows * m.nv);
-    anchors = copy(r.anchors, rows * m.na * 3);
-    history = copy(r.history, rows * m.nh);
-    by_q = copy(cotangent.q, rows * m.nq);
-    by_v = copy(cotangent.v, rows * m.nv);
-    by_anchors_end = copy(cotangent.anchors_end, n * m.na * 3);
-    by_history_end = copy(cotangent.history_end, n * m.nh);
-    by_tactile = copy(cotangent.tactile, r.row(reads, 0) * m.num_markers * 3);
-    by_u.resize(u.size());
-    by_anchors0.resize(by_anchors_end.size());
-    by_history0.resize(by_history_end.size());
-    trajectory = {r.steps,        reads,      r.environments, u.data(), q.data(),     v.data(), anchors.data(),
-                  history.data(), r.anchored, r.halvings,     r.status, r.read_after, nullptr};
-  }
-  TrajectoryCotangent<double> cotangent() const {
-    return {by_q.data(), by_v.data(), by_anchors_end.data(), by_history_end.data(), by_tactile.data()};
-  }
-  TrajectoryGradient<double> gradient(double* by_params) {
-    return {by_u.data(), by_q0.data(), by_v0.data(), by_anchors0.data(), by_history0.data(), by_params};
-  }
-  void copy_gradient(const TrajectoryGradient<T>& out) const {
-    std::copy(by_u.begin(), by_u.end(), out.u);
-    std::copy(by_q0.begin(), by_q0.end(), out.q);
-    std::copy(by_v0.begin(), by_v0.end(), out.v);
-    std::copy(by_anchors0.begin(), by_anchors0.end(), out.anchors);
-    std::copy(by_history0.begin(), by_history0.end(), out.history);
-  }
-};
-
-// Adds the gradient through all marker readings to by_q and by_v, shaped as in the trajectory. For models without
-// anchors, whose readings depend on the state alone.
-template <class T>
-void Batch<T>::add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q,
-                                double* by_v) {
-  const Model& m = *model;
-  pool_.run(n, [&](int e, int thread) {
-    for (int read = 0; read < r.reads && r.status[e] == 0; ++read) {
-      const int t = r.read_after[read];
-      const StateView<T> now = r.state(m, t, e);
-      StateGradient<T> gradient(m);
-      tactile_vjp<T>(m, params_of(e), now, cotangent.tactile + r.reading(m, read, e), gradient, memory_[thread].work);
-      const VX<double> q = Eigen::Map<const VX<T>>(now.q, m.nq).template cast<double>();
-      add_from_tangent<double>(m, q.data(), gradient.q.template cast<double>(), by_q + r.row(t, e) * m.nq);
-      for (int k = 0; k < m.nv; ++k) by_v[r.row(t, e) * m.nv + k] += gradient.v[k];
-    }
-  });
-}
-
-template <class T>
-void Batch<T>::rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent,
-                           const TrajectoryGradient<T>& out) {
-  const Model& m = *model;
-  if constexpr (std::is_same_v<T, double>) {
-    const std::size_t N = n;
-    std::fill_n(out.u, r.row(r.steps, 0) * m.actuators.size(), 0.0);
-    std::fill_n(out.q, N * m.nq, 0.0);
-    std::fill_n(out.v, N * m.nv, 0.0);
-    std::fill_n(out.anchors, N * m.na * 3, 0.0);
-    std::fill_n(out.history, N * m.nh, 0.0);
-    if (out.params) std::fill_n(out.params, N * m.param_names.size(), 0.0);
-    pool_.run(n, [&](int e, int thread) {
-      if (r.status[e] == 0) gelflow::rollout_vjp<T>(m, params_of(e), e, r, cotangent, out, memory_[thread]);
-    });
-  } else {
-    // Computed in double precision at the states of the single-precision trajectory, because rounding errors grow on the
-    // way back. Readings that depend on one state only do not need it: their gradient is computed in single precision.
-    if (!double_batch_) double_batch_ = std::make_unique<Batch<double>>(model, n, threads());
-    std::copy(params.begin(), params.end(), double_batch_->params.begin());
-    const bool separate_readings = m.na == 0 && out.params == nullptr;
-    DoubleTrajectory<T> doubles(m, r, cotangent, separate_readings ? 0 : r.reads);
-    if (separate_readings) add_readings_vjp(r, cotangent, doubles.by_q.data(), doubles.by_v.data());
-    double_batch_->rollout_vjp(doubles.trajectory, doubles.cotangent(), doubles.gradient(out.params));
-    doubles.copy_gradient(out);
   }
 }
 

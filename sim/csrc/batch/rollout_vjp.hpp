@@ -7,6 +7,17 @@
 
 namespace gelflow {
 
+// The gradient with respect to the marker forces of a reading, (markers, 3). `forces`: memory for it.
+template <class T>
+const T* by_marker_forces(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int read,
+                          std::size_t e, std::vector<T>& forces) {
+  const T* const by_reading = cotangent.tactile + r.reading(m, read, e);
+  if (r.reduction == nullptr) return by_reading;
+  forces.resize(static_cast<std::size_t>(m.num_markers) * 3);
+  r.reduction->apply_vjp(by_reading, forces.data());
+  return forces.data();
+}
+
 // Adds the gradient through the markers that were read after `step` steps, to the state there and to the parameters.
 // `read` is the last read that is not yet done.
 template <class T>
@@ -14,8 +25,9 @@ void readings_vjp(const Model& m, const T* params, int step, std::size_t e, cons
                   const TrajectoryCotangent<T>& cotangent, double* by_params, StateGradient<T>& gradient, int& read,
                   Workspace<T>& w) {
   const StateView<T> now = r.state(m, step, e);
+  std::vector<T> forces;
   for (; read >= 0 && r.read_after[read] == step; --read) {
-    const T* by_reading = cotangent.tactile + r.reading(m, read, e);
+    const T* by_reading = by_marker_forces(m, r, cotangent, read, e, forces);
     tactile_vjp<T>(m, params, now, by_reading, gradient, w);
     if (by_params == nullptr) continue;
     const ParamState at{m.step, now.q, now.v, nullptr, nullptr, nullptr, now.anchors, now.anchored};
@@ -41,7 +53,8 @@ void record_substeps(const Model& m, const T* params, const T* u, const StateVie
                    });
 }
 
-// The reverse pass of environment e. Gradients by parameters need T = double.
+// The reverse pass of environment e. Gradients by parameters need T = double. The state does not change after a touch
+// stop, nor where the environment rests: there the gradient passes, and later readings add to it.
 template <class T>
 void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajectory<T>& r,
                  const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out, StepMemory<T>& memory) {
@@ -50,7 +63,8 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
   std::copy_n(reinterpret_cast<const V3<T>*>(cotangent.anchors_end) + e * m.na, m.na, gradient.anchors.begin());
   std::copy_n(cotangent.history_end + e * m.nh, m.nh, gradient.history.data());
   std::vector<SubstepRecord<T>> records;
-  int read = r.reads - 1;
+  int read = r.active[e] == 0 ? -1 : r.reads - 1;
+  const int taken = r.steps_taken(e);
   for (int t = r.steps; t >= 0; --t) {
     const std::size_t row = r.row(t, e);
     const StateView<T> now = r.state(m, t, e);
@@ -58,6 +72,7 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
     gradient.v += Eigen::Map<const VX<T>>(cotangent.v + row * m.nv, m.nv);
     readings_vjp<T>(m, params, t, e, r, cotangent, by_params, gradient, read, memory.work);
     if (t == 0) break;
+    if (t > taken) continue;
     const T* u = r.controls(m, t - 1, e);
     T* by_u = out.u + (u - r.u);
     record_substeps<T>(m, params, u, r.state(m, t - 1, e), now, r.halvings[r.row(t - 1, e)] != 0, memory, records);

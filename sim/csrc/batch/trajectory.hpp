@@ -2,6 +2,7 @@
 // time first, then environment; N is the number of environments.
 #pragma once
 
+#include "contact/tactile_reduction.hpp"
 #include "solver/step.hpp"
 
 namespace gelflow {
@@ -9,14 +10,17 @@ namespace gelflow {
 template <class T>
 struct Trajectory {
   int steps, reads, environments;
-  const T* u;              // (steps, N, nu)
-  T *q, *v, *anchors;      // (steps + 1, N, ·); the first entry is the initial state
-  T* history;              // (steps + 1, N, nh)
-  std::uint8_t* anchored;  // (steps + 1, N, na)
-  std::int8_t* halvings;   // (steps, N)
-  std::int32_t* status;    // (N): a Status
-  const int* read_after;   // (reads): numbers of steps after which the markers are read, increasing
-  T* tactile;              // (reads, N, markers, 3)
+  const T* u;                         // (steps, N, nu)
+  T *q, *v, *anchors;                 // (steps + 1, N, ·); the first entry is the initial state
+  T* history;                         // (steps + 1, N, nh)
+  std::uint8_t* anchored;             // (steps + 1, N, na)
+  std::int8_t* halvings;              // (steps, N)
+  std::int32_t* status;               // (N): a Status
+  const std::uint8_t* active;         // (N): 0 where the environment rests: no step and no reading
+  std::int32_t* stopped_at;           // (N): number of steps before the touch stop; −1 without a stop
+  const int* read_after;              // (reads): numbers of steps after which the markers are read, increasing
+  const TactileReduction* reduction;  // of the readings; null: none
+  T* tactile;                         // (reads, N, markers, 3), or (reads, N, rows) with a reduction
 
   // Row of an environment after `step` steps, in arrays with one row per step and environment.
   std::size_t row(int step, std::size_t e) const { return static_cast<std::size_t>(step) * environments + e; }
@@ -27,8 +31,13 @@ struct Trajectory {
   }
   // Controls of the step that starts after `step` steps.
   const T* controls(const Model& m, int step, std::size_t e) const { return u + row(step, e) * m.actuators.size(); }
-  // Offset of an environment's markers in `tactile`.
-  std::size_t reading(const Model& m, int read, std::size_t e) const { return row(read, e) * m.num_markers * 3; }
+  std::size_t reading_size(const Model& m) const {
+    return static_cast<std::size_t>(reduction == nullptr ? m.num_markers * 3 : reduction->rows());
+  }
+  // Offset of an environment's reading in `tactile`.
+  std::size_t reading(const Model& m, int read, std::size_t e) const { return row(read, e) * reading_size(m); }
+  // Number of steps before an environment stopped; its state does not change in later ones.
+  int steps_taken(std::size_t e) const { return active[e] == 0 ? 0 : stopped_at[e] < 0 ? steps : stopped_at[e]; }
 };
 
 // Gradient of a scalar by the results of a rollout: the input of the reverse pass.
@@ -37,7 +46,7 @@ struct TrajectoryCotangent {
   const T *q, *v;        // shaped as in the trajectory; q by the quaternion's four numbers
   const T* anchors_end;  // (N, na, 3)
   const T* history_end;  // (N, nh)
-  const T* tactile;      // (reads, N, markers, 3)
+  const T* tactile;      // shaped as in the trajectory
 };
 
 // Gradient of the scalar by the inputs of a rollout: the output of the reverse pass.

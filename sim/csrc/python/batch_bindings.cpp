@@ -12,7 +12,12 @@ namespace {
 
 // The arrays of a rollout. Trajectory<T> views them after checks of type and shape.
 struct TrajectoryArrays {
-  py::array u, q, v, anchors, anchored, history, tactile, read_after, halvings, status;
+  py::array u, q, v, anchors, anchored, history, tactile, read_after, halvings, status, active, stopped_at;
+  std::shared_ptr<const TactileReduction> reduction;  // may be null
+};
+struct TouchStopArrays {
+  Array<double> threshold;
+  int reference_step, after_step;
 };
 struct CotangentArrays {
   py::array q, v, anchors_end, history_end, tactile;
@@ -24,6 +29,18 @@ struct GradientArrays {
 template <class T>
 py::ssize_t actuators(const Batch<T>& b) {
   return static_cast<py::ssize_t>(b.model->actuators.size());
+}
+
+void check_markers(const Model& m, const TactileReduction& reduction) {
+  if (reduction.markers() == m.num_markers) return;
+  throw std::invalid_argument("reduction is of " + std::to_string(reduction.markers()) + " markers; the scene has " +
+                              std::to_string(m.num_markers));
+}
+
+template <class T>
+Dimensions reading_shape(const Trajectory<T>& r, const Model& m) {
+  if (r.reduction != nullptr) return {r.reads, r.environments, r.reduction->rows()};
+  return {r.reads, r.environments, m.num_markers, 3};
 }
 
 template <class T>
@@ -49,9 +66,30 @@ Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t) {
   r.history = writable<T>(t.history, {steps + 1, n, m.nh}, "history");
   r.halvings = writable<std::int8_t>(t.halvings, {steps, n}, "halvings");
   r.status = writable<std::int32_t>(t.status, {n}, "status");
+  r.active = readable<std::uint8_t>(t.active, {n}, "active");
+  r.stopped_at = writable<std::int32_t>(t.stopped_at, {n}, "stopped_at");
   r.read_after = read_after;
-  r.tactile = writable<T>(t.tactile, {reads, n, m.num_markers, 3}, "tactile");
+  r.reduction = t.reduction.get();
+  if (r.reduction != nullptr) check_markers(m, *r.reduction);
+  r.tactile = writable<T>(t.tactile, reading_shape(r, m), "tactile");
   return r;
+}
+
+TouchStop checked(const TouchStopArrays& stop, int n, int steps) {
+  if (stop.reference_step < 0 || stop.after_step <= stop.reference_step || stop.after_step > steps) {
+    throw std::invalid_argument("a touch stop needs 0 ≤ reference_step < after_step ≤ number of steps, got " +
+                                std::to_string(stop.reference_step) + ", " + std::to_string(stop.after_step) + ", " +
+                                std::to_string(steps));
+  }
+  return {stop.reference_step, stop.after_step, readable<double>(stop.threshold, {n}, "threshold")};
+}
+
+// The flags of a mask, or null for all environments.
+using Mask = std::optional<Array<std::uint8_t>>;
+template <class T>
+const std::uint8_t* flags(const Batch<T>& b, const Mask& mask, const char* name) {
+  if (mask) check_shape(*mask, {b.n}, name);
+  return mask ? mask->data() : nullptr;
 }
 
 template <class T>
@@ -60,7 +98,7 @@ TrajectoryCotangent<T> checked(const Batch<T>& b, const Trajectory<T>& r, const 
   const py::ssize_t n = b.n;
   return {readable<T>(c.q, {r.steps + 1, n, m.nq}, "q"), readable<T>(c.v, {r.steps + 1, n, m.nv}, "v"),
           readable<T>(c.anchors_end, {n, m.na, 3}, "anchors_end"), readable<T>(c.history_end, {n, m.nh}, "history_end"),
-          readable<T>(c.tactile, {r.reads, n, m.num_markers, 3}, "tactile")};
+          readable<T>(c.tactile, reading_shape(r, m), "tactile")};
 }
 
 // Controls (N, nu), or (nu,) for all environments.
@@ -78,11 +116,14 @@ Controls<T> checked_controls(const Batch<T>& b, const Array<T>& u) {
 void bind_trajectory(py::module_& module) {
   using A = py::array;
   py::class_<TrajectoryArrays>(module, "Trajectory")
-      .def(py::init([](A u, A q, A v, A anchors, A anchored, A history, A tactile, A read_after, A halvings, A status) {
-             return TrajectoryArrays{u, q, v, anchors, anchored, history, tactile, read_after, halvings, status};
+      .def(py::init([](A u, A q, A v, A anchors, A anchored, A history, A tactile, A read_after, A halvings, A status,
+                       A active, A stopped_at, std::shared_ptr<TactileReduction> reduction) {
+             return TrajectoryArrays{u,          q,        v,      anchors, anchored,   history,  tactile,
+                                     read_after, halvings, status, active,  stopped_at, reduction};
            }),
            py::kw_only(), py::arg("u"), py::arg("q"), py::arg("v"), py::arg("anchors"), py::arg("anchored"),
-           py::arg("history"), py::arg("tactile"), py::arg("read_after"), py::arg("halvings"), py::arg("status"))
+           py::arg("history"), py::arg("tactile"), py::arg("read_after"), py::arg("halvings"), py::arg("status"),
+           py::arg("active"), py::arg("stopped_at"), py::arg("reduction") = py::none())
       .def_readonly("u", &TrajectoryArrays::u)
       .def_readonly("q", &TrajectoryArrays::q)
       .def_readonly("v", &TrajectoryArrays::v)
@@ -92,7 +133,10 @@ void bind_trajectory(py::module_& module) {
       .def_readonly("tactile", &TrajectoryArrays::tactile)
       .def_readonly("read_after", &TrajectoryArrays::read_after)
       .def_readonly("halvings", &TrajectoryArrays::halvings)
-      .def_readonly("status", &TrajectoryArrays::status);
+      .def_readonly("status", &TrajectoryArrays::status)
+      .def_readonly("active", &TrajectoryArrays::active)
+      .def_readonly("stopped_at", &TrajectoryArrays::stopped_at)
+      .def_property_readonly("reduction", [](const TrajectoryArrays& t) { return t.reduction; });
   py::class_<CotangentArrays>(module, "TrajectoryCotangent")
       .def(py::init([](A q, A v, A anchors_end, A history_end, A tactile) {
              return CotangentArrays{q, v, anchors_end, history_end, tactile};
@@ -111,6 +155,28 @@ void bind_trajectory(py::module_& module) {
       .def_readonly("anchors", &GradientArrays::anchors)
       .def_readonly("history", &GradientArrays::history)
       .def_readonly("params", &GradientArrays::params);
+}
+
+void bind_reading_options(py::module_& module) {
+  py::class_<TactileReduction, std::shared_ptr<TactileReduction>>(module, "TactileReduction")
+      .def(py::init([](const Array<double>& matrix) {
+             if (matrix.ndim() != 3 || matrix.shape(2) != 3) {
+               throw std::invalid_argument("matrix must have shape (rows, markers, 3)");
+             }
+             return std::make_shared<TactileReduction>(static_cast<int>(matrix.shape(0)),
+                                                       static_cast<int>(matrix.shape(1)), matrix.data());
+           }),
+           py::arg("matrix"))
+      .def_property_readonly("rows", &TactileReduction::rows)
+      .def_property_readonly("markers", &TactileReduction::markers);
+  py::class_<TouchStopArrays>(module, "TouchStop")
+      .def(py::init([](const Array<double>& threshold, int reference_step, int after_step) {
+             return TouchStopArrays{threshold, reference_step, after_step};
+           }),
+           py::kw_only(), py::arg("threshold"), py::arg("reference_step"), py::arg("after_step"))
+      .def_readonly("threshold", &TouchStopArrays::threshold)
+      .def_readonly("reference_step", &TouchStopArrays::reference_step)
+      .def_readonly("after_step", &TouchStopArrays::after_step);
 }
 
 template <class T>
@@ -170,20 +236,16 @@ template <class T>
 void bind_steps(py::class_<Batch<T>>& type) {
   using B = Batch<T>;
   type.def(
-          "reset",
-          [](B& b, const std::optional<Array<std::uint8_t>>& which) {
-            if (which) check_shape(*which, {b.n}, "which");
-            b.reset(which ? which->data() : nullptr);
-          },
-          py::arg("which") = py::none())
+          "reset", [](B& b, const Mask& which) { b.reset(flags(b, which, "which")); }, py::arg("which") = py::none())
       .def(
           "step",
-          [](B& b, const Array<T>& u, int steps) {
+          [](B& b, const Array<T>& u, int steps, const Mask& active) {
             const Controls<T> controls = checked_controls<T>(b, u);
+            const std::uint8_t* const mask = flags(b, active, "active");
             const py::gil_scoped_release release;
-            b.step(controls, steps);
+            b.step(controls, steps, mask);
           },
-          py::arg("u"), py::arg("steps") = 1)
+          py::arg("u"), py::arg("steps") = 1, py::arg("active") = py::none())
       .def(
           "error_estimate",
           [](B& b, const Array<T>& u) {
@@ -196,12 +258,14 @@ void bind_steps(py::class_<Batch<T>>& type) {
           py::arg("u"))
       .def(
           "rollout",
-          [](B& b, TrajectoryArrays& trajectory) {
+          [](B& b, TrajectoryArrays& trajectory, const std::optional<TouchStopArrays>& stop) {
             const Trajectory<T> r = checked<T>(b, trajectory);
+            const std::optional<TouchStop> touch =
+                stop ? std::optional<TouchStop>(checked(*stop, b.n, r.steps)) : std::nullopt;
             const py::gil_scoped_release release;
-            b.rollout(r);
+            b.rollout(r, touch ? &*touch : nullptr);
           },
-          py::arg("trajectory"))
+          py::arg("trajectory"), py::arg("stop") = py::none())
       .def(
           "contact_modes",
           [](B& b, TrajectoryArrays& trajectory) {
@@ -236,13 +300,31 @@ void bind_outputs(py::class_<Batch<T>>& type) {
   writes("bias", &B::bias, [](const Model& m) { return Dimensions{m.nv}; });
   type.def(
           "tactile",
-          [](B& b, py::array out) {
+          [](B& b, py::array out, const Mask& active) {
             T* data = writable<T>(out, {b.n, b.model->num_markers, 3}, "out");
+            const std::uint8_t* const mask = flags(b, active, "active");
             const py::gil_scoped_release release;
-            b.tactile(data);
+            b.tactile(data, mask);
           },
-          py::arg("out"))
-      .def("update_readings", &B::update_readings, py::call_guard<py::gil_scoped_release>());
+          py::arg("out"), py::arg("active") = py::none())
+      .def(
+          "reduced_tactile",
+          [](B& b, const TactileReduction& reduction, py::array out, const Mask& active) {
+            check_markers(*b.model, reduction);
+            T* data = writable<T>(out, {b.n, reduction.rows()}, "out");
+            const std::uint8_t* const mask = flags(b, active, "active");
+            const py::gil_scoped_release release;
+            b.reduced_tactile(reduction, data, mask);
+          },
+          py::arg("reduction"), py::arg("out"), py::arg("active") = py::none())
+      .def(
+          "update_readings",
+          [](B& b, const Mask& active) {
+            const std::uint8_t* const mask = flags(b, active, "active");
+            const py::gil_scoped_release release;
+            b.update_readings(mask);
+          },
+          py::arg("active") = py::none());
 }
 
 template <class T>
@@ -261,6 +343,7 @@ void bind_batch(py::module_& module, const char* name) {
 }  // namespace
 
 void bind_batches(py::module_& module) {
+  bind_reading_options(module);
   bind_trajectory(module);
   bind_batch<double>(module, "Batch");
   bind_batch<float>(module, "BatchFloat");

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS
-from gelflow.sim.simulator import Simulator, Trajectory, TrajectoryGradient
+from gelflow.sim.simulator import Simulator
+from gelflow.sim.trajectory import Trajectory, TrajectoryGradient
 from gelflow.sim.validation.gradient_check import RolloutLoss, compare_to_dual_numbers
 
 Array = NDArray[np.float64]

@@ -1,0 +1,68 @@
+#include "dynamics/site_poses.hpp"
+
+#include "dynamics/kinematics.hpp"
+
+namespace gelflow {
+
+namespace {
+
+struct SitePose {
+  V3<double> position;
+  V4<double> quaternion;
+};
+
+SitePose site_pose(const SiteDef& site, const Workspace<double>& w) {
+  M3<double> rotation = rotation_of<double>(site.pose.quat);
+  V3<double> position = site.pose.pos;
+  if (site.body != world) {
+    position = (w.position[site.body] + w.rotation[site.body] * position).eval();
+    rotation = (w.rotation[site.body] * rotation).eval();
+  }
+  const Eigen::Quaternion<double> turn(rotation);
+  return {position, {turn.w(), turn.x(), turn.y(), turn.z()}};
+}
+
+}  // namespace
+
+void site_poses(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
+                double* poses) {
+  Workspace<double> w(m);
+  for (int row = 0; row < rows; ++row, q += m.nq, params += m.param_names.size()) {
+    forward_positions<double>(m, params, q, w);
+    for (const SiteDef& site : sites) {
+      const SitePose pose = site_pose(site, w);
+      poses = std::copy_n(pose.position.data(), 3, poses);
+      poses = std::copy_n(pose.quaternion.data(), 4, poses);
+    }
+  }
+}
+
+// A motion (ω, v) of the body, v at the world's origin, moves the site by v + ω × x and changes its quaternion Q by
+// ½ (0, ω) ⊗ Q. A gradient F by the position therefore acts like a force at x.
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
+                    const double* by_poses, double* by_q) {
+  Workspace<double> w(m);
+  for (int row = 0; row < rows; ++row, q += m.nq, by_q += m.nq, params += m.param_names.size()) {
+    forward_positions<double>(m, params, q, w);
+    VX<double> by_tangent = VX<double>::Zero(m.nv);
+    for (const SiteDef& site : sites) {
+      const V3<double> by_position = vec3(by_poses);
+      const V4<double> by_quaternion = vec4(by_poses + 3);
+      by_poses += 7;
+      if (site.body == world) continue;
+      const SitePose pose = site_pose(site, w);
+      V3<double> by_rotation = pose.position.cross(by_position);
+      for (int a = 0; a < 3; ++a) {
+        V4<double> half_axis = V4<double>::Zero();
+        half_axis[1 + a] = 0.5;
+        by_rotation[a] += quaternion_product<double>(half_axis, pose.quaternion).dot(by_quaternion);
+      }
+      for (const int k : m.bodies[site.body].dofs) {
+        by_tangent[k] += w.axis[k].head<3>().dot(by_rotation) + w.axis[k].tail<3>().dot(by_position);
+      }
+    }
+    add_from_tangent<double>(m, q, by_tangent, by_q);
+  }
+}
+
+}  // namespace gelflow

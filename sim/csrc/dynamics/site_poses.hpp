@@ -1,0 +1,28 @@
+// Poses of sites, named frames on bodies, at given positions q, and their vector-Jacobian product. One compiled version in
+// double precision.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "model/definitions.hpp"
+#include "model/model.hpp"
+
+namespace gelflow {
+
+struct SiteDef {
+  std::string name;
+  int body = world;
+  PoseDef pose;  // in the body frame
+};
+
+// `poses` (rows, sites, 7): position, quaternion; for positions q (rows, nq) and parameters (rows, parameters).
+void site_poses(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
+                double* poses);
+
+// Adds to by_q (rows, nq) the gradient of a scalar with gradient `by_poses` (rows, sites, 7); for quaternions of q the
+// tangent gradient.
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
+                    const double* by_poses, double* by_q);
+
+}  // namespace gelflow

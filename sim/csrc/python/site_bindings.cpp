@@ -1,0 +1,62 @@
+// Sites and their poses.
+#include "dynamics/site_poses.hpp"
+#include "python/arrays.hpp"
+#include "python/bindings.hpp"
+
+namespace gelflow {
+
+namespace {
+
+using Sites = std::vector<SiteDef>;
+
+// Checks the arrays of a call and returns its number of rows.
+py::ssize_t checked_rows(const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
+  const py::ssize_t rows = q.ndim() == 2 ? q.shape(0) : 0;
+  check_shape(q, {rows, m.nq}, "q");
+  check_shape(params, {rows, static_cast<py::ssize_t>(m.param_names.size())}, "params");
+  for (const SiteDef& site : sites) {
+    if (site.body < world || site.body >= static_cast<int>(m.bodies.size())) {
+      throw std::invalid_argument("site '" + site.name + "' refers to body " + std::to_string(site.body));
+    }
+  }
+  return rows;
+}
+
+}  // namespace
+
+void bind_sites(py::module_& module) {
+  py::class_<SiteDef>(module, "SiteDef")
+      .def(py::init([](const std::string& name, int body, const V3<double>& pos, const V4<double>& quat) {
+             return SiteDef{name, body, {pos, quat}};
+           }),
+           py::kw_only(), py::arg("name"), py::arg("body"), py::arg("pos"), py::arg("quat"))
+      .def_readonly("name", &SiteDef::name)
+      .def_readonly("body", &SiteDef::body)
+      .def_property_readonly("pos", [](const SiteDef& site) { return site.pose.pos; })
+      .def_property_readonly("quat", [](const SiteDef& site) { return site.pose.quat; });
+  module.def(
+      "site_poses",
+      [](const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
+        const py::ssize_t rows = checked_rows(m, sites, params, q);
+        py::array_t<double> poses(Dimensions{rows, static_cast<py::ssize_t>(sites.size()), 7});
+        site_poses(m, sites, params.data(), q.data(), static_cast<int>(rows), poses.mutable_data());
+        return poses;
+      },
+      py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"),
+      "Poses (rows, sites, 7) at positions q (rows, nq) with parameters (rows, parameters).");
+  module.def(
+      "site_poses_vjp",
+      [](const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q,
+         const Array<double>& by_poses) {
+        const py::ssize_t rows = checked_rows(m, sites, params, q);
+        check_shape(by_poses, {rows, static_cast<py::ssize_t>(sites.size()), 7}, "by_poses");
+        py::array_t<double> by_q(Dimensions{rows, m.nq});
+        std::fill_n(by_q.mutable_data(), by_q.size(), 0.0);
+        site_poses_vjp(m, sites, params.data(), q.data(), static_cast<int>(rows), by_poses.data(), by_q.mutable_data());
+        return by_q;
+      },
+      py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"), py::arg("by_poses"),
+      "Gradient (rows, nq) from the gradient with respect to the poses (rows, sites, 7).");
+}
+
+}  // namespace gelflow
