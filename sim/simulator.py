@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
+from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
 
@@ -134,7 +135,10 @@ class Simulator:
         not move until `reset`. Raises UsageError when a control or the state is not finite.
         """
         try:
-            self._batch.step(self._controls(u), steps, self._mask("active", active))
+            if active is None:  # the usual case, without the cost of a mask
+                self._batch.step(self._controls(u), steps)
+            else:
+                self._batch.step(self._controls(u), steps, self._mask("active", active))
         except ValueError as error:
             raise UsageError(str(error)) from None
 
@@ -187,7 +191,7 @@ class Simulator:
         those environments are read; the others keep their values in the array. With a `reduction` the result is (N,
         rows): `out`, or a new array.
         """
-        mask = self._mask("active", active)
+        mask = None if active is None else self._mask("active", active)
         if reduction is not None:
             target = np.zeros((self.num_envs, len(reduction.names)), self.dtype) if out is None else out
             self._checked(self._batch.reduced_tactile, reduction.core, target, mask)
@@ -207,22 +211,7 @@ class Simulator:
         `Trajectory.tactile`. For a torch tensor the result is a tensor and differentiable. Raises UsageError when a pad
         of the scene has no gel.
         """
-        pads = getattr(self.scene, "pads", ())
-        if not pads:
-            raise UsageError("displacement needs a scene with pads")
-        if without_gel := [pad.name for pad in pads if pad.gel is None]:
-            raise UsageError(f"pad {without_gel[0]!r} has no gel; give pads.{without_gel[0]}.gel in the scene")
-        values = self.tactile() if forces is None else forces
-        if not hasattr(values, "requires_grad"):
-            values = np.asarray(values, self.dtype)
-        if values.ndim < 2 or tuple(values.shape[-2:]) != (self.model.num_markers, 3):
-            raise UsageError(f"forces must have shape (…, {self.model.num_markers}, 3), got {tuple(values.shape)}")
-        displacements = [pad.gel.displacement(values[..., self.marker_slice(pad.name), :]) for pad in pads]
-        if isinstance(values, np.ndarray):
-            return np.concatenate(displacements, axis=-2)
-        import torch  # deferred: only tensors need torch
-
-        return torch.cat(displacements, dim=-2)
+        return marker_displacement(self.scene, self.tactile() if forces is None else forces, self.dtype)
 
     def marker_slice(self, name: str) -> slice:
         """Slice of the marker axis that belongs to one pad."""
@@ -322,11 +311,12 @@ class Simulator:
             out.check_reusable(controls.shape, tactile_shape)
         mask = self._mask("active", active)
 
+        empty = np.empty if mask is None else np.zeros
         start = {"q": q, "v": v, "anchors": anchors, "anchored": anchored, "history": history}
         result = Trajectory(
             **{name: self._along_time(name, value, steps, out) for name, value in start.items()},
             u=controls,
-            tactile=np.zeros(tactile_shape, self.dtype) if out is None else out.tactile,
+            tactile=out.tactile if out is not None else empty(tactile_shape, self.dtype),
             read_after=np.asarray(read_after, dtype=np.int32),
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),
