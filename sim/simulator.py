@@ -291,11 +291,9 @@ class Simulator:
         q, v, anchors, anchored, history: initial state; those of the simulator by default
         read_after: numbers of steps after which marker forces are read (0 is the start)
         reduction: record this function of the marker forces instead of the forces
-        active: mask (N,) of the environments that move; the others rest: they keep their state, cost nothing, and have
-            readings of zero, or with `out` those in `out`
+        active: mask (N,); the others rest, cost nothing, and have readings of zero, or with `out` those in `out`
         stop: stops environments on touch
-        out: an earlier trajectory of the same shape whose arrays are overwritten, which saves the allocation of large
-            arrays
+        out: an earlier trajectory of the same shape whose arrays are overwritten, which saves their allocation
 
         Raises UsageError for wrong shapes and for values that are not finite.
         """
