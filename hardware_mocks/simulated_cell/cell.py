@@ -19,17 +19,20 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
-from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside, lower_face_corners
+from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside
 from gelflow.hardware_mocks.simulated_cell.progress import Progress, ProgressMonitor
-from gelflow.hardware_mocks.simulated_cell.world import PART_SIZE, Friction, Gels, World
+from gelflow.hardware_mocks.simulated_cell.world import Friction, Gels, World, training_world
 from gelflow.observation import Grid, resampling_weights
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.parts import part_geometry, with_part
 from gelflow.task import INSERTION, InsertionTask
 from gelflow.time_sync import MAX_LEAD, MIN_WAIT, SIMULATED_CELL
 
 Array = NDArray[np.float64]
 _PARKED_POSE = np.array([0.0, 0.5, 1.0, 1.0, 0.0, 0.0, 0.0])  # of a part that is not in use [m], w x y z
+_LOAD_ABOVE_RIM = 7e-3  # of a presented part's lower face [m]
+_OPENING = 25e-3  # of the open fingers beyond the part [m]
 _TRUTH_PERIOD = 0.016  # of measurements of a gripped part's slip [s]
 _AT_REST = (2e-5, math.radians(0.02))  # largest motion of a tool at rest [m, rad]
 
@@ -48,6 +51,7 @@ class SimulatedCellConfig:
     start_width: float = 0.060  # between the fingers [m]
     seed: int = 0  # of the first part; incremented for each further part
     preset: str | None = None  # of the insertion scene, except for its step: see `preset_config`
+    task: InsertionTask = INSERTION
 
     def __post_init__(self) -> None:
         if not 0 < self.step <= 4e-3 or abs(4e-3 / self.step - round(4e-3 / self.step)) > 1e-9:
@@ -70,12 +74,22 @@ class SimulatedCellConfig:
         return pose.position, pose.quaternion
 
 
-def preset_config(preset: str | None, *, seed: int, world: World | None = None) -> SimulatedCellConfig:
+def preset_config(
+    preset: str | None, *, seed: int, world: World | None = None, task: InsertionTask = INSERTION
+) -> SimulatedCellConfig:
     """The cell with a preset of the insertion scene; its step is the longest that divides 4 ms and is not longer.
 
-    Raises UsageError when there is no such preset.
+    Heights and widths follow from the task's part. Raises UsageError when there is no such preset.
     """
-    config = SimulatedCellConfig(seed=seed, world=world or World())
+    part = task.part
+    config = SimulatedCellConfig(
+        seed=seed,
+        world=world or training_world(part),
+        grasp_height=round(part.size[2] / 2 + float(np.clip(0.0, *part.grasp_height)), 9),
+        load_height=round(part.depth + _LOAD_ABOVE_RIM, 9),
+        start_width=round(part.grasp_width + _OPENING, 9),
+        task=task,
+    )
     if preset is None:
         return config
     step = load_scene("insertion", preset=preset).step
@@ -85,14 +99,17 @@ def preset_config(preset: str | None, *, seed: int, world: World | None = None) 
 class SimulatedCell:
     """The simulated cell. All plant methods may be called from any thread."""
 
-    def __init__(
-        self, clock: ScaledClock, config: SimulatedCellConfig | None = None, *, task: InsertionTask = INSERTION
-    ) -> None:
+    def __init__(self, clock: ScaledClock, config: SimulatedCellConfig | None = None) -> None:
         self.config = config = config or SimulatedCellConfig()
-        self._clock, self._task = clock, task
+        self._clock, self._task = clock, config.task
+        part = replace(config.task.part, clearance=config.world.hole.clearance)
+        self._geometry = part_geometry(part)
+        # The walls of a box's hole are moved by `CellPhysics`.
+        with_hole = config.task.part if part.shape == "box" else part
         scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
+        scene = with_part(scene, with_hole)
         self._sim = sim = Simulator(scene, threads=1)
-        self._physics = CellPhysics(sim, config.world)
+        self._physics = CellPhysics(sim, config.world, self._geometry.hole)
         self._arm = [sim.joint_q(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         self._part = sim.joint_q("part")
         self._part_v = sim.joint_v("part")
@@ -102,7 +119,7 @@ class SimulatedCell:
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         sim.reset()
         sim.q[0] = scene.q0
-        self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=PART_SIZE[0])
+        self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=part.grasp_width)
         self._lock = threading.Lock()
         self._time = clock.now()
         self._still_since = self._time
@@ -113,7 +130,7 @@ class SimulatedCell:
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
         self._slip: SlipMonitor | None = None  # while a part is gripped
-        self._progress = ProgressMonitor(task)
+        self._progress = ProgressMonitor(config.task)
         self._taught_to_base = config.taught_hole.inverse()
         self._height = 0.0  # of the gripper's lower face above the taught hole [m]
         self._truth_due = 0.0  # time of its next measurement [s]
@@ -288,7 +305,7 @@ class SimulatedCell:
 
     def _ready_to_load(self) -> bool:
         """Whether the fingers are open and the arm is at rest at the hand-over pose."""
-        open_wide = self._gripper.width() > PART_SIZE[0] + 0.005
+        open_wide = self._gripper.width() > self._geometry.part.grasp_width + 0.005
         there = self._tool.is_near(self._start, 1e-3, math.radians(1.0))
         return open_wide and there and self._time - self._still_since > 0.3
 
@@ -300,7 +317,12 @@ class SimulatedCell:
         self._to_scene = misaligned @ self._hole_to_base
         self._reset_arm()
         gx, gy, gz, turn = self._in_scene()
-        z = gz - self.config.grasp_height + PART_SIZE[2] / 2 + rng.uniform(-1, 1) * self.config.height_error
+        z = (
+            gz
+            - self.config.grasp_height
+            + self._geometry.part.size[2] / 2
+            + rng.uniform(-1, 1) * self.config.height_error
+        )
         self._held_pose = np.array([gx, gy, z, *yaw_quaternion(turn)])
         self._hold_part()
         self._sim.clear_history()
@@ -330,10 +352,10 @@ class SimulatedCell:
         if part.phase == "released":
             return
         pose = self._part_pose()
-        corners = lower_face_corners(pose)
+        corners = pose.apply(self._geometry.lower_face)
         part.x, part.y = float(pose.position[0]), float(pose.position[1])
         part.yaw, part.height = pose.yaw, float(corners[:, 2].max())
         slip = self._gripper_pose().inverse() @ pose
         part.slip = float(slip.position[0]), float(slip.position[1]), slip.yaw
-        inside = is_inside(corners, self.config.world.hole.half_opening)
+        inside = is_inside(corners, self._geometry.hole)
         part.inserted = part.phase == "gripped" and inside and part.height < self._task.success_height

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from gelflow.hardware_mocks.simulated_cell.world import World
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.parts import Outline, Rectangle
 
 _SIDES = ("left", "right")
 _STIFFNESSES = ("kn", "ks", "kt", "kd")  # contact parameters that are proportional to the stiffness of a surface
@@ -15,8 +16,10 @@ _INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 class CellPhysics:
     """The physical parameters of one simulator. The caller holds the cell's lock."""
 
-    def __init__(self, sim: Simulator, world: World) -> None:
+    def __init__(self, sim: Simulator, world: World, hole: Outline) -> None:
         self._sim = sim
+        self._hole = hole
+        self._hole_contacts = [name for name in sim.model.contact_names if name.startswith("part_hole")]
         self._nominal: dict[str, float] = {}  # values of the scene file, by parameter
         self.gel_compliance: NDArray[np.float64] = np.ones(2)  # of the left and right gel, relative to the scene's
         self.world = world
@@ -29,11 +32,13 @@ class CellPhysics:
             for surface in (f"pad_{side}", side):
                 self._scale_contact(surface, stiffness, world.friction.pads)
         self.gel_compliance = 1 / np.array([world.gels.left, world.gels.right])
-        opening = dict(zip("xy", world.hole.half_opening, strict=True))
-        for wall, (axis, sign) in _WALLS.items():
-            half = float(self._sim.param(f"{wall}.size.{axis}")[0])
-            self._set(f"{wall}.shape.pos.{axis}", sign * (half + opening[axis]))
-            self._scale_contact(f"part_hole/{wall}", world.hole.stiffness, world.friction.hole)
+        if isinstance(self._hole, Rectangle):
+            opening = dict(zip("xy", self._hole.half, strict=True))
+            for wall, (axis, sign) in _WALLS.items():
+                half = float(self._sim.param(f"{wall}.size.{axis}")[0])
+                self._set(f"{wall}.shape.pos.{axis}", sign * (half + opening[axis]))
+        for contact in self._hole_contacts:
+            self._scale_contact(contact, world.hole.stiffness, world.friction.hole)
         self._scale_contact("part_floor", world.hole.stiffness, world.friction.floor)
         for name in ("part.mass", *(f"part.inertia.{axes}" for axes in _INERTIA)):
             self._scale(name, world.part.mass / self._scene_value("part.mass"))

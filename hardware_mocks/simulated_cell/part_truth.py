@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import Pose
-from gelflow.hardware_mocks.simulated_cell.world import PART_SIZE
+from gelflow.sim.tasks.parts import Outline
 
 Array = NDArray[np.float64]
 
@@ -35,15 +35,9 @@ class PartTruth:
     largest_force: float = 0.0  # of hole and floor on the part while it was held [N]
 
 
-def lower_face_corners(part: Pose) -> Array:
-    """Corners of the part's lower face in the frame of `part`'s pose [m], shape (4, 3)."""
-    x, y, z = (size / 2 for size in PART_SIZE)
-    return part.apply(np.array([[i * x, j * y, -z] for i in (-1, 1) for j in (-1, 1)]))
-
-
-def is_inside(corners: Array, half_opening: tuple[float, float]) -> bool:
-    """Whether corners in the hole frame [m] are within the opening of the hole."""
-    return bool((np.abs(corners[:, :2]) < np.array(half_opening) + _INTO_WALL).all())
+def is_inside(corners: Array, hole: Outline) -> bool:
+    """Whether corners of the lower face in the hole frame (n, 3) [m] are within the outline of the hole."""
+    return bool((hole.distance(corners[:, :2]) < _INTO_WALL).all())
 
 
 class SlipMonitor:

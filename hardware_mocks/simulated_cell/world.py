@@ -15,13 +15,15 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.observation import Grid
+from gelflow.part import CUBOID
+from gelflow.part import Part as TrainedPart
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.lens import Lens
+from gelflow.sim.tasks.parts import part_geometry
 from gelflow.toml_tables import TomlTable, read_toml
 
 FORMAT = 1
-PART_SIZE = (0.035, 0.050, 0.060)  # of the part: between the pads, along them, height [m]
-_LARGEST_OPENING = 0.070  # of the hole: the walls of the scene must still support a part beside it [m]
+_LARGEST_CLEARANCE = 0.020  # of the hole: its walls must still support a part beside it [m]
 
 
 def _check(table: object, limits: dict[str, tuple[float, float]]) -> None:
@@ -63,13 +65,8 @@ class Hole:
 
     def __post_init__(self) -> None:
         _check(self, {"stiffness": (0.02, 50)})
-        if not all(c > 0 and size + c <= _LARGEST_OPENING for c, size in zip(self.clearance, PART_SIZE, strict=False)):
+        if not all(0 < c <= _LARGEST_CLEARANCE for c in self.clearance):
             raise UsageError(f"clearance must be above 0 and a few millimetres, got {self.clearance} m")
-
-    @property
-    def half_opening(self) -> tuple[float, float]:
-        """Half the opening along x and y [m]."""
-        return (PART_SIZE[0] + self.clearance[0]) / 2, (PART_SIZE[1] + self.clearance[1]) / 2
 
 
 @dataclass(frozen=True)
@@ -193,12 +190,22 @@ class World:
         return self.left_camera, self.right_camera
 
 
-def load_world(path: Path) -> World:
-    """Read a world from TOML. Raises UsageError on unknown keys and values out of range, naming the known ones."""
-    return world_from_tables(read_toml(path), str(path))
+def training_world(part: TrainedPart) -> World:
+    """The world in which policies for `part` are trained."""
+    if part == CUBOID:
+        return World()
+    return World(hole=Hole(clearance=part.clearance), part=Part(mass=part_geometry(part).mass))
 
 
-def world_from_tables(tables: dict[str, Any], location: str) -> World:
+def load_world(path: Path, part: TrainedPart = CUBOID) -> World:
+    """Read a world from TOML; without a value, hole and mass are those of `part`.
+
+    Raises UsageError on unknown keys and values out of range, naming the known ones.
+    """
+    return world_from_tables(read_toml(path), str(path), part)
+
+
+def world_from_tables(tables: dict[str, Any], location: str, part: TrainedPart = CUBOID) -> World:
     """A world from the tables of a TOML file at `location`; the table `cameras` holds for both cameras."""
     if tables.get("format", FORMAT) != FORMAT:
         raise UsageError(f"{location}: format must be {FORMAT}, got {tables['format']!r}")
@@ -208,6 +215,10 @@ def world_from_tables(tables: dict[str, Any], location: str) -> World:
     both = TomlTable(tables, location).table("cameras").data
     for name in ("left_camera", "right_camera"):
         merged[name] = {**both, **TomlTable(tables, location).table(name).data}
+    if part != CUBOID:
+        world = training_world(part)
+        for name, key, value in (("hole", "clearance", list(part.clearance)), ("part", "mass", world.part.mass)):
+            merged[name] = {key: value, **TomlTable(tables, location).table(name).data}
     return TomlTable(merged, location).as_dataclass(World)
 
 

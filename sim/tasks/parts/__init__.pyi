@@ -1,6 +1,7 @@
 from .geometry import PartGeometry as PartGeometry
 from .geometry import part_geometry as part_geometry
 from .outline import Outline as Outline
+from .outline import Rectangle as Rectangle
 from .part_file import load_part as load_part
 from .part_file import part_names as part_names
 from .part_scene import with_part as with_part
@@ -8,6 +9,7 @@ from .part_scene import with_part as with_part
 __all__ = [
     "Outline",
     "PartGeometry",
+    "Rectangle",
     "load_part",
     "part_geometry",
     "part_names",

@@ -32,6 +32,16 @@ class PartGeometry(ABC):
     def outline(self) -> Outline:
         """Outline of what enters the hole."""
 
+    @property
+    @abstractmethod
+    def volume(self) -> float:
+        """Volume [m³]."""
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return float(self.volume * self.part.density)
+
     @abstractmethod
     def body(self, body: BodyDef) -> BodyDef:
         """`body` with the mass and inertia of the part."""
@@ -72,10 +82,19 @@ class Box(PartGeometry):
     def outline(self) -> Outline:
         return Rectangle((float(self.half[0]), float(self.half[1])))
 
+    @property
+    def hole(self) -> Rectangle:
+        x, y = ((size + gap) / 2 for size, gap in zip(self.part.size, self.part.clearance, strict=False))
+        return Rectangle((x, y))
+
+    @property
+    def volume(self) -> float:
+        x, y, z = self.part.size
+        return x * y * z
+
     def body(self, body: BodyDef) -> BodyDef:
         x, y, z = self.part.size
-        mass = x * y * z * self.part.density
-        return _with_inertia(body, mass, mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
+        return _with_inertia(body, self.mass, self.mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y]))
 
     def shape(self, shape: ShapeDef) -> ShapeDef:
         return replace(shape, kind="box", size=self.half)
@@ -97,11 +116,14 @@ class Cylinder(PartGeometry):
     def outline(self) -> Outline:
         return Circle(float(self.half[0]))
 
+    @property
+    def volume(self) -> float:
+        return float(np.pi * self.half[0] ** 2 * self.part.size[2])
+
     def body(self, body: BodyDef) -> BodyDef:
         radius, height = self.half[0], self.part.size[2]
-        mass = np.pi * radius**2 * height * self.part.density
-        across = mass * (3 * radius**2 + height**2) / 12
-        return _with_inertia(body, mass, np.array([across, across, mass * radius**2 / 2]))
+        across = self.mass * (3 * radius**2 + height**2) / 12
+        return _with_inertia(body, self.mass, np.array([across, across, self.mass * radius**2 / 2]))
 
     def shape(self, shape: ShapeDef) -> ShapeDef:
         return replace(shape, kind="cylinder", size=np.array([self.half[0], self.half[2], 0.0]))

@@ -31,8 +31,8 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
         gripper=lab.GripperSettings(
             address=robot.gripper.addresses[0],
             grasp_force=12.0,
-            part_width=0.035,
-            open_width=0.06,
+            part_width=cell.task.part.grasp_width,
+            open_width=cell.start_width,
             speed=0.05,
             home_at_start=True,
         ),

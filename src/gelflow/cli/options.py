@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from gelflow.errors import UsageError
+from gelflow.part import CUBOID
 from gelflow.task import INSERTION, InsertionTask
 
 
@@ -69,6 +70,23 @@ def part_task(part: str | None) -> InsertionTask:
     from gelflow.sim.tasks.parts import load_part
 
     return load_part(part)
+
+
+def checkpoint_for(task: InsertionTask, given: Path | None) -> Path:
+    """The checkpoint `given` by `--checkpoint`, else the one of the task's part that comes with gelflow.
+
+    Raises UsageError when none comes with gelflow.
+    """
+    from gelflow.policies.checkpoint import default_checkpoint
+
+    default = default_checkpoint()
+    path = given or (default if task.part == CUBOID else default.with_name(f"{task.part.name}.safetensors"))
+    if given is None and not path.exists():
+        raise UsageError(
+            f"no policy for part {task.part.name!r} comes with gelflow; train one with gelflow train insertion --part, "
+            "then give --checkpoint"
+        )
+    return path
 
 
 def check_at_least(args: argparse.Namespace, **limits: int) -> None:

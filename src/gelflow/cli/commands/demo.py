@@ -17,15 +17,18 @@ from gelflow.cli.options import (
     add_checkpoint,
     add_json,
     add_out,
+    add_part,
     add_preset,
     add_quick,
     add_seed,
     check_at_least,
+    checkpoint_for,
+    part_task,
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
-from gelflow.task import INSERTION
+from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
@@ -42,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--insertions", type=int, default=5, metavar="N", help="number of parts (default %(default)s)")
     parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
     parser.add_argument("--no-real-time", action="store_true", help="omit the last insertion, which runs at factor 1")
+    add_part(parser)
     add_checkpoint(parser)
     add_quick(parser)
     add_seed(parser, default=1)
@@ -52,24 +56,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Insert the parts, show the results, and compare with the same policy in simulation."""
-    from gelflow.policies.checkpoint import default_checkpoint, load_policy
+    from gelflow.policies.checkpoint import load_policy
 
     check_at_least(args, insertions=1, seed=0)
     # With the default of 5 ms a computing thread delays the threads of gripper and cameras.
     sys.setswitchinterval(5e-4)
     output = Output(args.json)
-    checkpoint = args.checkpoint or default_checkpoint()
-    policy = load_policy(checkpoint, task=INSERTION)
+    task = part_task(args.part)
+    checkpoint = checkpoint_for(task, args.checkpoint)
+    policy = load_policy(checkpoint, task=task)
     _clear(args.out)
     count = 1 if args.quick else args.insertions
     plan = _Series(
-        policy, checkpoint, args.out, count=count, factor=args.factor, seed=args.seed, preset=args.preset,
+        policy, task, args.part, checkpoint, args.out,
+        count=count, factor=args.factor, seed=args.seed, preset=args.preset,
         title=f"Insertions with the mock robot at {args.factor:g} times real time",
     )  # fmt: skip
     results = [_run_series(output, plan)]
     if not (args.no_real_time or args.quick) and results[0].error is None:
         plan = _Series(
-            policy, checkpoint, args.out, count=1, factor=1.0, seed=args.seed + count, preset=args.preset,
+            policy, task, args.part, checkpoint, args.out,
+            count=1, factor=1.0, seed=args.seed + count, preset=args.preset,
             title="One more in real time (factor 1)", name="session-real-time", pictures="insertion-real-time",
         )  # fmt: skip
         results.append(_run_series(output, plan))
@@ -79,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     output.text(
         f"inserted: {robot} of {parts} as measured by the robot, {truth} of {parts} in truth; {first.wall:.0f} s."
     )
-    evaluations = [] if args.quick else _in_simulation(output, policy, preset=args.preset)
+    evaluations = [] if args.quick else _in_simulation(output, policy, task, preset=args.preset)
     session = args.out / "session.mcap"
     output.text(f"pictures of what the policy saw: {args.out}/insertion-*.png")
     output.text(f"the session is {session}; recompute its decisions with:")
@@ -96,6 +103,8 @@ class _Series:
     """Insertions with one mock robot, recorded in one session."""
 
     policy: "NetworkPolicy"
+    task: InsertionTask
+    part: str | None  # as --part names it
     checkpoint: Path
     out: Path
     count: int
@@ -147,7 +156,8 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
     begun = time.monotonic()
-    with mock_robot(factor=series.factor, seed=series.seed, preset=series.preset) as (lab_path, truth_url):
+    robot = mock_robot(factor=series.factor, seed=series.seed, preset=series.preset, part=series.part)
+    with robot as (lab_path, truth_url):
         lab = load_lab(lab_path)
         output.console.print(f"[bold]{series.title}[/]")
         output.text(f"{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
@@ -156,7 +166,7 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
         plan = RunPlan(
             lab=lab,
             policy=series.policy,
-            task=INSERTION,
+            task=series.task,
             session=series.out / f"{series.name}.mcap",
             checkpoint=series.checkpoint,
             insertions=series.count,
@@ -187,7 +197,7 @@ def _draw(result: _SeriesResult, lab: "Lab", series: _Series) -> None:
 
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
     for insertion, _ in result.insertions:
-        draw_insertion(insertion, mounts, INSERTION, series.out / f"{series.pictures}-{insertion.number + 1}.png")
+        draw_insertion(insertion, mounts, series.task, series.out / f"{series.pictures}-{insertion.number + 1}.png")
 
 
 def _table(result: _SeriesResult, title: str) -> Table:
@@ -213,12 +223,14 @@ def _table(result: _SeriesResult, title: str) -> Table:
     return view
 
 
-def _in_simulation(output: Output, policy: "NetworkPolicy", *, preset: str | None) -> "list[EvaluationResult]":
+def _in_simulation(
+    output: Output, policy: "NetworkPolicy", task: InsertionTask, *, preset: str | None
+) -> "list[EvaluationResult]":
     """Success in simulation without protocols and cameras, of the policy and of random corrections."""
     from gelflow.policies.environment import make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 
-    env = make_insertion_env(_EPISODES, preset=preset)
+    env = make_insertion_env(_EPISODES, preset=preset, task=task)
     actors: dict[str, NetworkActor | RandomActor] = {
         "policy": NetworkActor(policy.network, _EPISODES),
         "random": RandomActor(policy.network.reach, _EPISODES, 0),

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_part, add_preset, add_seed, check_at_least, part_task
+from gelflow.cli.options import (
+    add_checkpoint,
+    add_json,
+    add_part,
+    add_preset,
+    add_seed,
+    check_at_least,
+    checkpoint_for,
+    part_task,
+)
 from gelflow.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
@@ -30,9 +39,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Evaluate the policy and random actions, then print a table."""
     check_at_least(args, envs=1, episodes=1, seed=0)
-    from gelflow.policies.checkpoint import default_checkpoint, load_policy
+    from gelflow.policies.checkpoint import load_policy
 
-    path, task = args.checkpoint or default_checkpoint(), part_task(args.part)
+    task = part_task(args.part)
+    path = checkpoint_for(task, args.checkpoint)
     network = load_policy(path, task=task).network
     from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
     from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_preset, add_seed, check_at_least
+from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time limits of the lab file: those of a robot plus S seconds (default: twelve times as long)",
     )
+    add_part(parser)
     parser.add_argument("--attached", action="store_true", help="end when standard input is closed")
     add_seed(parser)
     add_preset(parser)
@@ -56,13 +57,14 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.hardware_mocks.faults.plan_file import load_plan
     from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
     from gelflow.hardware_mocks.simulated_cell.cell import preset_config
-    from gelflow.hardware_mocks.simulated_cell.world import World, load_world
+    from gelflow.hardware_mocks.simulated_cell.world import load_world
     from gelflow.real.runner.lab_file import save_lab
 
     check_at_least(args, seed=0, jitter=0)
-    world = load_world(args.world) if args.world is not None else World()
+    task = part_task(args.part)
+    world = load_world(args.world, task.part) if args.world is not None else None
     config = MockRobotConfig(
-        cell=preset_config(args.preset, seed=args.seed, world=world),
+        cell=preset_config(args.preset, seed=args.seed, world=world, task=task),
         egm_port=args.egm_port,
         tcp_port=args.tcp_port,
         truth_port=args.truth_port,

@@ -17,13 +17,12 @@ from gelflow.cli.insertion_text import (
     insertion_to_json,
     preflight_table,
 )
-from gelflow.cli.options import add_checkpoint, add_json, add_out, check_at_least
+from gelflow.cli.options import add_checkpoint, add_json, add_out, add_part, check_at_least, checkpoint_for, part_task
 from gelflow.cli.output import Output
 from gelflow.cli.prompt import read_line
 from gelflow.cli.way_out import way_out
 from gelflow.errors import GelflowError
 from gelflow.interrupts import interruptible
-from gelflow.task import INSERTION
 
 if TYPE_CHECKING:
     from gelflow.real.runner.motion_executor import MotionExecutor
@@ -35,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=("insertion",), help="task to run")
     parser.add_argument("--lab", type=Path, required=True, metavar="FILE", help="lab file (docs/guide/robot.md)")
+    add_part(parser)
     add_checkpoint(parser)
     parser.add_argument("--insertions", type=int, default=1, metavar="N", help="number of parts (default %(default)s)")
     parser.add_argument("--dry-run", action="store_true", help="connect, check and read; send no motion")
@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the insertions and print each attempt. A negative result: a part was not inserted."""
-    from gelflow.policies.checkpoint import default_checkpoint, load_policy
+    from gelflow.policies.checkpoint import load_policy
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
@@ -53,15 +53,16 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(5e-4)
     output = Output(args.json)
     lab = load_lab(args.lab)
-    checkpoint = args.checkpoint or default_checkpoint()
-    policy = load_policy(checkpoint, task=INSERTION)
+    task = part_task(args.part)
+    checkpoint = checkpoint_for(task, args.checkpoint)
+    policy = load_policy(checkpoint, task=task)
     out = args.out or Path("sessions") / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     session = out / "session.mcap"
     warnings: list[str] = []
     plan = RunPlan(
         lab=lab,
         policy=policy,
-        task=INSERTION,
+        task=task,
         session=session,
         checkpoint=checkpoint,
         insertions=args.insertions,
