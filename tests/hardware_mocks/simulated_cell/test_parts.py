@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.hardware_mocks.simulated_cell.harness import aligned_pose, go
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
@@ -12,7 +13,6 @@ from gelflow.hardware_mocks.simulated_cell.world import World, load_world, train
 from gelflow.session.records import from_plain, to_plain
 from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
-from tests.hardware_mocks.simulated_cell.harness import aligned_pose, go
 
 PEG = load_part("peg")
 
