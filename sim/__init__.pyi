@@ -18,6 +18,7 @@ from .tasks.randomization import Randomization as Randomization
 from .torch_layer import TorchRollout as TorchRollout
 from .torch_layer import TorchState as TorchState
 from .torch_layer import torch_rollout as torch_rollout
+from .torch_layer import torch_site_poses as torch_site_poses
 from .torch_layer import torch_state as torch_state
 from .torch_layer import torch_step as torch_step
 from .trajectory import TouchStop as TouchStop
@@ -52,6 +53,7 @@ __all__ = [
     "scene_names",
     "shear_features",
     "torch_rollout",
+    "torch_site_poses",
     "torch_state",
     "torch_step",
 ]

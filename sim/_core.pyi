@@ -356,6 +356,23 @@ class Model:
     def pad_markers(self) -> list[tuple[int, int]]: ...  # first marker and count
     def distance(self, shape: str, points: ArrayLike) -> tuple[Floats, Floats, Floats]: ...
 
+class SiteDef:
+    """A named frame on a body."""
+
+    def __init__(self, *, name: str, body: int, pos: ArrayLike, quat: ArrayLike) -> None: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def body(self) -> int: ...  # -1: the world
+    @property
+    def pos(self) -> Floats: ...  # (3,), in the body frame [m]
+    @property
+    def quat(self) -> Floats: ...  # (4,)
+
+# Positions q (rows, nq) of N environments, one after the other; params (N, parameters). Poses: (rows, sites, 7).
+def site_poses(model: Model, sites: list[SiteDef], params: Floats, q: Floats) -> Floats: ...
+def site_poses_vjp(model: Model, sites: list[SiteDef], params: Floats, q: Floats, by_poses: Floats) -> Floats: ...
+
 _Scalar = TypeVar("_Scalar", np.float64, np.float32)
 
 class TactileReduction:

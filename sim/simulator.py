@@ -12,6 +12,7 @@ from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import _core
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
+from gelflow.sim.site_poses import site_poses
 from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
 
 STATUS_MESSAGES = {
@@ -240,6 +241,15 @@ class Simulator:
         target = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype) if out is None else out
         self._batch.poses(target)
         return target
+
+    def site_poses(self, q: ArrayLike | None = None) -> NDArray[Any]:
+        """World poses of the sites, in the order of `Scene.sites`: (N, sites, 7), position [m] and quaternion w x y z.
+
+        At the present positions, or with another leading shape at `q` (…, N, nq), such as `Trajectory.q`. Raises
+        UsageError for a scene without sites. Differentiable: `torch_site_poses`.
+        """
+        poses = site_poses(self.scene, self.model, self.params, self.q if q is None else q)
+        return poses.astype(self.dtype, copy=False)
 
     def wrenches(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Contact wrenches on the first body of each contact, about the world origin, (N, contacts, 6).

@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 from gelflow.errors import UsageError
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.site_poses import site_poses, site_poses_vjp
 from gelflow.sim.trajectory import TouchStop, Trajectory
 
 
@@ -116,6 +117,28 @@ def torch_step(
     result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.num_markers else (), params=params)
     tactile = result.tactile[0] if sim.model.num_markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
+
+
+def torch_site_poses(sim: Simulator, q: torch.Tensor) -> torch.Tensor:
+    """World poses (…, N, sites, 7) of the sites at positions q (…, N, nq), such as `TorchRollout.q`.
+
+    Position [m] and quaternion w x y z, in the order of `Scene.sites`. Differentiable with respect to q; the parameters
+    are those of the simulator. Raises UsageError for wrong shapes and for a scene without sites.
+    """
+    return _SitePoses.apply(q, sim)  # type: ignore[no-untyped-call,no-any-return]
+
+
+class _SitePoses(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, q: torch.Tensor, sim: Simulator) -> torch.Tensor:
+        ctx.sim, ctx.params, ctx.q = sim, sim.params.copy(), q.detach().numpy().copy()
+        return torch.from_numpy(site_poses(sim.scene, sim.model, ctx.params, ctx.q)).to(q.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_poses: torch.Tensor) -> tuple[torch.Tensor, None]:
+        by_q = site_poses_vjp(ctx.sim.scene, ctx.sim.model, ctx.params, ctx.q, by_poses.numpy())
+        return torch.from_numpy(by_q).to(by_poses.dtype), None
 
 
 class _Rollout(torch.autograd.Function):

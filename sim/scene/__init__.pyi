@@ -17,6 +17,7 @@ from .mjcf.actuators import ActuatorDef as ActuatorDef
 from .mjcf.mechanics import WORLD as WORLD
 from .mjcf.mechanics import BodyDef as BodyDef
 from .mjcf.mechanics import JointDef as JointDef
+from .mjcf.mechanics import SiteDef as SiteDef
 from .pads import PadDef as PadDef
 from .presets import PRESET_NAMES as PRESET_NAMES
 from .scene import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
@@ -45,6 +46,7 @@ __all__ = [
     "Precision",
     "Scene",
     "ShapeDef",
+    "SiteDef",
     "SpringGel",
     "TriangleMesh",
     "distance_grid",

@@ -10,7 +10,7 @@ from typing import Any, cast
 from gelflow.errors import UsageError
 from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points
 from gelflow.sim.scene.joint_limits import read_limits
-from gelflow.sim.scene.mjcf.mechanics import read_mechanics
+from gelflow.sim.scene.mjcf.mechanics import SiteDef, read_mechanics
 from gelflow.sim.scene.pads import read_pads
 from gelflow.sim.scene.presets import Presets, apply_preset, read_presets
 from gelflow.sim.scene.scene import DEFAULT_TOLERANCE, Precision, Scene
@@ -94,6 +94,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
         points=tuple(p for p in points.values() if p.name in point_names),
         contacts=contacts,
         pads=pads,
+        sites=tuple(SiteDef(name, body, pose) for name, (body, pose) in mechanics.sites.items()),
         q0=mechanics.q0,
         not_modelled=(*mechanics.not_modelled, *unused_geoms, *unused_points),
         presets=presets,

@@ -13,7 +13,7 @@ from gelflow.observation import Grid
 from gelflow.sim.scene.contacts import ContactDef, PointsDef
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef
-from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef
+from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef, SiteDef
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.toml_tables import suggestion
@@ -53,6 +53,7 @@ class Scene:
     points: tuple[PointsDef, ...] = ()
     contacts: tuple[ContactDef, ...] = ()
     pads: tuple[PadDef, ...] = ()
+    sites: tuple[SiteDef, ...] = ()  # in the order of the model file; in a URDF the link frames
     not_modelled: tuple[str, ...] = ()  # elements of the files without effect in the simulation, with the reason
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # name -> dotted key -> value
 
@@ -100,6 +101,10 @@ class Scene:
     def body(self, name: str) -> int:
         """The index of a moving body. Raises UsageError on an unknown name."""
         return _index("moving body", name, [body.name for body in self.bodies])
+
+    def site(self, name: str) -> int:
+        """The index of a site. Raises UsageError on an unknown name."""
+        return _index("site", name, [site.name for site in self.sites])
 
     def contact_names(self, contact: str) -> tuple[str, ...]:
         """Names in the model of a contact of the TOML file, one per shape. Raises UsageError on an unknown name."""

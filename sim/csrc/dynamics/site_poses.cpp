@@ -1,5 +1,7 @@
 #include "dynamics/site_poses.hpp"
 
+#include <algorithm>
+
 #include "dynamics/kinematics.hpp"
 
 namespace gelflow {
@@ -22,28 +24,36 @@ SitePose site_pose(const SiteDef& site, const Workspace<double>& w) {
   return {position, {turn.w(), turn.x(), turn.y(), turn.z()}};
 }
 
+// Computes the kinematics of each row and calls visit(q of the row, row).
+template <class Visit>
+void for_rows(const Model& m, const SiteRows& at, Workspace<double>& w, Visit&& visit) {
+  for (int row = 0; row < at.rows; ++row) {
+    const double* const q = at.q + static_cast<std::ptrdiff_t>(row) * m.nq;
+    const std::size_t environment = row % at.environments;
+    forward_positions<double>(m, at.params + environment * m.param_names.size(), q, w);
+    visit(q, row);
+  }
+}
+
 }  // namespace
 
-void site_poses(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
-                double* poses) {
+void site_poses(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, double* poses) {
   Workspace<double> w(m);
-  for (int row = 0; row < rows; ++row, q += m.nq, params += m.param_names.size()) {
-    forward_positions<double>(m, params, q, w);
+  for_rows(m, at, w, [&](const double*, int) {
     for (const SiteDef& site : sites) {
       const SitePose pose = site_pose(site, w);
       poses = std::copy_n(pose.position.data(), 3, poses);
       poses = std::copy_n(pose.quaternion.data(), 4, poses);
     }
-  }
+  });
 }
 
 // A motion (ω, v) of the body, v at the world's origin, moves the site by v + ω × x and changes its quaternion Q by
 // ½ (0, ω) ⊗ Q. A gradient F by the position therefore acts like a force at x.
-void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
-                    const double* by_poses, double* by_q) {
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* by_poses,
+                    double* by_q) {
   Workspace<double> w(m);
-  for (int row = 0; row < rows; ++row, q += m.nq, by_q += m.nq, params += m.param_names.size()) {
-    forward_positions<double>(m, params, q, w);
+  for_rows(m, at, w, [&](const double* q, int row) {
     VX<double> by_tangent = VX<double>::Zero(m.nv);
     for (const SiteDef& site : sites) {
       const V3<double> by_position = vec3(by_poses);
@@ -61,8 +71,8 @@ void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const dou
         by_tangent[k] += w.axis[k].head<3>().dot(by_rotation) + w.axis[k].tail<3>().dot(by_position);
       }
     }
-    add_from_tangent<double>(m, q, by_tangent, by_q);
-  }
+    add_from_tangent<double>(m, q, by_tangent, by_q + static_cast<std::ptrdiff_t>(row) * m.nq);
+  });
 }
 
 }  // namespace gelflow

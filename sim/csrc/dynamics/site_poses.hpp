@@ -16,13 +16,19 @@ struct SiteDef {
   PoseDef pose;  // in the body frame
 };
 
-// `poses` (rows, sites, 7): position, quaternion; for positions q (rows, nq) and parameters (rows, parameters).
-void site_poses(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
-                double* poses);
+// Positions q (rows, nq) of N environments, one after the other: row i has the parameters of environment i % N.
+struct SiteRows {
+  const double* q;
+  const double* params;  // (N, parameters)
+  int rows, environments;
+};
+
+// `poses` (rows, sites, 7): position, quaternion.
+void site_poses(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, double* poses);
 
 // Adds to by_q (rows, nq) the gradient of a scalar with gradient `by_poses` (rows, sites, 7); for quaternions of q the
 // tangent gradient.
-void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const double* params, const double* q, int rows,
-                    const double* by_poses, double* by_q);
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* by_poses,
+                    double* by_q);
 
 }  // namespace gelflow

@@ -7,4 +7,5 @@ PYBIND11_MODULE(GELFLOW_CORE, module) {
   gelflow::bind_model(module);
   gelflow::bind_batches(module);
   gelflow::bind_directional(module);
+  gelflow::bind_sites(module);
 }

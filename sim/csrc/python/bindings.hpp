@@ -9,5 +9,6 @@ void bind_definitions(pybind11::module_& module);
 void bind_model(pybind11::module_& module);
 void bind_batches(pybind11::module_& module);
 void bind_directional(pybind11::module_& module);
+void bind_sites(pybind11::module_& module);
 
 }  // namespace gelflow

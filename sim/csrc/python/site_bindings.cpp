@@ -9,17 +9,18 @@ namespace {
 
 using Sites = std::vector<SiteDef>;
 
-// Checks the arrays of a call and returns its number of rows.
-py::ssize_t checked_rows(const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
-  const py::ssize_t rows = q.ndim() == 2 ? q.shape(0) : 0;
+// The rows of a call, after checks of its arrays.
+SiteRows checked(const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
+  const py::ssize_t rows = q.ndim() == 2 ? q.shape(0) : 0, n = params.ndim() == 2 ? params.shape(0) : 0;
   check_shape(q, {rows, m.nq}, "q");
-  check_shape(params, {rows, static_cast<py::ssize_t>(m.param_names.size())}, "params");
+  check_shape(params, {n, static_cast<py::ssize_t>(m.param_names.size())}, "params");
+  if (n == 0 || rows % n != 0) throw std::invalid_argument("q must have a multiple of the rows of params");
   for (const SiteDef& site : sites) {
     if (site.body < world || site.body >= static_cast<int>(m.bodies.size())) {
       throw std::invalid_argument("site '" + site.name + "' refers to body " + std::to_string(site.body));
     }
   }
-  return rows;
+  return {q.data(), params.data(), static_cast<int>(rows), static_cast<int>(n)};
 }
 
 }  // namespace
@@ -37,22 +38,22 @@ void bind_sites(py::module_& module) {
   module.def(
       "site_poses",
       [](const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
-        const py::ssize_t rows = checked_rows(m, sites, params, q);
-        py::array_t<double> poses(Dimensions{rows, static_cast<py::ssize_t>(sites.size()), 7});
-        site_poses(m, sites, params.data(), q.data(), static_cast<int>(rows), poses.mutable_data());
+        const SiteRows at = checked(m, sites, params, q);
+        py::array_t<double> poses(Dimensions{at.rows, static_cast<py::ssize_t>(sites.size()), 7});
+        site_poses(m, sites, at, poses.mutable_data());
         return poses;
       },
       py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"),
-      "Poses (rows, sites, 7) at positions q (rows, nq) with parameters (rows, parameters).");
+      "Poses (rows, sites, 7) at positions q (rows, nq) of N environments in turn, with parameters (N, parameters).");
   module.def(
       "site_poses_vjp",
       [](const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q,
          const Array<double>& by_poses) {
-        const py::ssize_t rows = checked_rows(m, sites, params, q);
-        check_shape(by_poses, {rows, static_cast<py::ssize_t>(sites.size()), 7}, "by_poses");
-        py::array_t<double> by_q(Dimensions{rows, m.nq});
+        const SiteRows at = checked(m, sites, params, q);
+        check_shape(by_poses, {at.rows, static_cast<py::ssize_t>(sites.size()), 7}, "by_poses");
+        py::array_t<double> by_q(Dimensions{at.rows, m.nq});
         std::fill_n(by_q.mutable_data(), by_q.size(), 0.0);
-        site_poses_vjp(m, sites, params.data(), q.data(), static_cast<int>(rows), by_poses.data(), by_q.mutable_data());
+        site_poses_vjp(m, sites, at, by_poses.data(), by_q.mutable_data());
         return by_q;
       },
       py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"), py::arg("by_poses"),

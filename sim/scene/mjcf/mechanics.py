@@ -36,6 +36,15 @@ class BodyDef:
 
 
 @dataclass(frozen=True)
+class SiteDef:
+    """A named frame on a body."""
+
+    name: str
+    body: int  # index of the moving body, or WORLD
+    pose: Pose  # in the body frame
+
+
+@dataclass(frozen=True)
 class JointDef:
     """A joint. Units are those of a slide joint; those of a hinge and ball joint have rad for m and N m for N."""
 
