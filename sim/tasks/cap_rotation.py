@@ -172,6 +172,12 @@ class CapRotation(ControlTask):
         self._thickness = 2 * cap.size[1]
         self._density = body.mass / (np.pi * cap.size[0] ** 2 * self._thickness)
 
+    @property
+    def quantities(self) -> dict[str, Array]:
+        """The randomized quantities of the present episodes, name → (N,)."""
+        names = ("center_x", "center_y", "radius", "damping")
+        return dict(zip(names, self.info["privileged"].T, strict=False))
+
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         check_options(self.description.name, options, _RESET_OPTIONS)
         sim, rows = self.sim, np.flatnonzero(which)

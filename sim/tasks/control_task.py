@@ -15,8 +15,6 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.task_batch import Array, Mask, TaskBatch
 from gelflow.task import TaskDescription
 
-_STATE = ("q", "v", "anchors", "anchored", "history", "status")
-
 
 def adapt_step(scene: Scene, period: float) -> Scene:
     """The scene with a step that divides the control period [s]: its own, or the next smaller one, with a warning."""
@@ -92,10 +90,7 @@ class ControlTask(TaskBatch):
 
     def _step(self, actions: Array, rng: np.random.Generator, active: Mask) -> None:
         controls = self._controls(actions, rng, active)
-        kept = {name: getattr(self.sim, name)[~active] for name in _STATE}
-        self.sim.step(controls, self.steps_per_period)
-        for name, values in kept.items():
-            getattr(self.sim, name)[~active] = values
+        self.sim.step(controls, self.steps_per_period, active=None if active.all() else active)
         self.info["steps"][active] += 1
         self._observe(active, rng)
         self._end_episodes(active)

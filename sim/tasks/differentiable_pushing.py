@@ -61,8 +61,6 @@ class DifferentiablePushing:
 
     def detach(self) -> None:
         """Cut the graph: later rewards have no gradient with respect to earlier actions."""
-        state = self._state
-        tensors = (state.q, state.v, state.anchors, state.anchored, state.history)
-        self._state = TorchState(*(tensor.detach() for tensor in tensors))
+        self._state = self._state.detach()
         self._frames = self._frames.detach()
         self.observation = self.observation.detach()

@@ -253,6 +253,12 @@ class Pushing(ControlTask):
         self._half_size = box.size[:2]
         self._steps_per_force = max(1, round(task.force_period / task.control_period))
 
+    @property
+    def quantities(self) -> dict[str, Array]:
+        """The randomized quantities of the present episodes, name → (N,)."""
+        names = ("goal_x", "goal_y", "goal_yaw", "half_size_x", "half_size_y", "mass")
+        return dict(zip(names, (*self.goal.T, *self.half_size.T, self.mass), strict=True))
+
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         task, rows = self.description, np.flatnonzero(which)
         check_options(task.name, options, _RESET_OPTIONS)
