@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from gelflow import __version__
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture
+from gelflow.policies.networks.base import Architecture, Network
 from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
 from gelflow.policies.networks.registry import architecture_from_json
-from gelflow.task import INSERTION, InsertionTask
+from gelflow.task import INSERTION, InsertionTask, TaskDescription
 
 FORMAT = 1
 MAX_BYTES = 2_000_000  # [bytes]
@@ -32,7 +32,7 @@ _HEADER_KEY = "gelflow"
 class Checkpoint:
     """The contents of a checkpoint file."""
 
-    task: Mapping[str, Any]  # as from InsertionTask.to_json
+    task: Mapping[str, Any]  # as from TaskDescription.to_json
     architecture: Architecture
     tensors: Mapping[str, NDArray[Any]]
     training: Mapping[str, Any]  # command, settings and validation results of the training
@@ -48,7 +48,7 @@ def default_checkpoint() -> Path:
 def save_checkpoint(
     path: Path,
     *,
-    task: InsertionTask,
+    task: TaskDescription,
     architecture: Architecture,
     tensors: Mapping[str, NDArray[Any]],
     training: Mapping[str, Any],
@@ -105,7 +105,15 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def load_policy(path: str | Path, *, task: InsertionTask = INSERTION) -> NetworkPolicy:
-    """Loads the policy of a checkpoint for `task`.
+    """Loads the policy of a checkpoint for the insertion `task`, for one part at a time. Raises as `load_network`."""
+    network = load_network(path, task=task)
+    if not isinstance(network, FlowMapNetwork):
+        raise UsageError(f"{path}: network {network.architecture.kind} does not correct the poses of an insertion")
+    return NetworkPolicy(network)
+
+
+def load_network(path: str | Path, *, task: TaskDescription) -> Network:
+    """Loads the network of a checkpoint for `task`; `Network.batch_policy` acts in its environments.
 
     Raises UsageError as `load_checkpoint` does, and when the checkpoint was trained for another task description; the
     message lists the fields that differ.
@@ -117,9 +125,7 @@ def load_policy(path: str | Path, *, task: InsertionTask = INSERTION) -> Network
             f"{path} was trained for another task: {different}; train a policy for this task, or use that task"
         )
     try:
-        network = checkpoint.architecture.network(task, checkpoint.tensors)
-        assert isinstance(network, FlowMapNetwork)
-        return NetworkPolicy(network)
+        return checkpoint.architecture.network(task, checkpoint.tensors)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from error
 

@@ -39,7 +39,7 @@ class MLP(ActorArchitecture):
     def encoder_shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of each tensor of the encoder."""
         size = self.observation_shape[0]
-        shapes: dict[str, tuple[int, ...]] = {"mean": (size,), "variance": (size,), "count": ()}
+        shapes: dict[str, tuple[int, ...]] = {"mean": (size,), "variance": (size,), "count": (1,)}
         for i, (wide, narrow) in enumerate(itertools.pairwise((size, *self.hidden))):
             shapes |= {f"layers.{i}.weight": (narrow, wide), f"layers.{i}.bias": (narrow,)}
         return shapes

@@ -54,7 +54,7 @@ class VectorEncoder(nn.Module):
         super().__init__()
         self.register_buffer("mean", torch.zeros(sizes[0]))
         self.register_buffer("variance", torch.ones(sizes[0]))
-        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("count", torch.zeros(1))
         self.mean: Tensor
         self.variance: Tensor
         self.count: Tensor

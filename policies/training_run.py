@@ -1,0 +1,317 @@
+"""A training run: one command, one seed and one folder, which the same command resumes after an interruption.
+
+The folder holds `run.json` (configuration, command, versions), `progress.csv`, TensorBoard logs, `policy.safetensors`
+(the best policy on the validation episodes), `state.safetensors` (the unfinished run) and `learning_curve.png`.
+"""
+
+import contextlib
+import fcntl
+import json
+import platform
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gelflow import __version__
+from gelflow.errors import UsageError
+from gelflow.policies import progress_curve
+from gelflow.policies.checkpoint import save_checkpoint, task_differences
+from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.evaluation import EvaluationResult
+from gelflow.policies.networks.base import Architecture
+from gelflow.policies.progress_log import ProgressLog
+from gelflow.policies.run_state import RunState, load_state, save_state
+from gelflow.sim.tasks.task_batch import TaskBatch
+
+FORMAT = 1
+POLICY, STATE, CONFIGURATION = "policy.safetensors", "state.safetensors", "run.json"
+PROGRESS, PICTURE, TENSORBOARD = "progress.csv", "learning_curve.png", "tensorboard"
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Settings of a run that do not depend on the algorithm. Steps are environment steps, over all environments."""
+
+    steps: int
+    seed: int = 0
+    minutes: float = float("inf")  # time limit; a run that reaches it is not repeatable
+    evaluate_every: int = 10_000  # steps; the state is saved after each evaluation
+    evaluate_episodes: int = 256
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.evaluate_every < 1 or self.evaluate_episodes < 1 or not self.minutes > 0:
+            raise UsageError(f"training requires steps, minutes and evaluations above 0, got {self}")
+
+
+class Stopwatch:
+    """Seconds spent in each share of a run, such as "simulation" and "learning"."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {"simulation": 0.0, "learning": 0.0}
+
+    @contextlib.contextmanager
+    def share(self, name: str) -> Iterator[None]:
+        """Adds the time of the block to the share `name`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+class Learner(ABC):
+    """An algorithm that improves a policy on a task, update by update.
+
+    A subclass lists the numbers of an update in `columns` and adds the environment steps of each update to `steps`.
+    It divides its time into `clock.share("simulation")` and `clock.share("learning")`.
+    """
+
+    columns: tuple[str, ...] = ()
+
+    def __init__(self, task: TaskBatch, architecture: Architecture) -> None:
+        self.task = task
+        self.architecture = architecture
+        self.steps = 0
+        self.clock = Stopwatch()
+
+    @abstractmethod
+    def update(self) -> dict[str, float]:
+        """One iteration of the algorithm; returns the numbers of `columns`."""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """The tensors of the present policy, as `Architecture.network` takes them."""
+
+    @abstractmethod
+    def state(self) -> RunState:
+        """Everything that determines the next updates, except the episodes, which are restarted."""
+
+    @abstractmethod
+    def load(self, state: RunState) -> None:
+        """Restores `state`."""
+
+    @abstractmethod
+    def restart_episodes(self) -> None:
+        """Starts new episodes in all environments.
+
+        The run calls it after each save: so the simulation needs no place in the state, and a resumed run continues as
+        an uninterrupted one does, bit for bit.
+        """
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """A finished run."""
+
+    folder: Path
+    best: EvaluationResult
+    steps: int
+    minutes: float
+    shares: dict[str, float]  # of the time: "simulation", "learning", "evaluation"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The best policy on the validation episodes."""
+        return self.folder / POLICY
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The numbers after an update, and of an evaluation if there was one."""
+
+    steps: int
+    minutes: float
+    numbers: Mapping[str, float]
+    evaluation: EvaluationResult | None = None
+
+
+@dataclass
+class TrainingRun:
+    """The run of a learner in `folder`.
+
+    Parameters
+    ----------
+    validation: environments of the evaluations; its episodes are not those of the training
+    configuration: everything that determines the result besides `settings`, as JSON data: task options, algorithm
+    command: command line that repeats the run, stored in the folder and in the checkpoint
+    report: called after each update and each evaluation
+    """
+
+    learner: Learner
+    validation: TaskBatch
+    folder: Path
+    settings: RunSettings
+    configuration: Mapping[str, Any]
+    command: Sequence[str] = ()
+    report: Callable[[Progress], None] | None = None
+    _best: EvaluationResult | None = field(default=None, init=False)
+    _seconds: float = field(default=0.0, init=False)  # of earlier processes
+
+    def train(self) -> TrainingResult:
+        """Trains until the steps or the minutes are used up, resuming an unfinished run of the same configuration.
+
+        Raises UsageError when the folder cannot be written, is in use, holds a finished run, or a run of another
+        configuration.
+        """
+        torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
+        with locked(self.folder):
+            self._prepare()
+            start = time.monotonic()
+            log = ProgressLog(self.folder, (*self.learner.columns,), self.learner.steps)
+            with contextlib.closing(log):
+                self._train(log, start)
+            return self._finish(start)
+
+    def _train(self, log: ProgressLog, start: float) -> None:
+        learner, s = self.learner, self.settings
+        next_evaluation = (learner.steps // s.evaluate_every + 1) * s.evaluate_every
+        while learner.steps < s.steps and self._minutes(start) < s.minutes:
+            numbers = learner.update()
+            over = learner.steps >= s.steps or self._minutes(start) >= s.minutes
+            evaluation = None
+            if learner.steps >= next_evaluation or over:
+                next_evaluation = (learner.steps // s.evaluate_every + 1) * s.evaluate_every
+                evaluation = self._evaluate()
+            progress = Progress(learner.steps, self._minutes(start), numbers, evaluation)
+            log.add(progress.steps, progress.minutes, learner.clock.seconds, numbers, evaluation)
+            if self.report:
+                self.report(progress)
+            if evaluation is not None and not over:
+                self._save(start)
+                learner.restart_episodes()
+
+    def _minutes(self, start: float) -> float:
+        return (self._seconds + time.monotonic() - start) / 60
+
+    def _evaluate(self) -> EvaluationResult:
+        """Evaluates the present policy; keeps it if it is the best."""
+        learner, s = self.learner, self.settings
+        tensors = learner.tensors()
+        with learner.clock.share("evaluation"):
+            network = learner.architecture.network(self.validation.description, tensors)
+            policy = network.batch_policy(self.validation.num_envs)
+            seed = s.seed + 1_000_003  # differs from the seed of the training
+            result = evaluate_task("validation", policy, self.validation, episodes=s.evaluate_episodes, seed=seed)
+        if self._best is None or (result.success, result.reward) >= (self._best.success, self._best.reward):
+            self._best = result
+            save_checkpoint(
+                self.folder / POLICY,
+                task=self.validation.description,
+                architecture=learner.architecture,
+                tensors=tensors,
+                training={**self._configuration(), "command": list(self.command), "steps": learner.steps}
+                | {"validation": _result_json(result)},
+            )
+        return result
+
+    def _configuration(self) -> dict[str, Any]:
+        """Everything that determines the result, as JSON data."""
+        settings = {name: None if value == float("inf") else value for name, value in vars(self.settings).items()}
+        return {
+            "task": self.learner.task.description.to_json(),
+            "environments": self.learner.task.num_envs,
+            "architecture": self.learner.architecture.to_json(),
+            "run": settings,
+            **self.configuration,
+        }
+
+    def _prepare(self) -> None:
+        """Checks the folder against the configuration, and restores the state of an unfinished run."""
+        path = self.folder / CONFIGURATION
+        configuration = json.loads(json.dumps(self._configuration()))
+        if path.exists():
+            stored = read_configuration(self.folder)
+            if stored["finished"]:
+                raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
+            if different := task_differences(_flat(stored["configuration"]), _flat(configuration)):
+                raise UsageError(
+                    f"{self.folder} holds an unfinished run with other settings: {different}; choose another folder, "
+                    "or repeat its command to resume it"
+                )
+        else:
+            self._write_configuration(configuration, finished=False)
+        if (self.folder / STATE).exists():
+            state = load_state(self.folder / STATE)
+            self.learner.load(state)
+            self.learner.clock.seconds.update(state.values["run"]["shares"])
+            self._seconds = state.values["run"]["seconds"]
+            self._best = EvaluationResult(**state.values["run"]["best"])
+            self.learner.restart_episodes()
+
+    def _save(self, start: float) -> None:
+        state = self.learner.state()
+        assert self._best is not None
+        seconds = 60 * self._minutes(start)
+        state.values["run"] = {
+            "seconds": seconds,
+            "shares": self.learner.clock.seconds,
+            "best": {**vars(self._best)},
+        }
+        save_state(self.folder / STATE, state)
+
+    def _write_configuration(self, configuration: Mapping[str, Any], *, finished: bool) -> None:
+        versions = {"gelflow": __version__, "python": platform.python_version()}
+        versions |= {"numpy": np.__version__, "torch": str(torch.__version__)}
+        values = {"format": FORMAT, "finished": finished, "command": list(self.command), "versions": versions}
+        partial = self.folder / f"{CONFIGURATION}.part"
+        partial.write_text(json.dumps({**values, "configuration": configuration}, indent=2) + "\n")
+        partial.replace(self.folder / CONFIGURATION)
+
+    def _finish(self, start: float) -> TrainingResult:
+        """Draws the learning curve and marks the run as finished."""
+        assert self._best is not None
+        progress_curve.draw(self.folder / PICTURE, self.folder / PROGRESS, title=self.learner.task.description.name)
+        self._write_configuration(self._configuration(), finished=True)
+        (self.folder / STATE).unlink(missing_ok=True)
+        seconds = self.learner.clock.seconds
+        shares = {name: value / sum(seconds.values()) for name, value in seconds.items()}
+        return TrainingResult(self.folder, self._best, self.learner.steps, self._minutes(start), shares)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Creates the folder and keeps other runs out of it. Raises UsageError when that is impossible."""
+    file: IO[str]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / "lock").open("w")
+    except OSError as error:
+        raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UsageError(f"{folder} is in use by another run; choose another folder") from error
+        yield
+
+
+def read_configuration(folder: Path) -> dict[str, Any]:
+    """The contents of `run.json`. Raises UsageError when it is missing, damaged or newer."""
+    path = folder / CONFIGURATION
+    try:
+        stored = json.loads(path.read_text())
+        version = stored["format"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path} is not the configuration of a run ({type(error).__name__})") from error
+    if version > FORMAT:
+        raise UsageError(f"{path} has format {version}; this gelflow reads format {FORMAT}: update gelflow")
+    return dict(stored)
+
+
+def _result_json(result: EvaluationResult) -> dict[str, Any]:
+    return {"episodes": result.episodes, "success": result.success, "attempts": result.attempts}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one, with keys such as "ppo.batch"."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat

@@ -1,0 +1,146 @@
+"""Training runs: one folder, resumed after a kill at any moment, on analytic tasks."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.policies.toy_tasks import PointTask, ToyDescription
+
+from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import load_checkpoint, load_network
+from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.networks.cnn import CNN
+from gelflow.policies.networks.mlp import MLP
+from gelflow.policies.ppo_learner import PPO, PPOSettings
+from gelflow.policies.progress_log import read_table
+from gelflow.policies.run_state import load_state
+from gelflow.policies.training_run import Progress, RunSettings, TrainingRun, locked
+
+PPO_SETTINGS = PPOSettings(rollout=16, batch=128, epochs=5, learning_rate=2e-3, discount=0.95, entropy=0.0)
+SHORT = RunSettings(steps=2048, evaluate_every=512, evaluate_episodes=16)
+
+
+class Killed(Exception):
+    """Ends a run as a kill would: nothing after it is executed."""
+
+
+def make_run(
+    folder: Path, *, settings: RunSettings = SHORT, recurrent: int = 0, report: Callable[[Progress], None] | None = None
+) -> TrainingRun:
+    task, validation = PointTask(16), PointTask(16)
+    architecture = MLP(observation_shape=(4,), actions=2, hidden=(16,), recurrent=recurrent)
+    learner = PPO(task, architecture, PPO_SETTINGS, seed=settings.seed, steps=settings.steps)
+    return TrainingRun(learner, validation, folder, settings, {"algorithm": "ppo"}, ["gelflow", "train"], report)
+
+
+def killed_after(steps: int) -> Callable[[Progress], None]:
+    def report(progress: Progress) -> None:
+        if progress.steps >= steps:
+            raise Killed
+
+    return report
+
+
+@pytest.mark.parametrize(("steps", "recurrent"), [(300, 0), (1024, 4), (1300, 0)])
+def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path, steps: int, recurrent: int) -> None:
+    whole = make_run(tmp_path / "whole", recurrent=recurrent).train()
+    with pytest.raises(Killed):
+        make_run(tmp_path / "killed", recurrent=recurrent, report=killed_after(steps)).train()
+    resumed = make_run(tmp_path / "killed", recurrent=recurrent).train()
+    first, second = load_checkpoint(whole.checkpoint), load_checkpoint(resumed.checkpoint)
+    assert first.training == second.training
+    assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
+    tables = [read_table(result.folder / "progress.csv") for result in (whole, resumed)]
+    kept = [[{k: v for k, v in row.items() if k != "minutes" and not k.endswith("_s")} for row in t] for t in tables]
+    assert kept[0] == kept[1]
+
+
+def test_at_most_the_last_interval_is_lost(tmp_path: Path) -> None:
+    with pytest.raises(Killed):
+        make_run(tmp_path, report=killed_after(1500)).train()
+    assert load_state(tmp_path / "state.safetensors").values["steps"] >= 1024
+    seen: list[int] = []
+    make_run(tmp_path, report=lambda progress: seen.append(progress.steps)).train()
+    assert seen[0] > 1024
+
+
+def test_a_run_learns_and_its_folder_holds_everything(tmp_path: Path) -> None:
+    settings = RunSettings(steps=12_288, seed=3, evaluate_every=4_096, evaluate_episodes=64)
+    result = make_run(tmp_path, settings=settings).train()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"run.json", "progress.csv", "policy.safetensors", "learning_curve.png"} <= names
+    assert "state.safetensors" not in names
+    assert result.best.success > 0.9 and set(result.shares) == {"simulation", "learning", "evaluation"}
+    assert sum(result.shares.values()) == pytest.approx(1)
+    run = json.loads((tmp_path / "run.json").read_text())
+    assert run["finished"] and run["configuration"]["run"]["seed"] == 3 and "torch" in run["versions"]
+    task = PointTask(32)
+    policy = load_network(result.checkpoint, task=task.description).batch_policy(32)
+    assert evaluate_task("policy", policy, task, episodes=128, seed=9).success > 0.9
+    with pytest.raises(UsageError, match=r"trained for another task: steps 8 \(here 9\)"):
+        load_network(result.checkpoint, task=ToyDescription(steps=9))
+
+
+def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
+    make_run(tmp_path / "done", settings=RunSettings(steps=256, evaluate_episodes=4)).train()
+    with pytest.raises(UsageError, match="already holds a trained policy"):
+        make_run(tmp_path / "done").train()
+    with pytest.raises(Killed):
+        make_run(tmp_path / "other", report=killed_after(600)).train()
+    with pytest.raises(UsageError, match=r"other settings: run.seed 0 \(here 1\)"):
+        make_run(
+            tmp_path / "other", settings=RunSettings(steps=2048, seed=1, evaluate_every=512, evaluate_episodes=16)
+        ).train()
+    with locked(tmp_path / "used"), pytest.raises(UsageError, match="in use"):
+        make_run(tmp_path / "used").train()
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot write into"):
+        make_run(tmp_path / "file").train()
+
+
+def test_a_damaged_state_gives_a_message_of_one_line(tmp_path: Path) -> None:
+    with pytest.raises(Killed):
+        make_run(tmp_path, report=killed_after(600)).train()
+    state = tmp_path / "state.safetensors"
+    data = state.read_bytes()
+    for bad in (data[:100], b"", b"no tensors at all"):
+        state.write_bytes(bad)
+        with pytest.raises(UsageError, match="is damaged") as error_info:
+            make_run(tmp_path).train()
+        assert "\n" not in str(error_info.value)
+
+
+def test_a_recurrent_policy_remembers_what_it_saw_first() -> None:
+    settings = PPOSettings(rollout=8, batch=256, epochs=10, learning_rate=3e-3, discount=0.9, entropy=0.0)
+    steps = 16_384
+
+    def success(recurrent: int) -> float:
+        task = PointTask(64, remember=True)
+        architecture = MLP(observation_shape=(4,), actions=2, hidden=(16,), recurrent=recurrent)
+        learner = PPO(task, architecture, settings, seed=0, steps=steps)
+        while learner.steps < steps:
+            learner.update()
+        policy = architecture.network(task.description, learner.tensors()).batch_policy(64)
+        return evaluate_task("policy", policy, PointTask(64, remember=True), episodes=128, seed=5).success
+
+    assert success(16) > 0.8 > success(0) + 0.3
+
+
+def test_a_privileged_critic_and_images_are_supported() -> None:
+    task = PointTask(16, image=True)
+    settings = PPOSettings(rollout=16, batch=128, epochs=4, learning_rate=2e-3, entropy=0.0, privileged_critic=True)
+    learner = PPO(task, CNN(observation_shape=(2, 8, 8), actions=2), settings, seed=0, steps=6_000)
+    rewards = []
+    while learner.steps < 6_000:
+        rewards.append(learner.update()["reward"])
+    assert np.mean(rewards[-3:]) > np.mean(rewards[:3]) + 0.2
+
+
+def test_impossible_settings_are_rejected() -> None:
+    for changes in ({"batch": 0}, {"learning_rate": 0.0}):
+        with pytest.raises(UsageError, match="positive"):
+            PPOSettings(**changes)
+    with pytest.raises(UsageError, match="above 0"):
+        RunSettings(steps=0)
