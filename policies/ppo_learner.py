@@ -17,14 +17,14 @@ from gelflow.errors import UsageError
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
-from gelflow.policies.run_state import (
+from gelflow.policies.training.learner import Learner
+from gelflow.policies.training.state import (
     RunState,
     generator_from,
     generator_value,
     load_optimizer_tensors,
     optimizer_tensors,
 )
-from gelflow.policies.training_run import Learner
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 

@@ -14,9 +14,9 @@ from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.networks.cnn import CNN
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.ppo_learner import PPO, PPOSettings
-from gelflow.policies.progress_log import read_table
-from gelflow.policies.run_state import load_state
-from gelflow.policies.training_run import Progress, RunSettings, TrainingRun, locked
+from gelflow.policies.training.progress_log import read_table
+from gelflow.policies.training.run import Progress, RunSettings, TrainingRun, locked
+from gelflow.policies.training.state import load_state
 
 PPO_SETTINGS = PPOSettings(rollout=16, batch=128, epochs=5, learning_rate=2e-3, discount=0.95, entropy=0.0)
 SHORT = RunSettings(steps=2048, evaluate_every=512, evaluate_episodes=16)

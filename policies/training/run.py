@@ -9,7 +9,6 @@ import fcntl
 import json
 import platform
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,17 +16,16 @@ from typing import IO, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from gelflow import __version__
 from gelflow.errors import UsageError
-from gelflow.policies import progress_curve
 from gelflow.policies.checkpoint import save_checkpoint, task_differences
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.evaluation import EvaluationResult
-from gelflow.policies.networks.base import Architecture
-from gelflow.policies.progress_log import ProgressLog
-from gelflow.policies.run_state import RunState, load_state, save_state
+from gelflow.policies.training import progress_curve
+from gelflow.policies.training.learner import Learner
+from gelflow.policies.training.progress_log import ProgressLog
+from gelflow.policies.training.state import load_state, save_state
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 FORMAT = 1
@@ -48,62 +46,6 @@ class RunSettings:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.evaluate_every < 1 or self.evaluate_episodes < 1 or not self.minutes > 0:
             raise UsageError(f"training requires steps, minutes and evaluations above 0, got {self}")
-
-
-class Stopwatch:
-    """Seconds spent in each share of a run, such as "simulation" and "learning"."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {"simulation": 0.0, "learning": 0.0}
-
-    @contextlib.contextmanager
-    def share(self, name: str) -> Iterator[None]:
-        """Adds the time of the block to the share `name`."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
-
-
-class Learner(ABC):
-    """An algorithm that improves a policy on a task, update by update.
-
-    A subclass lists the numbers of an update in `columns` and adds the environment steps of each update to `steps`.
-    It divides its time into `clock.share("simulation")` and `clock.share("learning")`.
-    """
-
-    columns: tuple[str, ...] = ()
-
-    def __init__(self, task: TaskBatch, architecture: Architecture) -> None:
-        self.task = task
-        self.architecture = architecture
-        self.steps = 0
-        self.clock = Stopwatch()
-
-    @abstractmethod
-    def update(self) -> dict[str, float]:
-        """One iteration of the algorithm; returns the numbers of `columns`."""
-
-    @abstractmethod
-    def tensors(self) -> dict[str, NDArray[Any]]:
-        """The tensors of the present policy, as `Architecture.network` takes them."""
-
-    @abstractmethod
-    def state(self) -> RunState:
-        """Everything that determines the next updates, except the episodes, which are restarted."""
-
-    @abstractmethod
-    def load(self, state: RunState) -> None:
-        """Restores `state`."""
-
-    @abstractmethod
-    def restart_episodes(self) -> None:
-        """Starts new episodes in all environments.
-
-        The run calls it after each save: so the simulation needs no place in the state, and a resumed run continues as
-        an uninterrupted one does, bit for bit.
-        """
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.figures import BLUE, VERMILION, save
-from gelflow.policies.progress_log import read_table
+from gelflow.policies.training.progress_log import read_table
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""Training runs of any algorithm: learner, folder, state, progress."""
