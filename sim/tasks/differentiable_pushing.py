@@ -14,50 +14,50 @@ class DifferentiablePushing:
 
     Attributes
     ----------
-    batch: the environments; their parameters and goals are those of the last `reset`, their state is not used
+    task: the environments; their parameters and goals are those of the last `reset`, their state is not used
     observation: (N, size); differentiable
     errors: distance of the box to the goal [m] and of the yaw angles [rad] after the last step, (N, 2)
     failed: (N,) bool, the simulation stopped in this episode; the gradient of a failed environment is zero
     """
 
-    def __init__(self, batch: Pushing) -> None:
-        self.batch = batch
-        self.max_steps = batch.description.max_steps
+    def __init__(self, task: Pushing) -> None:
+        self.task = task
+        self.max_steps = task.description.max_steps
         self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start new episodes in all environments."""
-        batch = self.batch
-        batch.reset(batch.all, rng)
+        task = self.task
+        task.reset(task.all, rng)
         self._rng = rng
-        self._state: TorchState = torch_state(batch.sim)
-        self._steps = np.zeros(batch.num_envs, dtype=np.int64)
-        self._frames = torch.from_numpy(batch.frames.copy())
+        self._state: TorchState = torch_state(task.sim)
+        self._steps = np.zeros(task.num_envs, dtype=np.int64)
+        self._frames = torch.from_numpy(task.frames.copy())
         self.observation = self._frames.flatten(1)
-        self.failed = np.zeros(batch.num_envs, dtype=bool)
+        self.failed = np.zeros(task.num_envs, dtype=bool)
 
     def step(self, actions: torch.Tensor) -> torch.Tensor:
         """One control period with actions (N, 3) in ±1; returns the rewards (N,)."""
-        batch, periods = self.batch, self.batch.steps_per_period
-        controls = batch.controls(actions, self._steps)
+        task, periods = self.task, self.task.steps_per_period
+        controls = task.controls(actions, self._steps)
         result = torch_rollout(
-            batch.sim, self._state, controls.expand(periods, -1, -1).contiguous(), read_after=(periods,)
+            task.sim, self._state, controls.expand(periods, -1, -1).contiguous(), read_after=(periods,)
         )
         self._state = result.end
         self._steps += 1
         self.failed |= ~result.ok.numpy()
-        state = batch.state(result.end.q, self._read(result.tactile[0]))
-        self._frames = stacked(self._frames, state.frame(batch.description))
+        state = task.state(result.end.q, self._read(result.tactile[0]))
+        self._frames = stacked(self._frames, state.frame(task.description))
         self.observation = self._frames.flatten(1)
         squared, yaw = state.goal_error()
         self.errors = np.stack([squared.detach().numpy() ** 0.5, np.abs(yaw.detach().numpy())], axis=1)
-        rewards: torch.Tensor = batch.description.reward(state, actions)
+        rewards: torch.Tensor = task.description.reward(state, actions)
         return rewards
 
     def _read(self, forces: torch.Tensor) -> torch.Tensor:
         """Readings of the pads; the deviations of real pads are constants for the gradient."""
         values = forces.detach().numpy()
-        return forces + torch.from_numpy(self.batch.read(values, self.batch.all, self._rng) - values)
+        return forces + torch.from_numpy(self.task.read(values, self.task.all, self._rng) - values)
 
     def detach(self) -> None:
         """Cut the graph: later rewards have no gradient with respect to earlier actions."""

@@ -1,19 +1,16 @@
-"""Back-propagation through time, on a point that moves to a goal, and on the pushing task."""
+"""Back-propagation through time, on a point that moves to a target, and on the pushing task."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
+from tests.policies.toy_tasks import PointTask
 
 from gelflow.errors import UsageError
-from gelflow.policies.backpropagation import (
-    BackpropagationSettings,
-    BackpropagationTrainer,
-    EpochResult,
-    evaluate,
-    limited,
-)
+from gelflow.policies.backpropagation import Backpropagation, BackpropagationSettings, limited, run_episodes
 from gelflow.policies.networks.mlp import MLP
+from gelflow.policies.training.state import load_state, save_state
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
 from gelflow.sim.tasks.pushing import Pushing, PushingTask
 
@@ -24,50 +21,57 @@ class Point:
     max_steps = 10
 
     def __init__(self, count: int) -> None:
-        self.count = count
+        self.task = PointTask(count)
+        self.errors = np.zeros((count, 1))
         self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
-        self.observation = torch.from_numpy(rng.uniform(-1, 1, (self.count, 1)))
-        self.failed = np.zeros(self.count, dtype=bool)
+        self.observation = torch.from_numpy(rng.uniform(-1, 1, (self.task.num_envs, 1)))
+        self.failed = np.zeros(self.task.num_envs, dtype=bool)
 
     def step(self, actions: torch.Tensor) -> torch.Tensor:
         self.observation = self.observation + 0.2 * actions
-        self.errors: NDArray[np.float64] = np.abs(self.observation.detach().numpy()).astype(np.float64)
+        self.errors[:] = np.abs(self.observation.detach().numpy())
         return -(self.observation**2).sum(1)
 
     def detach(self) -> None:
         self.observation = self.observation.detach()
 
 
-def trainer(epochs: int = 60, **settings: float) -> BackpropagationTrainer:
-    chosen = BackpropagationSettings(epochs=epochs, **settings)  # type: ignore[arg-type]
-    return BackpropagationTrainer(Point(16), MLP((1,), 1, hidden=(16,)), chosen)
+def learner(updates: int = 60, *, seed: int = 0, window: int = 100, rate: float = 0.005) -> Backpropagation:
+    settings = BackpropagationSettings(window=window, learning_rate=rate)
+    return Backpropagation(Point(16), MLP((1,), 1, hidden=(16,)), settings, seed=seed, steps=updates * 160)
+
+
+def error(actor_of: Backpropagation) -> float:
+    """Mean distance at the end of 200 episodes that are not those of the training."""
+    point = Point(200)
+    run_episodes(point, actor_of.actor, np.random.default_rng(9), window=None)
+    return float(point.errors.mean())
 
 
 @pytest.mark.parametrize("window", [10, 3])
-def test_training_finds_the_goal(window: int) -> None:
-    training = trainer(window=window, learning_rate=0.02)
-    untrained = evaluate(Point(200), training.actor, np.random.default_rng(9))
-    training.run()
-    trained = evaluate(Point(200), training.actor, np.random.default_rng(9))
-    assert untrained.errors[0] > 0.3 and trained.errors[0] < 0.03
-    assert trained.returns > untrained.returns and trained.gradient_norm == 0
+def test_training_finds_the_target(window: int) -> None:
+    training = learner(window=window, rate=0.02)
+    before = error(training)
+    numbers = [training.update() for _ in range(60)]
+    assert before > 0.3 and error(training) < 0.03
+    assert numbers[-1]["return"] > numbers[0]["return"] and training.steps == 60 * 160
+    assert set(numbers[0]) == set(Backpropagation.columns)
 
 
-def test_resumed_training_continues_bit_for_bit() -> None:
-    whole = trainer(epochs=6)
-    whole.run()
-    first = trainer(epochs=6)
+def test_resumed_training_continues_bit_for_bit(tmp_path: Path) -> None:
+    whole, first, second = learner(6), learner(6), learner(6, seed=1)
+    for _ in range(6):
+        whole.update()
     for _ in range(3):
-        first.run_epoch()
-    second = trainer(epochs=6, seed=0)
-    second.load_state_dict(first.state_dict())
-    results: list[EpochResult] = []
-    second.run(results.append)
-    assert [result.epoch for result in results] == [4, 5, 6]
-    for name, values in whole.actor.tensors().items():
-        np.testing.assert_array_equal(values, second.actor.tensors()[name])
+        first.update()
+    save_state(tmp_path / "state.safetensors", first.state())
+    second.load(load_state(tmp_path / "state.safetensors"))
+    for _ in range(3):
+        second.update()
+    for name, values in whole.tensors().items():
+        np.testing.assert_array_equal(values, second.tensors()[name])
 
 
 def test_limit_has_the_gradient_of_its_input() -> None:
@@ -80,24 +84,24 @@ def test_limit_has_the_gradient_of_its_input() -> None:
 
 def test_gradient_of_an_episode_is_that_of_its_return() -> None:
     """Finite differences of the return of pushing, by a weight of a recurrent policy."""
-    task = DifferentiablePushing(Pushing(2, task=PushingTask(max_steps=6), threads=1))
-    settings = BackpropagationSettings(epochs=1, max_gradient_norm=1e9, learning_rate=1e-12)
-    training = BackpropagationTrainer(task, MLP((393,), 3, 8, hidden=(8,)), settings)
+    episodes = DifferentiablePushing(Pushing(2, task=PushingTask(max_steps=6), threads=1))
+    architecture = MLP((393,), 3, 8, hidden=(8,))
+    training = Backpropagation(episodes, architecture, BackpropagationSettings(), seed=0, steps=1)
     bias = training.actor.head.bias
     with torch.no_grad():
         bias[0] = 0.8
-    training.run_epoch()
+    run_episodes(episodes, training.actor, np.random.default_rng(0), window=100)
     assert bias.grad is not None
     gradient, returns = float(bias.grad[0]), []
     for change in (1e-3, -1e-3):
         with torch.no_grad():
             bias[0] = 0.8 + change
-        returns.append(evaluate(task, training.actor, np.random.default_rng(0)).returns)
+        returns.append(run_episodes(episodes, training.actor, np.random.default_rng(0), window=None).mean())
     assert gradient == pytest.approx(-(returns[0] - returns[1]) / 2e-3 / 6, rel=2e-2)
 
 
 def test_settings_and_shapes_are_checked() -> None:
-    with pytest.raises(UsageError, match="requires epochs, window, rate and norm above 0"):
-        BackpropagationSettings(epochs=0)
+    with pytest.raises(UsageError, match="requires window, learning rate and gradient norm above 0"):
+        BackpropagationSettings(window=0)
     with pytest.raises(UsageError, match=r"the task observes \(1,\); the network takes \(2,\)"):
-        BackpropagationTrainer(Point(2), MLP((2,), 1), BackpropagationSettings())
+        Backpropagation(Point(2), MLP((2,), 1), BackpropagationSettings(), seed=0, steps=1)
