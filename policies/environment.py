@@ -87,6 +87,7 @@ class PolicyEnv:
         self.count = env.num_envs
         self.noise = noise
         self._rng = np.random.default_rng(0)
+        self.pose: Array = np.zeros((self.count, 3))  # true gripper poses of the latest attempts, for teachers
         self._last_reward: Array = np.zeros(self.count)
         self._part_noise: Array = np.zeros((self.count, 1 + 2 * task.sensors))
 
@@ -94,7 +95,7 @@ class PolicyEnv:
         """Resets all environments; returns the flow maps of the first attempts."""
         self._rng = np.random.default_rng(seed)
         images, info = self.env.reset(seed=seed)
-        self._last_reward = self.task.reward(info["pose"])
+        self._set_pose(info["pose"])
         return self._add_noise(images, np.ones(self.count, dtype=bool))
 
     def step(self, corrections: Array) -> StepResult:
@@ -105,10 +106,14 @@ class PolicyEnv:
         if done.any() and not self._same_step:
             images, info = self.env.reset(options={"reset_mask": done})
         improvement = reward - self._last_reward
-        self._last_reward = self.task.reward(info["pose"])
+        self._set_pose(info["pose"])
         return StepResult(
             self._add_noise(images, done), np.asarray(reward, dtype=float), improvement, done, np.asarray(terminated)
         )
+
+    def _set_pose(self, pose: Array) -> None:
+        self.pose = np.array(pose, dtype=float)
+        self._last_reward = self.task.reward(self.pose)
 
     def _add_noise(self, images: NDArray[Any], new_parts: NDArray[np.bool_]) -> NDArray[np.float32]:
         if self.noise is None:

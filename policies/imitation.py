@@ -1,0 +1,354 @@
+"""Training of the insertion policy by imitation of the true pose along its own attempts (DAgger).
+
+The simulation knows the misalignment, so the correct correction after any attempt is known. The policy makes attempts,
+with exploration; every attempt is stored with the correction that would have centred the part; the network learns to
+predict it. Because the attempts are those of the policy itself, it learns from the situations that it gets into (Ross,
+Gordon and Bagnell, A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning, 2011).
+
+The first attempts of a part often allow several explanations. The mean of the corrections inserts none of them, so the
+loss is bounded: the network learns to correct the most probable one (a mode), and the next attempt shows the error.
+"""
+
+import dataclasses
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.policies import checkpoint
+from gelflow.policies import learning_curve as curve
+from gelflow.policies.environment import PolicyEnv
+from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
+from gelflow.policies.learning_curve import LearningCurvePoint
+from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
+from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
+from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
+from gelflow.task import InsertionTask
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImitationSettings:
+    """Settings of a training run, stored in the checkpoint."""
+
+    attempts: int = 400_000  # total number of attempts
+    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not repeatable
+    seed: int = 0
+    rollout: int = 16  # attempts per environment in an iteration, which starts with new parts
+    updates: int = 60  # of the network per iteration
+    batch: int = 64  # sequences of `rollout` attempts in an update
+    memory: int = 40  # iterations whose attempts are learned from
+    learning_rate: float = 3e-3  # decreases linearly to zero
+    gradient_norm: float = 1.0  # largest norm of the gradient
+    # Error of a correction that counts as 1 [m, m, rad]: the clearance, and the yaw that a corner has of it.
+    tolerance: tuple[float, float, float] = (2.25e-3, 2.25e-3, 0.07)
+    bounded: float = 0.9  # share of the bounded loss, reached after `bounded_after` of the training
+    bounded_after: float = 0.3
+    # Largest standard deviation of the exploration, in units of the reach: at the start and at the end.
+    exploration: tuple[float, float] = (0.4, 0.03)
+    evaluate_every: int = 50_000  # attempts
+    evaluate_episodes: int = 512
+
+    def __post_init__(self) -> None:
+        counts = (self.attempts, self.rollout, self.updates, self.batch, self.memory, self.evaluate_episodes)
+        if min(counts) < 1 or not self.minutes > 0:
+            raise UsageError(f"training requires attempts, minutes and counts above 0, got {self}")
+
+
+@dataclass(frozen=True)
+class Attempts:
+    """Attempts of one iteration, in the canonical (mirrored) coordinates of the network; steps × parts."""
+
+    inputs: NDArray[np.float32]  # shape (steps, n, inputs)
+    targets: NDArray[np.float32]  # corrections that centre the part, in units of the reach, shape (steps, n, 3)
+    starts: NDArray[np.bool_]  # first attempts of a part, shape (steps, n)
+
+
+@dataclass(frozen=True)
+class IterationResult:
+    """One iteration."""
+
+    success: float  # rate of the episodes that ended; nan without any
+    reward: float  # mean `InsertionTask.reward` after the corrections
+    loss: float
+    exploration: float
+
+
+def train(
+    env: PolicyEnv,
+    validation: PolicyEnv,
+    *,
+    out: Path,
+    architecture: PolynomialGRU | None = None,
+    settings: ImitationSettings | None = None,
+    command: Sequence[str] = (),
+    report: Callable[[LearningCurvePoint], None] | None = None,
+) -> "TrainingResult":
+    """Trains a policy on `env` and keeps the checkpoint with the best result on `validation`.
+
+    Parameters
+    ----------
+    env: environment of the training
+    validation: environment of the evaluations
+    out: folder of insertion.safetensors, learning_curve.csv and learning_curve.png; created if missing
+    architecture: of the network
+    settings: of the algorithm
+    command: command line, stored in the checkpoint
+    report: called after each iteration and each evaluation
+
+    Raises UsageError when `out` already contains a trained policy.
+    """
+    torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
+    run = _Run(env, validation, architecture or PolynomialGRU(), settings or ImitationSettings(), out, command, report)
+    settings = run.settings
+    while run.attempts < settings.attempts and run.minutes() < settings.minutes:
+        progress = run.attempts / settings.attempts
+        sigma = np.interp(progress, [0, 1], settings.exploration)
+        begun = time.perf_counter()
+        attempts, success, reward = collect(run.network(), env, settings, seed=run.seed(), sigma=float(sigma))
+        run.simulation_time += time.perf_counter() - begun
+        begun = time.perf_counter()
+        run.memory.append(attempts)
+        loss = learn(run.layers, run.optimizer, list(run.memory), settings, run.scaled_tolerance, progress, run.rng())
+        run.learning_time += time.perf_counter() - begun
+        run.finish_iteration(IterationResult(success, reward, loss, float(sigma)))
+    return run.finish()
+
+
+def collect(
+    network: PolynomialGRUNetwork, env: PolicyEnv, settings: ImitationSettings, *, seed: int, sigma: float
+) -> tuple[Attempts, float, float]:
+    """Attempts of the policy with exploration, its success rate, and its mean reward.
+
+    The standard deviation of the exploration is drawn for each part, up to `sigma`.
+    """
+    rng = np.random.default_rng([seed, 1])
+    policy = network.batch_policy(env.count)
+    images = env.reset(seed)
+    spread = sigma * rng.uniform(size=(env.count, 1))
+    inputs, targets, starts, rewards = [], [], [], []
+    ended = inserted = 0
+    for _ in range(settings.rollout):
+        starts.append(policy.new.copy())
+        inputs.append(policy.observe(images).astype(np.float32))
+        centring = centring_correction(env.pose) / np.asarray(network.reach)
+        targets.append((centring * policy.signs).astype(np.float32))
+        output = policy.output(inputs[-1].astype(float))
+        corrections = policy.correct(np.clip(output, -1, 1) + spread * rng.standard_normal(output.shape))
+        result = env.step(corrections)
+        images = result.images
+        policy.reset(result.done)
+        spread = np.where(result.done[:, None], sigma * rng.uniform(size=spread.shape), spread)
+        rewards.append(result.reward.mean())
+        ended += int(result.done.sum())
+        inserted += int(result.success.sum())
+    attempts = Attempts(np.stack(inputs), np.stack(targets), np.stack(starts))
+    return attempts, inserted / ended if ended else float("nan"), float(np.mean(rewards))
+
+
+def centring_correction(pose: Array) -> Array:
+    """The correction (n, 3) in the gripper frame that moves grippers at `pose` (n, 3) to zero misalignment."""
+    x, y, yaw = pose.T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([-cos * x - sin * y, sin * x - cos * y, -yaw], axis=1)
+
+
+def learn(
+    layers: TorchPolynomialGRU,
+    optimizer: torch.optim.Optimizer,
+    memory: Sequence[Attempts],
+    settings: ImitationSettings,
+    tolerance: Array,
+    progress: float,
+    rng: np.random.Generator,
+) -> float:
+    """Updates the network with sequences drawn from `memory`; returns the mean loss.
+
+    `tolerance` (3,) is in units of the reach, `progress` is the share of the training that is done.
+    """
+    for group in optimizer.param_groups:
+        group["lr"] = settings.learning_rate * (1 - progress)
+    bounded = settings.bounded * min(1.0, progress / settings.bounded_after)
+    scale = torch.as_tensor(tolerance, dtype=torch.float32)
+    total = 0.0
+    for _ in range(settings.updates):
+        inputs, targets, starts = _draw_batch(memory, settings.batch, rng)
+        error = (layers(inputs, starts) - targets) / scale
+        loss = imitation_loss(error, bounded)
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(layers.parameters(), settings.gradient_norm)
+        optimizer.step()
+        total += float(loss.detach())
+    return total / settings.updates
+
+
+def imitation_loss(error: torch.Tensor, bounded: float) -> torch.Tensor:
+    """Mean over errors (…, 3): a share `bounded` of 1 − exp(−r²/2), which seeks modes, the rest √(1 + r²) − 1.
+
+    The second term has a gradient at any distance and dominates the start of a training.
+    """
+    squared = error.pow(2).sum(-1)
+    return (bounded * (1 - torch.exp(-squared / 2)) + (1 - bounded) * (torch.sqrt(1 + squared) - 1)).mean()
+
+
+def _draw_batch(
+    memory: Sequence[Attempts], count: int, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`count` sequences of random iterations and parts: inputs, targets, starts; each (steps, count, …)."""
+    parts = memory[0].starts.shape[1]
+    chosen = [(memory[i], part) for i, part in rng.integers(0, (len(memory), parts), (count, 2))]
+    arrays = (
+        np.stack([attempts.inputs[:, part] for attempts, part in chosen], axis=1),
+        np.stack([attempts.targets[:, part] for attempts, part in chosen], axis=1),
+        np.stack([attempts.starts[:, part] for attempts, part in chosen], axis=1),
+    )
+    inputs, targets, starts = (torch.from_numpy(array) for array in arrays)
+    return inputs, targets, starts
+
+
+def feature_scale(env: PolicyEnv, basis: Array, seed: int) -> Array:
+    """Root mean square of each feature over first attempts with noise, the divisor of the features.
+
+    It is common to the pads and the shear components of a polynomial term, so that mirroring preserves it, and at least
+    0.03, so that features without signal stay small.
+    """
+    squares = (reduce_maps(env.reset(seed), basis) ** 2).mean(0).reshape(-1, basis.shape[1])
+    return np.maximum(np.sqrt(np.broadcast_to(squares.mean(0), squares.shape).reshape(-1)), 0.03)
+
+
+class _Run:
+    """State and files of a training run."""
+
+    def __init__(
+        self,
+        env: PolicyEnv,
+        validation: PolicyEnv,
+        architecture: PolynomialGRU,
+        settings: ImitationSettings,
+        out: Path,
+        command: Sequence[str],
+        report: Callable[[LearningCurvePoint], None] | None,
+    ) -> None:
+        self.task: InsertionTask = env.task
+        self.settings, self.architecture = settings, architecture
+        self._env, self._validation, self._out, self._command, self._report = env, validation, out, command, report
+        if (out / CHECKPOINT).exists():  # never overwrite the result of another run
+            raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"cannot write into {out}: {error.strerror}") from error
+        with torch.random.fork_rng():
+            torch.manual_seed(settings.seed)
+            self.layers = TorchPolynomialGRU(architecture, self.task)
+        self.optimizer = torch.optim.Adam(self.layers.parameters(), settings.learning_rate)
+        self.scaled_tolerance = np.asarray(settings.tolerance) / np.asarray(architecture.reach)
+        basis = polynomial_basis(self.task.grid, architecture.degree)
+        self._fixed = {"basis": basis, "scale": feature_scale(env, basis, settings.seed)}
+        self.memory: deque[Attempts] = deque(maxlen=settings.memory)
+        self.attempts = 0
+        self.simulation_time = self.learning_time = 0.0  # [s]
+        self._begun = time.monotonic()
+        self._iterations = 0
+        self._best: EvaluationResult | None = None
+        self._points: list[LearningCurvePoint] = []
+
+    def minutes(self) -> float:
+        """Duration of the run [min]."""
+        return (time.monotonic() - self._begun) / 60
+
+    def seed(self) -> int:
+        """Seed of the present iteration's attempts."""
+        return int(np.random.SeedSequence([self.settings.seed, self._iterations]).generate_state(1)[0])
+
+    def rng(self) -> np.random.Generator:
+        """Generator of the present iteration's batches."""
+        return np.random.default_rng([self.settings.seed, self._iterations, 2])
+
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Tensors of the present network, as a checkpoint stores them."""
+        return {name: values.astype(np.float32) for name, values in (self._fixed | self.layers.tensors()).items()}
+
+    def network(self) -> PolynomialGRUNetwork:
+        """The present network for inference."""
+        return self.architecture.network(self.task, self.tensors())
+
+    def finish_iteration(self, result: IterationResult) -> None:
+        """Records an iteration; evaluates the network when it is due."""
+        before = self.attempts
+        self._iterations += 1
+        self.attempts += self.settings.rollout * self._env.count
+        every = self.settings.evaluate_every
+        point = LearningCurvePoint(self.attempts, self.minutes(), result.reward, result.success, result.exploration)
+        self._add_point(point)
+        if self.attempts // every > before // every and self.attempts < self.settings.attempts:
+            self._evaluate()
+
+    def _add_point(self, point: LearningCurvePoint) -> None:
+        self._points.append(point)
+        if self._report:
+            self._report(point)
+
+    def _evaluate(self) -> None:
+        validation, settings = self._validation, self.settings
+        actor = NetworkActor(self.network(), validation.count)
+        episodes = min(settings.evaluate_episodes, settings.attempts)  # limits the evaluations of short runs
+        seed = settings.seed + 1_000_003  # differs from the seeds of the training
+        result = evaluate("validation", actor, validation, episodes=episodes, seed=seed)
+        if self._best is None or (result.success, -result.attempts) > (self._best.success, -self._best.attempts):
+            self._best = result
+            self._save(result)
+        last = self._points[-1]
+        self._add_point(dataclasses.replace(last, minutes=self.minutes(), evaluation=result))
+        curve.write_table(self._out / CURVE, self._points)
+
+    def _save(self, result: EvaluationResult) -> None:
+        noise = self._env.noise
+        training = {
+            "algorithm": "imitation",
+            "command": list(self._command),
+            "settings": {k: None if v == float("inf") else v for k, v in dataclasses.asdict(self.settings).items()},
+            "noise": None if noise is None else dataclasses.asdict(noise),
+            "attempts": self.attempts,
+            "validation": {"episodes": result.episodes, "success": result.success, "attempts": result.attempts},
+            "versions": {"torch": str(torch.__version__)},
+        }
+        checkpoint.save_checkpoint(
+            self._out / CHECKPOINT,
+            task=self.task,
+            architecture=self.architecture,
+            tensors=self.tensors(),
+            training=training,
+        )
+
+    def finish(self) -> "TrainingResult":
+        """Evaluates the last network, draws the learning curve and returns the result."""
+        self._evaluate()
+        assert self._best is not None
+        curve.draw(self._out / PICTURE, self._points)
+        shares = (self.simulation_time, self.learning_time)
+        return TrainingResult(self._out / CHECKPOINT, self._best, self._out / CURVE, self._out / PICTURE, *shares)
+
+
+CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The files of a training run, its best validation result, and the time it took."""
+
+    checkpoint: Path
+    best: EvaluationResult
+    curve: Path
+    picture: Path
+    simulation_time: float  # [s]
+    learning_time: float  # [s]
