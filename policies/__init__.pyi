@@ -3,6 +3,7 @@ from .checkpoint import default_checkpoint as default_checkpoint
 from .checkpoint import load_checkpoint as load_checkpoint
 from .checkpoint import load_policy as load_policy
 from .checkpoint import save_checkpoint as save_checkpoint
+from .checkpoint import shipped_checkpoints as shipped_checkpoints
 from .environment import FlowMapNoise as FlowMapNoise
 from .environment import PolicyEnv as PolicyEnv
 from .environment import make_insertion_env as make_insertion_env
@@ -10,7 +11,9 @@ from .evaluation import EvaluationResult as EvaluationResult
 from .evaluation import NetworkActor as NetworkActor
 from .evaluation import RandomActor as RandomActor
 from .evaluation import evaluate as evaluate
+from .imitation import ImitationSettings as ImitationSettings
 from .learning_curve import LearningCurvePoint as LearningCurvePoint
+from .learning_curve import TrainingResult as TrainingResult
 from .networks.base import Architecture as Architecture
 from .networks.base import BatchPolicy as BatchPolicy
 from .networks.base import Network as Network
@@ -20,7 +23,6 @@ from .networks.polynomial_gru import PolynomialGRUNetwork as PolynomialGRUNetwor
 from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
 from .networks.polynomial_mlp import PolynomialNetwork as PolynomialNetwork
 from .ppo import PPOSettings as PPOSettings
-from .ppo import TrainingResult as TrainingResult
 from .ppo import train as train
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "Checkpoint",
     "EvaluationResult",
     "FlowMapNoise",
+    "ImitationSettings",
     "LearningCurvePoint",
     "Network",
     "NetworkActor",
@@ -47,5 +50,6 @@ __all__ = [
     "load_policy",
     "make_insertion_env",
     "save_checkpoint",
+    "shipped_checkpoints",
     "train",
 ]

@@ -26,6 +26,7 @@ from gelflow.task import INSERTION, InsertionTask, TaskDescription
 FORMAT = 1
 MAX_BYTES = 2_000_000  # [bytes]
 _HEADER_KEY = "gelflow"
+_SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,12 @@ class Checkpoint:
 
 def default_checkpoint() -> Path:
     """Path of the insertion policy that is shipped with gelflow."""
-    return Path(__file__).resolve().parent / "checkpoints" / "insertion.safetensors"
+    return _SHIPPED / "insertion.safetensors"
+
+
+def shipped_checkpoints() -> list[Path]:
+    """Paths of all policies that are shipped with gelflow, former ones included: recorded sessions name them."""
+    return sorted(_SHIPPED.glob("*.safetensors"))
 
 
 def save_checkpoint(

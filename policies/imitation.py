@@ -26,13 +26,17 @@ from gelflow.policies import checkpoint
 from gelflow.policies import learning_curve as curve
 from gelflow.policies.environment import PolicyEnv
 from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
-from gelflow.policies.learning_curve import LearningCurvePoint
+from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
+from gelflow.policies.training_state import check_same_run, finish_state, load_state, save_state
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
+
+CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
+_SAVE_INTERVAL = 20.0  # [s] between savings of an unfinished run, at the end of an iteration
 
 
 @dataclass(frozen=True)
@@ -72,16 +76,6 @@ class Attempts:
     starts: NDArray[np.bool_]  # first attempts of a part, shape (steps, n)
 
 
-@dataclass(frozen=True)
-class IterationResult:
-    """One iteration."""
-
-    success: float  # rate of the episodes that ended; nan without any
-    reward: float  # mean `InsertionTask.reward` after the corrections
-    loss: float
-    exploration: float
-
-
 def train(
     env: PolicyEnv,
     validation: PolicyEnv,
@@ -91,7 +85,7 @@ def train(
     settings: ImitationSettings | None = None,
     command: Sequence[str] = (),
     report: Callable[[LearningCurvePoint], None] | None = None,
-) -> "TrainingResult":
+) -> TrainingResult:
     """Trains a policy on `env` and keeps the checkpoint with the best result on `validation`.
 
     Parameters
@@ -104,7 +98,9 @@ def train(
     command: command line, stored in the checkpoint
     report: called after each iteration and each evaluation
 
-    Raises UsageError when `out` already contains a trained policy.
+    A run that was killed continues where its folder stands, at most an iteration or 20 s before the kill, and gives the
+    result of an uninterrupted one. Raises UsageError when `out` contains a trained policy, or an unfinished run with
+    other settings.
     """
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
     run = _Run(env, validation, architecture or PolynomialGRU(), settings or ImitationSettings(), out, command, report)
@@ -117,9 +113,9 @@ def train(
         run.simulation_time += time.perf_counter() - begun
         begun = time.perf_counter()
         run.memory.append(attempts)
-        loss = learn(run.layers, run.optimizer, list(run.memory), settings, run.scaled_tolerance, progress, run.rng())
+        learn(run.layers, run.optimizer, list(run.memory), settings, run.scaled_tolerance, progress, run.rng())
         run.learning_time += time.perf_counter() - begun
-        run.finish_iteration(IterationResult(success, reward, loss, float(sigma)))
+        run.finish_iteration(success, reward, float(sigma))
     return run.finish()
 
 
@@ -169,8 +165,8 @@ def learn(
     tolerance: Array,
     progress: float,
     rng: np.random.Generator,
-) -> float:
-    """Updates the network with sequences drawn from `memory`; returns the mean loss.
+) -> None:
+    """Updates the network with sequences drawn from `memory`.
 
     `tolerance` (3,) is in units of the reach, `progress` is the share of the training that is done.
     """
@@ -178,7 +174,6 @@ def learn(
         group["lr"] = settings.learning_rate * (1 - progress)
     bounded = settings.bounded * min(1.0, progress / settings.bounded_after)
     scale = torch.as_tensor(tolerance, dtype=torch.float32)
-    total = 0.0
     for _ in range(settings.updates):
         inputs, targets, starts = _draw_batch(memory, settings.batch, rng)
         error = (layers(inputs, starts) - targets) / scale
@@ -187,8 +182,6 @@ def learn(
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(layers.parameters(), settings.gradient_norm)
         optimizer.step()
-        total += float(loss.detach())
-    return total / settings.updates
 
 
 def imitation_loss(error: torch.Tensor, bounded: float) -> torch.Tensor:
@@ -241,7 +234,8 @@ class _Run:
         self.task: InsertionTask = env.task
         self.settings, self.architecture = settings, architecture
         self._env, self._validation, self._out, self._command, self._report = env, validation, out, command, report
-        if (out / CHECKPOINT).exists():  # never overwrite the result of another run
+        unfinished = load_state(out)
+        if unfinished is None and (out / CHECKPOINT).exists():  # never overwrite the result of another run
             raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -252,15 +246,25 @@ class _Run:
             self.layers = TorchPolynomialGRU(architecture, self.task)
         self.optimizer = torch.optim.Adam(self.layers.parameters(), settings.learning_rate)
         self.scaled_tolerance = np.asarray(settings.tolerance) / np.asarray(architecture.reach)
-        basis = polynomial_basis(self.task.grid, architecture.degree)
-        self._fixed = {"basis": basis, "scale": feature_scale(env, basis, settings.seed)}
         self.memory: deque[Attempts] = deque(maxlen=settings.memory)
         self.attempts = 0
         self.simulation_time = self.learning_time = 0.0  # [s]
-        self._begun = time.monotonic()
+        self._begun = self._saved = time.monotonic()
         self._iterations = 0
         self._best: EvaluationResult | None = None
         self._points: list[LearningCurvePoint] = []
+        # What must be equal when the run is continued.
+        self._identity: dict[str, Any] = {
+            "task": self.task.digest(),
+            "network": architecture.to_json(),
+            "settings": {name: str(value) for name, value in vars(settings).items() if name != "minutes"},
+            "environments": env.count,
+        }
+        if unfinished is None:
+            basis = polynomial_basis(self.task.grid, architecture.degree)
+            self._fixed = {"basis": basis, "scale": feature_scale(env, basis, settings.seed)}
+        else:
+            self._continue(*unfinished)
 
     def minutes(self) -> float:
         """Duration of the run [min]."""
@@ -282,16 +286,60 @@ class _Run:
         """The present network for inference."""
         return self.architecture.network(self.task, self.tensors())
 
-    def finish_iteration(self, result: IterationResult) -> None:
-        """Records an iteration; evaluates the network when it is due."""
-        before = self.attempts
+    def finish_iteration(self, success: float, reward: float, exploration: float) -> None:
+        """Records an iteration, evaluates the network when it is due, and saves the state."""
+        before, every = self.attempts, self.settings.evaluate_every
         self._iterations += 1
         self.attempts += self.settings.rollout * self._env.count
-        every = self.settings.evaluate_every
-        point = LearningCurvePoint(self.attempts, self.minutes(), result.reward, result.success, result.exploration)
-        self._add_point(point)
+        self._add_point(LearningCurvePoint(self.attempts, self.minutes(), reward, success, exploration))
         if self.attempts // every > before // every and self.attempts < self.settings.attempts:
             self._evaluate()
+        if time.monotonic() > self._saved + _SAVE_INTERVAL:
+            self._save_state()
+
+    def _save_state(self) -> None:
+        """Saves everything that the remaining iterations depend on, so that a continued run gives the same result."""
+        arrays: dict[str, NDArray[Any]] = {f"fixed.{name}": values for name, values in self._fixed.items()}
+        arrays |= {f"layers.{name}": values for name, values in self.layers.tensors().items()}
+        for index, values in self.optimizer.state_dict()["state"].items():
+            arrays |= {f"optimizer.{index}.{name}": tensor.numpy() for name, tensor in values.items()}
+        for index, attempts in enumerate(self.memory):
+            arrays |= {f"memory.{index}.{name}": array for name, array in vars(attempts).items()}
+        facts = {
+            "identity": self._identity,
+            "iterations": self._iterations,
+            "attempts": self.attempts,
+            "seconds": [self.simulation_time, self.learning_time, 60 * self.minutes()],
+            "best": None if self._best is None else dataclasses.asdict(self._best),
+            "points": [dataclasses.asdict(point) for point in self._points],
+        }
+        save_state(self._out, arrays, facts)
+        self._saved = time.monotonic()
+
+    def _continue(self, arrays: dict[str, NDArray[Any]], facts: dict[str, Any]) -> None:
+        """Restores the state of an unfinished run. Raises UsageError when it was started with other settings."""
+        check_same_run(self._out, facts["identity"], self._identity)
+        groups: dict[str, dict[str, NDArray[Any]]] = {}
+        for name, values in arrays.items():
+            group, _, key = name.partition(".")
+            groups.setdefault(group, {})[key] = values
+        self._fixed = groups["fixed"]
+        self.layers.load_state_dict({name: torch.from_numpy(values) for name, values in groups["layers"].items()})
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, values in groups["optimizer"].items():
+            index, key = name.split(".")
+            state.setdefault(int(index), {})[key] = torch.from_numpy(values)
+        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state})
+        memory = groups["memory"]
+        for index in range(len(memory) // 3):
+            self.memory.append(Attempts(*(memory[f"{index}.{name}"] for name in ("inputs", "targets", "starts"))))
+        self._iterations, self.attempts = facts["iterations"], facts["attempts"]
+        self.simulation_time, self.learning_time, seconds = facts["seconds"]
+        self._begun -= seconds
+        self._best = None if facts["best"] is None else EvaluationResult(**facts["best"])
+        for point in facts["points"]:
+            evaluation = None if point["evaluation"] is None else EvaluationResult(**point["evaluation"])
+            self._points.append(LearningCurvePoint(**{**point, "evaluation": evaluation}))
 
     def _add_point(self, point: LearningCurvePoint) -> None:
         self._points.append(point)
@@ -330,25 +378,11 @@ class _Run:
             training=training,
         )
 
-    def finish(self) -> "TrainingResult":
+    def finish(self) -> TrainingResult:
         """Evaluates the last network, draws the learning curve and returns the result."""
         self._evaluate()
         assert self._best is not None
         curve.draw(self._out / PICTURE, self._points)
+        finish_state(self._out)
         shares = (self.simulation_time, self.learning_time)
         return TrainingResult(self._out / CHECKPOINT, self._best, self._out / CURVE, self._out / PICTURE, *shares)
-
-
-CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """The files of a training run, its best validation result, and the time it took."""
-
-    checkpoint: Path
-    best: EvaluationResult
-    curve: Path
-    picture: Path
-    simulation_time: float  # [s]
-    learning_time: float  # [s]

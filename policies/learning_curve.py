@@ -23,6 +23,18 @@ class LearningCurvePoint:
     evaluation: EvaluationResult | None = None
 
 
+@dataclass(frozen=True)
+class TrainingResult:
+    """The files of a training run, its best validation result, and the time it took."""
+
+    checkpoint: Path
+    best: EvaluationResult
+    curve: Path
+    picture: Path
+    simulation_time: float = float("nan")  # [s]; nan if not measured
+    learning_time: float = float("nan")  # [s]
+
+
 COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated attempts")
 
 

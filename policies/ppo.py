@@ -28,7 +28,7 @@ from gelflow.policies import checkpoint
 from gelflow.policies import learning_curve as curve
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
-from gelflow.policies.learning_curve import LearningCurvePoint
+from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP, PolynomialNetwork
 
@@ -61,16 +61,6 @@ class PPOSettings:
 
 
 CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """The files of a training run, and its best validation result."""
-
-    checkpoint: Path
-    best: EvaluationResult
-    curve: Path
-    picture: Path
 
 
 class HistoryVecEnv(VecEnv):

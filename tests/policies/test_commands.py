@@ -26,10 +26,15 @@ def test_the_shipped_policy_inserts_in_simulation() -> None:
     assert result.attempts < 8
 
 
-def test_evaluation_loads_the_checkpoint_of_a_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["train", "insertion", "--attempts", "64", "--envs", "4", "--seed", "3", "--out", str(tmp_path / "run")]
+@pytest.mark.parametrize("algorithm", [[], ["--algorithm", "ppo"]])
+def test_evaluation_loads_the_checkpoint_of_a_training(
+    algorithm: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = ["--attempts", "64", "--envs", "4", "--seed", "3", "--out", str(tmp_path / "run")]
+    arguments = ["train", "insertion", *algorithm, *limits]
     assert main(arguments) == 0
-    assert "checkpoint" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "checkpoint" in out and ("simulation" in out) == (not algorithm)
     made = tmp_path / "run" / "insertion.safetensors"
     assert load_checkpoint(made).training["command"] == ["gelflow", *arguments]
     assert main(arguments) == 2
@@ -55,7 +60,7 @@ def test_evaluation_loads_the_checkpoint_of_a_training(tmp_path: Path, capsys: p
         (["train", "insertion", "--attempts", "0"], "above 0"),
         (["train", "insertion", "--minutes", "nan"], "above 0"),
         (["train", "insertion", "--seed", "-1"], "--seed"),
-        (["train", "insertion", "--envs", "17"], "multiple of the batch"),
+        (["train", "insertion", "--algorithm", "ppo", "--envs", "17"], "multiple of the batch"),
         (["train", "insertion", "--out", "pyproject.toml"], "pyproject.toml"),
     ],
 )

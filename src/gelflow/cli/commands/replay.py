@@ -164,12 +164,12 @@ def _perception(description: Mapping[str, Any]) -> tuple[InsertionTask, Percepti
 
 def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
     """The checkpoint of the session, at its recorded path or shipped with gelflow."""
-    from gelflow.policies.checkpoint import default_checkpoint
+    from gelflow.policies.checkpoint import shipped_checkpoints
 
     recorded = description.get("checkpoint")
     if not recorded:
         raise UsageError("the session names no checkpoint; name the policy's file with --checkpoint")
-    for path in (Path(recorded["path"]), default_checkpoint()):
+    for path in (Path(recorded["path"]), *shipped_checkpoints()):
         if path.is_file() and file_digest(path) == recorded["digest"]:
             return path
     wanted = f"{recorded['path']} (SHA-256 {recorded['digest'][:12]}…)"

@@ -1,4 +1,4 @@
-"""`gelflow train insertion`: train a policy in simulation with PPO."""
+"""`gelflow train insertion`: train a policy in simulation, by imitation of the true pose or with PPO."""
 
 import argparse
 import shlex
@@ -12,7 +12,10 @@ from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_see
 from gelflow.cli.output import Output, progress_bar
 
 if TYPE_CHECKING:
-    from gelflow.policies.learning_curve import LearningCurvePoint
+    from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
+
+_DEFAULT = "imitation"
+_ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algorithm
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +23,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=["insertion"], help="task to learn")
     parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: docs/guide/training.md)")
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
-    parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
+    parser.add_argument(
+        "--algorithm", choices=list(_ENVS), default=_DEFAULT, help="learning algorithm (default %(default)s)"
+    )
+    envs = " or ".join(f"{number} with {name}" for name, number in _ENVS.items())
+    parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (default {envs})")
     add_part(parser)
     add_seed(parser)
     add_preset(parser)
@@ -30,26 +37,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
+    args.envs = _ENVS[args.algorithm] if args.envs is None else args.envs
     check_at_least(args, envs=1, seed=0)
-    from gelflow.policies.environment import FlowMapNoise, make_insertion_env  # deferred: torch is slow to import
-    from gelflow.policies.ppo import PPOSettings, train
-
     output = Output(args.json)
-    task = part_task(args.part)
-    given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
-    settings = PPOSettings(seed=args.seed, **given)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
-        bar = _TrainingProgress(progress, settings.attempts)
-        made = train(
-            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task),
-            make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task),
-            out=args.out,
-            settings=settings,
-            command=_command(args, settings.attempts),
-            report=bar.report,
-        )
+        made = _train(args, progress)
     best = made.best
     output.text(f"best on validation: {best.success:.1%} inserted in {best.attempts:.1f} attempts")
+    seconds = made.simulation_time + made.learning_time
+    if seconds > 0:  # not nan
+        share = made.simulation_time / seconds
+        output.text(f"{seconds / 60:.1f} min: simulation {share:.0%}, learning {1 - share:.0%}")
     output.text(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}")
     of_part = "" if args.part is None else f" --part {shlex.quote(args.part)}"
     output.text(f"evaluate it with: gelflow eval insertion{of_part} --checkpoint {shlex.quote(str(made.checkpoint))}")
@@ -59,9 +57,31 @@ def run(args: argparse.Namespace) -> int:
             "learning_curve": made.curve,
             "picture": made.picture,
             "validation": {"success": best.success, "attempts": best.attempts},
+            "seconds": {"simulation": made.simulation_time, "learning": made.learning_time},
         }
     )
     return SUCCESS
+
+
+def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
+    from gelflow.policies.environment import FlowMapNoise, make_insertion_env  # deferred: torch is slow to import
+
+    given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
+    task = part_task(args.part)
+    env, validation = (
+        make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task) for _ in range(2)
+    )
+    if args.algorithm == "ppo":
+        from gelflow.policies import ppo
+
+        ppo_settings = ppo.PPOSettings(seed=args.seed, **given)
+        command, bar = _command(args, ppo_settings.attempts), _TrainingProgress(progress, ppo_settings.attempts)
+        return ppo.train(env, validation, out=args.out, settings=ppo_settings, command=command, report=bar.report)
+    from gelflow.policies import imitation
+
+    settings = imitation.ImitationSettings(seed=args.seed, **given)
+    command, bar = _command(args, settings.attempts), _TrainingProgress(progress, settings.attempts)
+    return imitation.train(env, validation, out=args.out, settings=settings, command=command, report=bar.report)
 
 
 class _TrainingProgress:
@@ -87,6 +107,7 @@ class _TrainingProgress:
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
     names = ("part", "minutes", "envs", "seed", "preset", "out")
-    values = {"attempts": attempts} | {name: getattr(args, name) for name in names}
+    algorithm = {} if args.algorithm == _DEFAULT else {"algorithm": args.algorithm}
+    values = algorithm | {"attempts": attempts} | {name: getattr(args, name) for name in names}
     given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
     return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]

@@ -1,0 +1,183 @@
+"""The recurrent network and its training by imitation, on an analytic environment that replaces the simulator."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from tests.policies.toy_insertion import Toy, images, mirrored
+
+from gelflow.errors import UsageError
+from gelflow.observation import FlowMap
+from gelflow.policies import imitation
+from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
+from gelflow.policies.environment import FlowMapNoise, PolicyEnv
+from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
+from gelflow.policies.imitation import ImitationSettings, centring_correction, imitation_loss, train
+from gelflow.policies.networks.polynomial_features import polynomial_basis
+from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
+from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
+from gelflow.policies.training_state import STATE, load_state
+from gelflow.task import INSERTION
+
+SMALL = PolynomialGRU(degree=1, units=24, head=12)
+
+
+def network(architecture: PolynomialGRU = SMALL, seed: int = 0) -> PolynomialGRUNetwork:
+    """A network with random weights."""
+    rng = np.random.default_rng(seed)
+    values = {name: rng.normal(0, 0.3, shape) for name, shape in architecture.tensor_shapes(INSERTION).items()}
+    values["basis"] = polynomial_basis(INSERTION.grid, architecture.degree)
+    values["scale"] = np.ones(architecture.features(INSERTION))
+    return architecture.network(INSERTION, values)
+
+
+def test_numpy_and_torch_give_the_same_outputs_for_sequences_with_several_parts() -> None:
+    layers = TorchPolynomialGRU(SMALL, INSERTION)
+    fixed = {
+        "basis": polynomial_basis(INSERTION.grid, SMALL.degree),
+        "scale": np.full(SMALL.features(INSERTION), 0.7),
+    }
+    policy = SMALL.network(INSERTION, fixed | layers.tensors()).batch_policy(3)
+    inputs, outputs, starts = [], [], []
+    for i in range(7):
+        policy.reset(np.array([i == 4, False, i == 2]))
+        starts.append(policy.new.copy())
+        inputs.append(policy.observe(images(3, seed=i)))
+        outputs.append(policy.output(inputs[-1]))
+        policy.correct(outputs[-1])
+    with torch.no_grad():
+        twin = layers(torch.from_numpy(np.array(inputs)).float(), torch.from_numpy(np.array(starts)))
+    assert np.array(starts).sum() == 5  # three first parts and two more
+    assert np.allclose(twin.numpy(), outputs, atol=1e-5)
+
+
+@pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
+def test_mirrored_flow_maps_give_mirrored_corrections(in_x: bool, in_y: bool) -> None:
+    one, other = network().batch_policy(8), network().batch_policy(8)
+    signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
+    for i in range(5):
+        stack = images(8, seed=i)
+        reflected = np.stack([mirrored(image, in_x, in_y) for image in stack])
+        assert np.allclose(other.corrections(reflected), one.corrections(stack) * signs, atol=1e-9)
+
+
+def test_a_part_without_symmetry_is_not_mirrored() -> None:
+    plain = network(dataclasses.replace(SMALL, mirror=()))
+    one, other = plain.batch_policy(8), plain.batch_policy(8)
+    stack = images(8)
+    assert (one.signs == 1).all()
+    assert not np.allclose(
+        other.corrections(np.stack([mirrored(image, True, False) for image in stack])),
+        one.corrections(stack) * [-1, 1, -1],
+        atol=1e-4,
+    )
+
+
+def test_parts_are_independent_and_reset_clears_the_memory() -> None:
+    together, alone = network().batch_policy(3), network().batch_policy(1)
+    for i in range(6):
+        if i == 2:
+            together.reset(np.array([True, False, True]))
+        stack = images(3, seed=i)
+        both = together.corrections(stack)
+        assert np.allclose(both[1], alone.corrections(stack[1:2])[0], rtol=1e-12, atol=1e-15)
+    first = network().batch_policy(3).corrections(images(3))
+    together.reset(np.ones(3, dtype=bool))
+    assert (together.corrections(images(3)) == first).all()
+
+
+def test_a_checkpoint_holds_the_network(tmp_path: Path) -> None:
+    path = tmp_path / "policy.safetensors"
+    values = {name: tensor.astype(np.float32) for name, tensor in network()._tensors.items()}
+    save_checkpoint(path, task=INSERTION, architecture=SMALL, tensors=values, training={})
+    assert load_checkpoint(path).architecture == SMALL
+    expected = SMALL.network(INSERTION, values).batch_policy(1)
+    policy = load_policy(path)
+    for image in images(4):
+        observed = FlowMap(image, 1.0, "mm", np.zeros((2, 13, 10), dtype=bool))
+        assert (policy.act(observed) == expected.corrections(image[None])[0]).all()
+
+
+@pytest.mark.parametrize("changes", [{"units": 0}, {"reach": (1e-3, 0.0, 0.1)}, {"mirror": ("z",)}])
+def test_an_impossible_architecture_is_rejected(changes: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        dataclasses.replace(SMALL, **changes)
+
+
+def test_the_centring_correction_centres_a_part() -> None:
+    pose = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * INSERTION.misalignment
+    assert np.allclose(INSERTION.corrected(pose, centring_correction(pose)), 0, atol=1e-15)
+
+
+def test_the_bounded_loss_prefers_a_mode_and_the_other_one_the_mean() -> None:
+    modes = torch.tensor([[-4.0, 0, 0], [-4.0, 0, 0], [4.0, 0, 0]])
+    at_mode, at_mean = torch.tensor([-4.0, 0, 0]), modes.mean(0)
+    assert imitation_loss(modes - at_mode, 1.0) < imitation_loss(modes - at_mean, 1.0)
+    assert imitation_loss(torch.zeros(5, 3), 0.5) == 0
+
+
+SHORT = ImitationSettings(attempts=8_192, updates=40, evaluate_every=4_000, evaluate_episodes=128)
+
+
+def sides() -> tuple[PolicyEnv, PolicyEnv]:
+    return PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), PolicyEnv(Toy(32), INSERTION, FlowMapNoise())
+
+
+def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Path) -> None:
+    points: list[Any] = []
+    result = train(
+        *sides(), out=tmp_path, architecture=SMALL, settings=SHORT, command=["gelflow", "train"], report=points.append
+    )
+    env = PolicyEnv(Toy(32), INSERTION, FlowMapNoise())
+    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), env, episodes=256, seed=1)
+    actor = NetworkActor(load_policy(result.checkpoint).network, 32)
+    policy = evaluate("policy", actor, env, episodes=256, seed=1)
+    assert policy.success > 0.95 and policy.attempts < random.attempts
+    assert load_checkpoint(result.checkpoint).training["command"] == ["gelflow", "train"]
+    assert len(result.curve.read_text().splitlines()) == 1 + len(points)
+    assert result.picture.read_bytes().startswith(b"\x89PNG")
+    assert result.simulation_time > 0 and result.learning_time > 0
+    assert not (tmp_path / STATE).exists()
+    with pytest.raises(UsageError, match="already holds a trained policy"):
+        train(*sides(), out=tmp_path, architecture=SMALL, settings=SHORT)
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_training_continues_to_the_result_of_an_uninterrupted_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(imitation, "_SAVE_INTERVAL", 0.0)
+    settings = dataclasses.replace(SHORT, attempts=3_072, updates=5, memory=3, evaluate_every=1_000)
+
+    def run(folder: Path, settings: ImitationSettings, stop_at: float = np.inf) -> dict[str, NDArray[Any]]:
+        def report(point: Any) -> None:
+            if point.attempts >= stop_at:
+                raise Killed
+
+        result = train(*sides(), out=folder, architecture=SMALL, settings=settings, report=report)
+        return dict(load_checkpoint(result.checkpoint).tensors)
+
+    whole = run(tmp_path / "whole", settings)
+    with pytest.raises(Killed):
+        run(tmp_path / "killed", settings, stop_at=2_000)
+    state = load_state(tmp_path / "killed")
+    assert state is not None and state[1]["attempts"] == 1_536
+    with pytest.raises(UsageError, match=r"unfinished training with settings .*'updates': '5'.*'updates': '6'"):
+        run(tmp_path / "killed", dataclasses.replace(settings, updates=6))
+    continued = run(tmp_path / "killed", settings)
+    assert all((continued[name] == whole[name]).all() for name in whole)
+    other = run(tmp_path / "other", dataclasses.replace(settings, seed=1))
+    assert any((other[name] != whole[name]).any() for name in whole)
+
+
+def test_a_damaged_state_is_rejected(tmp_path: Path) -> None:
+    (tmp_path / STATE).write_bytes(b"nothing")
+    with pytest.raises(UsageError, match="damaged"):
+        train(*sides(), out=tmp_path, settings=SHORT)
