@@ -179,7 +179,7 @@ def learn(
         error = (layers(inputs, starts) - targets) / scale
         loss = imitation_loss(error, bounded)
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(layers.parameters(), settings.gradient_norm)
         optimizer.step()
 
@@ -215,7 +215,7 @@ def feature_scale(env: PolicyEnv, basis: Array, seed: int) -> Array:
     0.03, so that features without signal stay small.
     """
     squares = (reduce_maps(env.reset(seed), basis) ** 2).mean(0).reshape(-1, basis.shape[1])
-    return np.maximum(np.sqrt(np.broadcast_to(squares.mean(0), squares.shape).reshape(-1)), 0.03)
+    return np.asarray(np.maximum(np.sqrt(np.broadcast_to(squares.mean(0), squares.shape).reshape(-1)), 0.03))
 
 
 class _Run:
@@ -331,8 +331,8 @@ class _Run:
             state.setdefault(int(index), {})[key] = torch.from_numpy(values)
         self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": state})
         memory = groups["memory"]
-        for index in range(len(memory) // 3):
-            self.memory.append(Attempts(*(memory[f"{index}.{name}"] for name in ("inputs", "targets", "starts"))))
+        for i in range(len(memory) // 3):
+            self.memory.append(Attempts(*(memory[f"{i}.{name}"] for name in ("inputs", "targets", "starts"))))
         self._iterations, self.attempts = facts["iterations"], facts["attempts"]
         self.simulation_time, self.learning_time, seconds = facts["seconds"]
         self._begun -= seconds

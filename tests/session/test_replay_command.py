@@ -127,6 +127,22 @@ def test_the_command_detects_another_policy(
     assert reddish(tmp_path / "same.png") == 0
 
 
+def test_a_session_finds_its_policy_among_those_shipped(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = real_session.parent / "policy.safetensors"
+    (tmp_path / "former.safetensors").write_bytes(recorded.read_bytes())
+    untrained(tmp_path / "insertion.safetensors", 2)
+    monkeypatch.setattr(checkpoint, "_SHIPPED", tmp_path)
+    away = recorded.rename(recorded.with_suffix(".away"))
+    try:
+        assert main(["replay", str(real_session)]) == 0
+    finally:
+        away.rename(recorded)
+    out = capsys.readouterr().out
+    assert "all 3 decisions identical" in out and "note:" not in out
+
+
 def with_grasp(source: Path, target: Path, *, delay: float) -> Path:
     """A session with the first image of each camera and a grasp whose images arrive `delay` [s] late."""
     rng = np.random.default_rng(4)
