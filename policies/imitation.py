@@ -52,8 +52,8 @@ class ImitationSettings:
     memory: int = 40  # iterations whose attempts are learned from
     learning_rate: float = 3e-3  # decreases linearly to zero
     gradient_norm: float = 1.0  # largest norm of the gradient
-    # Error of a correction that counts as 1 [m, m, rad]: the clearance, and the yaw that a corner has of it.
-    tolerance: tuple[float, float, float] = (2.25e-3, 2.25e-3, 0.07)
+    # Error of a correction that counts as 1 [m, m, rad]; None: `part_tolerance`.
+    tolerance: tuple[float, float, float] | None = None
     bounded: float = 0.9  # share of the bounded loss, reached after `bounded_after` of the training
     bounded_after: float = 0.3
     # Largest standard deviation of the exploration, in units of the reach: at the start and at the end.
@@ -93,7 +93,7 @@ def train(
     env: environment of the training
     validation: environment of the evaluations
     out: folder of insertion.safetensors, learning_curve.csv and learning_curve.png; created if missing
-    architecture: of the network
+    architecture: of the network; None takes the mirror symmetry of the task's part
     settings: of the algorithm
     command: command line, stored in the checkpoint
     report: called after each iteration and each evaluation
@@ -103,7 +103,8 @@ def train(
     other settings.
     """
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
-    run = _Run(env, validation, architecture or PolynomialGRU(), settings or ImitationSettings(), out, command, report)
+    architecture = architecture or PolynomialGRU(mirror=env.task.part.mirror)
+    run = _Run(env, validation, architecture, settings or ImitationSettings(), out, command, report)
     settings = run.settings
     while run.attempts < settings.attempts and run.minutes() < settings.minutes:
         progress = run.attempts / settings.attempts
@@ -135,7 +136,7 @@ def collect(
     for _ in range(settings.rollout):
         starts.append(policy.new.copy())
         inputs.append(policy.observe(images).astype(np.float32))
-        centring = centring_correction(env.pose) / np.asarray(network.reach)
+        centring = centring_correction(env.pose, env.task) / np.asarray(network.reach)
         targets.append((centring * policy.signs).astype(np.float32))
         output = policy.output(inputs[-1].astype(float))
         corrections = policy.correct(np.clip(output, -1, 1) + spread * rng.standard_normal(output.shape))
@@ -150,11 +151,18 @@ def collect(
     return attempts, inserted / ended if ended else float("nan"), float(np.mean(rewards))
 
 
-def centring_correction(pose: Array) -> Array:
-    """The correction (n, 3) in the gripper frame that moves grippers at `pose` (n, 3) to zero misalignment."""
+def centring_correction(pose: Array, task: InsertionTask) -> Array:
+    """The correction (n, 3) in the gripper frame that moves grippers at `pose` (n, 3) to the nearest fitting pose."""
     x, y, yaw = pose.T
     cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([-cos * x - sin * y, sin * x - cos * y, -yaw], axis=1)
+    return np.stack([-cos * x - sin * y, sin * x - cos * y, -task.part.yaw_error(yaw)], axis=1) * task.corrected_axes
+
+
+def part_tolerance(task: InsertionTask) -> tuple[float, float, float]:
+    """The gap beside the part in x and y [m], and the yaw that moves a corner by the smaller one [rad]."""
+    x, y = (clearance / 2 for clearance in task.part.clearance)
+    corner = float(np.hypot(*task.part.size[:2])) / 2
+    return x, y, min(x, y) / corner
 
 
 def learn(
@@ -245,7 +253,7 @@ class _Run:
             torch.manual_seed(settings.seed)
             self.layers = TorchPolynomialGRU(architecture, self.task)
         self.optimizer = torch.optim.Adam(self.layers.parameters(), settings.learning_rate)
-        self.scaled_tolerance = np.asarray(settings.tolerance) / np.asarray(architecture.reach)
+        self.scaled_tolerance = np.asarray(settings.tolerance or part_tolerance(self.task)) / architecture.reach
         self.memory: deque[Attempts] = deque(maxlen=settings.memory)
         self.attempts = 0
         self.simulation_time = self.learning_time = 0.0  # [s]

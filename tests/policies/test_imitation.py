@@ -12,16 +12,23 @@ from tests.policies.toy_insertion import Toy, images, mirrored
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
+from gelflow.part import CUBOID
 from gelflow.policies import imitation
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
-from gelflow.policies.imitation import ImitationSettings, centring_correction, imitation_loss, train
+from gelflow.policies.imitation import (
+    ImitationSettings,
+    centring_correction,
+    imitation_loss,
+    part_tolerance,
+    train,
+)
 from gelflow.policies.networks.polynomial_features import polynomial_basis
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
 from gelflow.policies.training_state import STATE, load_state
-from gelflow.task import INSERTION
+from gelflow.task import INSERTION, insertion_task
 
 SMALL = PolynomialGRU(degree=1, units=24, head=12)
 
@@ -110,7 +117,17 @@ def test_an_impossible_architecture_is_rejected(changes: dict[str, Any]) -> None
 
 def test_the_centring_correction_centres_a_part() -> None:
     pose = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * INSERTION.misalignment
-    assert np.allclose(INSERTION.corrected(pose, centring_correction(pose)), 0, atol=1e-15)
+    assert np.allclose(INSERTION.corrected(pose, centring_correction(pose, INSERTION)), 0, atol=1e-15)
+    hexagon = insertion_task(dataclasses.replace(CUBOID, symmetry=6))
+    turned = pose + np.array([0, 0, np.pi / 3])
+    assert np.allclose(centring_correction(turned, hexagon)[:, 2], -pose[:, 2])
+    peg = insertion_task(dataclasses.replace(CUBOID, symmetry=0))
+    assert (centring_correction(pose, peg)[:, 2] == 0).all()
+
+
+def test_the_tolerance_is_the_gap_and_the_yaw_of_a_corner() -> None:
+    x, y, yaw = part_tolerance(INSERTION)
+    assert x == y == 2.25e-3 and np.hypot(17.5, 25) * yaw == pytest.approx(2.25)
 
 
 def test_the_bounded_loss_prefers_a_mode_and_the_other_one_the_mean() -> None:
