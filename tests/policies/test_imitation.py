@@ -57,9 +57,9 @@ def test_numpy_and_torch_give_the_same_outputs_for_sequences_with_several_parts(
         outputs.append(policy.output(inputs[-1]))
         policy.correct(outputs[-1])
     with torch.no_grad():
-        twin = layers(torch.from_numpy(np.array(inputs)).float(), torch.from_numpy(np.array(starts)))
+        from_torch = layers(torch.from_numpy(np.array(inputs)).float(), torch.from_numpy(np.array(starts)))
     assert np.array(starts).sum() == 5  # three first parts and two more
-    assert np.allclose(twin.numpy(), outputs, atol=1e-5)
+    assert np.allclose(from_torch.numpy(), outputs, atol=1e-5)
 
 
 @pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
