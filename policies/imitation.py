@@ -261,7 +261,7 @@ class _Run:
         self._iterations = 0
         self._best: EvaluationResult | None = None
         self._points: list[LearningCurvePoint] = []
-        # What must be equal when the run is continued.
+        # All of it must be equal when the run is continued.
         self._identity: dict[str, Any] = {
             "task": self.task.digest(),
             "network": architecture.to_json(),
