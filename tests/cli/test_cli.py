@@ -18,6 +18,7 @@ from gelflow.session import SessionRecorder
 MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
 COMMON_OPTIONS = {
     "train": {"--json", "--out", "--seed", "--preset"},
+    "sweep": {"--json", "--out"},
     "eval": {"--json", "--seed", "--preset", "--checkpoint"},
     "track": {"--json", "--out"},
     "calibrate-camera": {"--json", "--out"},

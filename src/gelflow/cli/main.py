@@ -19,6 +19,7 @@ from gelflow.interrupts import Interrupted
 # Command → description in one line. Its module is gelflow.cli.commands.<command>, with _ for -.
 COMMANDS = {
     "train": "train a policy in simulation",
+    "sweep": "train many configurations and seeds on this machine, a Ray cluster or SLURM",
     "eval": "measure the success of a policy in simulation, and that of random actions",
     "track": "track markers in tactile images: a folder, a video, a stream or a camera",
     "calibrate-camera": "calibrate a camera in millimetres from one image of the gel at rest",

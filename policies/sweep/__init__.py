@@ -1,0 +1,1 @@
+"""Many training runs on one or many machines (`gelflow sweep`)."""

@@ -1,0 +1,1 @@
+"""Engines that execute runs: this machine, a Ray cluster, SLURM."""

@@ -1,0 +1,77 @@
+"""A sweep: starts the runs of a grid that are not complete on an engine, and again those that are lost."""
+
+import contextlib
+import dataclasses
+import fcntl
+import os
+import platform
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from gelflow.errors import UsageError
+from gelflow.policies.sweep.engines.engine import Engine
+from gelflow.policies.sweep.run import Run, RunRecord, read_record, write_record
+
+Report = Callable[[Run, RunRecord, bool], None]  # a run that ended, its record, and whether it is started again
+
+
+@contextlib.contextmanager
+def sweep_folder(folder: Path, grid_file: Path) -> Iterator[None]:
+    """Prepare the folder of a sweep and keep it locked for this process.
+
+    Raises UsageError when it cannot be written, or another sweep uses it.
+    """
+    try:
+        for name in ("runs", "records", "results", "logs", "locks"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        lock = (folder / "locks" / "sweep.lock").open("a+", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            raise UsageError(f"another sweep uses {folder}: {lock.read().strip()}") from None
+        except OSError:  # a file system without locks
+            pass
+        lock.truncate(0)
+        lock.write(f"process {os.getpid()} on {platform.node()}\n")
+        lock.flush()
+        if grid_file.resolve() != (folder / "grid.toml").resolve():
+            shutil.copyfile(grid_file, folder / "grid.toml")
+        yield
+
+
+def incomplete(runs: Sequence[Run]) -> list[Run]:
+    """The runs that are not complete. Raises UsageError when the folder holds a run with other options."""
+    return [run for run in runs if read_record(run).state != "complete"]
+
+
+def execute_runs(runs: Sequence[Run], engine: Engine, *, tries: int, report: Report) -> None:
+    """Execute runs until each is complete or has failed.
+
+    Parameters
+    ----------
+    runs: those that are not complete
+    engine: executes them
+    tries: starts of a run; one that ends with an error of its input is not started again
+    report: called for each run that ended
+    """
+    tried = Counter({run.name: 1 for run in runs})
+    remaining = len(runs)
+    engine.submit(runs)
+    while remaining:
+        for run, record in engine.ended():
+            if record.exit_code is None:  # the worker could not write it
+                record = dataclasses.replace(read_record(run), state="failed", error=record.error)
+                write_record(run, record)
+            again = record.start_again and tried[run.name] < tries
+            report(run, record, again)
+            if again:
+                tried[run.name] += 1
+                engine.submit([run])
+            else:
+                remaining -= 1

@@ -1,0 +1,82 @@
+"""Sweeps through submitit, whose local executor runs the jobs as processes of this machine."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from tests.policies.sweep.harness import assert_resumed, held, kill, make_runs, steps, sweep
+
+from gelflow.errors import UsageError
+from gelflow.policies.sweep.engines.slurm import SlurmEngine, SlurmSettings
+from gelflow.policies.sweep.run import Run, read_record
+from gelflow.toml_tables import TomlTable
+
+pytest.importorskip("submitit", reason="submitit is not installed (pip install 'gelflow[slurm]')")
+
+
+@pytest.fixture(autouse=True)
+def jobs_import_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As installed packages are imported on a cluster."""
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")])
+    )
+
+
+def local(runs: list[Run]) -> SlurmEngine:
+    return SlurmEngine(runs[0].folder, SlurmSettings(cluster="local"), cpus=1)
+
+
+def parent(process: int) -> int:
+    """Process id of the parent."""
+    return int(Path(f"/proc/{process}/status").read_text().split("PPid:")[1].split()[0])
+
+
+def test_a_killed_run_is_submitted_again_and_continues(tmp_path: Path) -> None:
+    first, second = runs = make_runs(tmp_path)
+    with held(runs, lambda: kill(first)):
+        ended = sweep(runs, lambda: local(runs))
+    assert (first.name, "failed", True) in ended
+    assert_resumed(first)
+    assert read_record(second).starts == 1
+
+
+def test_a_run_survives_the_death_of_its_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("submitit.core.core.Job._results_timeout_s", 0)  # the results are on a disk of this machine
+    runs = make_runs(tmp_path)[:1]
+    with held(runs, lambda: os.kill(parent(steps(runs[0])[-1][1]), signal.SIGKILL)):
+        ended = sweep(runs, lambda: local(runs))
+    assert ended == [(runs[0].name, "failed", True), (runs[0].name, "complete", False)]
+    assert_resumed(runs[0])
+
+
+def test_a_run_continues_after_the_time_limit_of_its_job(tmp_path: Path) -> None:
+    """Before its limit a job is sent SIGUSR2; the job is queued again and is no failed run."""
+    runs = make_runs(tmp_path)[:1]
+    with held(runs, lambda: os.kill(parent(steps(runs[0])[-1][1]), signal.SIGUSR2)):
+        ended = sweep(runs, lambda: local(runs))
+    assert ended == [(runs[0].name, "complete", False)]
+    assert_resumed(runs[0])
+
+
+def test_settings_become_options_of_sbatch() -> None:
+    data = {"partition": "cpu", "minutes": 90, "memory_gb": 2.5, "parallel": 8, "setup": "module load gcc"}
+    settings = SlurmSettings.from_table(TomlTable({**data, "sbatch": {"constraint": "avx2"}}, "grid.toml, slurm"))
+    assert settings.parameters(cpus=2) == {
+        "name": "gelflow",
+        "timeout_min": 90,
+        "mem_gb": 2.5,
+        "cpus_per_task": 2,
+        "slurm_partition": "cpu",
+        "slurm_array_parallelism": 8,
+        "slurm_setup": ["module load gcc"],
+        "slurm_additional_parameters": {"constraint": "avx2"},
+    }
+    with pytest.raises(UsageError, match="unknown key 'partitoin'; did you mean 'partition'"):
+        SlurmSettings.from_table(TomlTable({"partitoin": "cpu"}, "grid.toml, slurm"))
+
+
+def test_a_machine_without_slurm_is_an_error_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UsageError, match="this machine has no SLURM"):
+        SlurmEngine(tmp_path, SlurmSettings(), cpus=1)

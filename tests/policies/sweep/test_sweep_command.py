@@ -1,0 +1,62 @@
+"""The command `gelflow sweep` with tiny trainings."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.policies.checkpoint import load_checkpoint
+
+GRID = 'task = "insertion"\nseeds = [0, 1]\n[options]\nattempts = 16\nenvs = 4\n'
+
+
+def test_a_sweep_of_real_trainings_collects_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid, out = tmp_path / "tiny.toml", tmp_path / "sweep"
+    grid.write_text(GRID)
+    assert main(["sweep", str(grid), "--out", str(out), "--jobs", "1", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["complete"] == 2 and printed["failed"] == 0
+    assert [row["seed"] for row in printed["runs"]] == [0, 1]
+    for row in printed["runs"]:
+        checkpoint = load_checkpoint(Path(row["checkpoint"]))
+        assert checkpoint.training["settings"]["seed"] == row["seed"]
+    assert all(Path(path).stat().st_size > 0 for path in printed["files"].values())
+    assert set(printed["files"]) == {"runs", "summary", "curves", "picture"}
+    (configuration,) = printed["configurations"]
+    assert configuration["complete"] == 2 and "validation.success" in configuration["results"]
+
+    before = sorted((path, path.stat().st_mtime_ns) for path in (out / "runs").rglob("*"))
+    assert main(["sweep", str(grid), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "2 runs in" in text and "2 of them complete" in text and "success" in text
+    assert max(map(len, text.splitlines()[1:-1])) <= 100
+    assert sorted((path, path.stat().st_mtime_ns) for path in (out / "runs").rglob("*")) == before
+
+
+def test_a_failed_run_gives_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = tmp_path / "wrong.toml"
+    grid.write_text('task = "insertion"\n[options]\nenvs = 17\nattempts = 64\n')
+    assert main(["sweep", str(grid), "--out", str(tmp_path / "sweep")]) == 1
+    text = capsys.readouterr().out
+    assert "failed: seed=0: exit code 2: gelflow train: " in text and "multiple of the batch" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[options]\natempts = 1", "unknown key 'atempts'; did you mean 'attempts'?"),
+        ("[options]\nout = 'x'", "every run has a folder of its own"),
+        ("[options]\nattempts = 'many'", "argument --attempts: invalid int value: 'many'"),
+        ("[grid]\npresets = ['fast']", "grid: unknown key 'presets'; did you mean 'preset'?"),
+    ],
+)
+def test_a_wrong_grid_file_is_an_error_in_one_line(
+    text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid = tmp_path / "grid.toml"
+    grid.write_text(f'task = "insertion"\n{text}\n')
+    assert main(["sweep", str(grid), "--out", str(tmp_path / "sweep")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"gelflow sweep: {grid}") and message in error and error.count("\n") == 1
+    assert not (tmp_path / "sweep").exists()
