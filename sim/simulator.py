@@ -1,6 +1,5 @@
 """Batched simulation of one scene: state and parameters as NumPy arrays, steps, rollouts and their gradients."""
 
-import os
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Literal, Protocol
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
+from gelflow.measurement.machine import default_threads
 from gelflow.sim import _core
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
@@ -35,7 +35,8 @@ class Simulator:
     ----------
     scene: a `Scene` or a core model
     num_envs: number of environments N
-    threads: maximum number of threads; None uses all available cores. Results do not depend on it.
+    threads: maximum number of threads; None uses all available cores, at most OMP_NUM_THREADS. Results do not
+        depend on it.
     precision: "double" or "single"; None takes the scene's setting, and "double" for a core model
 
     Attributes
@@ -70,8 +71,7 @@ class Simulator:
         self.scene: Any = scene  # attributes of a `Scene` are used where present
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
-        available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = max(1, min(num_envs, threads or available))
+        workers = max(1, min(num_envs, threads or default_threads()))
         batch = _core.Batch if precision == "double" else _core.BatchFloat
         self._batch = batch(self.model, num_envs, workers)
         self.num_envs = num_envs

@@ -15,12 +15,8 @@ from gelflow.policies.sweep.results import Row, group
 from gelflow.policies.sweep.run import Run, RunRecord
 from gelflow.toml_tables import suggestion
 
-PREFERRED = (
-    "evaluated success",
-    "evaluated_success",
-    "success",
-    "reward",
-)  # columns to draw, the first that holds numbers
+# Columns to draw; the first that holds numbers is taken.
+PREFERRED = ("evaluated success", "evaluated_success", "success", "reward")
 RESULT_KEY = "learning_curve"  # of the file in the JSON object that a run prints
 _LINES = ("-", "--", ":", "-.")  # one per round through the colours
 

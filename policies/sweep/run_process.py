@@ -67,8 +67,9 @@ class RunProcess:
             record = read_record(self._run)
             if record.state == "complete":  # by the process that had the lock
                 return record
-            if record.state == "started" and (result := _json_object(self._run.output)) is not None:
-                return self._complete(record, result)  # it ended after its worker was lost
+            if record.exit_code is None and (result := _json_object(self._run.output)) is not None:
+                # It ended after its worker was lost.
+                return self._complete(dataclasses.replace(record, exit_code=0), result)
             self._start(dataclasses.replace(record, starts=record.starts + 1))
             return None
         code = self._process.poll()
@@ -145,7 +146,7 @@ class RunProcess:
         return record
 
     def _complete(self, record: RunRecord, result: dict[str, Any]) -> RunRecord:
-        record = dataclasses.replace(record, state="complete", result=result)
+        record = dataclasses.replace(record, state="complete", error="", result=result)
         write_record(self._run, record)
         return record
 

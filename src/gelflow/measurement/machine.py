@@ -13,6 +13,15 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def default_threads() -> int:
+    """Threads of a computation that are not given: the cores, but at most the environment variable OMP_NUM_THREADS.
+
+    Ray and other schedulers set it to what a process may use of a machine that it shares.
+    """
+    limit = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    return min(cores(), int(limit)) if limit.isdigit() and int(limit) else cores()
+
+
 def processor() -> str:
     """Name of the processor, and number of cores available to this process."""
     name = platform.processor() or platform.machine()

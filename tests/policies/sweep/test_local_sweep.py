@@ -101,7 +101,7 @@ def test_the_result_of_a_run_that_ended_after_its_worker_was_lost_is_kept(tmp_pa
     (run,) = make_runs(tmp_path)[:1]
     sweep([run], two)
     complete = read_record(run)
-    write_record(run, dataclasses.replace(complete, state="started", result={}))
+    write_record(run, dataclasses.replace(complete, state="failed", exit_code=None, error="lost", result={}))
     assert sweep([run], two) == [(run.name, "complete", False)]
     assert read_record(run) == complete
 

@@ -85,17 +85,18 @@ def test_a_run_survives_the_death_of_its_node(tmp_path: Path, cluster: Any) -> N
     """The last test: it leaves one node."""
     runs = make_runs(tmp_path)
     (lost_node,) = cluster.worker_nodes
-    lost: list[tuple[Run, int]] = []
+    lost: list[Run] = []
 
     def remove_node() -> None:
         (run,) = [run for run in runs if lost_node.node_id.startswith(node(run))]
-        lost.append((run, steps(run)[-1][1]))
+        process = steps(run)[-1][1]
+        lost.append(run)
         cluster.remove_node(lost_node, allow_graceful=False)
+        wait_until(lambda: not is_running(process))
 
     with held(runs, remove_node):
         ended = sweep(runs, RayEngine)
-    ((run, process),) = lost
+    (run,) = lost
     assert (run.name, "failed", True) in ended and len(ended) == 3
     assert_resumed(run)
     assert cluster.head_node.node_id.startswith(node(run))
-    wait_until(lambda: not is_running(process))

@@ -59,7 +59,7 @@ def test_a_configuration_has_median_and_range_of_its_complete_runs(tmp_path: Pat
 
 
 def test_curves_are_interpolated_to_the_common_points_of_the_seeds(tmp_path: Path) -> None:
-    tables = {
+    tables: dict[tuple[str, int], list[tuple[Any, ...]]] = {
         ("fast", 0): [(0, 0.0, "a"), (10, "", ""), (20, 1.0, "")],
         ("fast", 1): [(0, 0.2, "b"), (10, 0.4, ""), (30, 0.6, "")],
     }
