@@ -4,11 +4,13 @@ import contextlib
 import json
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
 from tests.policies.sweep.fake_training import STEPS
 
 from gelflow.errors import UsageError
@@ -30,6 +32,7 @@ def check(arguments: Sequence[str]) -> None:
             raise UsageError(f"argument --rate: invalid float value: {word!r}") from None
 
 
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes together with their parent")
 OPTIONS = CommandOptions(
     names=["rate", "fast"], flags=["fast"], reserved={"seed": "list them as seeds = [0, 1, 2]"}, check=check
 )
@@ -107,6 +110,14 @@ def held(runs: Sequence[Run], then: Callable[[], None], *, release: bool = True)
 def kill(run: Run) -> None:
     """Kill the process of a run, as the operating system does when memory is short."""
     os.kill(steps(run)[-1][1], signal.SIGKILL)
+
+
+def signal_worker(run: Run, number: signal.Signals) -> None:
+    """Send a signal to the worker of a run, and wait until the process of the run has ended with it."""
+    process = steps(run)[-1][1]
+    worker = Path(f"/proc/{process}/status").read_text().split("PPid:")[1].split()[0]
+    os.kill(int(worker), number)
+    wait_until(lambda: not is_running(process))
 
 
 def assert_resumed(run: Run) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.policies.sweep.harness import (
+    LINUX,
     TWO_SEEDS,
     assert_resumed,
     held,
@@ -124,7 +125,7 @@ def test_two_sweeps_cannot_use_one_folder(tmp_path: Path) -> None:
         pass
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes together with their parent")
+@LINUX
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_runs_end_with_their_sweep_and_the_next_sweep_continues_them(tmp_path: Path, number: signal.Signals) -> None:
     runs = make_runs(tmp_path)

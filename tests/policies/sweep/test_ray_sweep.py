@@ -2,13 +2,23 @@
 
 import os
 import signal
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.policies.sweep.harness import assert_resumed, held, is_running, kill, make_runs, steps, sweep, wait_until
+from tests.policies.sweep.harness import (
+    LINUX,
+    assert_resumed,
+    held,
+    is_running,
+    kill,
+    make_runs,
+    signal_worker,
+    steps,
+    sweep,
+    wait_until,
+)
 
 from gelflow.policies.sweep.engines.ray import RayEngine
 from gelflow.policies.sweep.run import Run, read_record
@@ -64,23 +74,17 @@ def test_runs_are_spread_over_the_nodes_and_a_killed_one_continues(tmp_path: Pat
     assert read_record(second).starts == 1
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes together with their parent")
+@LINUX
 def test_a_run_survives_the_death_of_its_worker(tmp_path: Path, cluster: Any) -> None:
     (run,) = make_runs(tmp_path)[:1]
-
-    def kill_worker() -> None:
-        process = steps(run)[-1][1]
-        status = Path(f"/proc/{process}/status").read_text()
-        os.kill(int(status.split("PPid:")[1].split()[0]), signal.SIGKILL)
-
-    with held([run], kill_worker):
+    with held([run], lambda: signal_worker(run, signal.SIGKILL)):
         ended = sweep([run], RayEngine)
     assert ended == [(run.name, "failed", True), (run.name, "complete", False)]
     assert_resumed(run)
     assert run.log.read_text().count("=== start ") == 2
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes together with their parent")
+@LINUX
 def test_a_run_survives_the_death_of_its_node(tmp_path: Path, cluster: Any) -> None:
     """The last test: it leaves one node."""
     runs = make_runs(tmp_path)

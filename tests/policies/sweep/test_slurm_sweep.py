@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from tests.policies.sweep.harness import assert_resumed, held, kill, make_runs, steps, sweep
+from tests.policies.sweep.harness import LINUX, assert_resumed, held, kill, make_runs, signal_worker, sweep
 
 from gelflow.errors import UsageError
 from gelflow.policies.sweep.engines.slurm import SlurmEngine, SlurmSettings
@@ -27,11 +27,6 @@ def local(runs: list[Run]) -> SlurmEngine:
     return SlurmEngine(runs[0].folder, SlurmSettings(cluster="local"), cpus=1)
 
 
-def parent(process: int) -> int:
-    """Process id of the parent."""
-    return int(Path(f"/proc/{process}/status").read_text().split("PPid:")[1].split()[0])
-
-
 def test_a_killed_run_is_submitted_again_and_continues(tmp_path: Path) -> None:
     first, second = runs = make_runs(tmp_path)
     with held(runs, lambda: kill(first)):
@@ -41,19 +36,21 @@ def test_a_killed_run_is_submitted_again_and_continues(tmp_path: Path) -> None:
     assert read_record(second).starts == 1
 
 
+@LINUX
 def test_a_run_survives_the_death_of_its_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("submitit.core.core.Job._results_timeout_s", 0)  # the results are on a disk of this machine
     runs = make_runs(tmp_path)[:1]
-    with held(runs, lambda: os.kill(parent(steps(runs[0])[-1][1]), signal.SIGKILL)):
+    with held(runs, lambda: signal_worker(runs[0], signal.SIGKILL)):
         ended = sweep(runs, lambda: local(runs))
     assert ended == [(runs[0].name, "failed", True), (runs[0].name, "complete", False)]
     assert_resumed(runs[0])
 
 
+@LINUX
 def test_a_run_continues_after_the_time_limit_of_its_job(tmp_path: Path) -> None:
     """Before its limit a job is sent SIGUSR2; the job is queued again and is no failed run."""
     runs = make_runs(tmp_path)[:1]
-    with held(runs, lambda: os.kill(parent(steps(runs[0])[-1][1]), signal.SIGUSR2)):
+    with held(runs, lambda: signal_worker(runs[0], signal.SIGUSR2)):
         ended = sweep(runs, lambda: local(runs))
     assert ended == [(runs[0].name, "complete", False)]
     assert_resumed(runs[0])
