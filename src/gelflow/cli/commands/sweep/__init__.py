@@ -5,13 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.measure import Measurement
 from rich.progress import Progress
-from rich.table import Table
 
 from gelflow.cli.commands import train
+from gelflow.cli.commands.sweep.table import summary_table
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_json, add_out, check_at_least
 from gelflow.cli.output import Output, progress_bar
@@ -22,7 +19,6 @@ from gelflow.measurement.machine import cores
 if TYPE_CHECKING:
     from gelflow.policies.sweep.engines.engine import Engine
     from gelflow.policies.sweep.grid import CommandOptions, Grid
-    from gelflow.policies.sweep.results import Configuration, Range
     from gelflow.policies.sweep.run import Run, RunRecord
 
 _RESERVED = {
@@ -155,7 +151,7 @@ def _finish(grid: "Grid", runs: Sequence["Run"], folder: Path, output: Output) -
         results.write_csv(files["curves"], drawn.rows())
         curves.draw(files["picture"], drawn, grid.task)
     failed = [run for run in runs if records[run.name].state != "complete"]
-    output.console.print(table(found, output.console))
+    output.console.print(summary_table(found, output.console))
     for run in failed:
         output.text(f"failed: {run.name}: {records[run.name].error} (log: {run.log})")
     output.text(f"written: {', '.join(str(path) for path in files.values())}")
@@ -164,38 +160,3 @@ def _finish(grid: "Grid", runs: Sequence["Run"], folder: Path, output: Output) -
         | {"runs": rows, "configurations": found, "files": files}
     )
     return NEGATIVE_RESULT if failed else SUCCESS
-
-
-def table(found: Sequence["Configuration"], console: Console) -> Table:
-    """Options, complete runs and results of the configurations, with as many results as fit the console."""
-    names = list(dict.fromkeys(name for configuration in found for name in configuration.results))
-    view = _table(found, [])
-    for count in range(len(names), 0, -1):
-        wider = _table(found, names[:count])
-        if Measurement.get(console, console.options.update(max_width=10_000), wider).maximum <= console.width:
-            return wider
-    return view
-
-
-def _table(found: Sequence["Configuration"], names: Sequence[str]) -> Table:
-    """The table with the results `names`."""
-    title = "median (smallest to largest) over the seeds"
-    view = Table(title=title if names else None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    options = list(found[0].values)
-    for option in options:
-        view.add_column(option, overflow="ellipsis", no_wrap=True)
-    view.add_column("complete", justify="right", no_wrap=True)
-    last_parts = [name.split(".")[-1] for name in names]
-    for name, last in zip(names, last_parts, strict=True):
-        view.add_column(last if last_parts.count(last) == 1 else name, justify="right", no_wrap=True)
-    for configuration in found:
-        cells = [_range(configuration.results.get(name)) for name in names]
-        complete = f"{configuration.complete} of {configuration.runs}"
-        view.add_row(*(str(configuration.values[option]) for option in options), complete, *cells)
-    return view
-
-
-def _range(value: "Range | None") -> str:
-    if value is None:
-        return ""
-    return f"{value.median:.4g}" + ("" if value.low == value.high else f" ({value.low:.4g} to {value.high:.4g})")
