@@ -1,4 +1,4 @@
-"""`gelflow eval insertion`: success of a policy in simulation, compared with random actions."""
+"""`gelflow eval TASK`: success of a policy in simulation, compared with random actions."""
 
 import argparse
 import dataclasses
@@ -11,6 +11,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
     add_checkpoint,
     add_json,
+    add_out,
     add_part,
     add_preset,
     add_seed,
@@ -19,6 +20,8 @@ from gelflow.cli.options import (
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.task_training import TASKS, evaluate_task, refuse
+from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
@@ -26,18 +29,24 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion"], help="task of the policy")
+    parser.add_argument("task", choices=["insertion", *TASKS], help="task of the policy")
     add_part(parser)
     add_checkpoint(parser)
-    parser.add_argument("--episodes", type=int, default=200, metavar="N", help="parts to insert (default %(default)s)")
+    parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
     add_seed(parser, default=1)
     add_preset(parser)
+    add_out(parser, "folder for videos, pictures and a table of failures; not for the insertion", folder=True)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate the policy and random actions, then print a table."""
+    if args.task != "insertion":
+        refuse(args, part=None)
+        return evaluate_task(args)
+    if args.out is not None:
+        raise UsageError("--out is for other tasks than the insertion")
     check_at_least(args, envs=1, episodes=1, seed=0)
     from gelflow.policies.checkpoint import load_policy
 

@@ -1,4 +1,4 @@
-"""`gelflow train insertion`: train a policy in simulation, by imitation of the true pose or with PPO."""
+"""`gelflow train TASK`: train a policy in simulation; the insertion by imitation of the true pose or with PPO."""
 
 import argparse
 import shlex
@@ -10,6 +10,8 @@ from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.task_training import DEFAULT_RECIPE, TASKS, refuse, train_task
+from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
@@ -20,23 +22,32 @@ _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algor
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion"], help="task to learn")
-    parser.add_argument("--attempts", type=int, metavar="N", help="total attempts (default: docs/guide/training.md)")
+    parser.add_argument("task", choices=["insertion", *TASKS], help="task to learn")
+    parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
+    text = "environment steps in total, for the insertion attempts (default: docs/guide/training.md)"
+    parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=text)
     parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not repeatable")
     parser.add_argument(
         "--algorithm", choices=list(_ENVS), default=_DEFAULT, help="learning algorithm (default %(default)s)"
     )
     envs = " or ".join(f"{number} with {name}" for name, number in _ENVS.items())
-    parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (default {envs})")
+    parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (insertion: {envs})")
     add_part(parser)
     add_seed(parser)
     add_preset(parser)
-    add_out(parser, "folder for checkpoint and learning curve", default=Path("runs/insertion"), folder=True)
+    add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
+    if args.task != "insertion":
+        refuse(args, part=None, algorithm=_DEFAULT)
+        args.recipe = args.recipe or DEFAULT_RECIPE
+        return train_task(args)
+    if args.recipe is not None:
+        raise UsageError("--recipe is for other tasks than the insertion, which has --algorithm")
+    args.out = args.out or Path("runs/insertion")
     args.envs = _ENVS[args.algorithm] if args.envs is None else args.envs
     check_at_least(args, envs=1, seed=0)
     output = Output(args.json)

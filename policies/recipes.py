@@ -1,0 +1,160 @@
+"""Recipes: how each task is trained, by name of the task and of the recipe."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gelflow.errors import UsageError
+from gelflow.policies.networks.actor import ActorArchitecture
+from gelflow.policies.networks.cnn import CNN
+from gelflow.policies.networks.mlp import MLP
+from gelflow.policies.ppo_learner import PPO, PPOSettings
+from gelflow.policies.training.learner import Learner
+from gelflow.policies.training.run import Progress, RunSettings, TrainingResult, TrainingRun
+from gelflow.sim.tasks.cap_rotation import CapRotationTask
+from gelflow.sim.tasks.registry import make_task
+from gelflow.sim.tasks.task_batch import TaskBatch
+
+DEFAULT, PAPER = "default", "paper"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Algorithm, settings and length of a training."""
+
+    task: str  # as in `gelflow train TASK`
+    steps: int  # environment steps, over all environments
+    envs: int  # parallel environments
+    evaluate_every: int  # steps
+    evaluate_episodes: int
+    algorithm: str  # as in the configuration of a run
+    settings: Any  # of the algorithm, a dataclass
+    learner: Callable[["Recipe", TaskBatch, int, int], Learner]  # (recipe, task, seed, steps)
+    network: Mapping[str, Any] = field(default_factory=dict)  # settings of the architecture
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the task's batch
+
+    def make_task(self, envs: int | None = None, **options: Any) -> TaskBatch:
+        """A batch of environments of the recipe; `options` are those of the task."""
+        return make_task(self.task, envs or self.envs, threads=1, **{**self.options, **options})
+
+    def make_learner(self, task: TaskBatch, *, seed: int, steps: int) -> Learner:
+        """The learner on `task`; `steps` is the length of the whole training."""
+        return self.learner(self, task, seed, steps)
+
+    def configuration(self) -> dict[str, Any]:
+        """The settings that determine the result, as JSON data."""
+        return {"algorithm": self.algorithm, "settings": dataclasses.asdict(self.settings)}
+
+
+def actor_for(task: TaskBatch, settings: Mapping[str, Any]) -> ActorArchitecture:
+    """The architecture for the observations of `task`: a convolutional network for images, otherwise a perceptron."""
+    shape = tuple(int(size) for size in task.observation_space.shape)
+    architecture = CNN if len(shape) == 3 else MLP
+    return architecture(observation_shape=shape, actions=int(task.action_space.shape[0]), **settings)
+
+
+def _ppo(recipe: Recipe, task: TaskBatch, seed: int, steps: int) -> Learner:
+    return PPO(task, actor_for(task, recipe.network), recipe.settings, seed=seed, steps=steps)
+
+
+# Table 6 of the paper: 32 environments, 32 steps a rollout.
+_TABLE_6 = PPOSettings(
+    rollout=32, batch=256, epochs=10, learning_rate=3e-4, discount=0.99, trace=0.95, clip=0.2, value=0.5, entropy=0.01
+)
+# Long rollouts of many environments for an action of 9 joints; the critic sees the cap, which the hand cannot.
+_CAP = PPOSettings(
+    rollout=64,
+    batch=1024,
+    epochs=5,
+    learning_rate=1e-3,
+    last_learning_rate=0.1,
+    discount=0.98,
+    entropy=0.0,
+    privileged_critic=True,
+)
+
+
+def _grasp(steps: int) -> Recipe:
+    return Recipe("grasp", steps, 32, 4_096, 256, "ppo", _TABLE_6, _ppo)
+
+
+def _cap(settings: PPOSettings, envs: int, **task: Any) -> Recipe:
+    options = {"task": CapRotationTask(**task)}
+    return Recipe("cap", 400_000, envs, 102_400, 256, "ppo", settings, _ppo, {"hidden": (128, 128)}, options)
+
+
+_RECIPES: dict[str, dict[str, Recipe]] = {
+    "grasp": {DEFAULT: _grasp(10_240), PAPER: _grasp(20_480)},
+    "cap": {
+        DEFAULT: _cap(_CAP, 64, commanded=True, reward="progress"),
+        "no-touch": _cap(_CAP, 64, commanded=True, touch=False, reward="progress"),
+        "paper-observation": _cap(_CAP, 64, reward="progress"),
+        "paper-observation-no-touch": _cap(_CAP, 64, touch=False, reward="progress"),
+        PAPER: _cap(_TABLE_6, 32),
+    },
+}
+
+
+def recipe_for(task: str, name: str = DEFAULT) -> Recipe:
+    """The recipe `name` of a task. Raises UsageError for an unknown task or name."""
+    if task not in _RECIPES:
+        raise UsageError(f"no recipe trains {task!r}; there are {', '.join(_RECIPES)}")
+    recipes = _RECIPES[task]
+    if name not in recipes:
+        raise UsageError(f"{task} has no recipe {name!r}; there are {', '.join(recipes)}")
+    return recipes[name]
+
+
+def recipe_names(task: str) -> tuple[str, ...]:
+    """Names of the recipes of a task."""
+    recipe_for(task)
+    return tuple(_RECIPES[task])
+
+
+def trained_tasks() -> tuple[str, ...]:
+    """Names of the tasks that have a recipe."""
+    return tuple(_RECIPES)
+
+
+def train(
+    task: str,
+    folder: Path,
+    *,
+    recipe: str = DEFAULT,
+    seed: int = 0,
+    steps: int | None = None,
+    envs: int | None = None,
+    minutes: float = float("inf"),
+    options: Mapping[str, Any] | None = None,
+    command: Sequence[str] = (),
+    report: Callable[[Progress], None] | None = None,
+) -> TrainingResult:
+    """Trains a policy on a task into `folder`; the same call resumes an unfinished run.
+
+    Parameters
+    ----------
+    task, recipe: names, see `recipe_for`
+    steps, envs: environment steps in total and parallel environments; None: those of the recipe
+    minutes: time limit; a run that reaches it is not repeatable
+    options: of the task's batch, such as `preset` and `friction`; JSON data
+    command: that repeats the run, stored in the folder
+    report: called after each update
+
+    Raises UsageError as `TrainingRun.train`, and for an unknown task, recipe or option.
+    """
+    chosen, given = recipe_for(task, recipe), dict(options or {})
+    total = chosen.steps if steps is None else steps
+    settings = RunSettings(
+        steps=total,
+        seed=seed,
+        minutes=minutes,
+        evaluate_every=chosen.evaluate_every,
+        evaluate_episodes=min(chosen.evaluate_episodes, total),
+    )
+    batch = chosen.make_task(envs, **given)
+    learner = chosen.make_learner(batch, seed=seed, steps=total)
+    configuration = {"recipe": recipe, "options": given, **chosen.configuration()}
+    validation = chosen.make_task(envs, **given)
+    return TrainingRun(learner, validation, folder, settings, configuration, command, report).train()

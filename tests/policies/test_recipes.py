@@ -1,0 +1,113 @@
+"""Recipes, the evaluation report, and the commands `gelflow train` and `gelflow eval` of tasks other than insertion."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.policies.toy_tasks import PointTask
+
+from gelflow.cli.main import main
+from gelflow.cli.task_training import TASKS
+from gelflow.errors import UsageError
+from gelflow.policies.episodes import Episodes, run_episodes
+from gelflow.policies.evaluation_report import OraclePolicy, evaluate_all, failure_ranges
+from gelflow.policies.networks.mlp import MLP
+from gelflow.policies.networks.torch_actor import TorchActor
+from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
+from gelflow.sim.tasks.registry import task_names
+
+
+def test_the_commands_know_the_tasks_of_the_recipes() -> None:
+    assert set(trained_tasks()) == set(TASKS)
+
+
+@pytest.mark.parametrize("task", [name for name in TASKS if name in task_names()])
+def test_every_recipe_makes_a_learner(task: str) -> None:
+    for name in recipe_names(task):
+        recipe = recipe_for(task, name)
+        batch = recipe.make_task(2)
+        assert recipe.make_learner(batch, seed=0, steps=recipe.steps).steps == 0
+        json.dumps(recipe.configuration())
+
+
+def test_unknown_tasks_and_recipes_are_rejected() -> None:
+    with pytest.raises(UsageError, match="no recipe trains 'juggling'"):
+        recipe_for("juggling")
+    with pytest.raises(UsageError, match=r"grasp has no recipe 'best'; there are default, paper"):
+        recipe_for("grasp", "best")
+
+
+def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    options = ["--steps", "8", "--envs", "8", "--recipe", "paper", "--seed", "3", "--out", str(folder), "--json"]
+    assert main(["train", "cap", *options]) == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["steps"] >= 8 and set(made["shares"]) == {"simulation", "learning", "evaluation"}
+    assert main(["train", "cap", *options]) == 2
+    assert "already holds a trained policy" in capsys.readouterr().err
+    arguments = ["--checkpoint", made["checkpoint"], "--episodes", "2", "--envs", "2", "--json"]
+    assert main(["eval", "cap", *arguments]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in printed["results"]] == ["policy", "random"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "grasp", "--recipe", "none"], "no recipe 'none'"),
+        (["train", "cap", "--part", "peg.toml"], "--part is for the insertion"),
+        (["train", "grasp", "--steps", "0"], "above 0"),
+        (["train", "insertion", "--recipe", "paper"], "--recipe"),
+        (["eval", "grasp"], "requires --checkpoint"),
+        (["eval", "insertion", "--out", "x"], "--out"),
+    ],
+)
+def test_an_invalid_option_gives_a_message_of_one_line(
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error and "\n" not in error
+
+
+def test_a_report_has_tables_and_videos(tmp_path: Path) -> None:
+    task = PointTask(4)
+    architecture = MLP(observation_shape=(4,), actions=2, hidden=(8,))
+    network = architecture.network(task.description, TorchActor(architecture).tensors())
+    report = evaluate_all(network, task, episodes=40, seed=1, out=tmp_path)
+    assert [result.name for result in report.results] == ["policy", "random"]
+    assert {"episodes.csv", "failures.csv", "failures.png", "failure.gif"} <= {path.name for path in report.files}
+    assert all(path.stat().st_size > 0 for path in report.files)
+
+
+def test_failures_are_counted_in_ranges_of_equally_many_episodes() -> None:
+    values = np.linspace(0, 1, 100)
+    success = values < 0.7
+    table = {"mass": values, "fixed": np.ones(100)}
+    episodes = Episodes(success, ~success, np.ones(100, int), np.zeros(100), table)
+    ranges = failure_ranges(episodes)
+    assert [entry.quantity for entry in ranges] == ["mass"] * 5
+    assert [entry.episodes for entry in ranges] == [20] * 5
+    assert [entry.failures for entry in ranges] == [0, 0, 0, 10, 20]
+
+
+def test_every_episode_counts_once_whatever_its_length() -> None:
+    class Direct(OraclePolicy):
+        def act(self, observations: NDArray[Any]) -> NDArray[np.float64]:
+            return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
+
+    one, many = (run_episodes(Direct(t), t, episodes=50, seed=2) for t in (PointTask(1), PointTask(7)))
+    for episodes in (one, many):
+        assert len(episodes.success) == 50 and episodes.success.all()
+        assert set(episodes.quantities) == {"target_x", "target_y"}
+        assert (episodes.steps <= 4).all()
+    again = run_episodes(Direct(PointTask(7)), PointTask(7), episodes=50, seed=2)
+    assert (again.reward == many.reward).all()
