@@ -20,6 +20,7 @@ extensions = [
     "plain_docstrings",
     "promises",
     "public_names",
+    "randomization",
 ]
 exclude_patterns = ["extensions", "**/.ipynb_checkpoints"]
 root_doc = "index"

@@ -15,15 +15,15 @@ from gelflow.sim.tasks.task_batch import Mask, TaskBatch
 Observation = NDArray[np.float32]
 
 
-def _batch(task: TaskBatch | str, num_envs: int | None, options: dict[str, Any]) -> TaskBatch:
+def _batch(batch: TaskBatch | str, num_envs: int | None, options: dict[str, Any]) -> TaskBatch:
     """The given batch, or a new batch of the task with this name."""
-    if isinstance(task, str):
-        return make_task(task, 1 if num_envs is None else num_envs, **options)
+    if isinstance(batch, str):
+        return make_task(batch, 1 if num_envs is None else num_envs, **options)
     if options:
         raise UsageError(f"a batch is given: options such as {next(iter(options))!r} have no effect")
-    if num_envs not in (None, task.num_envs):
-        raise UsageError(f"the batch has {task.num_envs} environments, expected {num_envs}")
-    return task
+    if num_envs not in (None, batch.num_envs):
+        raise UsageError(f"the batch has {batch.num_envs} environments, expected {num_envs}")
+    return batch
 
 
 def _check_render_mode(mode: str | None, modes: list[str]) -> None:
@@ -36,16 +36,16 @@ class TaskEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     Parameters
     ----------
-    task: name of a task, or a batch of one environment
+    batch: name of a task, or a batch of one environment
     render_mode: None or "rgb_array"
     options: of the task's batch, such as `preset` (only with a name)
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (declared like this by gymnasium.Env)
 
-    def __init__(self, task: TaskBatch | str, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, batch: TaskBatch | str, *, render_mode: str | None = None, **options: Any) -> None:
         _check_render_mode(render_mode, self.metadata["render_modes"])
-        self.batch = _batch(task, 1, options)
+        self.batch = _batch(batch, 1, options)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": self.batch.frames_per_second}
         spaces: tuple[Any, Any] = self.batch.observation_space, self.batch.action_space
@@ -86,17 +86,17 @@ class TaskVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     Parameters
     ----------
-    task: name of a task, or a batch
+    batch: name of a task, or a batch
     num_envs: number of environments (only with a name)
     render_mode: None or "rgb_array"
     options: of the task's batch, such as `preset` (only with a name)
     """
 
     def __init__(
-        self, task: TaskBatch | str, num_envs: int | None = None, *, render_mode: str | None = None, **options: Any
+        self, batch: TaskBatch | str, num_envs: int | None = None, *, render_mode: str | None = None, **options: Any
     ) -> None:
         _check_render_mode(render_mode, TaskEnv.metadata["render_modes"])
-        self.batch = _batch(task, num_envs, options)
+        self.batch = _batch(batch, num_envs, options)
         self.metadata = {
             **TaskEnv.metadata,
             "render_fps": self.batch.frames_per_second,

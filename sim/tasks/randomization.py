@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,9 @@ class Distribution(Protocol):
 
 
 @dataclass(frozen=True)
-class _Range:
+class Uniform:
+    """Uniform between `low` and `high`."""
+
     low: float
     high: float
 
@@ -35,29 +37,31 @@ class _Range:
         if not 0 <= self.high - self.low < math.inf:
             raise UsageError(f"a range must be (low, high) with low ≤ high, got ({self.low}, {self.high})")
 
-    def with_range(self, low: float, high: float) -> Self:
-        return dataclasses.replace(self, low=low, high=high)
-
-
-@dataclass(frozen=True)
-class Uniform(_Range):
-    """Uniform between `low` and `high`."""
-
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         return rng.uniform(self.low, self.high, count)
 
+    def with_range(self, low: float, high: float) -> "Uniform":
+        return Uniform(low, high)
+
 
 @dataclass(frozen=True)
-class LogUniform(_Range):
+class LogUniform:
     """Uniform in the logarithm between `low` and `high`."""
 
+    low: float
+    high: float
+
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if not 0 <= self.high - self.low < math.inf:
+            raise UsageError(f"a range must be (low, high) with low ≤ high, got ({self.low}, {self.high})")
         if not self.low > 0:
             raise UsageError(f"a logarithmic range must be positive, got ({self.low}, {self.high})")
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         return np.exp(rng.uniform(np.log(self.low), np.log(self.high), count))
+
+    def with_range(self, low: float, high: float) -> "LogUniform | Uniform":
+        return Uniform(0.0, 0.0) if low == high == 0 else LogUniform(low, high)
 
 
 @dataclass(frozen=True)

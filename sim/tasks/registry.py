@@ -1,15 +1,18 @@
 """The tasks of gelflow by name: the environments, trainings and evaluations of a task start from its name."""
 
 import importlib
+from types import ModuleType
 from typing import Any
 
 from gelflow.errors import UsageError
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.toml_tables import suggestion
 
 # name → module and class of its batch
 _TASKS: dict[str, tuple[str, str]] = {
     "rolling": ("gelflow.sim.tasks.rolling", "Rolling"),
+    "grasp": ("gelflow.sim.tasks.grasp", "Grasp"),
     "pushing": ("gelflow.sim.tasks.pushing", "Pushing"),
     "cap": ("gelflow.sim.tasks.cap_rotation", "CapRotation"),
 }
@@ -20,15 +23,31 @@ def task_names() -> tuple[str, ...]:
     return tuple(_TASKS)
 
 
+def randomizations(name: str) -> dict[str, Randomization]:
+    """The randomization tables of the task `name`, by their names. Raises UsageError for an unknown task."""
+    tables: dict[str, Randomization] = _module(name).RANDOMIZATIONS
+    return tables
+
+
 def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
     """A batch of `num_envs` environments of the task `name`.
 
-    `options` are those of the task's class; all tasks have `preset`, `friction`, `randomization` and `threads`. Raises
-    UsageError for an unknown name.
+    `options` are those of the task's class; all tasks have `task` (the description), `preset`, `friction`,
+    `randomization` and `threads`. `randomization` may also be the name of one of the task's tables, such as "full".
+    Raises UsageError for an unknown name.
     """
-    if name not in _TASKS:
-        raise UsageError(f"no task {name!r}; {suggestion(name, task_names())}")
-    module, cls = _TASKS[name]
-    batch = getattr(importlib.import_module(module), cls)(num_envs, **options)
+    batch_class = getattr(_module(name), _TASKS[name][1])
+    if isinstance(table := options.get("randomization"), str):
+        tables = randomizations(name)
+        if table not in tables:
+            raise UsageError(f"{name} has no randomization {table!r}; {suggestion(table, tables)}")
+        options["randomization"] = tables[table]
+    batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch
+
+
+def _module(name: str) -> ModuleType:
+    if name not in _TASKS:
+        raise UsageError(f"no task {name!r}; {suggestion(name, task_names())}")
+    return importlib.import_module(_TASKS[name][0])

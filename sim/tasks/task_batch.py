@@ -119,6 +119,10 @@ class TaskBatch(ABC):
     def _step(self, actions: Array, rng: np.random.Generator, active: Mask) -> None:
         """Step the environments `active` with actions (N, k) in ±1 and write their results."""
 
+    def oracle(self) -> Array:
+        """Actions (N, k) of an oracle that knows the true state. Raises UsageError when the task has none."""
+        raise UsageError(f"{self.description.name}: the task has no oracle")
+
     @abstractmethod
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`, scene and pads; shape (height, width, 3)."""

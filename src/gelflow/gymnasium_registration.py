@@ -11,13 +11,20 @@ from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
-# id → entry point of the environment, entry point of the vector environment
-ENVIRONMENTS = {
+_TASK_ENVS = ("gelflow.sim.tasks.gymnasium_envs:TaskEnv", "gelflow.sim.tasks.gymnasium_envs:TaskVectorEnv")
+# id → entry points of the environment and the vector environment, and their arguments
+ENVIRONMENTS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "gelflow/Rolling-v0": (*_TASK_ENVS, {"batch": "rolling"}),
+    "gelflow/Grasp-v0": (*_TASK_ENVS, {"batch": "grasp"}),
+    "gelflow/Pushing-v0": (*_TASK_ENVS, {"batch": "pushing"}),
+    "gelflow/CapRotation-v0": (*_TASK_ENVS, {"batch": "cap"}),
     "gelflow/Insertion-v0": (
         "gelflow.sim.tasks.environments:InsertionEnv",
         "gelflow.sim.tasks.environments:InsertionVectorEnv",
-    )
+        {},
+    ),
 }
 
 
@@ -25,9 +32,9 @@ def register_environments() -> None:
     """Add the environments to Gymnasium's registry; a second call has no effect."""
     from gymnasium.envs.registration import register, registry  # deferred: slow to import
 
-    for name, (entry_point, vector_entry_point) in ENVIRONMENTS.items():
+    for name, (entry_point, vector_entry_point, arguments) in ENVIRONMENTS.items():
         if name not in registry:
-            register(id=name, entry_point=entry_point, vector_entry_point=vector_entry_point)
+            register(id=name, entry_point=entry_point, vector_entry_point=vector_entry_point, kwargs=arguments)
 
 
 def register_when_imported() -> None:
