@@ -12,9 +12,18 @@ from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
 from .tasks.environments import InsertionEnv as InsertionEnv
 from .tasks.environments import InsertionVectorEnv as InsertionVectorEnv
+from .tasks.gymnasium_envs import TaskEnv as TaskEnv
+from .tasks.gymnasium_envs import TaskVectorEnv as TaskVectorEnv
 from .tasks.insertion import InsertionAttempts as InsertionAttempts
 from .tasks.insertion import insertion_scene as insertion_scene
+from .tasks.randomization import Fixed as Fixed
+from .tasks.randomization import LogUniform as LogUniform
+from .tasks.randomization import Normal as Normal
 from .tasks.randomization import Randomization as Randomization
+from .tasks.randomization import Uniform as Uniform
+from .tasks.registry import make_task as make_task
+from .tasks.registry import task_names as task_names
+from .tasks.task_batch import TaskBatch as TaskBatch
 from .torch_layer import TorchRollout as TorchRollout
 from .torch_layer import TorchState as TorchState
 from .torch_layer import torch_rollout as torch_rollout
@@ -31,27 +40,36 @@ __all__ = [
     "STATUS_MESSAGES",
     "Energy",
     "EnergyGauge",
+    "Fixed",
     "InsertionAttempts",
     "InsertionEnv",
     "InsertionVectorEnv",
+    "LogUniform",
+    "Normal",
     "Randomization",
     "Scene",
     "Simulator",
     "TactileReduction",
+    "TaskBatch",
+    "TaskEnv",
+    "TaskVectorEnv",
     "TorchRollout",
     "TorchState",
     "TouchStop",
     "Trajectory",
     "TrajectoryGradient",
+    "Uniform",
     "center_of_pressure",
     "describe",
     "insertion_scene",
     "load_scene",
+    "make_task",
     "mean_shear",
     "pad_forces",
     "pad_moments",
     "scene_names",
     "shear_features",
+    "task_names",
     "torch_rollout",
     "torch_site_poses",
     "torch_state",

@@ -217,12 +217,13 @@ class Grasp(AttemptTask):
             "bar.inertia.zz": across,
         }
         if self._moving_load:
-            end = self.bar.block_centers[-1]
+            # The bar does not tip on its tables wherever the load rests.
+            end, share = self.bar.max_center_of_mass, drawn["load_share"]
             params |= {f"load.inertia.{axis}": load * BLOCK**2 / 6 for axis in ("xx", "yy", "zz")}
             params |= {
                 "load.mass": load,
-                "load.lower": np.maximum(center - drawn["load_travel"], -end),
-                "load.upper": np.minimum(center + drawn["load_travel"], end),
+                "load.lower": center - np.minimum(drawn["load_travel"], (end + center) / share),
+                "load.upper": center + np.minimum(drawn["load_travel"], (end - center) / share),
                 "load.frictionloss": -self.scene.gravity[2] * load * drawn["load_friction"],
             }
         return params

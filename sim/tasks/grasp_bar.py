@@ -92,6 +92,7 @@ class Bar:
         resting = (cloud.points[:, 2] < 0) & (np.abs(np.abs(y) - self.table_y) <= _TABLE_HALF_WIDTH)
         y, k = y[resting], stiffness * cloud.weights[resting]
         weight = -scene.gravity[2] * mass
+        center = np.clip(center, -self.max_center_of_mass, self.max_center_of_mass)
         loaded = np.ones((len(mass), len(y)), dtype=bool)
         for _ in range(10):  # points that would pull are released; the set of loaded points settles in two or three
             kn = k * loaded
