@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, Grid, normalize
 from gelflow.sim.scene import Scene, load_scene
-from gelflow.sim.simulator import Simulator, Trajectory
+from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.attempt_task import AttemptTask
 from gelflow.sim.tasks.grasp_bar import BLOCK, SCENE_BLOCKS, Bar, with_load
 from gelflow.sim.tasks.gripper_pads import NOMINAL_PADS, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
+from gelflow.sim.trajectory import Trajectory
 from gelflow.task import TaskDescription
 
 _CHUNK = 64  # environments of one rollout: bounds the memory of its trajectory
@@ -275,7 +276,11 @@ class Grasp(AttemptTask):
         close, total = self._steps[0], sum(self._steps)
         sim.reset()
         self._rollout = trajectory = sim.rollout(
-            self._controls(rows), q=full, read_after=(close, total), out=self._rollout
+            self._controls(rows),
+            q=full,
+            read_after=(close, total),
+            active=np.arange(sim.num_envs) < count,
+            out=self._rollout,
         )
         end = trajectory.q[-1, :count]
         for name, values in self._lifted.items():

@@ -18,44 +18,41 @@ from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.gripper_pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.parts.geometry import part_geometry
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
+from gelflow.sim.trajectory import TouchStop, Trajectory
 from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
 
 DESCENT_TIME = (
     0.225  # [s] of an attempt, as in Xu et al. (CoRL 2022): 45 steps of 5 ms, about ten times faster than the robot
 )
 SETTLE_TIME = 0.120  # [s] until the part is at rest in the closed gripper
 ARM_JOINTS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
-PADS = ("left", "right")
+ROLLOUT_SIZE = 64  # environments of one rollout
+_GRASP_STATE = ("q", "anchors", "anchored")
+_STATE = ("v", *_GRASP_STATE)
 _CLEAR_HEIGHT = 0.1  # [m] height of the part while the gripper closes, clear of the hole
 _OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
 
-# Relaxation times k_t / k_s of the elastic law: long enough to damp vibration, short enough that a frame of the fast
-# simulated descent equals one of the slow descent of the robot.
-CONTACT_RELAXATION = 10e-3  # [s]
-MARKER_RELAXATION = 5e-3  # [s]
-
 # The ranges of contact, pad and grasp parameters are published (paper, appendix, Table 7). Quantities that the
 # published simulator does not have are chosen here.
+_HOLE_QUANTITIES: Mapping[str, Quantity] = {
+    "hole_kn": Quantity(LogUniform(2.5e3, 2e4), "N/m", "contact of part and hole, per point"),
+    "hole_mu": Quantity(Uniform(0.3, 1.5), "", "friction of part and hole, down to printed plastic"),
+}
 DEFAULT_RANDOMIZATION = Randomization(
     {
-        "pad_kn": Quantity(Uniform(2e3, 1.4e4), "N/m", "contact of pad and part, per point"),
-        "pad_mu": Quantity(Uniform(0.5, 2.5), "", "friction of pad and part"),
-        "marker_kn": Quantity(Uniform(50.0, 450.0), "N/m", "normal stiffness of a marker"),
-        "marker_mu": Quantity(Uniform(0.5, 2.5), "", "friction of a marker"),
-        "marker_kd": Quantity(Uniform(0.0, 100.0), "N s/m²", "normal damping of a marker"),
-        "hole_kn": Quantity(LogUniform(2.5e3, 2e4), "N/m", "contact of part and hole, per point"),
-        "hole_mu": Quantity(Uniform(0.3, 1.5), "", "friction of part and hole, down to printed plastic"),
-        "pad_ks": Quantity(LogUniform(100.0, 1000.0), "N/m", "shear stiffness of the pads, soft to stiff", "elastic"),
-        "marker_ks": Quantity(LogUniform(50.0, 450.0), "N/m", "shear stiffness of a marker", "elastic"),
-        "pad_kt": Quantity(Uniform(20.0, 140.0), "N s/m", "shear damping of the pads", "viscous"),
-        "marker_kt": Quantity(Uniform(0.2, 2.3), "N s/m", "shear damping of a marker", "viscous"),
+        **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is None},
+        **_HOLE_QUANTITIES,
+        **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is not None},
         "arm_stiffness": Quantity(LogUniform(200.0, 3e5), "N/m", "of the arm, published servo to industrial arm"),
         "grasp_force": Quantity(Uniform(2.5, 16.0), "N", "of each finger"),
         "grasp_height": Quantity(Uniform(-10e-3, 5e-3), "m", "of the pad centres above the part's centre"),
@@ -73,17 +70,9 @@ FULL_RANDOMIZATION = Randomization({**DEFAULT_RANDOMIZATION.quantities, **SENSOR
 
 # Fixed parameters of the scene file, with the arm stiffness of a robot; for tests and pictures.
 NOMINAL = DEFAULT_RANDOMIZATION.replace(
-    pad_kn=8e3,
-    pad_mu=1.5,
-    marker_kn=250.0,
-    marker_mu=1.5,
-    marker_kd=25.0,
+    **NOMINAL_PAD_VALUES,
     hole_kn=5e3,
     hole_mu=1.5,
-    pad_ks=250.0,
-    marker_ks=150.0,
-    pad_kt=80.0,
-    marker_kt=1.25,
     arm_stiffness=1e5,
     grasp_force=12.0,
     grasp_height=0.0,
@@ -137,7 +126,9 @@ class InsertionAttempts:
     steps: simulation steps of a descent; None gives 225 ms
 
     `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to it between attempts.
-    Raises UsageError when the scene does not match the task.
+    An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the memory of its trajectory; `sim`
+    simulates that many, and holds the end of the last attempt. Raises UsageError when the scene does not match the
+    task.
     """
 
     def __init__(
@@ -161,7 +152,7 @@ class InsertionAttempts:
         self.randomization = randomization
         if [p.name for p in self.scene.pads] != list(PADS) or any(g != task.grid for g in self.scene.grids):
             raise UsageError(f"the scene's pads must be {', '.join(PADS)} with the task's markers {task.grid}")
-        self.sim = Simulator(self.scene, num_envs=num_envs, threads=threads)
+        self.sim = Simulator(self.scene, num_envs=min(num_envs, ROLLOUT_SIZE), threads=threads)
         self.num_envs = num_envs
         self._frames = [self._step_at(depth) for depth in task.frame_depths]
         self._reference_at = self._step_at(task.reference_depth)
@@ -169,24 +160,20 @@ class InsertionAttempts:
         self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
         self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
         self._geometry = part_geometry(task.part)
-        self._corners = self._geometry.lower_face
-        self._hole = self._geometry.hole
         self._clear_height = max(_CLEAR_HEIGHT, task.part.depth + task.part.size[2])
         self.pose: Array = np.zeros((num_envs, 3))
         self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
         self._stop_shear: Array = np.full(num_envs, np.inf)
+        self._params = np.repeat(self.sim.params[:1], num_envs, axis=0)
+        # The right jaw is force controlled; the left one holds its position.
+        self._param("hold_right.kp")[:] = self._param("hold_right.kd")[:] = 0
         # The grasp at rest: controls, state and shear forces.
         self._u: Array = np.zeros((num_envs, self.scene.nu))
-        self._grasp: dict[str, NDArray[Any]] = {
-            "q": self.sim.q.copy(),
-            "anchors": self.sim.anchors.copy(),
-            "anchored": self.sim.anchored.copy(),
-            "tactile": np.zeros((num_envs, self.scene.num_markers, 2)),
-        }
-        # Shear forces of the present attempt, and their copies after the steps at which a frame is due.
-        self._shear = np.zeros_like(self._grasp["tactile"])
-        self._frame_shear = {step: np.zeros_like(self._shear) for step in (self._reference_at, *self._frames)}
+        self._grasp = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _GRASP_STATE}
+        self._end = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _STATE}
+        self._grasp_shear: Array = np.zeros((num_envs, self.scene.num_markers, 2))
+        self._trajectory: Trajectory | None = None
 
     def _step_at(self, depth: float) -> int:
         """Number of steps after which the gripper's target is `depth` [m] below its start."""
@@ -194,136 +181,159 @@ class InsertionAttempts:
             raise UsageError(f"frame depth {depth} m is outside the descent of {self.task.descent} m")
         return int(np.ceil(depth / self.task.descent * self._steps - 1e-6))
 
-    def draw(self, rng: np.random.Generator, *, misalignment: Array | None = None) -> None:
-        """Start new parts in all environments.
+    def _param(self, name: str) -> Array:
+        """Values of a parameter of the simulator in all environments: a writable view, (N,)."""
+        return self._params[:, self.sim.param_index[name]]
 
-        Physics and grasp come from the randomization, `pose` from the task unless `misalignment` (N, 3) is given.
+    def draw(self, rng: np.random.Generator, *, which: Mask | None = None, misalignment: Array | None = None) -> None:
+        """Start new parts in the environments `which` (N,), or in all.
+
+        Physics and grasp come from the randomization, `pose` from the task unless `misalignment` is given, (3,) or one
+        for each of these environments.
         """
-        sampled = self.randomization.sample(rng, self.num_envs, friction=self.scene.friction)
+        chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
+        rows = np.flatnonzero(chosen)
+        sampled = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
         params = simulator_parameters(sampled, elastic=self.scene.friction == "elastic")
         for name, values in hole_parameters(self.scene, params).items():
-            self.sim.param(name)[:] = values
-        self._stop_shear, self._start_height = sampled["stop_shear"], sampled["start_height"]
-        self.pose = self.task.draw_misalignment(rng, self.num_envs)
+            self._param(name)[rows] = values
+        self._stop_shear[rows], self._start_height[rows] = sampled["stop_shear"], sampled["start_height"]
+        self.pose[rows] = self.task.draw_misalignment(rng, len(rows))
         if misalignment is not None:
-            self.pose = np.array(np.broadcast_to(misalignment, self.pose.shape), dtype=float)
-        self._close(sampled["grasp_force"], sampled["grasp_height"])
-        self._sensors.draw(np.ones(self.num_envs, dtype=bool), sampled, rng)
+            self.pose[rows] = misalignment
+        for part in _parts(len(rows)):
+            self._close(rows[part], sampled["grasp_force"][part], sampled["grasp_height"][part])
+        self._sensors.draw(chosen, sampled, rng)
 
-    def _close(self, force: Array, height: Array) -> None:
-        """Close the grippers on their parts, far above the holes, and store the state at rest."""
-        sim, scene = self.sim, self.scene
+    def _close(self, rows: Rows, force: Array, height: Array) -> None:
+        """Close the grippers `rows` on their parts, far above the holes, and store the state at rest."""
+        sim, scene, n = self.sim, self.scene, len(rows)
         sim.reset()
-        sim.q[:] = scene.q0
-        sim.q[:, self._part_q + 2] = self._clear_height
-        sim.q[:, self._arm_q[2]] = self._clear_height + height
+        sim.params[:n] = self._params[rows]
+        q, u = np.tile(scene.q0, (n, 1)), np.zeros((sim.num_envs, scene.nu))
+        q[:, self._part_q + 2] = self._clear_height
+        q[:, self._arm_q[2]] = self._clear_height + height
         for finger, pad in (("finger_left", "pad_left"), ("finger_right", "pad_right")):
             gaps = pad_gaps(scene, self._geometry, pad, height)
-            sim.q[:, scene.q(finger)] += indentation(gaps, force, sim.param(f"{pad}.kn"))[:, None]
-            self._u[:, scene.u(finger)] = force
-        # The left jaw holds its position; the right one is force controlled.
-        self._u[:, scene.u("hold_left")] = sim.q[:, scene.q("finger_left").start]
-        sim.param("hold_right.kp")[:] = 0
-        sim.param("hold_right.kd")[:] = 0
-        self._u[:, self._arm_u] = sim.q[:, self._arm_q]
-        weight = -scene.gravity[2] * sum(sim.param(f"{body.name}.mass") for body in scene.bodies)
-        self._u[:, self._arm_u[2]] += weight / sim.param("arm_z.kp")  # gravity compensation
-        sim.step(self._u, self._settle_steps)
-        self._grasp["q"][:] = sim.q
-        self._grasp["anchors"][:] = sim.anchors
-        self._grasp["anchored"][:] = sim.anchored
-        self._grasp["tactile"][:] = sim.tactile()[..., :2]
+            q[:, scene.q(finger)] += indentation(gaps, force, self._param(f"{pad}.kn")[rows])[:, None]
+            u[:n, scene.u(finger)] = force
+        u[:n, scene.u("hold_left")] = q[:, scene.q("finger_left").start]
+        u[:n, self._arm_u] = q[:, self._arm_q]
+        weight = -scene.gravity[2] * sum(self._param(f"{body.name}.mass")[rows] for body in scene.bodies)
+        u[:n, self._arm_u[2]] += weight / self._param("arm_z.kp")[rows]  # gravity compensation
+        sim.q[:n] = q
+        sim.step(u, self._settle_steps, active=np.arange(sim.num_envs) < n)
+        self._u[rows] = u[:n]
+        for name, values in self._grasp.items():
+            values[rows] = getattr(sim, name)[:n]
+        self._grasp_shear[rows] = sim.tactile()[:n, :, :2]
 
-    def attempt(self, rng: np.random.Generator) -> AttemptResult:
-        """Simulate one attempt in every environment, starting from `pose`.
+    def attempt(self, rng: np.random.Generator, *, which: Mask | None = None) -> AttemptResult:
+        """Simulate one attempt in the environments `which` (N,), or in all, starting from `pose`.
 
-        As on the robot, contact stops the descent: later frames repeat the forces at the stop.
+        As on the robot, contact stops the descent: later frames repeat the forces at the stop. The first axis of the
+        results counts the environments in `which`.
         """
-        sim, z = self.sim, self._arm_u[2]
-        u = self._start(rng)
-        start = u[:, z].copy()
-        shear = self._shear
-        shear[:] = self._grasp["tactile"]
-        frames = self._frame_shear
-        if 0 in frames:
-            frames[0][:] = shear
-        stopped = np.zeros(self.num_envs, dtype=bool)
-        for step in range(1, self._steps + 1):
-            u[:, z] = start - self.task.descent * step / self._steps
-            sim.step(u)
-            np.copyto(shear, sim.tactile()[..., :2], where=~stopped[:, None, None])
-            if step in frames:
-                frames[step][:] = shear
-            if step > self._reference_at:
-                stopped |= self._mean_shear(shear - frames[self._reference_at]) > self._stop_shear
-        readings = self._readings(frames, rng)
+        chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
+        rows = np.flatnonzero(chosen)
+        jitter = rng.uniform(-1, 1, len(rows)) * self._start_height[rows]
+        steps = sorted({self._reference_at, *self._frames})
+        shear = np.zeros((len(steps), len(rows), self.scene.num_markers, 2))
+        height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
+        for part in _parts(len(rows)):
+            trajectory = self._simulate(rows[part], jitter[part], steps)
+            n = len(rows[part])
+            for k, step in enumerate(steps):
+                # The markers of the start are those of the closed grasp.
+                shear[k, part] = trajectory.tactile[k, :n, :, :2] if step else self._grasp_shear[rows[part]]
+            height[part], inserted[part] = self._outcome(trajectory.q[-1, :n])
+            failed[part] = trajectory.status[:n] != 0
+            inserted[part] &= ~failed[part] & (trajectory.stopped_at[:n] < 0)
+        readings = self._readings(dict(zip(steps, shear, strict=True)), chosen, rng)
         stack = np.stack([readings[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
-        height, inserted = self._outcome()
-        failed = sim.status != 0
-        inserted &= ~failed & ~stopped
         return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed)
 
-    def _mean_shear(self, change: NDArray[Any]) -> Array:
-        """Mean change of the shear along the finger, maximum over the pads [N], shape (N,)."""
-        along = change[..., 0].reshape(self.num_envs, len(PADS), -1)
-        return np.asarray(np.abs(along.mean(2)).max(1))
+    def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
+        """The descent of the grippers `rows`, read after `steps`."""
+        sim, n, z = self.sim, len(rows), self._arm_u[2]
+        start = self._start(rows, jitter)
+        u = np.repeat(start[None], self._steps, axis=0)
+        u[:, :n, z] = start[:n, z] - (self.task.descent * np.arange(1, self._steps + 1) / self._steps)[:, None]
+        threshold = np.full(sim.num_envs, np.inf)
+        threshold[:n] = self._stop_shear[rows]
+        can_stop = self._reference_at < self._steps
+        self._trajectory = trajectory = sim.rollout(
+            u,
+            read_after=steps,
+            active=np.arange(sim.num_envs) < n,
+            stop=TouchStop(threshold, reference_step=self._reference_at) if can_stop else None,
+            out=self._trajectory,
+        )
+        for name, values in self._end.items():
+            getattr(sim, name)[:] = getattr(trajectory, name)[-1]
+            values[rows] = getattr(sim, name)[:n]
+        return trajectory
 
-    def _start(self, rng: np.random.Generator) -> Array:
-        """Set the state to the grasp at `pose`, the lower face at its start height; returns the controls."""
-        sim, at = self.sim, self._part_q
-        grasp = self._grasp["q"]
+    def show_end(self, index: int) -> Simulator:
+        """The simulator, with the end of the last attempt of environment `index` in its first place."""
+        self.sim.params[0] = self._params[index]
+        for name, values in self._end.items():
+            getattr(self.sim, name)[0] = values[index]
+        return self.sim
+
+    def _start(self, rows: Rows, jitter: Array) -> Array:
+        """Set the state to the grasps `rows` at `pose`, the lower face at its start height; returns the controls."""
+        sim, at, n = self.sim, self._part_q, len(rows)
         sim.reset()
+        sim.params[:n] = self._params[rows]
+        grasp = self._grasp["q"][rows]
         part = grasp[:, at : at + 7]
-        jitter = rng.uniform(-1, 1, self.num_envs) * self._start_height
         lift = self.task.start_height + jitter - (part[:, 2] - self.task.part.size[2] / 2)
-        x, y, yaw = self.pose.T
+        x, y, yaw = self.pose[rows].T
         cos, sin = np.cos(yaw), np.sin(yaw)
-        sim.q[:] = grasp
-        sim.q[:, self._arm_q] = np.column_stack([x, y, grasp[:, self._arm_q[2]] + lift, yaw])
-        sim.q[:, at] = x + cos * part[:, 0] - sin * part[:, 1]
-        sim.q[:, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
-        sim.q[:, at + 2] = part[:, 2] + lift
-        sim.q[:, at + 3 : at + 7] = _rotated_z(part[:, 3:], yaw)
-        sim.anchors[:] = self._grasp["anchors"]
-        sim.anchored[:] = self._grasp["anchored"]
-        u = self._u.copy()
-        u[:, self._arm_u] = np.column_stack([x, y, u[:, self._arm_u[2]] + lift, yaw])
+        sim.q[:n] = grasp
+        sim.q[:n, self._arm_q] = np.column_stack([x, y, grasp[:, self._arm_q[2]] + lift, yaw])
+        sim.q[:n, at] = x + cos * part[:, 0] - sin * part[:, 1]
+        sim.q[:n, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
+        sim.q[:n, at + 2] = part[:, 2] + lift
+        sim.q[:n, at + 3 : at + 7] = _rotated_z(part[:, 3:], yaw)
+        sim.anchors[:n] = self._grasp["anchors"][rows]
+        sim.anchored[:n] = self._grasp["anchored"][rows]
+        u = np.zeros((sim.num_envs, self.scene.nu))
+        u[:n] = self._u[rows]
+        u[:n, self._arm_u] = np.column_stack([x, y, u[:n, self._arm_u[2]] + lift, yaw])
         return u
 
-    def _readings(self, frames: Mapping[int, Array], rng: np.random.Generator) -> dict[int, Array]:
-        """Readings of the pads after the given numbers of steps, (N, pads, rows, cols, 2) each."""
-        everyone, grid = np.ones(self.num_envs, dtype=bool), self.task.grid
-        self._sensors.clear(everyone)
+    def _readings(self, frames: Mapping[int, Array], which: Mask, rng: np.random.Generator) -> dict[int, Array]:
+        """Readings of the pads after the given numbers of steps, (n, pads, rows, cols, 2) each."""
+        grid = self.task.grid
+        self._sensors.clear(which)
         readings, last = {}, 0
-        for step in sorted(frames):
-            reading = self._sensors.read(frames[step], everyone, rng, interval=(step - last) * self.scene.step)
-            readings[step] = reading.reshape(self.num_envs, len(PADS), grid.rows, grid.cols, 2)
+        for step, shear in frames.items():
+            reading = self._sensors.read(shear, which, rng, interval=(step - last) * self.scene.step)
+            readings[step] = reading.reshape(len(shear), len(PADS), grid.rows, grid.cols, 2)
             last = step
         return readings
 
-    def _outcome(self) -> tuple[Array, NDArray[np.bool_]]:
+    def _outcome(self, q: Array) -> tuple[Array, Mask]:
         """Height of the highest corner of the part's lower face [m], and whether the face is inside the hole."""
-        part = self.sim.q[:, self._part_q : self._part_q + 7]
-        corners = part[:, None, :3] + np.einsum("nij,kj->nki", rotation_matrices(part[:, 3:]), self._corners)
+        part = q[:, self._part_q : self._part_q + 7]
+        corners = part[:, None, :3] + np.einsum(
+            "nij,kj->nki", rotation_matrices(part[:, 3:]), self._geometry.lower_face
+        )
         height = corners[..., 2].max(1)
-        inside = (self._hole.distance(corners[..., :2]) < _OUTLINE_TOLERANCE).all(1)
+        inside = (self._geometry.hole.distance(corners[..., :2]) < _OUTLINE_TOLERANCE).all(1)
         return height, inside & (height < self.task.success_height)
 
     def reward(self) -> Array:
         """Reward of the present poses, shape (N,); see `InsertionTask.reward`."""
         return self.task.reward(self.pose)
 
-    def copy_parts(self, rows: NDArray[np.int64], other: "InsertionAttempts", other_rows: NDArray[np.int64]) -> None:
-        """Copy parts (physics, grasp and pose) from `other_rows` of another batch to `rows`."""
-        self.sim.params[rows] = other.sim.params[other_rows]
-        self.pose[rows] = other.pose[other_rows]
-        self._start_height[rows] = other._start_height[other_rows]
-        self._sensors.copy(rows, other._sensors, other_rows)
-        self._stop_shear[rows] = other._stop_shear[other_rows]
-        self._u[rows] = other._u[other_rows]
-        for name, values in self._grasp.items():
-            values[rows] = other._grasp[name][other_rows]
+
+def _parts(count: int) -> list[slice]:
+    """Slices of at most `ROLLOUT_SIZE` of `count` environments."""
+    return [slice(first, min(first + ROLLOUT_SIZE, count)) for first in range(0, count, ROLLOUT_SIZE)]
 
 
 def _rotated_z(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
@@ -335,16 +345,10 @@ def _rotated_z(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
 
 def simulator_parameters(sampled: Mapping[str, Array], *, elastic: bool) -> dict[str, Array]:
     """Parameters of the simulator, name → (n,), for sampled quantities."""
-    pad = {"kn": sampled["pad_kn"], "mu": sampled["pad_mu"]}
-    marker = {"kn": sampled["marker_kn"], "mu": sampled["marker_mu"], "kd": sampled["marker_kd"]}
     hole = {"kn": sampled["hole_kn"], "mu": sampled["hole_mu"]}
     if elastic:
-        pad["ks"], marker["ks"], hole["ks"] = sampled["pad_ks"], sampled["marker_ks"], hole["kn"] / 2
-        pad["kt"], marker["kt"] = CONTACT_RELAXATION * pad["ks"], MARKER_RELAXATION * marker["ks"]
-    else:
-        pad["kt"], marker["kt"] = sampled["pad_kt"], sampled["marker_kt"]
-    params = {f"pad_{side}.{key}": values for side in PADS for key, values in pad.items()}
-    params |= {f"{side}.{key}": values for side in PADS for key, values in marker.items()}
+        hole["ks"] = hole["kn"] / 2
+    params = pad_parameters(sampled, elastic=elastic)
     walls = ("left", "right", "front", "back")
     params |= {f"part_hole/wall_{wall}.{key}": values for wall in walls for key, values in hole.items()}
     # Published ratios to the stiffness: damping 1/200 s, yaw servo 0.05 m².

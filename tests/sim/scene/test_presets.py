@@ -145,7 +145,7 @@ def test_flow_maps_agree_between_presets() -> None:
 
 
 def test_environments_take_a_scene_or_a_preset() -> None:
-    assert InsertionEnv(preset="fast")._attempts.scene.step == 10e-3
+    assert InsertionEnv(preset="fast").batch.attempts.scene.step == 10e-3
     with pytest.raises(UsageError, match="scene and preset exclude each other"):
         InsertionEnv(preset="fast", scene=insertion_scene())
     with pytest.raises(UsageError, match="no preset 'quick'"):

@@ -13,6 +13,7 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import (
     DEFAULT_RANDOMIZATION,
     NOMINAL,
+    ROLLOUT_SIZE,
     InsertionAttempts,
     insertion_scene,
     simulator_parameters,
@@ -150,7 +151,7 @@ def test_observation_is_the_flow_map_of_the_frames() -> None:
 
     last = attempts.sim.tactile().copy()
     for env in range(2):
-        expected = flow_map([frame(last, env)], frame(attempts._grasp["tactile"], env), grid=grid)
+        expected = flow_map([frame(last, env)], frame(attempts._grasp_shear, env), grid=grid)
         np.testing.assert_allclose(result.image[env], expected.image, atol=1e-5)
         assert result.divisor[env] == pytest.approx(expected.divisor, rel=1e-5)
         assert result.divisor[env] > MIN_DIVISORS["N"]
@@ -196,17 +197,22 @@ def test_results_depend_neither_on_the_batch_nor_on_threads() -> None:
         assert (alone.image[0] == together.image[i]).all()
 
 
-def test_parts_can_be_copied_to_another_batch() -> None:
-    rng = np.random.default_rng(5)
+def test_some_environments_attempt_and_draw_while_the_others_rest() -> None:
+    """More environments than one rollout simulates; the result of a part does not depend on its place."""
     quiet = DEFAULT_RANDOMIZATION.replace(start_height=0.0, noise=1e-30)
-    source, target = InsertionAttempts(3, randomization=quiet), InsertionAttempts(2, randomization=quiet)
-    source.draw(rng)
-    target.draw(rng)
-    expected = source.attempt(rng)
-    target.copy_parts(np.array([1]), source, np.array([2]))
-    moved = target.attempt(rng)
-    np.testing.assert_array_equal(moved.image[1], expected.image[2])
-    assert moved.height[1] == expected.height[2]
+    attempts = InsertionAttempts(ROLLOUT_SIZE + 3, randomization=quiet)
+    rng = np.random.default_rng(5)
+    attempts.draw(rng)
+    every = attempts.attempt(rng)
+    some = np.arange(ROLLOUT_SIZE + 3) % 20 == 6
+    result = attempts.attempt(rng, which=some)
+    np.testing.assert_array_equal(result.image, every.image[some])
+    np.testing.assert_array_equal(result.height, every.height[some])
+    poses_before = attempts.pose.copy()
+    attempts.draw(rng, which=some)
+    np.testing.assert_array_equal(attempts.pose[~some], poses_before[~some])
+    assert (attempts.pose[some] != poses_before[some]).all()
+    np.testing.assert_array_equal(attempts.attempt(rng, which=~some).image, every.image[~some])
 
 
 @pytest.mark.parametrize("elastic", [True, False])

@@ -12,7 +12,6 @@ from gelflow.gymnasium_registration import ENVIRONMENTS
 from gelflow.sim.tasks.registry import make_task, task_names
 
 ids = pytest.mark.parametrize("name", ENVIRONMENTS)
-batch_ids = pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != "gelflow/Insertion-v0"])
 
 
 @ids
@@ -24,7 +23,7 @@ def test_environment_passes_gymnasium_check(name: str) -> None:
         check_env(env.unwrapped)
 
 
-@batch_ids
+@ids
 def test_render_gives_a_picture(name: str) -> None:
     env = gymnasium.make(name, render_mode="rgb_array", threads=1)
     env.reset(seed=0)
@@ -33,7 +32,7 @@ def test_render_gives_a_picture(name: str) -> None:
     assert picture.std() > 5
 
 
-@batch_ids
+@ids
 def test_a_seed_determines_every_bit(name: str) -> None:
     def run(threads: int) -> list[Any]:
         envs: Any = gymnasium.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", threads=threads)
