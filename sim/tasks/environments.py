@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene import Scene
-from gelflow.sim.tasks.attempt_task import AttemptTask
+from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
 from gelflow.sim.tasks.insertion import RANDOMIZATIONS as RANDOMIZATIONS  # found by the registry beside `Insertion`
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene

@@ -16,9 +16,9 @@ from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, Grid, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.attempt_task import AttemptTask
-from gelflow.sim.tasks.grasp_bar import BLOCK, SCENE_BLOCKS, Bar, with_load
-from gelflow.sim.tasks.gripper_pads import NOMINAL_PADS, PAD_QUANTITIES, PADS, pad_parameters
+from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
+from gelflow.sim.tasks.gripper.bar import BLOCK, SCENE_BLOCKS, Bar, with_load
+from gelflow.sim.tasks.gripper.pads import NOMINAL_PADS, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows

@@ -18,7 +18,7 @@ from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.gripper_pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
+from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.parts.geometry import part_geometry
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part

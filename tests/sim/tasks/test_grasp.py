@@ -8,7 +8,7 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.grasp import DEFAULT_RANDOMIZATION, FULL_RANDOMIZATION, Grasp, GraspTask
-from gelflow.sim.tasks.grasp_bar import Bar
+from gelflow.sim.tasks.gripper.bar import Bar
 from gelflow.sim.tasks.registry import make_task, task_names
 
 QUIET = DEFAULT_RANDOMIZATION.replace(noise=0.0)

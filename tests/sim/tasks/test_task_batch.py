@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import load_scene
-from gelflow.sim.tasks.attempt_task import AttemptTask
 from gelflow.sim.tasks.control_task import ControlTask, adapt_step
+from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, InsertionTask, TaskDescription
