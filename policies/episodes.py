@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy
-from gelflow.sim.tasks.attempt_task import AttemptTask
+from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 Array = NDArray[np.float64]
