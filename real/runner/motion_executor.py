@@ -308,13 +308,14 @@ class Progress:
 
     def check(self) -> None:
         """Hold and raise PeerTimeout when the arm came no closer for 3 s [robot time]."""
+        now = self._clock.now()  # before the pose: a delay of this thread between the two is no lack of progress
         pose = self._motion.pose()
         distance = float(np.linalg.norm(pose.position - self._target.position)) / ARRIVED[0]
         turn = angle_between(pose.quaternion, self._target.quaternion) / ARRIVED[1]
         remaining = max(distance, turn)  # 1 at the arrival
         if remaining < self._best - _PROGRESS:
-            self._best, self._since = remaining, self._clock.now()
-        elif self._clock.now() - self._since > _BLOCKED_AFTER:
+            self._best, self._since = remaining, now
+        elif now - self._since > _BLOCKED_AFTER:
             self._motion.hold()
             millimetres, degrees = 1e3 * distance * ARRIVED[0], math.degrees(turn * ARRIVED[1])
             raise PeerTimeout(
