@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.environments import InsertionVectorEnv
+from gelflow.sim.tasks.insertion import RANDOMIZATIONS
 from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
@@ -124,10 +125,21 @@ class PolicyEnv:
 
 
 def make_insertion_env(
-    count: int, *, noise: FlowMapNoise | None = None, preset: str | None = None, task: InsertionTask = INSERTION
+    count: int,
+    *,
+    noise: FlowMapNoise | None = None,
+    preset: str | None = None,
+    task: InsertionTask = INSERTION,
+    randomization: str = "default",
 ) -> PolicyEnv:
     """`count` parallel simulated insertions with domain randomization and `noise` on the flow maps.
 
-    `preset` is a preset of the insertion scene. Raises UsageError when the scene has no such preset.
+    `preset` is a preset of the insertion scene, `randomization` one of `RANDOMIZATIONS`; its grasp height is that of
+    the task's part. Raises UsageError for unknown names.
     """
-    return PolicyEnv(InsertionVectorEnv(count, task=task, preset=preset), task, noise)
+    if randomization not in RANDOMIZATIONS:
+        raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {randomization!r}")
+    table = RANDOMIZATIONS[randomization]
+    if randomization != "nominal":
+        table = table.replace(grasp_height=task.part.grasp_height)
+    return PolicyEnv(InsertionVectorEnv(count, task=task, preset=preset, randomization=table), task, noise)

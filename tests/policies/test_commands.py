@@ -55,6 +55,8 @@ def test_evaluation_loads_the_checkpoint_of_a_training(
         (["eval", "insertion", "--checkpoint", "nowhere.safetensors"], "no checkpoint at nowhere.safetensors"),
         (["eval", "insertion", "--checkpoint", "pyproject.toml"], "is not a gelflow checkpoint"),
         (["eval", "insertion", "--episodes", "0"], "--episodes"),
+        (["eval", "insertion", "--randomization", "none"], "one of nominal, default, full, got 'none'"),
+        (["train", "insertion", "--randomization", "none"], "one of nominal, default, full, got 'none'"),
         (["eval", "insertion", "--seed", "-1"], "--seed"),
         (["train", "insertion", "--envs", "0"], "--envs"),
         (["train", "insertion", "--attempts", "0"], "above 0"),

@@ -63,6 +63,16 @@ def add_part(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_randomization(parser: argparse.ArgumentParser) -> None:
+    """`--randomization`: the distribution of the physical parameters."""
+    parser.add_argument(
+        "--randomization",
+        default="default",
+        metavar="NAME",
+        help="physical parameters: nominal, default, or full, which adds deviations of real pads (default %(default)s)",
+    )
+
+
 def part_task(part: str | None) -> InsertionTask:
     """The insertion of the part that `--part` names. Raises UsageError when its file is missing or invalid."""
     if part is None:

@@ -14,6 +14,7 @@ from gelflow.cli.options import (
     add_out,
     add_part,
     add_preset,
+    add_randomization,
     add_seed,
     check_at_least,
     checkpoint_for,
@@ -31,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=["insertion", *TASKS], help="task of the policy")
     add_part(parser)
+    add_randomization(parser)
     add_checkpoint(parser)
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
@@ -59,7 +61,8 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json)
     count = min(args.envs, args.episodes)
     plain, noisy = (
-        make_insertion_env(count, noise=noise, preset=args.preset, task=task) for noise in (None, FlowMapNoise())
+        make_insertion_env(count, noise=noise, preset=args.preset, task=task, randomization=args.randomization)
+        for noise in (None, FlowMapNoise())
     )
     reach = network.reach
     cases: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_seed, check_at_least, part_task
+from gelflow.cli.options import (
+    add_json,
+    add_out,
+    add_part,
+    add_preset,
+    add_randomization,
+    add_seed,
+    check_at_least,
+    part_task,
+)
 from gelflow.cli.output import Output, progress_bar
 from gelflow.cli.task_training import DEFAULT_RECIPE, TASKS, refuse, train_task
 from gelflow.errors import UsageError
@@ -33,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     envs = " or ".join(f"{number} with {name}" for name, number in _ENVS.items())
     parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (insertion: {envs})")
     add_part(parser)
+    add_randomization(parser)
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
@@ -79,9 +89,8 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
 
     given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
     task = part_task(args.part)
-    env, validation = (
-        make_insertion_env(args.envs, noise=FlowMapNoise(), preset=args.preset, task=task) for _ in range(2)
-    )
+    options = {"preset": args.preset, "task": task, "randomization": args.randomization}
+    env, validation = (make_insertion_env(args.envs, noise=FlowMapNoise(), **options) for _ in range(2))
     if args.algorithm == "ppo":
         from gelflow.policies import ppo
 
@@ -118,7 +127,8 @@ class _TrainingProgress:
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
     names = ("part", "minutes", "envs", "seed", "preset", "out")
-    algorithm = {} if args.algorithm == _DEFAULT else {"algorithm": args.algorithm}
-    values = algorithm | {"attempts": attempts} | {name: getattr(args, name) for name in names}
+    defaults = {"algorithm": _DEFAULT, "randomization": "default"}
+    chosen = {name: getattr(args, name) for name, value in defaults.items() if getattr(args, name) != value}
+    values = chosen | {"attempts": attempts} | {name: getattr(args, name) for name in names}
     given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
     return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]
