@@ -38,11 +38,8 @@ class Part:
     symmetry: int = 2
     mirror: tuple[str, ...] = ("x", "y")  # axes in which the part is its own mirror image: "x", "y", both or none
     mesh: str = ""  # SHA-256 of the mesh file; empty for box and cylinder
-    hole_mesh: str = ""  # SHA-256 of the mesh of the hole; empty: the part's outline with `clearance`
-    # Where the meshes lie on this computer; not part of the description.
-    mesh_file: str = field(default="", compare=False)
-    hole_file: str = field(default="", compare=False)
-    mesh_scale: float = 1.0  # metres per unit of the mesh files
+    mesh_scale: float = 1.0  # metres per unit of the mesh file
+    mesh_file: str = field(default="", compare=False)  # on this computer; not part of the description
 
     def __post_init__(self) -> None:
         """Raises UsageError, in one line, for values that no gripper and no hole can have."""
@@ -78,10 +75,9 @@ class Part:
             raise UsageError(f"the clearance of a {self.shape} must be equal along x and y, got {list(self.clearance)}")
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data, for task descriptions; without the places of files."""
+        """As plain data, for task descriptions; without the place of the mesh."""
         values = dataclasses.asdict(self)
-        for name in ("mesh_file", "hole_file"):
-            del values[name]
+        del values["mesh_file"]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod

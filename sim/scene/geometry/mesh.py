@@ -7,6 +7,7 @@ import importlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -39,6 +40,23 @@ class TriangleMesh:
         """Enclosed volume [m³]; negative if the faces are oriented inwards."""
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         return float((a * np.cross(b, c)).sum() / 6)
+
+
+def read_mesh(path: Path) -> TriangleMesh:
+    """The triangles of an .obj, .stl, .ply or .off file, in its own unit.
+
+    Raises UsageError when the file cannot be read, and if libigl is not installed.
+    """
+    if not path.is_file():
+        raise UsageError(f"no such mesh file: {path}")
+    try:
+        vertices, faces, *_ = _igl(path.name).read_triangle_mesh(str(path))
+    except (RuntimeError, ValueError) as error:
+        raise UsageError(f"cannot read the mesh {path}: {' '.join(str(error).split())}") from None
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces, dtype=np.int64)
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+        raise UsageError(f"the mesh {path} has no triangles")
+    return TriangleMesh(vertices, faces)
 
 
 def closed_mesh(mesh: TriangleMesh, name: str) -> TriangleMesh:

@@ -102,7 +102,7 @@ class Box(PartGeometry):
     def points(self, points: PointsDef) -> PointsDef:
         spacing = (_FACE_SPACING, _FACE_SPACING, _HEIGHT_SPACING)
         counts = [max(2, round(size / step) + 1) for size, step in zip(self.part.size, spacing, strict=True)]
-        return _with_points(points, *box_surface(self.half.tolist(), counts, faces=("-z", "-x", "+x", "-y", "+y")))
+        return with_points(points, *box_surface(self.half.tolist(), counts, faces=("-z", "-x", "+x", "-y", "+y")))
 
     def side_gaps(self, points: Array, side: int) -> Array:
         on_side = (np.abs(points) <= self.half[1:]).all(-1)
@@ -133,7 +133,7 @@ class Cylinder(PartGeometry):
         angles = max(12, 4 * round(np.pi * radius / _RING_SPACING / 2))
         radii, heights = max(1, round(radius / _FACE_SPACING)), max(2, round(height / _HEIGHT_SPACING) + 1)
         surface = cylinder(radius, height / 2, angles=angles, radii=radii, heights=heights, faces=("-z", "wall"))
-        return _with_points(points, *surface)
+        return with_points(points, *surface)
 
     def side_gaps(self, points: Array, side: int) -> Array:
         y, z = np.abs(points[..., 0]), np.abs(points[..., 1])
@@ -146,10 +146,15 @@ def _with_inertia(body: BodyDef, mass: float, diagonal: Array) -> BodyDef:
     return replace(body, mass=float(mass), com=np.zeros(3), inertia=np.append(diagonal, [0.0, 0.0, 0.0]))
 
 
-def _with_points(points: PointsDef, local: Array, areas: Array) -> PointsDef:
+def with_points(points: PointsDef, local: Array, areas: Array) -> PointsDef:
+    """`points` at other places `local` (n, 3) [m], with area components `areas` (n, 3) [m²]."""
     return replace(points, points=local, areas=areas, weights=np.ones(len(local)))
 
 
 def part_geometry(part: Part) -> PartGeometry:
     """The geometry of a part. Raises UsageError when the mesh of the part cannot be read."""
+    if part.shape == "mesh":
+        from gelflow.sim.tasks.parts.mesh_part import MeshPart
+
+        return MeshPart(part)
     return {"box": Box, "cylinder": Cylinder}[part.shape](part)

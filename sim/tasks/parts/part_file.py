@@ -15,7 +15,7 @@ FORMAT = 1
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m³]
 _TABLES = ("format", "name", "part", "hole", "grasp", "misalignment", "symmetry")
-_PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height")}
+_PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}
 _WEIGHTS = ("density", "mass")
 
 
@@ -43,9 +43,9 @@ def load_part(part: str | Path) -> InsertionTask:
 def _read_part(top: TomlTable, path: Path) -> Part:
     table = top.table("part")
     shape = table.string("shape", choices=SHAPES)
-    if shape not in _PART_KEYS:
-        raise UsageError(f"{table.location}: a {shape} is not supported yet; {', '.join(_PART_KEYS)} are")
     table.check_keys(("shape", *_PART_KEYS[shape], *_WEIGHTS))
+    if shape == "mesh":
+        return _read_mesh_part(top, path)
     hole = top.table("hole").check_keys(("clearance", "depth"))
     if shape == "box":
         x, y, z = table.numbers("size", 3)
@@ -65,6 +65,38 @@ def _read_part(top: TomlTable, path: Path) -> Part:
         depth=hole.number("depth", CUBOID.depth),
         symmetry=symmetry,
         grasp_height=_pair(top.table("grasp").check_keys(("height",)), "height", CUBOID.grasp_height),
+    )
+
+
+def _read_mesh_part(top: TomlTable, path: Path) -> Part:
+    """A part whose shape is a mesh; size, grasp width and symmetry are found from it, unless the file gives them."""
+    from gelflow.sim.tasks.parts import mesh_part
+
+    table, hole = top.table("part"), top.table("hole").check_keys(("clearance", "depth"))
+    file = (path.parent / table.string("file")).resolve()
+    scale = table.number("scale", 1.0, minimum=1e-9)
+    grasp = _pair(top.table("grasp").check_keys(("height",)), "height", CUBOID.grasp_height)
+    mesh = mesh_part.load_part_mesh(file, scale)
+    left, right = mesh_part.grasped_sides(mesh, grasp)
+    x, y, z = (float(extent) for extent in mesh.vertices.max(0) - mesh.vertices.min(0))
+    given = top.table("symmetry").check_keys(("rotations", "mirror"))
+    symmetry, mirror = (1, ()) if len(given.data) == 2 else mesh_part.found_symmetry(mesh, file.name)
+    if "mirror" in given.data:
+        mirror = given.strings("mirror") if given.data["mirror"] else ()
+    return Part(
+        name=top.string("name", path.stem),
+        shape="mesh",
+        size=(x, y, z),
+        grasp_width=right - left,
+        density=_density(table, mesh.volume()),
+        clearance=_both(hole),
+        depth=hole.number("depth", CUBOID.depth),
+        grasp_height=grasp,
+        symmetry=given.integer("rotations", symmetry, minimum=0),
+        mirror=mirror,
+        mesh=mesh_part.file_digest(file),
+        mesh_file=str(file),
+        mesh_scale=scale,
     )
 
 
