@@ -45,7 +45,7 @@ class Picture:
         """Indices of the pixels at points (…, 2), clipped to the picture, and whether the points are within it."""
         at = np.round((points - self.origin) / self.pixel).astype(int)
         last = np.array(self.low.shape) - 1
-        within = ((at >= 0) & (at <= last)).all(-1)
+        within = np.asarray(((at >= 0) & (at <= last)).all(-1))
         at = np.clip(at, 0, last)
         return at[..., 0], at[..., 1], within
 
