@@ -19,9 +19,9 @@ from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
-from gelflow.sim.tasks.parts.geometry import part_geometry
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part
+from gelflow.sim.tasks.parts.registry import part_geometry
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.sim.trajectory import TouchStop, Trajectory

@@ -1,10 +1,10 @@
 from .geometry import PartGeometry as PartGeometry
-from .geometry import part_geometry as part_geometry
 from .outline import Outline as Outline
 from .outline import Rectangle as Rectangle
 from .part_file import load_part as load_part
 from .part_file import part_names as part_names
 from .part_scene import with_part as with_part
+from .registry import part_geometry as part_geometry
 
 __all__ = [
     "Outline",

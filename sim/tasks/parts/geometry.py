@@ -149,12 +149,3 @@ def _with_inertia(body: BodyDef, mass: float, diagonal: Array) -> BodyDef:
 def with_points(points: PointsDef, local: Array, areas: Array) -> PointsDef:
     """`points` at other places `local` (n, 3) [m], with area components `areas` (n, 3) [m²]."""
     return replace(points, points=local, areas=areas, weights=np.ones(len(local)))
-
-
-def part_geometry(part: Part) -> PartGeometry:
-    """The geometry of a part. Raises UsageError when the mesh of the part cannot be read."""
-    if part.shape == "mesh":
-        from gelflow.sim.tasks.parts.mesh_part import MeshPart
-
-        return MeshPart(part)
-    return {"box": Box, "cylinder": Cylinder}[part.shape](part)

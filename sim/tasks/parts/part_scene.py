@@ -12,8 +12,9 @@ from gelflow.part import CUBOID, Part
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.contacts import ContactDef
 from gelflow.sim.scene.shapes import ShapeDef
-from gelflow.sim.tasks.parts.geometry import PartGeometry, part_geometry
+from gelflow.sim.tasks.parts.geometry import PartGeometry
 from gelflow.sim.tasks.parts.outline import hole_grid
+from gelflow.sim.tasks.parts.registry import part_geometry
 
 T = TypeVar("T")
 
