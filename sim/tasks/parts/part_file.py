@@ -143,4 +143,4 @@ def _find(part: str | Path) -> Path:
 
 
 def _folder() -> Traversable:
-    return resources.files("gelflow.sim") / "tasks" / "parts"
+    return resources.files("gelflow.sim") / "tasks" / "parts" / "shipped"

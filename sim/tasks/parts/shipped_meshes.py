@@ -72,9 +72,9 @@ def obj_text(mesh: TriangleMesh) -> str:
 
 
 def main() -> None:
-    """Write the meshes beside their part files."""
+    """Write the meshes to the folder of the part files."""
     for name, mesh in (("hexagon", hexagon()), ("connector", connector())):
-        (Path(__file__).parent / f"{name}.obj").write_text(obj_text(mesh), encoding="utf-8")
+        (Path(__file__).parent / "shipped" / f"{name}.obj").write_text(obj_text(mesh), encoding="utf-8")
 
 
 if __name__ == "__main__":
