@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.errors import UsageError
+from gelflow.policies.backpropagation import Backpropagation, BackpropagationSettings
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.cnn import CNN
 from gelflow.policies.networks.mlp import MLP
@@ -14,6 +15,8 @@ from gelflow.policies.ppo_learner import PPO, PPOSettings
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.run import Progress, RunSettings, TrainingResult, TrainingRun
 from gelflow.sim.tasks.cap_rotation import CapRotationTask
+from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
+from gelflow.sim.tasks.pushing import Pushing, PushingTask
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.task_batch import TaskBatch
 
@@ -59,6 +62,12 @@ def _ppo(recipe: Recipe, task: TaskBatch, seed: int, steps: int) -> Learner:
     return PPO(task, actor_for(task, recipe.network), recipe.settings, seed=seed, steps=steps)
 
 
+def _backpropagation(recipe: Recipe, task: TaskBatch, seed: int, steps: int) -> Learner:
+    assert isinstance(task, Pushing)
+    episodes, architecture = DifferentiablePushing(task), actor_for(task, recipe.network)
+    return Backpropagation(episodes, architecture, recipe.settings, seed=seed, steps=steps)
+
+
 # Table 6 of the paper: 32 environments, 32 steps a rollout.
 _TABLE_6 = PPOSettings(
     rollout=32, batch=256, epochs=10, learning_rate=3e-4, discount=0.99, trace=0.95, clip=0.2, value=0.5, entropy=0.01
@@ -85,8 +94,21 @@ def _cap(settings: PPOSettings, envs: int, **task: Any) -> Recipe:
     return Recipe("cap", 400_000, envs, 102_400, 256, "ppo", settings, _ppo, {"hidden": (128, 128)}, options)
 
 
+def _pushing(observation: str, *, recurrent: int = 0) -> Recipe:
+    """300 updates of 16 episodes of 100 steps, as in the paper."""
+    network, options = {"recurrent": recurrent}, {"task": PushingTask(observation=observation)}
+    settings = BackpropagationSettings()
+    return Recipe("pushing", 480_000, 16, 80_000, 64, "backpropagation", settings, _backpropagation, network, options)
+
+
 _RECIPES: dict[str, dict[str, Recipe]] = {
     "grasp": {DEFAULT: _grasp(10_240), PAPER: _grasp(20_480)},
+    "pushing": {
+        DEFAULT: _pushing("tactile", recurrent=64),
+        PAPER: _pushing("tactile"),
+        "privileged": _pushing("privileged"),
+        "no-touch": _pushing("none"),
+    },
     "cap": {
         DEFAULT: _cap(_CAP, 64, commanded=True, reward="progress"),
         "no-touch": _cap(_CAP, 64, commanded=True, touch=False, reward="progress"),
