@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gelflow.policies.training.run import Progress
 
 DEFAULT_RECIPE = "default"
-TASKS = ("cap", "grasp")  # those of `gelflow.policies.recipes`, which is slow to import
+TASKS = ("cap", "grasp", "pushing")  # those of `gelflow.policies.recipes`, which is slow to import
 
 
 def refuse(args: argparse.Namespace, **unset: object) -> None:
