@@ -61,7 +61,8 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         stack.callback(interrupts.resume)
         interrupts.defer()
         mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
-        latency = LatencyMonitor(("left", "right"), [mount.tracker_config() for mount in mounts])
+        configs = [mount.tracker_config() for mount in mounts]
+        latency = LatencyMonitor(("left", "right"), configs, clock_factor=lab.clock_factor)
         left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder, latency))
         right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder, latency))
         gripper = stack.enter_context(gripper_of(lab, clock, recorder, latency, dry_run=dry_run))

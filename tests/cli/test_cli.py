@@ -19,7 +19,7 @@ MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sy
 COMMON_OPTIONS = {
     "train": {"--json", "--out", "--seed", "--preset"},
     "sweep": {"--json", "--out"},
-    "eval": {"--json", "--seed", "--preset", "--checkpoint"},
+    "eval": {"--json", "--seed", "--preset", "--checkpoint", "--out"},
     "track": {"--json", "--out"},
     "calibrate-camera": {"--json", "--out"},
     "run": {"--json", "--out", "--checkpoint"},

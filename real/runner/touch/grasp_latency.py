@@ -14,7 +14,7 @@ from gelflow.real.camera.latency import LatencyEstimate, combine_latencies, esti
 
 _AROUND = 0.4  # before and after the rise of the force, in which images are tracked [s]
 _RISEN = 0.1  # of the largest force, above which it has risen
-_TOLERATED = 5e-3  # of the latency of the lab file: what its rounding and the gripper's own delay may leave [s]
+_TOLERATED = 5e-3  # beyond the lab file: its rounding, the gripper's own delay, the jitter of this computer [s, wall]
 
 
 @dataclass
@@ -61,10 +61,12 @@ class LatencyMonitor:
     """Collects the signals of grasps and keeps the resulting latencies of each camera.
 
     `image` and `gripper_state` are called in the threads of the devices, for every image and every state.
+    `clock_factor` is robot time over wall time: a mock robot's delays by this computer count as often.
     """
 
-    def __init__(self, names: Sequence[str], trackers: Sequence[TrackerConfig]) -> None:
+    def __init__(self, names: Sequence[str], trackers: Sequence[TrackerConfig], *, clock_factor: float) -> None:
         self._names, self._trackers = names, trackers
+        self._tolerated = _TOLERATED * clock_factor  # [s]
         self._signals: GraspSignals | None = None
         self.estimates: list[list[LatencyEstimate]] = [[] for _ in names]
 
@@ -94,9 +96,8 @@ class LatencyMonitor:
         """Time by which images are at least later than their stamps, the largest of all grasps and cameras [s]."""
         return max((self._excess(known) for known in self.estimates), default=0.0)
 
-    @staticmethod
-    def _excess(known: Sequence[LatencyEstimate]) -> float:
-        return max((estimate.low for estimate in known if estimate.low > _TOLERATED), default=0.0)
+    def _excess(self, known: Sequence[LatencyEstimate]) -> float:
+        return max((estimate.low for estimate in known if estimate.low > self._tolerated), default=0.0)
 
     def warnings(self) -> list[str]:
         """One line for each camera whose images are certainly later than the lab file says."""

@@ -47,7 +47,7 @@ def test_a_failed_run_gives_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFi
     [
         ("[options]\natempts = 1", "unknown key 'atempts'; did you mean 'attempts'?"),
         ("[options]\nout = 'x'", "every run has a folder of its own"),
-        ("[options]\nattempts = 'many'", "argument --attempts: invalid int value: 'many'"),
+        ("[options]\nattempts = 'many'", "argument --steps/--attempts: invalid int value: 'many'"),
         ("[grid]\npresets = ['fast']", "grid: unknown key 'presets'; did you mean 'preset'?"),
     ],
 )

@@ -156,6 +156,7 @@ def test_part_that_slides_out_of_a_slippery_grip_is_not_called_inserted(robot: M
     assert part(robot)["largest_push"] < MOST_PUSHED
 
 
+@pytest.mark.slow
 def test_constant_delay_of_a_camera_is_seen_at_the_grasp(robot: MockRobot, tmp_path: Path) -> None:
     robot.cameras[1].begin_fault(1, "delay", {"delay": 0.12})
     warnings: list[str] = []
