@@ -35,7 +35,6 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
-CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
 _SAVE_INTERVAL = 20.0  # [s] between savings of an unfinished run, at the end of an iteration
 
 
@@ -136,7 +135,7 @@ def collect(
     for _ in range(settings.rollout):
         starts.append(policy.new.copy())
         inputs.append(policy.observe(images).astype(np.float32))
-        centring = centring_correction(env.pose, env.task) / np.asarray(network.reach)
+        centring = env.task.centring_correction(env.pose) / np.asarray(network.reach)
         targets.append((centring * policy.signs).astype(np.float32))
         output = policy.output(inputs[-1].astype(float))
         corrections = policy.correct(np.clip(output, -1, 1) + spread * rng.standard_normal(output.shape))
@@ -149,13 +148,6 @@ def collect(
         inserted += int(result.success.sum())
     attempts = Attempts(np.stack(inputs), np.stack(targets), np.stack(starts))
     return attempts, inserted / ended if ended else float("nan"), float(np.mean(rewards))
-
-
-def centring_correction(pose: Array, task: InsertionTask) -> Array:
-    """The correction (n, 3) in the gripper frame that moves grippers at `pose` (n, 3) to the nearest fitting pose."""
-    x, y, yaw = pose.T
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([-cos * x - sin * y, sin * x - cos * y, -task.part.yaw_error(yaw)], axis=1) * task.corrected_axes
 
 
 def part_tolerance(task: InsertionTask) -> tuple[float, float, float]:
@@ -243,12 +235,8 @@ class _Run:
         self.settings, self.architecture = settings, architecture
         self._env, self._validation, self._out, self._command, self._report = env, validation, out, command, report
         unfinished = load_state(out)
-        if unfinished is None and (out / CHECKPOINT).exists():  # never overwrite the result of another run
-            raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"cannot write into {out}: {error.strerror}") from error
+        if unfinished is None:
+            curve.create_folder(out)
         with torch.random.fork_rng():
             torch.manual_seed(settings.seed)
             self.layers = TorchPolynomialGRU(architecture, self.task)
@@ -365,7 +353,7 @@ class _Run:
             self._save(result)
         last = self._points[-1]
         self._add_point(dataclasses.replace(last, minutes=self.minutes(), evaluation=result))
-        curve.write_table(self._out / CURVE, self._points)
+        curve.write_table(self._out / curve.CURVE, self._points)
 
     def _save(self, result: EvaluationResult) -> None:
         noise = self._env.noise
@@ -379,7 +367,7 @@ class _Run:
             "versions": {"torch": str(torch.__version__)},
         }
         checkpoint.save_checkpoint(
-            self._out / CHECKPOINT,
+            self._out / curve.CHECKPOINT,
             task=self.task,
             architecture=self.architecture,
             tensors=self.tensors(),
@@ -390,7 +378,9 @@ class _Run:
         """Evaluates the last network, draws the learning curve and returns the result."""
         self._evaluate()
         assert self._best is not None
-        curve.draw(self._out / PICTURE, self._points)
+        curve.draw(self._out / curve.PICTURE, self._points)
         finish_state(self._out)
         shares = (self.simulation_time, self.learning_time)
-        return TrainingResult(self._out / CHECKPOINT, self._best, self._out / CURVE, self._out / PICTURE, *shares)
+        return TrainingResult(
+            self._out / curve.CHECKPOINT, self._best, self._out / curve.CURVE, self._out / curve.PICTURE, *shares
+        )

@@ -60,9 +60,6 @@ class PPOSettings:
     evaluate_episodes: int = 512
 
 
-CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
-
-
 class HistoryVecEnv(VecEnv):
     """`PolicyEnv` as an environment of stable-baselines3.
 
@@ -169,12 +166,7 @@ def train(
     architecture = architecture or PolynomialMLP()
     settings = settings or PPOSettings()
     _check_settings(settings, env)
-    if (out / CHECKPOINT).exists():  # never overwrite the result of another run
-        raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}") from error
+    curve.create_folder(out)
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
     basis = polynomial_basis(env.task.grid, architecture.degree)
     scale = feature_scale(env, architecture, basis, settings)
@@ -298,19 +290,19 @@ class _TrainingCallback(BaseCallback):
                 "validation": {"episodes": result.episodes, "success": result.success, "attempts": result.attempts},
                 "versions": {"torch": str(torch.__version__), "stable_baselines3": stable_baselines3.__version__},
             }
-            path = run.out / CHECKPOINT
+            path = run.out / curve.CHECKPOINT
             checkpoint.save_checkpoint(
                 path, task=task, architecture=run.architecture, tensors=tensors, training=training
             )
         self._add_point(result)
-        curve.write_table(run.out / CURVE, self._points)
+        curve.write_table(run.out / curve.CURVE, self._points)
 
     def finish(self) -> TrainingResult:
         """Draws the learning curve and returns the result."""
         assert self._best is not None
-        curve.draw(self._run.out / PICTURE, self._points)
+        curve.draw(self._run.out / curve.PICTURE, self._points)
         out = self._run.out
-        return TrainingResult(out / CHECKPOINT, self._best, out / CURVE, out / PICTURE)
+        return TrainingResult(out / curve.CHECKPOINT, self._best, out / curve.CURVE, out / curve.PICTURE)
 
 
 def _to_json(settings: PPOSettings) -> dict[str, Any]:

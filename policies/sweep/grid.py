@@ -1,4 +1,4 @@
-"""Grid files: the task, fixed options, options of which every combination is trained, and seeds."""
+"""Grid files: a task, fixed options, lists of options, whose combinations are all trained, and seeds."""
 
 import hashlib
 import itertools

@@ -81,7 +81,7 @@ class TrainingRun:
     Parameters
     ----------
     validation: environments of the evaluations; its episodes are not those of the training
-    configuration: everything that determines the result besides `settings`, as JSON data: task options, algorithm
+    configuration: all other values that determine the result, as JSON data: task options, algorithm
     command: command line that repeats the run, stored in the folder and in the checkpoint
     report: called after each update and each evaluation
     """

@@ -86,11 +86,9 @@ class Insertion(AttemptTask):
         }
 
     def oracle(self) -> Array:
-        """Actions to the middle of the hole."""
-        x, y, yaw = self.attempts.pose.T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        correction = np.column_stack([-cos * x - sin * y, sin * x - cos * y, -yaw])
-        return np.asarray(np.clip(correction / self.description.action_scale, -1, 1))
+        """Actions to the nearest pose in which the part fits."""
+        task = self.description
+        return np.asarray(np.clip(task.centring_correction(self.attempts.pose) / task.action_scale, -1, 1))
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """The part of environment `index` at the end of its last attempt, and the pads."""

@@ -134,6 +134,13 @@ class InsertionTask(TaskDescription):
         limit = np.asarray(self.workspace)
         return np.asarray(np.clip(moved, -limit, limit))
 
+    def centring_correction(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The correction (…, 3) in the gripper frame from `pose` (…, 3) to the nearest pose where the part fits."""
+        x, y, yaw = np.moveaxis(np.asarray(pose, dtype=float), -1, 0)
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        centring = np.stack([-cos * x - sin * y, sin * x - cos * y, -self.part.yaw_error(yaw)], axis=-1)
+        return np.asarray(centring * self.corrected_axes)
+
     def reward(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """Reward of gripper poses in the hole's frame, shape (…, 3) [m, m, rad]: −1e4 ‖(x, y)‖² − 20 yaw² (eq. 27).
 

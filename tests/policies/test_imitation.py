@@ -19,7 +19,6 @@ from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 from gelflow.policies.imitation import (
     ImitationSettings,
-    centring_correction,
     imitation_loss,
     part_tolerance,
     train,
@@ -117,12 +116,12 @@ def test_an_impossible_architecture_is_rejected(changes: dict[str, Any]) -> None
 
 def test_the_centring_correction_centres_a_part() -> None:
     pose = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * INSERTION.misalignment
-    assert np.allclose(INSERTION.corrected(pose, centring_correction(pose, INSERTION)), 0, atol=1e-15)
+    assert np.allclose(INSERTION.corrected(pose, INSERTION.centring_correction(pose)), 0, atol=1e-15)
     hexagon = insertion_task(dataclasses.replace(CUBOID, symmetry=6))
     turned = pose + np.array([0, 0, np.pi / 3])
-    assert np.allclose(centring_correction(turned, hexagon)[:, 2], -pose[:, 2])
+    assert np.allclose(hexagon.centring_correction(turned)[:, 2], -pose[:, 2])
     peg = insertion_task(dataclasses.replace(CUBOID, symmetry=0))
-    assert (centring_correction(pose, peg)[:, 2] == 0).all()
+    assert (peg.centring_correction(pose)[:, 2] == 0).all()
 
 
 def test_the_tolerance_is_the_gap_and_the_yaw_of_a_corner() -> None:

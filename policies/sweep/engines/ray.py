@@ -70,6 +70,6 @@ class RayEngine(Engine):
 
 
 def _execute(run: Run) -> RunRecord:
-    """The task of a run; its record names the node besides the machine."""
+    """The task of a run; its record names the node and the machine."""
     ray: Any = importlib.import_module("ray")
     return execute(run, f"{platform.node()}/{ray.get_runtime_context().get_node_id()[:8]}")
