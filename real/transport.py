@@ -18,6 +18,7 @@ from gelflow.errors import PeerError, PeerTimeout, UsageError
 # Lower bound of every wait: with a fast clock, a peer on the same machine still needs time from the scheduler.
 SHORTEST_WALL_TIMEOUT = 0.5  # [s]
 _READ_SIZE = 4096  # bytes
+_CLOSE_TIMEOUT = 0.2  # a peer that does not close its side is waited for no longer [s, wall]
 
 
 class Transport(Protocol):
@@ -111,9 +112,22 @@ class TcpTransport:
     def close(self) -> None:
         if self._socket is not None:
             with contextlib.suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+                self._socket.shutdown(socket.SHUT_WR)
+                self._discard_until_closed(self._socket)
             self._socket.close()
             self._socket = None
+
+    @staticmethod
+    def _discard_until_closed(connection: socket.socket) -> None:
+        """Read until the peer closes too.
+
+        Unread bytes at `close` would reset the connection, and the peer could lose the last command.
+        """
+        deadline = time.monotonic() + _CLOSE_TIMEOUT
+        while (left := deadline - time.monotonic()) > 0:
+            connection.settimeout(left)
+            if not connection.recv(_READ_SIZE):
+                return
 
     def _connected(self) -> socket.socket:
         if self._socket is None:
