@@ -71,6 +71,7 @@ def test_missed_cycles_and_jitter_are_counted() -> None:
     summary = statistics.summary()
     assert (summary["cycles"], summary["lost"], summary["unanswered"]) == (4, 1, 1)
     assert summary["missed"] == pytest.approx(2 / 6)
+    assert statistics.missed == [(0.0085, 0.0165, 1), (pytest.approx(0.0125), 0.0165, 1)]
     assert summary["jitter_max_ms"] == pytest.approx(4.0)
     assert summary["latency_max_ms"] == pytest.approx(0.2)
 

@@ -20,6 +20,7 @@ from gelflow.cli.promises.rig import Rig, near_seed
 from gelflow.errors import PeerError, PeerTimeout
 from gelflow.geometry import Pose
 from gelflow.measurement.machine import processor
+from gelflow.measurement.stalls import StallWatch, overlaps
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.cell import Cell, open_cell
@@ -44,6 +45,7 @@ class CycleStatistics:
     cycles: int = 0  # messages received and answered
     lost: int = 0  # messages that did not arrive
     unanswered: int = 0  # messages that a newer one had overtaken
+    missed: list[tuple[float, float, int]] = field(default_factory=list)  # begin and end [s], number of missed cycles
     intervals: list[float] = field(default_factory=list)  # between two receptions [s]
     latencies: list[float] = field(default_factory=list)  # from reception to answer [s]
     _last: EgmCycle | None = None
@@ -52,10 +54,10 @@ class CycleStatistics:
         """Add cycles in the order of their reception."""
         for cycle in cycles:
             if self._last is not None:
-                self.lost += max(0, cycle.sequence - self._last.sequence - 1)
+                self._miss(self._last.stamp, cycle.stamp, lost=max(0, cycle.sequence - self._last.sequence - 1))
                 self.intervals.append(cycle.stamp - self._last.stamp)
             unanswered = EgmFlag.UNANSWERED in cycle.flags or math.isnan(cycle.answered)
-            self.unanswered += unanswered
+            self._miss(cycle.stamp - _PERIOD, cycle.stamp, unanswered=int(unanswered))
             self.cycles += not unanswered
             if not unanswered:
                 self.latencies.append(cycle.answered - cycle.stamp)
@@ -63,8 +65,15 @@ class CycleStatistics:
 
     def stop(self, silence: float) -> None:
         """Count a stop after `silence` [s] without a message: its cycles are lost, the next one is a new start."""
-        self.lost += round(silence / _PERIOD)
+        if self._last is not None:
+            self._miss(self._last.stamp, self._last.stamp + silence, lost=round(silence / _PERIOD))
         self._last = None
+
+    def _miss(self, begin: float, end: float, *, lost: int = 0, unanswered: int = 0) -> None:
+        self.lost += lost
+        self.unanswered += unanswered
+        if lost + unanswered:
+            self.missed.append((begin, end, lost + unanswered))
 
     def summary(self) -> dict[str, float]:
         """Fraction of missed cycles, and times in milliseconds."""
@@ -94,6 +103,8 @@ class Endurance:
     images: tuple[int, int]  # tracked of each camera
     recorded: int  # bytes
     late: int  # cycles that the mock controller skipped, because this computer was busy
+    stalls: list[float]  # lengths of the stalls of this computer [s], see `gelflow.measurement.stalls`
+    missed_in_stalls: int  # missed cycles that overlap a stall
     stops: list[str]  # reasons why the arm was stopped; it was connected again each time
     load_before: float | None
     load_after: float | None
@@ -102,6 +113,13 @@ class Endurance:
     def missed(self) -> float:
         """Fraction of the cycles that were sent and not answered in time."""
         return self.cycles["missed"]
+
+    @property
+    def missed_by_program(self) -> float:
+        """Fraction of the cycles that were missed while this computer did not stall."""
+        c = self.cycles
+        total = c["cycles"] + c["lost"] + c["unanswered"]
+        return (c["lost"] + c["unanswered"] - self.missed_in_stalls) / max(1.0, total)
 
     def to_json(self) -> dict[str, Any]:
         """As JSON data, with the computer."""
@@ -117,6 +135,9 @@ class Endurance:
             f"99 % {c['jitter_99_ms']:.3f}, largest {c['jitter_max_ms']:.1f} ms",
             f"answer after: median {c['latency_median_ms']:.3f}, 99 % {c['latency_99_ms']:.3f}, "
             f"largest {c['latency_max_ms']:.1f} ms",
+            f"stalls of this computer, in which no program ran: {len(self.stalls)}, in total {sum(self.stalls):.1f} s, "
+            f"the longest {1e3 * max(self.stalls, default=0.0):.0f} ms; {self.missed_in_stalls} cycles were missed in "
+            f"them, {100 * self.missed_by_program:.3f} % outside them",
             f"tracked images: {self.images[0]} and {self.images[1]}; recorded {self.recorded / 1e6:.1f} MB; the mock "
             f"controller skipped {self.late} cycles; load before {self.load_before}, after {self.load_after}",
             *(f"stopped, then connected again: {reason}" for reason in self.stops),
@@ -130,15 +151,27 @@ def measure_endurance(seconds: float) -> Endurance:
         save_lab(rig.lab, rig.folder / "lab.toml", title="Written by gelflow soak --egm.")
         arguments = [sys.executable, "-m", "gelflow.cli.promises.endurance", str(rig.folder), repr(seconds)]
         late = rig.robot.arm.report.late
-        result = subprocess.run(arguments, capture_output=True, timeout=seconds + _START_LIMIT, check=False)
+        with StallWatch() as watch:
+            result = subprocess.run(arguments, capture_output=True, timeout=seconds + _START_LIMIT, check=False)
         if result.returncode != 0:
             lines = result.stderr.decode(errors="replace").strip().splitlines()
             raise PeerError(f"the endurance run ended early: {lines[-1] if lines else 'no reason given'}")
         values = json.loads(result.stdout)
         recorded = os.path.getsize(rig.folder / "session.mcap")
         late = rig.robot.arm.report.late - late
-    images = tuple(values["images"])
-    return Endurance(seconds, values["cycles"], images, recorded, late, values["stops"], before, load())
+    missed_in_stalls = sum(n for begin, end, n in values["missed"] if overlaps((begin, end), watch.intervals))
+    return Endurance(
+        seconds,
+        values["cycles"],
+        tuple(values["images"]),
+        recorded,
+        late,
+        [end - begin for begin, end in watch.intervals],
+        missed_in_stalls,
+        values["stops"],
+        before,
+        load(),
+    )
 
 
 def run_devices(folder: Path, seconds: float) -> dict[str, Any]:
@@ -157,7 +190,7 @@ def run_devices(folder: Path, seconds: float) -> dict[str, Any]:
             except PeerTimeout as error:
                 statistics.stop(lab.limits.stale_pose)
                 stops.append(str(error))
-    return {"cycles": statistics.summary(), "images": images, "stops": stops}
+    return {"cycles": statistics.summary(), "missed": statistics.missed, "images": images, "stops": stops}
 
 
 def _run_until(end: float, lab: Lab, recorder: SessionRecorder, statistics: CycleStatistics, images: list[int]) -> None:
