@@ -18,12 +18,12 @@ def site_poses(scene: Any, model: _core.Model, params: NDArray[Any], q: ArrayLik
     return poses.reshape(*np.shape(q)[:-1], len(sites), 7)
 
 
-def site_poses_vjp(scene: Any, model: _core.Model, params: NDArray[Any], q: ArrayLike, by_poses: ArrayLike) -> Floats:
+def site_poses_vjp(scene: Any, model: _core.Model, params: NDArray[Any], q: ArrayLike, grad_poses: ArrayLike) -> Floats:
     """Gradient with respect to q, like q, from that with respect to the poses; for quaternions the tangent gradient."""
     sites, rows = _sites(scene), _rows(model, params, q)
-    by_rows = np.ascontiguousarray(by_poses, dtype=float).reshape(len(rows), len(sites), 7)
-    by_q = _core.site_poses_vjp(model, sites, np.asarray(params, dtype=float), rows, by_rows)
-    return by_q.reshape(np.shape(q))
+    grad_rows = np.ascontiguousarray(grad_poses, dtype=float).reshape(len(rows), len(sites), 7)
+    grad_q = _core.site_poses_vjp(model, sites, np.asarray(params, dtype=float), rows, grad_rows)
+    return grad_q.reshape(np.shape(q))
 
 
 def _sites(scene: Any) -> list[_core.SiteDef]:

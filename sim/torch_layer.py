@@ -136,9 +136,9 @@ class _SitePoses(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_poses: torch.Tensor) -> tuple[torch.Tensor, None]:
-        by_q = site_poses_vjp(ctx.sim.scene, ctx.sim.model, ctx.params, ctx.q, by_poses.numpy())
-        return torch.from_numpy(by_q).to(by_poses.dtype), None
+    def backward(ctx: Any, grad_poses: torch.Tensor) -> tuple[torch.Tensor, None]:
+        grad_q = site_poses_vjp(ctx.sim.scene, ctx.sim.model, ctx.params, ctx.q, grad_poses.numpy())
+        return torch.from_numpy(grad_q).to(grad_poses.dtype), None
 
 
 class _Rollout(torch.autograd.Function):
@@ -181,11 +181,11 @@ class _Rollout(torch.autograd.Function):
     @once_differentiable
     def backward(
         ctx: Any,
-        by_q: torch.Tensor,
-        by_v: torch.Tensor,
-        by_tactile: torch.Tensor,
-        by_anchors: torch.Tensor,
-        by_history: torch.Tensor,
+        grad_q: torch.Tensor,
+        grad_v: torch.Tensor,
+        grad_tactile: torch.Tensor,
+        grad_anchors: torch.Tensor,
+        grad_history: torch.Tensor,
         *_: Any,
     ) -> tuple[torch.Tensor | None, ...]:
         sim: Simulator = ctx.sim
@@ -194,16 +194,16 @@ class _Rollout(torch.autograd.Function):
         with _temporary_params(sim, ctx.params):
             gradient = sim.rollout_gradient(
                 trajectory,
-                q=by_q.numpy(),
-                v=by_v.numpy(),
-                tactile=by_tactile.numpy(),
-                anchors_end=by_anchors.numpy(),
-                history_end=by_history.numpy(),
+                q=grad_q.numpy(),
+                v=grad_v.numpy(),
+                tactile=grad_tactile.numpy(),
+                anchors_end=grad_anchors.numpy(),
+                history_end=grad_history.numpy(),
                 params=wanted,
             )
         arrays = (gradient.u, gradient.q, gradient.v, gradient.anchors, gradient.history)
-        by_params = torch.from_numpy(gradient.params.astype(sim.dtype)) if wanted else None
-        return (*(torch.from_numpy(array) for array in arrays), by_params, None, None, None)
+        grad_params = torch.from_numpy(gradient.params.astype(sim.dtype)) if wanted else None
+        return (*(torch.from_numpy(array) for array in arrays), grad_params, None, None, None)
 
 
 @contextmanager

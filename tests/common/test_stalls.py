@@ -20,7 +20,7 @@ def test_overlap(interval: tuple[float, float], expected: bool) -> None:
 
 def test_a_stopped_watcher_reports_a_stall() -> None:
     with StallWatch() as watch:
-        pid = watch._processes[0].pid
+        pid = watch._helpers[0].pid
         begin = time.monotonic()
         os.kill(pid, signal.SIGSTOP)
         time.sleep(0.2)

@@ -147,7 +147,7 @@ class MotionBenchmark:
             start: dict[str, Any] = {**starts[frame]}
             trajectory = sim.rollout(u, **start, read_after=(self.steps,) if reads else ())
             held = min(self.every, self.look - frame + 1)
-            by_tactile = scale * held * fields[frame] / self._weights if reads else None
+            grad_tactile = scale * held * fields[frame] / self._weights if reads else None
             at_end = {name: np.zeros(getattr(trajectory, name).shape) for name in ("q", "v")}
             for name, values in at_end.items():
                 values[-1] = later.get(name, 0)
@@ -155,7 +155,7 @@ class MotionBenchmark:
                 trajectory,
                 q=at_end["q"],
                 v=at_end["v"],
-                tactile=by_tactile,
+                tactile=grad_tactile,
                 anchors_end=later.get("anchors"),
                 history_end=later.get("history"),
             )

@@ -69,7 +69,8 @@ class Batch {
   void read(T* out, NonzeroMarkers* nonzero, const std::uint8_t* active);
   void read_one(int env, int thread, T* out, NonzeroMarkers* nonzero);
   void rollout_one(const Trajectory<T>& r, const TouchStop* stop, int env, int thread);
-  void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q, double* by_v);
+  void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* grad_q,
+                        double* grad_v);
   void check_state(const std::uint8_t* active) const;
   void check_controls(const T* u, int rows, const std::uint8_t* active) const;
   std::vector<StepMemory<T>> memory_;             // one per thread

@@ -233,8 +233,8 @@ void Batch<T>::mass_matrix(T* out) {
   for (int e = 0; e < n; ++e, out += size) {
     kinematics(e, w);
     w.residual.setZero();
-    w.by_q.setZero();
-    w.by_v.setZero();
+    w.dg_dq.setZero();
+    w.dg_dv.setZero();
     add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     for (const Joint& joint : model->joints) {
       for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += joint.params.in(params_of(e)).armature;

@@ -26,9 +26,9 @@ struct TapedState {
 
   // Adds the gradient with respect to the parameters, which are the first entries on the tape. `weights` are the
   // gradients of all its entries.
-  void add_to(double* by_params, std::vector<double>& weights) const {
+  void add_to(double* grad_params, std::vector<double>& weights) const {
     Tape::current().backward(weights);
-    for (std::size_t i = 0; i < params.size(); ++i) by_params[i] += weights[i];
+    for (std::size_t i = 0; i < params.size(); ++i) grad_params[i] += weights[i];
   }
 };
 
@@ -39,7 +39,7 @@ void set_weight(std::vector<double>& weights, const Taped& result, double weight
 }  // namespace
 
 void add_step_param_gradient(const Model& m, const double* params, const ParamState& s, const double* multipliers,
-                             const V3<double>* by_next, double* by_params) {
+                             const V3<double>* grad_next, double* grad_params) {
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
   const Taped beta_h(s.beta_h);
@@ -58,21 +58,21 @@ void add_step_param_gradient(const Model& m, const double* params, const ParamSt
   std::vector<double> weights(Tape::current().size(), 0.0);
   for (int k = 0; k < m.nv; ++k) set_weight(weights, w.residual[k], -multipliers[k]);
   for (int i = 0; i < m.na; ++i) {
-    for (int a = 0; next_set[i] && a < 3; ++a) set_weight(weights, next[i][a], by_next[i][a]);
+    for (int a = 0; next_set[i] && a < 3; ++a) set_weight(weights, next[i][a], grad_next[i][a]);
   }
-  t.add_to(by_params, weights);
+  t.add_to(grad_params, weights);
 }
 
-void add_reading_param_gradient(const Model& m, const double* params, const ParamState& s, const double* by_reading,
-                                double* by_params) {
+void add_reading_param_gradient(const Model& m, const double* params, const ParamState& s, const double* grad_reading,
+                                double* grad_params) {
   TapedState t(m, params, s);
   Workspace<Taped> w(m);
   forward_state<false, Taped>(m, t.params.data(), t.q0.data(), nullptr, t.v0.data(), w);
   std::vector<Taped> readings(static_cast<std::size_t>(m.num_markers) * 3);
   read_markers<Taped>(m, t.params.data(), t.anchors.data(), s.anchored, w, readings.data(), nullptr);
   std::vector<double> weights(Tape::current().size(), 0.0);
-  for (std::size_t i = 0; i < readings.size(); ++i) set_weight(weights, readings[i], by_reading[i]);
-  t.add_to(by_params, weights);
+  for (std::size_t i = 0; i < readings.size(); ++i) set_weight(weights, readings[i], grad_reading[i]);
+  t.add_to(grad_params, weights);
 }
 
 }  // namespace gelflow

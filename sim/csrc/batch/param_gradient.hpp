@@ -14,12 +14,12 @@ struct ParamState {
   const std::uint8_t* anchored;
 };
 
-// Adds −multipliersᵀ ∂residual/∂params + by_nextᵀ ∂(anchors after the step)/∂params.
+// Adds −multipliersᵀ ∂residual/∂params + grad_nextᵀ ∂(anchors after the step)/∂params.
 void add_step_param_gradient(const Model& m, const double* params, const ParamState& s, const double* multipliers,
-                             const V3<double>* by_next, double* by_params);
+                             const V3<double>* grad_next, double* grad_params);
 
-// Adds by_readingᵀ ∂readings/∂params.
-void add_reading_param_gradient(const Model& m, const double* params, const ParamState& s, const double* by_reading,
-                                double* by_params);
+// Adds grad_readingᵀ ∂readings/∂params.
+void add_reading_param_gradient(const Model& m, const double* params, const ParamState& s, const double* grad_reading,
+                                double* grad_params);
 
 }  // namespace gelflow

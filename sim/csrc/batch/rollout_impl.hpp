@@ -76,12 +76,12 @@ void Batch<T>::contact_modes(const Trajectory<T>& r, std::uint64_t* out) {
 template <class T>
 struct DoubleTrajectory {
   std::vector<double> u, q, v, anchors, history;
-  std::vector<double> by_q, by_v, by_anchors_end, by_history_end, by_tactile;
-  std::vector<double> by_u, by_q0, by_v0, by_anchors0, by_history0;
+  std::vector<double> grad_q, grad_v, grad_anchors_end, grad_history_end, grad_tactile;
+  std::vector<double> grad_u, grad_q0, grad_v0, grad_anchors0, grad_history0;
   Trajectory<double> trajectory{};
 
   DoubleTrajectory(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int reads)
-      : by_q0(r.row(1, 0) * m.nq), by_v0(r.row(1, 0) * m.nv) {
+      : grad_q0(r.row(1, 0) * m.nq), grad_v0(r.row(1, 0) * m.nv) {
     const std::size_t n = r.environments, rows = r.row(r.steps + 1, 0), nu = m.actuators.size();
     const auto copy = [](const T* values, std::size_t count) { return std::vector<double>(values, values + count); };
     u = copy(r.u, (rows - n) * nu);
@@ -89,14 +89,14 @@ struct DoubleTrajectory {
     v = copy(r.v, rows * m.nv);
     anchors = copy(r.anchors, rows * m.na * 3);
     history = copy(r.history, rows * m.nh);
-    by_q = copy(cotangent.q, rows * m.nq);
-    by_v = copy(cotangent.v, rows * m.nv);
-    by_anchors_end = copy(cotangent.anchors_end, n * m.na * 3);
-    by_history_end = copy(cotangent.history_end, n * m.nh);
-    by_tactile = copy(cotangent.tactile, r.row(reads, 0) * r.reading_size(m));
-    by_u.resize(u.size());
-    by_anchors0.resize(by_anchors_end.size());
-    by_history0.resize(by_history_end.size());
+    grad_q = copy(cotangent.q, rows * m.nq);
+    grad_v = copy(cotangent.v, rows * m.nv);
+    grad_anchors_end = copy(cotangent.anchors_end, n * m.na * 3);
+    grad_history_end = copy(cotangent.history_end, n * m.nh);
+    grad_tactile = copy(cotangent.tactile, r.row(reads, 0) * r.reading_size(m));
+    grad_u.resize(u.size());
+    grad_anchors0.resize(grad_anchors_end.size());
+    grad_history0.resize(grad_history_end.size());
     trajectory.steps = r.steps;
     trajectory.reads = reads;
     trajectory.environments = r.environments;
@@ -114,25 +114,25 @@ struct DoubleTrajectory {
     trajectory.reduction = r.reduction;
   }
   TrajectoryCotangent<double> cotangent() const {
-    return {by_q.data(), by_v.data(), by_anchors_end.data(), by_history_end.data(), by_tactile.data()};
+    return {grad_q.data(), grad_v.data(), grad_anchors_end.data(), grad_history_end.data(), grad_tactile.data()};
   }
-  TrajectoryGradient<double> gradient(double* by_params) {
-    return {by_u.data(), by_q0.data(), by_v0.data(), by_anchors0.data(), by_history0.data(), by_params};
+  TrajectoryGradient<double> gradient(double* grad_params) {
+    return {grad_u.data(), grad_q0.data(), grad_v0.data(), grad_anchors0.data(), grad_history0.data(), grad_params};
   }
   void copy_gradient(const TrajectoryGradient<T>& out) const {
-    std::copy(by_u.begin(), by_u.end(), out.u);
-    std::copy(by_q0.begin(), by_q0.end(), out.q);
-    std::copy(by_v0.begin(), by_v0.end(), out.v);
-    std::copy(by_anchors0.begin(), by_anchors0.end(), out.anchors);
-    std::copy(by_history0.begin(), by_history0.end(), out.history);
+    std::copy(grad_u.begin(), grad_u.end(), out.u);
+    std::copy(grad_q0.begin(), grad_q0.end(), out.q);
+    std::copy(grad_v0.begin(), grad_v0.end(), out.v);
+    std::copy(grad_anchors0.begin(), grad_anchors0.end(), out.anchors);
+    std::copy(grad_history0.begin(), grad_history0.end(), out.history);
   }
 };
 
-// Adds the gradient through all marker readings to by_q and by_v, shaped as in the trajectory. For models without
+// Adds the gradient through all marker readings to grad_q and grad_v, shaped as in the trajectory. For models without
 // anchors, whose readings depend on the state alone.
 template <class T>
-void Batch<T>::add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* by_q,
-                                double* by_v) {
+void Batch<T>::add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* grad_q,
+                                double* grad_v) {
   const Model& m = *model;
   for_active(r.active, [&](int e, int thread) {
     std::vector<T> forces;
@@ -140,11 +140,11 @@ void Batch<T>::add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangen
       const int t = r.read_after[read];
       const StateView<T> now = r.state(m, t, e);
       StateGradient<T> gradient(m);
-      const T* const by_reading = by_marker_forces(m, r, cotangent, read, e, forces);
-      tactile_vjp<T>(m, params_of(e), now, by_reading, gradient, memory_[thread].work);
+      const T* const grad_reading = grad_marker_forces(m, r, cotangent, read, e, forces);
+      tactile_vjp<T>(m, params_of(e), now, grad_reading, gradient, memory_[thread].work);
       const VX<double> q = Eigen::Map<const VX<T>>(now.q, m.nq).template cast<double>();
-      add_from_tangent<double>(m, q.data(), gradient.q.template cast<double>(), by_q + r.row(t, e) * m.nq);
-      for (int k = 0; k < m.nv; ++k) by_v[r.row(t, e) * m.nv + k] += gradient.v[k];
+      add_from_tangent<double>(m, q.data(), gradient.q.template cast<double>(), grad_q + r.row(t, e) * m.nq);
+      for (int k = 0; k < m.nv; ++k) grad_v[r.row(t, e) * m.nv + k] += gradient.v[k];
     }
   });
 }
@@ -171,7 +171,7 @@ void Batch<T>::rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>&
     std::copy(params.begin(), params.end(), double_batch_->params.begin());
     const bool separate_readings = m.na == 0 && out.params == nullptr;
     DoubleTrajectory<T> doubles(m, r, cotangent, separate_readings ? 0 : r.reads);
-    if (separate_readings) add_readings_vjp(r, cotangent, doubles.by_q.data(), doubles.by_v.data());
+    if (separate_readings) add_readings_vjp(r, cotangent, doubles.grad_q.data(), doubles.grad_v.data());
     double_batch_->rollout_vjp(doubles.trajectory, doubles.cotangent(), doubles.gradient(out.params));
     doubles.copy_gradient(out);
   }

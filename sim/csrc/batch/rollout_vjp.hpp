@@ -9,12 +9,12 @@ namespace gelflow {
 
 // The gradient with respect to the marker forces of a reading, (markers, 3). `forces`: memory for it.
 template <class T>
-const T* by_marker_forces(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int read,
-                          std::size_t e, std::vector<T>& forces) {
-  const T* const by_reading = cotangent.tactile + r.reading(m, read, e);
-  if (r.reduction == nullptr) return by_reading;
+const T* grad_marker_forces(const Model& m, const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, int read,
+                            std::size_t e, std::vector<T>& forces) {
+  const T* const grad_reading = cotangent.tactile + r.reading(m, read, e);
+  if (r.reduction == nullptr) return grad_reading;
   forces.resize(static_cast<std::size_t>(m.num_markers) * 3);
-  r.reduction->apply_vjp(by_reading, forces.data());
+  r.reduction->apply_vjp(grad_reading, forces.data());
   return forces.data();
 }
 
@@ -22,16 +22,16 @@ const T* by_marker_forces(const Model& m, const Trajectory<T>& r, const Trajecto
 // `read` is the last read that is not yet done.
 template <class T>
 void readings_vjp(const Model& m, const T* params, int step, std::size_t e, const Trajectory<T>& r,
-                  const TrajectoryCotangent<T>& cotangent, double* by_params, StateGradient<T>& gradient, int& read,
+                  const TrajectoryCotangent<T>& cotangent, double* grad_params, StateGradient<T>& gradient, int& read,
                   Workspace<T>& w) {
   const StateView<T> now = r.state(m, step, e);
   std::vector<T> forces;
   for (; read >= 0 && r.read_after[read] == step; --read) {
-    const T* by_reading = by_marker_forces(m, r, cotangent, read, e, forces);
-    tactile_vjp<T>(m, params, now, by_reading, gradient, w);
-    if (by_params == nullptr) continue;
+    const T* grad_reading = grad_marker_forces(m, r, cotangent, read, e, forces);
+    tactile_vjp<T>(m, params, now, grad_reading, gradient, w);
+    if (grad_params == nullptr) continue;
     const ParamState at{m.step, now.q, now.v, nullptr, nullptr, nullptr, now.anchors, now.anchored};
-    add_reading_param_gradient(m, params, at, by_reading, by_params);
+    add_reading_param_gradient(m, params, at, grad_reading, grad_params);
   }
 }
 
@@ -58,7 +58,7 @@ void record_substeps(const Model& m, const T* params, const T* u, const StateVie
 template <class T>
 void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajectory<T>& r,
                  const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out, StepMemory<T>& memory) {
-  double* by_params = out.params == nullptr ? nullptr : out.params + e * m.param_names.size();
+  double* grad_params = out.params == nullptr ? nullptr : out.params + e * m.param_names.size();
   StateGradient<T> gradient(m);
   std::copy_n(reinterpret_cast<const V3<T>*>(cotangent.anchors_end) + e * m.na, m.na, gradient.anchors.begin());
   std::copy_n(cotangent.history_end + e * m.nh, m.nh, gradient.history.data());
@@ -70,19 +70,19 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
     const StateView<T> now = r.state(m, t, e);
     gradient.q += to_tangent<T>(m, now.q, cotangent.q + row * m.nq);
     gradient.v += Eigen::Map<const VX<T>>(cotangent.v + row * m.nv, m.nv);
-    readings_vjp<T>(m, params, t, e, r, cotangent, by_params, gradient, read, memory.work);
+    readings_vjp<T>(m, params, t, e, r, cotangent, grad_params, gradient, read, memory.work);
     if (t == 0) break;
     if (t > taken) continue;
     const T* u = r.controls(m, t - 1, e);
-    T* by_u = out.u + (u - r.u);
+    T* grad_u = out.u + (u - r.u);
     record_substeps<T>(m, params, u, r.state(m, t - 1, e), now, r.halvings[r.row(t - 1, e)] != 0, memory, records);
     for (auto it = records.rbegin(); it != records.rend(); ++it) {
-      substep_vjp<T>(m, params, u, *it, gradient, by_u, memory, [&](const VX<T>& multiplier) {
-        if (by_params == nullptr) return;
+      substep_vjp<T>(m, params, u, *it, gradient, grad_u, memory, [&](const VX<T>& multiplier) {
+        if (grad_params == nullptr) return;
         const ParamState at{
             it->beta_h, it->q0.data(),      it->v_star.data(),  it->bdf2 ? it->history.data() : nullptr, it->v1.data(),
             u,          it->anchors.data(), it->anchored.data()};
-        add_step_param_gradient(m, params, at, multiplier.data(), gradient.anchors.data(), by_params);
+        add_step_param_gradient(m, params, at, multiplier.data(), gradient.anchors.data(), grad_params);
       });
     }
   }

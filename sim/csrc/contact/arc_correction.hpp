@@ -31,13 +31,13 @@ V3<T> moment_of(const M3<T>& m) {
 template <class P>
 struct SpringForce {
   Vec3<P> force;
-  Mat3<P> by_x, by_v;
+  Mat3<P> dforce_dx, dforce_dv;
 };
 template <bool derivatives, class T>
 GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const T& step_length) {
   using P = Pack<T>;
   SpringForce<P> s{-(t.law.kn * t.at.d) * t.at.n, zero33<P>(), zero33<P>()};
-  s.by_x.row[2].z = -t.law.kn;  // n = z
+  s.dforce_dx.row[2].z = -t.law.kn;  // n = z
   if (!t.law.elastic) return s;
   // −k_s s = k_t v_t + q f_t + (1 − q) f*
   PointForce<P> f;
@@ -49,11 +49,11 @@ GELFLOW_INLINE SpringForce<Pack<T>> spring_force(const ContactPack<T>& t, const 
   s.force.y += if_anchored(e.y);
   if constexpr (derivatives) {
     for (int i = 0; i < 2; ++i) {
-      Vec3<P> by_x = q * f.by_x.row[i], by_v = q * f.by_v.row[i];
-      (i == 0 ? by_x.x : by_x.y) -= rest * t.law.ks;
-      (i == 0 ? by_v.x : by_v.y) += q * t.law.kt;
-      s.by_x.row[i] = {if_anchored(by_x.x), if_anchored(by_x.y), if_anchored(by_x.z)};
-      s.by_v.row[i] = {if_anchored(by_v.x), if_anchored(by_v.y), if_anchored(by_v.z)};
+      Vec3<P> dforce_dx = q * f.dforce_dx.row[i], dforce_dv = q * f.dforce_dv.row[i];
+      (i == 0 ? dforce_dx.x : dforce_dx.y) -= rest * t.law.ks;
+      (i == 0 ? dforce_dv.x : dforce_dv.y) += q * t.law.kt;
+      s.dforce_dx.row[i] = {if_anchored(dforce_dx.x), if_anchored(dforce_dx.y), if_anchored(dforce_dx.z)};
+      s.dforce_dv.row[i] = {if_anchored(dforce_dv.x), if_anchored(dforce_dv.y), if_anchored(dforce_dv.z)};
     }
   }
   return s;
@@ -76,7 +76,7 @@ V3<T> body_origin_in_shape(const PairFrame<T>& frame, int body, const Workspace<
 // Sums over the contact points in the shape's frame: Q, and the derivatives of m by δ, φ (at constant N), v' and ω'.
 template <class T>
 struct ArcSums {
-  M3<T> outer, by_translation, by_rotation, by_linear, by_angular;
+  M3<T> outer, dmoment_dtranslation, dmoment_drotation, dmoment_dlinear, dmoment_dangular;
 };
 template <bool derivatives, class T>
 GELFLOW_INLINE void sum_springs(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
@@ -85,34 +85,34 @@ GELFLOW_INLINE void sum_springs(const PairFrame<T>& frame, const CandidatePoints
   using P = Pack<T>;
   const Mat3<P> n = broadcast<P>(arm);
   const Vec3<P> origin = broadcast<P>(body_origin), angular = broadcast<P>(frame.angular);
-  Mat3<P> outer_sum = zero33<P>(), by_translation = outer_sum, by_rotation = outer_sum, by_linear = outer_sum,
-          by_angular = outer_sum;
+  Mat3<P> outer_sum = zero33<P>(), dmoment_dtranslation = outer_sum, dmoment_drotation = outer_sum,
+          dmoment_dlinear = outer_sum, dmoment_dangular = outer_sum;
   for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
     const Vec3<P> r = t.center - origin;
     const SpringForce<P> s = spring_force<derivatives, T>(t, settings.step_length);
     outer_sum += outer(r, s.force);
     if constexpr (derivatives) {
       const Vec3<P> corrected = n * r;
-      const Mat3<P> x = cross_columns(corrected, s.by_x);
-      by_translation += x;
-      by_rotation -= cross_rows(x, r);
+      const Mat3<P> x = cross_columns(corrected, s.dforce_dx);
+      dmoment_dtranslation += x;
+      dmoment_drotation -= cross_rows(x, r);
       if (!t.law.elastic) return;
-      const Mat3<P> v = cross_columns(corrected, s.by_v);
-      by_linear += v;
-      by_angular -= cross_rows(v, r);
-      by_rotation -= cross_rows(v, cross(angular, r));
+      const Mat3<P> v = cross_columns(corrected, s.dforce_dv);
+      dmoment_dlinear += v;
+      dmoment_dangular -= cross_rows(v, r);
+      dmoment_drotation -= cross_rows(v, cross(angular, r));
     }
   });
   sums.outer = sum33<T>(outer_sum);
   if constexpr (derivatives) {
-    sums.by_translation = sum33<T>(by_translation);
-    sums.by_rotation = sum33<T>(by_rotation);
-    sums.by_linear = sum33<T>(by_linear);
-    sums.by_angular = sum33<T>(by_angular);
+    sums.dmoment_dtranslation = sum33<T>(dmoment_dtranslation);
+    sums.dmoment_drotation = sum33<T>(dmoment_drotation);
+    sums.dmoment_dlinear = sum33<T>(dmoment_dlinear);
+    sums.dmoment_dangular = sum33<T>(dmoment_dangular);
   }
 }
 
-// Subtracts h m from w.residual; with derivatives also from w.by_q and w.by_v.
+// Subtracts h m from w.residual; with derivatives also from w.dg_dq and w.dg_dv.
 template <bool derivatives, class T>
 void subtract_arc_correction(const Model& m, int body, const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
                              const ContactSettings<T>& settings, Workspace<T>& w) {
@@ -126,17 +126,19 @@ void subtract_arc_correction(const Model& m, int body, const PairFrame<T>& frame
   const V3<T> moment = rotation.transpose() * moment_of<T>(arm.value * q);
   for (int i = 0; i < 3; ++i) w.residual[k + 3 + i] -= step_length * moment[i];
   if constexpr (derivatives) {
-    M3<T> by_theta, by_rotation = sums.by_rotation;
+    M3<T> dmoment_dtheta, dmoment_drotation = sums.dmoment_drotation;
     for (int j = 0; j < 3; ++j) {
-      by_theta.col(j) = moment_of<T>(arm.by[j] * q);
-      by_rotation.col(j) += moment_of<T>(arm.value * skew<T>(V3<T>(V3<T>::Unit(j))) * q);
+      dmoment_dtheta.col(j) = moment_of<T>(arm.derivative[j] * q);
+      dmoment_drotation.col(j) += moment_of<T>(arm.value * skew<T>(V3<T>(V3<T>::Unit(j))) * q);
     }
-    by_rotation -= step_length * (by_theta * skew<T>(frame.angular));
+    dmoment_drotation -= step_length * (dmoment_dtheta * skew<T>(frame.angular));
     const M3<T> to_body = step_length * rotation.transpose();
-    w.by_q.template block<3, 3>(k + 3, k) -= to_body * sums.by_translation * frame.to_world.transpose();
-    w.by_q.template block<3, 3>(k + 3, k + 3) -= step_length * skew<T>(moment) + to_body * by_rotation * rotation;
-    w.by_v.template block<3, 3>(k + 3, k) -= to_body * sums.by_linear * frame.to_world.transpose();
-    w.by_v.template block<3, 3>(k + 3, k + 3) -= to_body * (sums.by_angular + step_length * by_theta) * rotation;
+    w.dg_dq.template block<3, 3>(k + 3, k) -= to_body * sums.dmoment_dtranslation * frame.to_world.transpose();
+    w.dg_dq.template block<3, 3>(k + 3, k + 3) -=
+        step_length * skew<T>(moment) + to_body * dmoment_drotation * rotation;
+    w.dg_dv.template block<3, 3>(k + 3, k) -= to_body * sums.dmoment_dlinear * frame.to_world.transpose();
+    w.dg_dv.template block<3, 3>(k + 3, k + 3) -=
+        to_body * (sums.dmoment_dangular + step_length * dmoment_dtheta) * rotation;
   }
 }
 

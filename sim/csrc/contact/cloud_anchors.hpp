@@ -26,24 +26,24 @@ void advance_anchors(const PairFrame<T>& frame, const CandidatePoints<T>& candid
 // and the anchors before the step.
 template <class T, class Points>
 void anchors_vjp(const PairFrame<T>& frame, const Points& points, const ContactSettings<T>& settings,
-                 const V3<T>* by_next, V6<T>& by_pose, V6<T>& by_twist, V3<T>* by_anchor) {
+                 const V3<T>* grad_next, V6<T>& grad_pose, V6<T>& grad_twist, V3<T>* grad_anchor) {
   using P = Pack<T>;
   Vec3<P> rotation = zero3<P>(), translation = rotation, angular = rotation, linear = rotation;
   for_contact_points<true, T>(frame, points, settings, [&](const ContactPack<T>& t) {
     Vec3<P> lambda = zero3<P>();
-    t.for_each_active([&](int k, int i) { set_lane3<T>(lambda, k, by_next[i]); });
+    t.for_each_active([&](int k, int i) { set_lane3<T>(lambda, k, grad_next[i]); });
     const PointGradient<P> g = next_anchor_vjp(t.law, P(settings.step_length), t.at, t.v, t.e, t.has_anchor, lambda);
-    const Vec3<P> by_point = g.x - cross(broadcast<P>(frame.angular), g.v);
-    rotation += cross(t.center, by_point);
-    translation += by_point;
+    const Vec3<P> grad_point = g.x - cross(broadcast<P>(frame.angular), g.v);
+    rotation += cross(t.center, grad_point);
+    translation += grad_point;
     angular += cross(t.x, g.v);
     linear += g.v;
     t.for_each_active([&](int k, int i) {
-      if (is_set(t.has_anchor, k)) by_anchor[i] += lane3<T>(g.anchor, k);
+      if (is_set(t.has_anchor, k)) grad_anchor[i] += lane3<T>(g.anchor, k);
     });
   });
-  by_pose += stack<T>(sum3<T>(rotation), sum3<T>(translation));
-  by_twist += stack<T>(sum3<T>(angular), sum3<T>(linear));
+  grad_pose += stack<T>(sum3<T>(rotation), sum3<T>(translation));
+  grad_twist += stack<T>(sum3<T>(angular), sum3<T>(linear));
 }
 
 }  // namespace gelflow

@@ -23,22 +23,22 @@ void advance_contact_anchors(const Model& m, const T* params, const T& step_leng
   }
 }
 
-// Gradients with respect to the anchors after the step (`by_next`), carried to the state at the step's end (by_q, by_v)
-// and to the anchors before it (by_anchor).
+// Gradients with respect to the anchors after the step (`grad_next`), carried to the state at the step's end (grad_q,
+// grad_v) and to the anchors before it (grad_anchor).
 template <class T>
 void contact_anchors_vjp(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
-                         const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
-                         V3<T>* by_anchor) {
+                         const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* grad_next, VX<T>& grad_q,
+                         VX<T>& grad_v, V3<T>* grad_anchor) {
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const Mount& first = m.point_sets[contact.points].mount;
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     contact_jacobian<T>(contact.pair, first.body, frame, w);
-    V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
+    V6<T> grad_pose = V6<T>::Zero(), grad_twist = V6<T>::Zero();
     anchors_vjp<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, step_length),
-                   by_next + contact.anchor, by_pose, by_twist, by_anchor + contact.anchor);
-    pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
+                   grad_next + contact.anchor, grad_pose, grad_twist, grad_anchor + contact.anchor);
+    pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
   }
 }
 
@@ -55,7 +55,7 @@ V6<T> virtual_twist(const ContactJacobian<T>& c, const VX<T>& multipliers) {
 // Adds −cᵀ ∂g/∂(anchors before the step) with c the multipliers of the residual g. `bdf2`: the step was one of BDF2.
 template <class T>
 void residual_anchors_vjp(const Model& m, const T* params, const T& beta_h, bool bdf2, const V3<T>* anchors,
-                          const std::uint8_t* anchored, Workspace<T>& w, const VX<T>& multipliers, V3<T>* by_anchor) {
+                          const std::uint8_t* anchored, Workspace<T>& w, const VX<T>& multipliers, V3<T>* grad_anchor) {
   using P = Pack<T>;
   for (std::size_t n = 0; n < m.contacts.size(); ++n) {
     const Contact& contact = m.contacts[n];
@@ -64,7 +64,7 @@ void residual_anchors_vjp(const Model& m, const T* params, const T& beta_h, bool
     const PairFrame<T> frame = pair_frame<T>(params, first, m.shapes[contact.shape], w);
     contact_jacobian<T>(contact.pair, first.body, frame, w);
     const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored);
-    V3<T>* const by_contact = by_anchor + contact.anchor;
+    V3<T>* const grad_contact = grad_anchor + contact.anchor;
     const V6<T> twist = virtual_twist<T>(w.jacobian, multipliers);
     const bool arc = contact.uses_arc_correction && !bdf2;
     const Mat3<P> arm =
@@ -72,13 +72,13 @@ void residual_anchors_vjp(const Model& m, const T* params, const T& beta_h, bool
     const Vec3<P> origin = broadcast<P>(arc ? body_origin_in_shape<T>(frame, first.body, w) : V3<T>(V3<T>::Zero()));
     const Vec3<P> angular = broadcast<P>(V3<T>(top(twist))), linear = broadcast<P>(V3<T>(bottom(twist)));
     for_contact_points<true, T>(frame, w.candidates[n], settings, [&](const ContactPack<T>& t) {
-      const Vec3<P> by_friction = P(beta_h) * (linear + cross(angular, t.x)), none = zero3<P>();
-      const Vec3<P> by_spring = P(beta_h) * cross(angular, arm * (t.center - origin));
+      const Vec3<P> grad_friction = P(beta_h) * (linear + cross(angular, t.x)), none = zero3<P>();
+      const Vec3<P> grad_spring = P(beta_h) * cross(angular, arm * (t.center - origin));
       const P q = relaxation_factor(t.law, P(beta_h));  // −k_s s = k_t v_t + q f_t + (1 − q) f*
-      const Vec3<P> by = point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, none, by_friction + q * by_spring,
-                                         (P(1.0) - q) * by_spring, none)
-                             .anchor;
-      t.for_each_active([&](int k, int i) { by_contact[i] += lane3<T>(by, k); });
+      const Vec3<P> grad = point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, none, grad_friction + q * grad_spring,
+                                           (P(1.0) - q) * grad_spring, none)
+                               .anchor;
+      t.for_each_active([&](int k, int i) { grad_contact[i] += lane3<T>(grad, k); });
     });
   }
 }

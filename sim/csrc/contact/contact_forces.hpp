@@ -20,14 +20,14 @@ GELFLOW_INLINE void wrench_changes(const ContactSums<T>& sums, ContactJacobian<T
       y[a] = load<P>(c.y.at(i, a));
     }
     for (int a = 0; a < 6; ++a) {
-      P by_q = P(sums.k(a, 0)) * s[0] + P(sums.d(a, 0)) * y[0], by_v = P(sums.d(a, 0)) * s[0];
+      P jac_q = P(sums.k(a, 0)) * s[0] + P(sums.d(a, 0)) * y[0], jac_v = P(sums.d(a, 0)) * s[0];
       for (int b = 1; b < 6; ++b) {
         const P d(sums.d(a, b));
-        by_q += P(sums.k(a, b)) * s[b] + d * y[b];
-        by_v += d * s[b];
+        jac_q += P(sums.k(a, b)) * s[b] + d * y[b];
+        jac_v += d * s[b];
       }
-      store(by_q, c.wrench_by_q.at(i, a));
-      store(by_v, c.wrench_by_v.at(i, a));
+      store(jac_q, c.dwrench_dq.at(i, a));
+      store(jac_v, c.dwrench_dv.at(i, a));
     }
     const T* const f = sums.wrench();
     const Vec3<P> angular{s[0], s[1], s[2]}, linear{s[3], s[4], s[5]}, moment{P(f[0]), P(f[1]), P(f[2])},
@@ -40,8 +40,8 @@ GELFLOW_INLINE void wrench_changes(const ContactSums<T>& sums, ContactJacobian<T
   }
 }
 
-// Subtracts row r of β h Sᵀ (K S + D Y), β h Sᵀ D S and the change of the axis from w.by_q and w.by_v. `first_component`:
-// 3 for an axis without angular part; `coupled`: displacements of other dofs change the axis.
+// Subtracts row r of β h Sᵀ (K S + D Y), β h Sᵀ D S and the change of the axis from w.dg_dq and w.dg_dv.
+// `first_component`: 3 for an axis without angular part; `coupled`: displacements of other dofs change the axis.
 template <int first_component, bool coupled, class T>
 GELFLOW_INLINE void subtract_row(const T& beta_h, int r, Workspace<T>& w) {
   using P = Pack<T>;
@@ -51,20 +51,20 @@ GELFLOW_INLINE void subtract_row(const T& beta_h, int r, Workspace<T>& w) {
   P s[6];
   for (int a = first_component; a < 6; ++a) s[a] = P(T(beta_h * c.s.at(r - r % width, a)[r % width]));
   for (int i = 0; i < c.n; i += width) {
-    P by_q(0.0), by_v(0.0), by_axis(0.0);
+    P jac_q(0.0), jac_v(0.0), jac_axis(0.0);
     for (int a = first_component; a < 6; ++a) {
-      by_q += s[a] * load<P>(c.wrench_by_q.at(i, a));
-      by_v += s[a] * load<P>(c.wrench_by_v.at(i, a));
-      if (coupled) by_axis += s[a] * load<P>(c.axis_wrench.at(i, a));
+      jac_q += s[a] * load<P>(c.dwrench_dq.at(i, a));
+      jac_v += s[a] * load<P>(c.dwrench_dv.at(i, a));
+      if (coupled) jac_axis += s[a] * load<P>(c.axis_wrench.at(i, a));
     }
-    if (coupled) by_q -= load<P>(&c.dofs->axis_coupling[static_cast<std::size_t>(r) * c.n + i]) * by_axis;
-    const std::ptrdiff_t at = row * w.by_q.outerStride() + c.dofs->start[i / width];
-    store(load<P>(w.by_q.data() + at) - by_q, w.by_q.data() + at);
-    store(load<P>(w.by_v.data() + at) - by_v, w.by_v.data() + at);
+    if (coupled) jac_q -= load<P>(&c.dofs->axis_coupling[static_cast<std::size_t>(r) * c.n + i]) * jac_axis;
+    const std::ptrdiff_t at = row * w.dg_dq.outerStride() + c.dofs->start[i / width];
+    store(load<P>(w.dg_dq.data() + at) - jac_q, w.dg_dq.data() + at);
+    store(load<P>(w.dg_dv.data() + at) - jac_v, w.dg_dv.data() + at);
   }
 }
 
-// Subtracts β h · ∂(generalized forces of the pair)/∂(q, v) from w.by_q and w.by_v; w.jacobian is that of the pair.
+// Subtracts β h · ∂(generalized forces of the pair)/∂(q, v) from w.dg_dq and w.dg_dv; w.jacobian is that of the pair.
 template <class T>
 void subtract_contact_derivatives(const T& beta_h, const ContactSums<T>& sums, Workspace<T>& w) {
   ContactJacobian<T>& c = w.jacobian;
@@ -110,8 +110,8 @@ void subtract_impulses(const PairDofs& pair, const T& beta_h, const V6<T>& wrenc
   }
 }
 
-// Subtracts β h · (generalized contact forces) from w.residual; with derivatives also from w.by_q and w.by_v. `cache`:
-// the state of the candidate points in w. `add_impulses`: adds the absolute values to w.impulses.
+// Subtracts β h · (generalized contact forces) from w.residual; with derivatives also from w.dg_dq and w.dg_dv.
+// `cache`: the state of the candidate points in w. `add_impulses`: adds the absolute values to w.impulses.
 template <bool derivatives, class T>
 void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& start, CacheState cache,
                              bool add_impulses, Workspace<T>& w) {

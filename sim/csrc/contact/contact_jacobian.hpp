@@ -58,13 +58,14 @@ void contact_jacobian(const PairDofs& pair, int first, const PairFrame<T>& f, Wo
 
 // Carries gradients with respect to the relative pose and twist to the generalized coordinates.
 template <class T>
-void pull_back(const ContactJacobian<T>& c, const V6<T>& by_pose, const V6<T>& by_twist, VX<T>& by_q, VX<T>& by_v) {
+void pull_back(const ContactJacobian<T>& c, const V6<T>& grad_pose, const V6<T>& grad_twist, VX<T>& grad_q,
+               VX<T>& grad_v) {
   for (int i = 0; i < c.n; ++i) {
     const int dof = c.dofs->dof[i];
     if (dof < 0) continue;
     const V6<T> s = c.s[i], y = c.y[i];
-    by_q[dof] += s.dot(by_pose) + y.dot(by_twist);
-    by_v[dof] += s.dot(by_twist);
+    grad_q[dof] += s.dot(grad_pose) + y.dot(grad_twist);
+    grad_v[dof] += s.dot(grad_twist);
   }
 }
 

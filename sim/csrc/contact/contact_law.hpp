@@ -39,7 +39,7 @@ struct PointLaw {
 template <class P>
 struct PointForce {
   Vec3<P> force;
-  Mat3<P> by_x, by_v;  // ∂force/∂(x, v)
+  Mat3<P> dforce_dx, dforce_dv;  // ∂force/∂(x, v)
   Mask<P> sliding;
   Vec3<P> friction, slip_velocity, trial;  // f_t, v_t, f*
 };
@@ -47,9 +47,9 @@ struct PointForce {
 // The terms of the force.
 template <class P>
 struct ForceTerms {
-  P rate, normal, normal_by_d, normal_by_rate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
-  P normal_offset;                              // n·e
-  Vec3<P> slip_velocity, trial;                 // v_t, f*
+  P rate, normal, dnormal_ddistance, dnormal_drate;  // ḋ, N, ∂N/∂d, ∂N/∂ḋ
+  P normal_offset;                                   // n·e
+  Vec3<P> slip_velocity, trial;                      // v_t, f*
   Mask<P> sliding;
   P inverse, ratio;  // 1/‖f*‖ and µN/‖f*‖ where the point slides, else 1
 };
@@ -65,8 +65,8 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
     const Mask<P> positive = unclipped > zero;
     const P stiffness = select(positive, unclipped, zero);
     p.normal = -stiffness * at.d;
-    p.normal_by_d = -stiffness;
-    p.normal_by_rate = select(positive, law.kd * at.d, zero);
+    p.dnormal_ddistance = -stiffness;
+    p.dnormal_drate = select(positive, law.kd * at.d, zero);
   } else {
     const P ramp(1e-6);  // [m]
     const Mask<P> full = at.d < -ramp;
@@ -74,8 +74,8 @@ GELFLOW_INLINE void force_terms(const PointLaw<P>& law, const Distance<P>& at, c
     const P unclipped = -law.kn * at.d - r * law.kd * p.rate;
     const Mask<P> positive = unclipped > zero;
     p.normal = select(positive, unclipped, zero);
-    p.normal_by_d = select(positive, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
-    p.normal_by_rate = select(positive, -r * law.kd, zero);
+    p.dnormal_ddistance = select(positive, select(full, zero, law.kd * p.rate / ramp) - law.kn, zero);
+    p.dnormal_drate = select(positive, -r * law.kd, zero);
   }
   p.slip_velocity = v - p.rate * n;
   p.trial = -law.kt * p.slip_velocity;
@@ -113,31 +113,31 @@ GELFLOW_INLINE void point_force(const PointLaw<P>& law, const Distance<P>& at, c
     // d f_t = A d f* + g dN with A = 1, g = 0 (stick) or A = ratio (1 − t tᵀ), g = µ t (slip).
     const P anchor_stiffness = law.elastic ? select(anchored, law.ks, zero) : zero;
     const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
-    Vec3<P> normal_by_x = p.normal_by_d * n;
-    const Vec3<P> force_by_normal = n + law.mu * direction;  // ∂f/∂N
+    Vec3<P> dnormal_dx = p.dnormal_ddistance * n;
+    const Vec3<P> dforce_dnormal = n + law.mu * direction;  // ∂f/∂N
     // A (1 − n nᵀ) = ratio (1 − n nᵀ − t tᵀ + (t·n) t nᵀ); t·n = 0 unless n is the gradient of a grid and not of
     // unit length, see HessianForm::field.
     Mat3<P> project = p.ratio * (identity_minus_outer(n) - outer(direction, direction));
     if (at.form == HessianForm::field) [[unlikely]] {
       project += p.ratio * dot(direction, n) * outer(direction, n);
     }
-    out.by_v = -law.kt * project;
-    out.by_v += outer(force_by_normal, p.normal_by_rate * n);
+    out.dforce_dv = -law.kt * project;
+    out.dforce_dv += outer(dforce_dnormal, p.dnormal_drate * n);
     if (law.elastic) {
-      out.by_x = -anchor_stiffness * project;
+      out.dforce_dx = -anchor_stiffness * project;
     } else {
-      out.by_x = zero33<P>();
+      out.dforce_dx = zero33<P>();
     }
     if (at.form != HessianForm::zero) {
       const Mat3<P> hessian = at.hessian_matrix();
       const Vec3<P> hv = hessian * v;
-      normal_by_x += p.normal_by_rate * hv;
-      Mat3<P> trial_by_x = law.kt * (outer(n, hv) + p.rate * hessian);
-      if (law.elastic) trial_by_x += anchor_stiffness * (outer(n, hessian * e) + p.normal_offset * hessian);
-      out.by_x += p.ratio * (trial_by_x - outer(direction, transposed_times(trial_by_x, direction)));
-      out.by_x += p.normal * hessian;
+      dnormal_dx += p.dnormal_drate * hv;
+      Mat3<P> dtrial_dx = law.kt * (outer(n, hv) + p.rate * hessian);
+      if (law.elastic) dtrial_dx += anchor_stiffness * (outer(n, hessian * e) + p.normal_offset * hessian);
+      out.dforce_dx += p.ratio * (dtrial_dx - outer(direction, transposed_times(dtrial_dx, direction)));
+      out.dforce_dx += p.normal * hessian;
     }
-    out.by_x += outer(force_by_normal, normal_by_x);
+    out.dforce_dx += outer(dforce_dnormal, dnormal_dx);
   }
 }
 
@@ -152,36 +152,36 @@ struct PointGradient {
 template <class P>
 GELFLOW_INLINE PointGradient<P> point_force_vjp(const PointLaw<P>& law, const Distance<P>& at, const Vec3<P>& v,
                                                 const Vec3<P>& e, const Mask<P>& anchored,
-                                                const Vec3<P>& by_normal_force, const Vec3<P>& by_friction,
-                                                const Vec3<P>& by_trial_direct, const Vec3<P>& by_slip) {
+                                                const Vec3<P>& grad_normal_force, const Vec3<P>& grad_friction,
+                                                const Vec3<P>& grad_trial_direct, const Vec3<P>& grad_slip) {
   ForceTerms<P> p;
   force_terms(law, at, v, e, p);
   const P zero(0.0);
   const Vec3<P>& n = at.n;
   const Vec3<P> direction = select(p.sliding, p.inverse, zero) * p.trial;
-  const P by_direction = dot(direction, by_friction);
-  const Vec3<P> by_trial = p.ratio * (by_friction - by_direction * direction) + by_trial_direct;
-  const P by_normal = dot(n, by_normal_force) + law.mu * by_direction;
+  const P grad_direction = dot(direction, grad_friction);
+  const Vec3<P> grad_trial = p.ratio * (grad_friction - grad_direction * direction) + grad_trial_direct;
+  const P grad_normal = dot(n, grad_normal_force) + law.mu * grad_direction;
   // v_t = v − ḋ n, f* = −k_t v_t − k_s (e − (n·e) n)
-  const Vec3<P> by_slip_total = by_slip - law.kt * by_trial;
-  const P by_rate = by_normal * p.normal_by_rate - dot(n, by_slip_total);
+  const Vec3<P> grad_slip_total = grad_slip - law.kt * grad_trial;
+  const P grad_rate = grad_normal * p.dnormal_drate - dot(n, grad_slip_total);
   PointGradient<P> g;
   g.sliding = p.sliding;
   g.force = p.normal * n + p.ratio * p.trial;
-  g.v = by_slip_total + by_rate * n;
-  g.x = by_normal * p.normal_by_d * n;
+  g.v = grad_slip_total + grad_rate * n;
+  g.x = grad_normal * p.dnormal_ddistance * n;
   g.anchor = zero3<P>();
-  P by_normal_offset = zero;
+  P grad_normal_offset = zero;
   if (law.elastic) {
     const P anchor_stiffness = select(anchored, law.ks, zero);
-    by_normal_offset = anchor_stiffness * dot(n, by_trial);
-    g.anchor = anchor_stiffness * by_trial - by_normal_offset * n;
+    grad_normal_offset = anchor_stiffness * dot(n, grad_trial);
+    g.anchor = anchor_stiffness * grad_trial - grad_normal_offset * n;
     g.x -= g.anchor;
   }
   if (at.form != HessianForm::zero) {
-    Vec3<P> by_n = p.normal * by_normal_force + by_rate * v - p.rate * by_slip_total;
-    if (law.elastic) by_n += by_normal_offset * e + select(anchored, law.ks, zero) * p.normal_offset * by_trial;
-    g.x += at.hessian_times(by_n);
+    Vec3<P> grad_n = p.normal * grad_normal_force + grad_rate * v - p.rate * grad_slip_total;
+    if (law.elastic) grad_n += grad_normal_offset * e + select(anchored, law.ks, zero) * p.normal_offset * grad_trial;
+    g.x += at.hessian_times(grad_n);
   }
   return g;
 }

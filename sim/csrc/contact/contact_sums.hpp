@@ -29,7 +29,7 @@ struct ForceBuffer {
   static constexpr int capacity = 8;
   struct Entry {
     Vec3<P> x, force;
-    Mat3<P> by_pose, by_v;  // A and B
+    Mat3<P> dforce_dpose, dforce_dv;  // A and B
   };
   int count = 0;
   Entry entry[capacity];
@@ -49,30 +49,30 @@ GELFLOW_INLINE void add_blocks(const ForceBuffer<T>& buffer, Mat3<Pack<T>> Force
   using P = Pack<T>;
   const P up(center_height);
   for (int i = 0; i < 3; ++i) {
-    Vec3<P> by_rotation = zero3<P>(), by_translation = by_rotation;
+    Vec3<P> jac_rotation = zero3<P>(), jac_translation = jac_rotation;
     for (int n = 0; n < buffer.count; ++n) {
       const auto& e = buffer.entry[n];
       const Vec3<P>& row = (e.*matrix).row[i];
-      by_translation += row;
-      by_rotation += cross(Vec3<P>{e.x.x, e.x.y, e.x.z + up}, row);
+      jac_translation += row;
+      jac_rotation += cross(Vec3<P>{e.x.x, e.x.y, e.x.z + up}, row);
     }
     for (int j = 0; j < 3; ++j) {
-      accumulate<first>(by_rotation[j], out[(3 + i) * 6 + j]);
-      accumulate<first>(by_translation[j], out[(3 + i) * 6 + 3 + j]);
+      accumulate<first>(jac_rotation[j], out[(3 + i) * 6 + j]);
+      accumulate<first>(jac_translation[j], out[(3 + i) * 6 + 3 + j]);
     }
   }
   const auto moments = [&](int j, auto&& component) GELFLOW_LOOP_BODY {
-    Vec3<P> by_rotation = zero3<P>(), by_translation = by_rotation;
+    Vec3<P> jac_rotation = zero3<P>(), jac_translation = jac_rotation;
     for (int n = 0; n < buffer.count; ++n) {
       const auto& e = buffer.entry[n];
       const Mat3<P>& a = e.*matrix;
       const Vec3<P> c{e.x.x, e.x.y, e.x.z + up};
-      by_translation += cross(e.x, Vec3<P>{a.row[0][j], a.row[1][j], a.row[2][j]});
-      by_rotation += cross(e.x, Vec3<P>{component(c, a.row[0]), component(c, a.row[1]), component(c, a.row[2])});
+      jac_translation += cross(e.x, Vec3<P>{a.row[0][j], a.row[1][j], a.row[2][j]});
+      jac_rotation += cross(e.x, Vec3<P>{component(c, a.row[0]), component(c, a.row[1]), component(c, a.row[2])});
     }
     for (int i = 0; i < 3; ++i) {
-      accumulate<first>(by_rotation[i], out[i * 6 + j]);
-      accumulate<first>(by_translation[i], out[i * 6 + 3 + j]);
+      accumulate<first>(jac_rotation[i], out[i * 6 + j]);
+      accumulate<first>(jac_translation[i], out[i * 6 + 3 + j]);
     }
   };
   using V = Vec3<P>;
@@ -102,8 +102,8 @@ __attribute__((noinline)) void flush(ForceBuffer<T>& buffer, const T& center_hei
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) accumulate<first>(outer_sum.row[i][j], sums[ContactSums<T>::outer_at + 3 * i + j]);
     }
-    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::by_pose, center_height, sums + ContactSums<T>::k_at);
-    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::by_v, T(0), sums + ContactSums<T>::d_at);
+    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::dforce_dpose, center_height, sums + ContactSums<T>::k_at);
+    add_blocks<first, T>(buffer, &ForceBuffer<T>::Entry::dforce_dv, T(0), sums + ContactSums<T>::d_at);
   }
   buffer.count = 0;
 }
@@ -148,8 +148,8 @@ bool sum_forces(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
     e.x = t.x;
     e.force = force.force;
     if constexpr (derivatives) {
-      e.by_pose = force.by_x + cross_rows(force.by_v, broadcast<P>(frame.angular));
-      e.by_v = force.by_v;
+      e.dforce_dpose = force.dforce_dx + cross_rows(force.dforce_dv, broadcast<P>(frame.angular));
+      e.dforce_dv = force.dforce_dv;
     }
     if (buffer.count == ForceBuffer<T>::capacity) flush_buffer();
   });

@@ -99,73 +99,74 @@ void advance_marker_anchors(const Model& m, const T* params, const T& step_lengt
 }
 
 // Adds the gradients with respect to the relative pose and twist of a pad and its shape number s, and to the anchors
-// before (null where there are none), of readings with gradient `by_reading`.
+// before (null where there are none), of readings with gradient `grad_reading`.
 template <class T>
 GELFLOW_INLINE void read_pad_vjp(const Pad& pad, const PairFrame<T>& frame, const ContactSettings<T>& settings,
-                                 const T* by_reading, V3<T>* by_anchor, V6<T>& by_pose, V6<T>& by_twist) {
+                                 const T* grad_reading, V3<T>* grad_anchor, V6<T>& grad_pose, V6<T>& grad_twist) {
   using P = Pack<T>;
   Vec3<P> rotation = zero3<P>(), translation = rotation, angular = rotation, linear = rotation;
-  const ReadingsView<T, const T> by_readings(pad, by_reading);
+  const ReadingsView<T, const T> grad_readings(pad, grad_reading);
   const Mat3<P> axes = marker_axes<T>(pad, frame);
   for_contact_points<true, T>(frame, pad.cloud, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
     const unsigned active = bits(t.active);
-    Vec3<P> by_force = by_readings.read(t.first, active);
-    by_force.z = -by_force.z;
+    Vec3<P> grad_force = grad_readings.read(t.first, active);
+    grad_force.z = -grad_force.z;
     if (pad.flat) [[likely]] {
-      by_force = axes * by_force;
+      grad_force = axes * grad_force;
     } else {
-      const Vec3<P> by_marker_force = by_force;  // a copy: taking the address of `by_force` would keep it in memory
-      const Vec3<P> in_shape = from_curved_pad<T>(pad, frame, t.first, active, by_marker_force);
-      for (int a = 0; a < 3; ++a) by_force[a] = in_shape[a];
+      const Vec3<P> grad_marker_force =
+          grad_force;  // a copy: taking the address of `grad_force` would keep it in memory
+      const Vec3<P> in_shape = from_curved_pad<T>(pad, frame, t.first, active, grad_marker_force);
+      for (int a = 0; a < 3; ++a) grad_force[a] = in_shape[a];
     }
     const PointGradient<P> g =
-        point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, by_force, by_force, zero3<P>(), zero3<P>());
-    const Vec3<P> by_point = g.x - cross(broadcast<P>(frame.angular), g.v);
-    rotation += cross(t.x, by_point) + cross(by_force, g.force);  // the marker axes rotate too
-    translation += by_point;
+        point_force_vjp(t.law, t.at, t.v, t.e, t.has_anchor, grad_force, grad_force, zero3<P>(), zero3<P>());
+    const Vec3<P> grad_point = g.x - cross(broadcast<P>(frame.angular), g.v);
+    rotation += cross(t.x, grad_point) + cross(grad_force, g.force);  // the marker axes rotate too
+    translation += grad_point;
     angular += cross(t.x, g.v);
     linear += g.v;
-    if (by_anchor == nullptr) return;
-    t.for_each_active([&](int k, int i) { by_anchor[i] += lane3<T>(g.anchor, k); });
+    if (grad_anchor == nullptr) return;
+    t.for_each_active([&](int k, int i) { grad_anchor[i] += lane3<T>(g.anchor, k); });
   });
-  by_pose = stack<T>(sum3<T>(rotation), sum3<T>(translation));
-  by_twist = stack<T>(sum3<T>(angular), sum3<T>(linear));
+  grad_pose = stack<T>(sum3<T>(rotation), sum3<T>(translation));
+  grad_twist = stack<T>(sum3<T>(angular), sum3<T>(linear));
 }
 
-// Adds to by_q, by_v and by_anchor the gradient of readings with gradient `by_reading`, shape (markers, 3), at the state
-// whose kinematics are in w. by_anchor may be null where there are no anchors.
+// Adds to grad_q, grad_v and grad_anchor the gradient of readings with gradient `grad_reading`, shape (markers, 3), at
+// the state whose kinematics are in w. grad_anchor may be null where there are no anchors.
 template <class T>
 void read_markers_vjp(const Model& m, const T* params, const V3<T>* anchors, const std::uint8_t* anchored,
-                      Workspace<T>& w, const T* by_reading, VX<T>& by_q, VX<T>& by_v, V3<T>* by_anchor) {
+                      Workspace<T>& w, const T* grad_reading, VX<T>& grad_q, VX<T>& grad_v, V3<T>* grad_anchor) {
   for (const Pad& pad : m.pads) {
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
-      V3<T>* const by_pad = pad.anchor < 0 ? nullptr : by_anchor + pad.anchor + s * pad.cloud.size();
-      V6<T> by_pose, by_twist;
-      read_pad_vjp<T>(pad, frame, contact_settings<T>(pad, s, params, anchors, anchored), by_reading, by_pad, by_pose,
-                      by_twist);
+      V3<T>* const grad_pad = pad.anchor < 0 ? nullptr : grad_anchor + pad.anchor + s * pad.cloud.size();
+      V6<T> grad_pose, grad_twist;
+      read_pad_vjp<T>(pad, frame, contact_settings<T>(pad, s, params, anchors, anchored), grad_reading, grad_pad,
+                      grad_pose, grad_twist);
       contact_jacobian<T>(pad.pairs[s], pad.mount.body, frame, w);
-      pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
+      pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
     }
   }
 }
 
-// Gradients with respect to the anchors after the step (`by_next`), carried to the state at the step's end and to the
+// Gradients with respect to the anchors after the step (`grad_next`), carried to the state at the step's end and to the
 // anchors before it.
 template <class T>
 void marker_anchors_vjp(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
-                        const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* by_next, VX<T>& by_q, VX<T>& by_v,
-                        V3<T>* by_anchor) {
+                        const std::uint8_t* anchored, Workspace<T>& w, const V3<T>* grad_next, VX<T>& grad_q,
+                        VX<T>& grad_v, V3<T>* grad_anchor) {
   for (const Pad& pad : m.pads) {
     if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
-      V6<T> by_pose = V6<T>::Zero(), by_twist = V6<T>::Zero();
+      V6<T> grad_pose = V6<T>::Zero(), grad_twist = V6<T>::Zero();
       anchors_vjp<T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored, step_length),
-                     by_next + slot, by_pose, by_twist, by_anchor + slot);
+                     grad_next + slot, grad_pose, grad_twist, grad_anchor + slot);
       contact_jacobian<T>(pad.pairs[s], pad.mount.body, frame, w);
-      pull_back<T>(w.jacobian, by_pose, by_twist, by_q, by_v);
+      pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
     }
   }
 }

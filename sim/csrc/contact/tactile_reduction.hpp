@@ -39,15 +39,15 @@ class TactileReduction {
     }
     for (int row = 0; row < rows_; ++row) reduced[row] = T(sums[row]);
   }
-  // by_forces = Wᵀ by_reduced.
+  // grad_forces = Wᵀ grad_reduced.
   template <class T>
-  void apply_vjp(const T* by_reduced, T* by_forces) const {
+  void apply_vjp(const T* grad_reduced, T* grad_forces) const {
     for (std::size_t c = 0; c < columns_.size(); ++c) {
       const Column& column = columns_[c];
       const double* value = values_.data() + column.first;
       double sum = 0;
-      for (int row = column.begin; row < column.end; ++row) sum += static_cast<double>(by_reduced[row]) * *value++;
-      by_forces[c] = T(sum);
+      for (int row = column.begin; row < column.end; ++row) sum += static_cast<double>(grad_reduced[row]) * *value++;
+      grad_forces[c] = T(sum);
     }
   }
 

@@ -65,7 +65,7 @@ GELFLOW_INLINE void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T
                                               Workspace<T>& w) {
   const int k = b.k;
   for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = b.mass;
-  w.by_v.template block<3, 3>(k + 3, k + 3) +=
+  w.dg_dv.template block<3, 3>(k + 3, k + 3) +=
       beta_h * (cross_columns<T>(b.spin, b.inertia) - skew<T>(b.angular_momentum));
   if (b.centered) {  // another environment may have another centre of mass: blocks are set, not assumed zero
     w.mass.template block<3, 3>(k + 3, k + 3) = b.inertia;
@@ -78,17 +78,17 @@ GELFLOW_INLINE void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T
   w.mass.template block<3, 3>(k, k + 3) = -turned * arm;
   w.mass.template block<3, 3>(k + 3, k) = arm * turned.transpose();
   if (!start) return;
-  w.by_q.template block<3, 3>(k, k + 3) -= beta_h * (turned * skew<T>(b.y));
-  w.by_q.template block<3, 3>(k + 3, k + 3) +=
+  w.dg_dq.template block<3, 3>(k, k + 3) -= beta_h * (turned * skew<T>(b.y));
+  w.dg_dq.template block<3, 3>(k + 3, k + 3) +=
       beta_h * b.mass * (arm * skew<T>(b.rotation.transpose() * b.acceleration));
-  const M3<T> by_turn = beta_h * (skew<T>(b.before.u) * right_jacobian<T>(b.turn));
-  w.by_v.template block<3, 3>(k, k + 3) -= turned * by_turn;
-  w.by_v.template block<3, 3>(k + 3, k + 3) -= b.mass * (arm * by_turn);
+  const M3<T> jac_turn = beta_h * (skew<T>(b.before.u) * right_jacobian<T>(b.turn));
+  w.dg_dv.template block<3, 3>(k, k + 3) -= turned * jac_turn;
+  w.dg_dv.template block<3, 3>(k + 3, k + 3) -= b.mass * (arm * jac_turn);
   if (start->history != nullptr) return;
   const MomentArmCorrection<T> arc(b.turn, true);
-  w.by_q.template block<3, 3>(k + 3, k + 3) += beta_h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
+  w.dg_dq.template block<3, 3>(k + 3, k + 3) += beta_h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
   for (int j = 0; j < 3; ++j) {
-    w.by_v.template block<3, 1>(k + 3, k + 3 + j) += beta_h * beta_h * cross<T>(arc.by[j] * b.c, b.weight);
+    w.dg_dv.template block<3, 1>(k + 3, k + 3 + j) += beta_h * beta_h * cross<T>(arc.derivative[j] * b.c, b.weight);
   }
 }
 
@@ -133,7 +133,7 @@ void add_free_body(const Model& m, const Body& body, const T* params, const T& b
 // on these through u too.
 template <class T>
 void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& start, const Workspace<T>& w,
-                     const VX<T>& multipliers, VX<T>& by_v_star, VX<T>& by_shift, VX<T>& by_earlier) {
+                     const VX<T>& multipliers, VX<T>& grad_v_star, VX<T>& grad_shift, VX<T>& grad_earlier) {
   for (std::size_t i = 0; i < m.bodies.size(); ++i) {
     const Body& body = m.bodies[i];
     const V3<T> c = body.params.in(params).com;
@@ -141,17 +141,17 @@ void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& start,
     const int turn = m.joints[body.joint_begin].v + 3;
     const CenterVelocity<T> before = previous_center_velocity<T>(start, m.nv, turn, c, w);
     const V3<T> push = as<T>(w.rotation[i]).transpose() * vec3(multipliers.data() + turn - 3);
-    const V3<T> by_u = body.params.in(params).mass * (push + cross<T>(vec3(multipliers.data() + turn), c));
-    const V3<T> by_velocity = before.inverse_rotation.transpose() * by_u;
-    by_v_star.template segment<3>(turn) += cross<T>(c, by_velocity - by_u);
+    const V3<T> grad_u = body.params.in(params).mass * (push + cross<T>(vec3(multipliers.data() + turn), c));
+    const V3<T> grad_velocity = before.inverse_rotation.transpose() * grad_u;
+    grad_v_star.template segment<3>(turn) += cross<T>(c, grad_velocity - grad_u);
     if (start.history == nullptr) continue;
     const V3<T> theta = vec3(w.increment.data() + turn), delta = vec3(start.history + turn);
-    const V3<T> earlier = cross<T>(vec3(start.history + m.nv + turn), c), third = by_velocity / T(3);
+    const V3<T> earlier = cross<T>(vec3(start.history + m.nv + turn), c), third = grad_velocity / T(3);
     const M3<T> inverse = inverse_rotation<T>(delta);
-    by_earlier.template segment<3>(turn) += cross<T>(c, third - inverse.transpose() * third);
-    const V3<T> by_delta = right_jacobian<T>(delta).transpose() * cross<T>(inverse * earlier, third);
-    by_shift.template segment<3>(turn) +=
-        T(3) * by_delta - right_jacobian<T>(theta).transpose() * cross<T>(before.u, by_u);
+    grad_earlier.template segment<3>(turn) += cross<T>(c, third - inverse.transpose() * third);
+    const V3<T> grad_delta = right_jacobian<T>(delta).transpose() * cross<T>(inverse * earlier, third);
+    grad_shift.template segment<3>(turn) +=
+        T(3) * grad_delta - right_jacobian<T>(theta).transpose() * cross<T>(before.u, grad_u);
   }
 }
 

@@ -108,8 +108,8 @@ GELFLOW_INLINE void set_motion_derivatives(int j, Workspace<T>& w) {
   const V6<T> q = -cross_motion<T>(s, w.acceleration_before[j]) - cross_motion<T>(p, before);
   const V6<T> o = p - cross_motion<T>(s, w.twist_after[j]);
   w.p[j] = p;
-  w.motion_by_q[j] = q;
-  w.motion_by_v[j] = o;
+  w.dmotion_dq[j] = q;
+  w.dmotion_dv[j] = o;
 }
 
 // Rows and columns of the mass matrix and of the derivatives that dof j shares with its ancestors and its group.
@@ -118,8 +118,8 @@ GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& beta_h, int j, 
   const int body = m.dof_body[j];
   const Composite<T>& composite = w.composite[body];
   const V6<T> s = w.axis[j];
-  const V6<T> force_q = times_inertia<T>(composite, w.motion_by_q[j]) + times_rate<T>(composite, w.p[j]);
-  const V6<T> force_v = times_inertia<T>(composite, w.motion_by_v[j]) + times_rate<T>(composite, s);
+  const V6<T> force_q = times_inertia<T>(composite, w.dmotion_dq[j]) + times_rate<T>(composite, w.p[j]);
+  const V6<T> force_v = times_inertia<T>(composite, w.dmotion_dv[j]) + times_rate<T>(composite, s);
   const V6<T> force_a = times_inertia<T>(composite, s);
   const V3<T> rate_s = transposed_rate_times<T>(composite, s);
   const V6<T> moved_force_q = force_q + cross_force<T>(s, w.force[body]);
@@ -127,22 +127,22 @@ GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& beta_h, int j, 
     if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
     const V6<T> sk = w.axis[k];
     const bool same_group = m.group_begin[k] == m.group_begin[j];
-    w.by_q(k, j) += beta_h * dot6<T>(sk, same_group ? force_q : moved_force_q);
-    w.by_v(k, j) += beta_h * dot6<T>(sk, force_v);
+    w.dg_dq(k, j) += beta_h * dot6<T>(sk, same_group ? force_q : moved_force_q);
+    w.dg_dv(k, j) += beta_h * dot6<T>(sk, force_v);
     w.mass(k, j) = dot6<T>(sk, force_a);
     if (same_group) continue;
     w.mass(j, k) = w.mass(k, j);
     if (m.translation_only[k]) continue;
     // The transposed entry, the force at dof j by the ancestor k, sums over the subtree of j. I is symmetric:
     // Sⱼᵀ I = (I Sⱼ)ᵀ.
-    w.by_q(j, k) += beta_h * (dot6<T>(force_a, w.motion_by_q[k]) + rate_s.dot(top(w.p[k])));
-    w.by_v(j, k) += beta_h * (dot6<T>(force_a, w.motion_by_v[k]) + rate_s.dot(top(sk)));
+    w.dg_dq(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dq[k]) + rate_s.dot(top(w.p[k])));
+    w.dg_dv(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dv[k]) + rate_s.dot(top(sk)));
   }
 }
 
-// Adds β h · (inverse dynamics) to w.residual; with derivatives also to w.by_q and w.by_v, and sets w.mass (without the
-// factor β h). `start` is the start of the step; null: w.q and w.generalized_acceleration alone define the state and the
-// accelerations, and of the derivatives of free bodies only w.mass is set.
+// Adds β h · (inverse dynamics) to w.residual; with derivatives also to w.dg_dq and w.dg_dv, and sets w.mass (without
+// the factor β h). `start` is the start of the step; null: w.q and w.generalized_acceleration alone define the state
+// and the accelerations, and of the derivatives of free bodies only w.mass is set.
 template <bool derivatives, class T>
 void add_inverse_dynamics(const Model& m, const T* params, const T& beta_h, const T* v, const StepStart<T>* start,
                           Workspace<T>& w) {

@@ -199,7 +199,7 @@ void integrate(const Model& m, const T* q0, const T* q_rounding, const VX<T>& in
 
 // columns ← columns · ∂q_t/∂increment, where the columns refer to the tangent of q_t: Jr(φ) on rotational dofs.
 template <class T>
-void times_position_by_increment(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
+void times_dposition_dincrement(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
   for (const Joint& joint : m.joints) {
     if (!joint.has_quaternion()) continue;
     const int k = joint.angular_v();
@@ -213,7 +213,7 @@ void times_position_by_increment(const Model& m, const VX<T>& increment, typenam
 
 // (∂q_t/∂increment)ᵀ λ and (∂q_t/∂q_{t-1})ᵀ λ on tangent vectors.
 template <class T>
-VX<T> position_by_increment_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
+VX<T> dposition_dincrement_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
     if (!joint.has_quaternion()) continue;
     const int k = joint.angular_v();
@@ -223,7 +223,7 @@ VX<T> position_by_increment_vjp(const Model& m, const VX<T>& increment, VX<T> la
   return lambda;
 }
 template <class T>
-VX<T> position_by_position_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
+VX<T> dposition_dposition_vjp(const Model& m, const VX<T>& increment, VX<T> lambda) {
   for (const Joint& joint : m.joints) {
     if (!joint.has_quaternion()) continue;
     const int k = joint.angular_v();

@@ -50,28 +50,28 @@ void site_poses(const Model& m, const std::vector<SiteDef>& sites, const SiteRow
 
 // A motion (ω, v) of the body, v at the world's origin, moves the site by v + ω × x and changes its quaternion Q by
 // ½ (0, ω) ⊗ Q. A gradient F by the position therefore acts like a force at x.
-void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* by_poses,
-                    double* by_q) {
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* grad_poses,
+                    double* grad_q) {
   Workspace<double> w(m);
   for_rows(m, at, w, [&](const double* q, int row) {
-    VX<double> by_tangent = VX<double>::Zero(m.nv);
+    VX<double> grad_tangent = VX<double>::Zero(m.nv);
     for (const SiteDef& site : sites) {
-      const V3<double> by_position = vec3(by_poses);
-      const V4<double> by_quaternion = vec4(by_poses + 3);
-      by_poses += 7;
+      const V3<double> grad_position = vec3(grad_poses);
+      const V4<double> grad_quaternion = vec4(grad_poses + 3);
+      grad_poses += 7;
       if (site.body == world) continue;
       const SitePose pose = site_pose(site, w);
-      V3<double> by_rotation = pose.position.cross(by_position);
+      V3<double> grad_rotation = pose.position.cross(grad_position);
       for (int a = 0; a < 3; ++a) {
         V4<double> half_axis = V4<double>::Zero();
         half_axis[1 + a] = 0.5;
-        by_rotation[a] += quaternion_product<double>(half_axis, pose.quaternion).dot(by_quaternion);
+        grad_rotation[a] += quaternion_product<double>(half_axis, pose.quaternion).dot(grad_quaternion);
       }
       for (const int k : m.bodies[site.body].dofs) {
-        by_tangent[k] += w.axis[k].head<3>().dot(by_rotation) + w.axis[k].tail<3>().dot(by_position);
+        grad_tangent[k] += w.axis[k].head<3>().dot(grad_rotation) + w.axis[k].tail<3>().dot(grad_position);
       }
     }
-    add_from_tangent<double>(m, q, by_tangent, by_q + static_cast<std::ptrdiff_t>(row) * m.nq);
+    add_from_tangent<double>(m, q, grad_tangent, grad_q + static_cast<std::ptrdiff_t>(row) * m.nq);
   });
 }
 

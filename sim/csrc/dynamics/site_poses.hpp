@@ -26,9 +26,9 @@ struct SiteRows {
 // `poses` (rows, sites, 7): position, quaternion.
 void site_poses(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, double* poses);
 
-// Adds to by_q (rows, nq) the gradient of a scalar with gradient `by_poses` (rows, sites, 7); for quaternions of q the
-// tangent gradient.
-void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* by_poses,
-                    double* by_q);
+// Adds to grad_q (rows, nq) the gradient of a scalar with gradient `grad_poses` (rows, sites, 7); for quaternions of q
+// the tangent gradient.
+void site_poses_vjp(const Model& m, const std::vector<SiteDef>& sites, const SiteRows& at, const double* grad_poses,
+                    double* grad_q);
 
 }  // namespace gelflow

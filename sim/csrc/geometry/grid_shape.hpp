@@ -62,7 +62,7 @@ GELFLOW_INLINE void sum_spline(const DistanceGrid& g, const float* const* start,
   sums.gradient = zero3<P>();
   sums.xx = sums.yy = sums.zz = sums.xy = sums.xz = sums.yz = zero;
   for (int i = 0; i < 4; ++i) {
-    P plane = zero, by_y = zero, by_z = zero, by_yy = zero, by_yz = zero, by_zz = zero;
+    P plane = zero, d_y = zero, d_z = zero, d_yy = zero, d_yz = zero, d_zz = zero;
     for (int j = 0; j < 4; ++j) {
       const std::ptrdiff_t row = i * g.stride(0) + j * g.stride(1);
       P line = zero, line_z = zero, line_zz = zero;
@@ -73,20 +73,20 @@ GELFLOW_INLINE void sum_spline(const DistanceGrid& g, const float* const* start,
         line_zz += pz.second[k] * c;
       }
       plane += py.value[j] * line;
-      by_y += py.first[j] * line;
-      by_yy += py.second[j] * line;
-      by_z += py.value[j] * line_z;
-      by_yz += py.first[j] * line_z;
-      by_zz += py.value[j] * line_zz;
+      d_y += py.first[j] * line;
+      d_yy += py.second[j] * line;
+      d_z += py.value[j] * line_z;
+      d_yz += py.first[j] * line_z;
+      d_zz += py.value[j] * line_zz;
     }
     sums.value += px.value[i] * plane;
-    sums.gradient += Vec3<P>{px.first[i] * plane, px.value[i] * by_y, px.value[i] * by_z};
+    sums.gradient += Vec3<P>{px.first[i] * plane, px.value[i] * d_y, px.value[i] * d_z};
     sums.xx += px.second[i] * plane;
-    sums.xy += px.first[i] * by_y;
-    sums.xz += px.first[i] * by_z;
-    sums.yy += px.value[i] * by_yy;
-    sums.yz += px.value[i] * by_yz;
-    sums.zz += px.value[i] * by_zz;
+    sums.xy += px.first[i] * d_y;
+    sums.xz += px.first[i] * d_z;
+    sums.yy += px.value[i] * d_yy;
+    sums.yz += px.value[i] * d_yz;
+    sums.zz += px.value[i] * d_zz;
   }
 }
 

@@ -9,7 +9,7 @@ namespace gelflow {
 // N = Jr(θ) − 1 and its derivatives: with K = [θ]×, N = −a K + b K², a = (1 − cos θ)/θ², b = (θ − sin θ)/θ³.
 template <class T>
 struct MomentArmCorrection {
-  M3<T> value, by[3];
+  M3<T> value, derivative[3];
   explicit MomentArmCorrection(const V3<T>& theta, bool derivatives) {
     const T squared = theta.squaredNorm();
     const RotationSeries<T> s(squared);
@@ -25,7 +25,7 @@ struct MomentArmCorrection {
     const M3<T> along = b1 * kk - a1 * k;
     for (int j = 0; j < 3; ++j) {
       const M3<T> e = skew<T>(V3<T>(V3<T>::Unit(j)));
-      by[j] = b * (e * k + k * e) - a * e + theta[j] * along;
+      derivative[j] = b * (e * k + k * e) - a * e + theta[j] * along;
     }
   }
 };

@@ -87,11 +87,11 @@ struct CandidatePoints {
 template <class T>
 struct ContactJacobian {
   explicit ContactJacobian(int capacity)
-      : s(capacity), y(capacity), wrench_by_q(capacity), wrench_by_v(capacity), axis_wrench(capacity) {}
+      : s(capacity), y(capacity), dwrench_dq(capacity), dwrench_dv(capacity), axis_wrench(capacity) {}
   const PackedDofs* dofs = nullptr;
   int n = 0;         // columns, a whole number of packs
   SixPacks<T> s, y;  // S and Y, signs applied
-  SixPacks<T> wrench_by_q, wrench_by_v,
+  SixPacks<T> dwrench_dq, dwrench_dv,
       axis_wrench;  // derivatives of the contact forces by the columns' dofs (contact_forces.hpp)
 };
 
@@ -127,8 +127,8 @@ struct Workspace {
         twist_after(m.nv),
         acceleration_before(m.nv),
         p(m.nv),
-        motion_by_q(m.nv),
-        motion_by_v(m.nv),
+        dmotion_dq(m.nv),
+        dmotion_dv(m.nv),
         residual(stride),
         impulses(stride),
         residual_scale(stride),
@@ -139,9 +139,9 @@ struct Workspace {
         search_start(m.nv),
         best_velocity(m.nv),
         mass(m.nv, stride),
-        by_q(m.nv, stride),
-        by_v(m.nv, stride),
-        by_u(m.actuators.size()),
+        dg_dq(m.nv, stride),
+        dg_dv(m.nv, stride),
+        dg_du(m.actuators.size()),
         tangent(m.nv, stride),
         q(m.nq),
         pivots(m.nv),
@@ -165,7 +165,7 @@ struct Workspace {
   SixRows<T> twist_before;              // before the dof's group
   std::vector<V6<T>> twist_after, acceleration_before;
 
-  std::vector<V6<T>> p, motion_by_q, motion_by_v;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
+  std::vector<V6<T>> p, dmotion_dq, dmotion_dv;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
 
   // Residual g of the step and its derivatives.
   VX<T> residual, impulses, residual_scale;  // behind the last number as many zeros as rows have (newton.hpp)
@@ -174,9 +174,9 @@ struct Workspace {
   VX<T> velocity_change;                     // v_t − v*
   VX<T> direction;                           // of Newton's method
   VX<T> search_start, best_velocity;         // start of the line search; iterate with the smallest residual
-  Rows mass, by_q, by_v;                     // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
-  VX<T> by_u;                                // ∂g_dof/∂u per actuator
-  Rows tangent;             // ∂g/∂v_t in all: by_v + by_q ∂q_t/∂v_t; then its factors (linear_solver.hpp)
+  Rows mass, dg_dq, dg_dv;                   // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  VX<T> dg_du;                               // ∂g_dof/∂u per actuator
+  Rows tangent;             // ∂g/∂v_t in all: dg_dv + dg_dq ∂q_t/∂v_t; then its factors (linear_solver.hpp)
   VX<PositionScalar<T>> q;  // q_t of the trial velocity
   std::vector<int> pivots;
 

@@ -187,15 +187,15 @@ GradientArrays rollout_vjp(Batch<T>& b, TrajectoryArrays& trajectory, const Cota
   const py::ssize_t n = b.n, np = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
   py::array_t<T> u(Dimensions{r.steps, n, actuators(b)}), q(Dimensions{n, m.nq}), v(Dimensions{n, m.nv});
   py::array_t<T> anchors(Dimensions{n, m.na, 3}), history(Dimensions{n, m.nh});
-  py::array_t<double> by_params(Dimensions{n, np});
+  py::array_t<double> grad_params(Dimensions{n, np});
   const TrajectoryGradient<T> gradient{u.mutable_data(),       q.mutable_data(),
                                        v.mutable_data(),       anchors.mutable_data(),
-                                       history.mutable_data(), params ? by_params.mutable_data() : nullptr};
+                                       history.mutable_data(), params ? grad_params.mutable_data() : nullptr};
   {
     const py::gil_scoped_release release;
     b.rollout_vjp(r, c, gradient);
   }
-  return {u, q, v, anchors, history, by_params};
+  return {u, q, v, anchors, history, grad_params};
 }
 
 template <class T>

@@ -48,15 +48,15 @@ void bind_sites(py::module_& module) {
   module.def(
       "site_poses_vjp",
       [](const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q,
-         const Array<double>& by_poses) {
+         const Array<double>& grad_poses) {
         const SiteRows at = checked(m, sites, params, q);
-        check_shape(by_poses, {at.rows, static_cast<py::ssize_t>(sites.size()), 7}, "by_poses");
-        py::array_t<double> by_q(Dimensions{at.rows, m.nq});
-        std::fill_n(by_q.mutable_data(), by_q.size(), 0.0);
-        site_poses_vjp(m, sites, at, by_poses.data(), by_q.mutable_data());
-        return by_q;
+        check_shape(grad_poses, {at.rows, static_cast<py::ssize_t>(sites.size()), 7}, "grad_poses");
+        py::array_t<double> grad_q(Dimensions{at.rows, m.nq});
+        std::fill_n(grad_q.mutable_data(), grad_q.size(), 0.0);
+        site_poses_vjp(m, sites, at, grad_poses.data(), grad_q.mutable_data());
+        return grad_q;
       },
-      py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"), py::arg("by_poses"),
+      py::arg("model"), py::arg("sites"), py::arg("params"), py::arg("q"), py::arg("grad_poses"),
       "Gradient (rows, nq) from the gradient with respect to the poses (rows, sites, 7).");
 }
 

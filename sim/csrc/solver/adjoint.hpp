@@ -70,60 +70,60 @@ struct StateCopy {
 template <class T>
 std::vector<V3<T>> end_anchors_vjp(const Model& m, const T* params, const SubstepRecord<T>& r, const T& step_length,
                                    StateGradient<T>& g, Workspace<T>& w) {
-  std::vector<V3<T>> by_anchor(m.na, V3<T>::Zero());
-  if (m.na == 0) return by_anchor;
+  std::vector<V3<T>> grad_anchor(m.na, V3<T>::Zero());
+  if (m.na == 0) return grad_anchor;
   contact_anchors_vjp<T>(m, params, step_length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
-                         by_anchor.data());
+                         grad_anchor.data());
   marker_anchors_vjp<T>(m, params, step_length, r.anchors.data(), r.anchored.data(), w, g.anchors.data(), g.q, g.v,
-                        by_anchor.data());
-  return by_anchor;
+                        grad_anchor.data());
+  return grad_anchor;
 }
 
-// Transforms g from the gradient at the substep's end to the gradient at its start, and adds to by_u.
+// Transforms g from the gradient at the substep's end to the gradient at its start, and adds to grad_u.
 // `on_multiplier`(c) is called before the gradient of the anchors changes.
 template <class T, class OnMultiplier>
-void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecord<T>& r, StateGradient<T>& g, T* by_u,
+void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecord<T>& r, StateGradient<T>& g, T* grad_u,
                  StepMemory<T>& memory, OnMultiplier&& on_multiplier) {
   Workspace<T>& w = memory.work;
   const StepStart<T> start = r.start(u);
   evaluate<true, T>(m, params, start, r.v1.data(), CacheState::stale, false, w);
-  std::vector<V3<T>> by_anchor = end_anchors_vjp<T>(m, params, r, start.length(), g, w);
-  VX<T> by_increment = VX<T>::Zero(m.nv), by_v0 = by_increment;  // through the history after the step
+  std::vector<V3<T>> grad_anchor = end_anchors_vjp<T>(m, params, r, start.length(), g, w);
+  VX<T> grad_increment = VX<T>::Zero(m.nv), grad_v0 = grad_increment;  // through the history after the step
   if (m.nh > 0 && r.full_step) {
-    by_increment = g.history.head(m.nv);
-    by_v0 = g.history.segment(m.nv, m.nv);
+    grad_increment = g.history.head(m.nv);
+    grad_v0 = g.history.segment(m.nv, m.nv);
   }
-  const VX<T> b = g.v + r.beta_h * (position_by_increment_vjp<T>(m, w.increment, g.q) + by_increment);
+  const VX<T> b = g.v + r.beta_h * (dposition_dincrement_vjp<T>(m, w.increment, g.q) + grad_increment);
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> multiplier(m.nv);
   solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
   on_multiplier(multiplier);
-  for (std::size_t a = 0; a < m.actuators.size(); ++a) by_u[a] -= multiplier[m.actuators[a].dof] * w.by_u[a];
-  const VX<T> by_q1 = g.q - w.by_q.leftCols(m.nv).transpose() * multiplier;
-  VX<T> by_v_star = w.mass.leftCols(m.nv).transpose() * multiplier, by_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
-  by_increment += position_by_increment_vjp<T>(m, w.increment, by_q1);
-  free_bodies_vjp<T>(m, params, start, w, multiplier, by_v_star, by_increment, by_v_before);
-  g.q = position_by_position_vjp<T>(m, w.increment, by_q1);
-  g.v = by_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * by_v_star;
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) grad_u[a] -= multiplier[m.actuators[a].dof] * w.dg_du[a];
+  const VX<T> grad_q1 = g.q - w.dg_dq.leftCols(m.nv).transpose() * multiplier;
+  VX<T> grad_v_star = w.mass.leftCols(m.nv).transpose() * multiplier, grad_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
+  grad_increment += dposition_dincrement_vjp<T>(m, w.increment, grad_q1);
+  free_bodies_vjp<T>(m, params, start, w, multiplier, grad_v_star, grad_increment, grad_v_before);
+  g.q = dposition_dposition_vjp<T>(m, w.increment, grad_q1);
+  g.v = grad_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * grad_v_star;
   g.history.setZero();
   if (r.bdf2) {
-    g.history.head(m.nv) = by_increment / T(3);
-    g.history.segment(m.nv, m.nv) = by_v_before - by_v_star / T(3);
+    g.history.head(m.nv) = grad_increment / T(3);
+    g.history.segment(m.nv, m.nv) = grad_v_before - grad_v_star / T(3);
   }
   if (m.na > 0) {
     residual_anchors_vjp<T>(m, params, r.beta_h, r.bdf2, r.anchors.data(), r.anchored.data(), w, multiplier,
-                            by_anchor.data());
-    g.anchors.swap(by_anchor);
+                            grad_anchor.data());
+    g.anchors.swap(grad_anchor);
   }
 }
 
 // Adds the gradient of marker readings at a state to g.
 template <class T>
-void tactile_vjp(const Model& m, const T* params, const StateView<T>& s, const T* by_reading, StateGradient<T>& g,
+void tactile_vjp(const Model& m, const T* params, const StateView<T>& s, const T* grad_reading, StateGradient<T>& g,
                  Workspace<T>& w) {
   forward_state<true, T>(m, params, s.q, s.q_rounding, s.v, w);
-  read_markers_vjp<T>(m, params, s.anchors, s.anchored, w, by_reading, g.q, g.v, g.anchors.data());
+  read_markers_vjp<T>(m, params, s.anchors, s.anchored, w, grad_reading, g.q, g.v, g.anchors.data());
 }
 
 }  // namespace gelflow

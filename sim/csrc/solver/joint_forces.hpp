@@ -11,7 +11,7 @@ constexpr double friction_creep = 1e-3;
 // A joint limit is a damped spring that never pulls.
 template <class T>
 struct LimitForce {
-  T force, by_q, by_v;
+  T force, dforce_dq, dforce_dv;
 };
 template <class T>
 LimitForce<T> limit_force(const JointParams<T>& p, const T& value, const T& v) {
@@ -25,7 +25,7 @@ LimitForce<T> limit_force(const JointParams<T>& p, const T& value, const T& v) {
 // Force of an actuator and its derivatives by control, length and speed (gear times those of the joint).
 template <class T>
 struct ActuatorForce {
-  T force, by_u, by_length, by_speed;
+  T force, dforce_du, dforce_dlength, dforce_dspeed;
   int clipped;  // bits: 1 control below, 2 above its range; 4 force below, 8 above
 };
 template <class T, class Q>
@@ -48,19 +48,19 @@ ActuatorForce<T> actuator_force(const Actuator& actuator, const ActuatorParams<T
       bias = p.bias;
       break;
   }
-  const T gain = out.by_u;
+  const T gain = out.dforce_du;
   T control = u;
   if (u < p.ctrl_lower || u > p.ctrl_upper) {
     out.clipped = u < p.ctrl_lower ? 1 : 2;
     control = u < p.ctrl_lower ? p.ctrl_lower : p.ctrl_upper;
-    out.by_u = T(0);
+    out.dforce_du = T(0);
   }
-  out.force =
-      gain * control + bias + out.by_length * (gear * T(q[actuator.q])) + out.by_speed * (gear * v[actuator.dof]);
+  out.force = gain * control + bias + out.dforce_dlength * (gear * T(q[actuator.q])) +
+              out.dforce_dspeed * (gear * v[actuator.dof]);
   if (continuation < 1) {
     out.force *= T(continuation);
-    out.by_length *= T(continuation);
-    out.by_speed *= T(continuation);
+    out.dforce_dlength *= T(continuation);
+    out.dforce_dspeed *= T(continuation);
   }
   if (out.force < p.force_lower || out.force > p.force_upper) {
     const bool below = out.force < p.force_lower;
@@ -77,18 +77,18 @@ GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, 
   const T damping = p.damping, armature = p.armature;
   for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
     w.residual[k] += beta_h * damping * v[k];
-    if constexpr (derivatives) w.by_v(k, k) += beta_h * damping;
+    if constexpr (derivatives) w.dg_dv(k, k) += beta_h * damping;
     if (p.frictionloss != T(0)) {
       const bool slides = abs(v[k]) > creep;
       const T force = slides ? T(v[k] > T(0) ? p.frictionloss : -p.frictionloss) : T(p.frictionloss / creep * v[k]);
       w.residual[k] += beta_h * force;
       if (add_impulses) w.impulses[k] += beta_h * p.frictionloss;
-      if constexpr (derivatives) w.by_v(k, k) += slides ? T(0) : T(beta_h * p.frictionloss / creep);
+      if constexpr (derivatives) w.dg_dv(k, k) += slides ? T(0) : T(beta_h * p.frictionloss / creep);
     }
     if (armature != T(0)) {
       w.residual[k] += armature * w.velocity_change[k];
       if constexpr (derivatives) {
-        w.by_v(k, k) += armature;
+        w.dg_dv(k, k) += armature;
         w.mass(k, k) += armature;
       }
     }
@@ -103,12 +103,12 @@ GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const JointParams<T
   const int k = joint.v;
   const T value(q[joint.q]);
   w.residual[k] += beta_h * stiffness * (value - springref);
-  if constexpr (derivatives) w.by_q(k, k) += beta_h * stiffness;
+  if constexpr (derivatives) w.dg_dq(k, k) += beta_h * stiffness;
   const LimitForce<T> limit = limit_force<T>(p, value, v[k]);
   w.residual[k] += beta_h * limit.force;
   if constexpr (derivatives) {
-    w.by_q(k, k) += beta_h * limit.by_q;
-    w.by_v(k, k) += beta_h * limit.by_v;
+    w.dg_dq(k, k) += beta_h * limit.dforce_dq;
+    w.dg_dv(k, k) += beta_h * limit.dforce_dv;
   }
 }
 
@@ -132,9 +132,9 @@ void subtract_joint_forces(const Model& m, const T* params, const T& beta_h, con
     w.residual[k] -= beta_h * gear * out.force;
     if (add_impulses) w.impulses[k] += beta_h * abs(gear * out.force);
     if constexpr (derivatives) {
-      w.by_u[a] = -beta_h * gear * out.by_u;
-      w.by_q(k, k) -= beta_h * gear * gear * out.by_length;
-      w.by_v(k, k) -= beta_h * gear * gear * out.by_speed;
+      w.dg_du[a] = -beta_h * gear * out.dforce_du;
+      w.dg_dq(k, k) -= beta_h * gear * gear * out.dforce_dlength;
+      w.dg_dv(k, k) -= beta_h * gear * gear * out.dforce_dspeed;
     }
   }
 }

@@ -57,9 +57,9 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& star
   for (int i = 0; i < m.nv; ++i) {
     double velocity_terms = m.angular[i] ? reach * momentum : momentum, position_terms = 0;
     for (int j = 0; j < m.nv; ++j) {
-      position_terms += std::abs(real_part(w.by_q(i, j))) * (m.angular[j] ? angle : reach);
+      position_terms += std::abs(real_part(w.dg_dq(i, j))) * (m.angular[j] ? angle : reach);
       velocity_terms +=
-          std::abs(real_part(w.by_v(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(start.v_star[j])));
+          std::abs(real_part(w.dg_dv(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(start.v_star[j])));
     }
     const double bound = unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;

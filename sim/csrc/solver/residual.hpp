@@ -35,20 +35,20 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& start, const 
   forward_velocities<derivatives, T>(m, params, v, w.generalized_acceleration.data(), w);
   w.residual.setZero();
   if constexpr (derivatives) {
-    w.by_q.setZero();
-    w.by_v.setZero();
+    w.dg_dq.setZero();
+    w.dg_dv.setZero();
   }
   add_inverse_dynamics<derivatives, T>(m, params, beta_h, v, &start, w);
-  if constexpr (derivatives) w.by_v += w.mass;
+  if constexpr (derivatives) w.dg_dv += w.mass;
   if (add_impulses) {
     for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
   subtract_joint_forces<derivatives, T>(m, params, beta_h, w.q.data(), v, start.u, start.continuation, add_impulses, w);
   subtract_contact_forces<derivatives, T>(m, params, start, cache, add_impulses, w);
   if constexpr (derivatives) {
-    w.tangent = beta_h * w.by_q;
-    times_position_by_increment<T>(m, w.increment, w.tangent);
-    w.tangent += w.by_v;
+    w.tangent = beta_h * w.dg_dq;
+    times_dposition_dincrement<T>(m, w.increment, w.tangent);
+    w.tangent += w.dg_dv;
   }
 }
 

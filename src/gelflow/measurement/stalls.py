@@ -4,10 +4,8 @@ A busy host of a virtual machine, or a kernel function that cannot be interrupte
 of reaction times needs these intervals to tell such delays from those of the measured program.
 """
 
-import json
 import os
 import select
-import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
@@ -15,44 +13,38 @@ from types import TracebackType
 from typing import Self
 
 from gelflow.clock import raise_priority
+from gelflow.helper_process import HelperProcess, connect_to_parent
 
 Interval = tuple[float, float]  # begin and end on the system's monotonic clock [s]
 
 _SLEEP = 1e-3  # of the watching process [s]
 _SHORTEST = 3e-3  # a longer delay of its wake-up is a stall [s]
-_END_LIMIT = 10.0  # [s]
+_ANSWER_LIMIT = 60.0  # of the start and of the last report [s]
 
 
 class StallWatch:
-    """Records the stalls of each CPU while the `with` block runs, in one process per CPU; `intervals` has them after it.
+    """Records stalls while the `with` block runs, with one process per CPU; `intervals` has them after the block.
 
-    Without permission for real-time priority, other programs with load count as stalls too.
+    Without permission for real-time priority, delays by other programs count as stalls too.
     """
 
     def __init__(self) -> None:
         self.intervals: list[Interval] = []
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._helpers: list[HelperProcess] = []
 
     def __enter__(self) -> Self:
-        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [-1]
-        self._processes = [
-            subprocess.Popen(
-                [sys.executable, "-m", "gelflow.measurement.stalls", str(cpu)],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-            )
-            for cpu in cpus
-        ]
-        for process in self._processes:
-            assert process.stdout is not None
-            process.stdout.readline()  # it has started
+        cpus = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+        self._helpers = [HelperProcess.start("gelflow.measurement.stalls", {"cpu": cpu}) for cpu in cpus]
+        for helper in self._helpers:
+            helper.messages.wait(_ANSWER_LIMIT)  # it has started
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         found: list[Interval] = []
-        for process in self._processes:
-            output, _ = process.communicate(timeout=_END_LIMIT)  # closes standard input, which ends the process
-            found += [(begin, end) for begin, end in json.loads(output)]
+        for helper in self._helpers:
+            helper.messages.send("report")
+            found += [(begin, end) for begin, end in helper.messages.wait(_ANSWER_LIMIT)[0]]
+            helper.close()
         self.intervals = united(found)
 
 
@@ -72,21 +64,25 @@ def overlaps(interval: Interval, others: Sequence[Interval]) -> bool:
     return any(begin <= interval[1] and interval[0] <= end for begin, end in others)
 
 
-def main(cpu: int) -> None:
-    """Watch one CPU (-1: any) until standard input closes, then print the stalls as JSON."""
-    if cpu >= 0:
-        os.sched_setaffinity(0, {cpu})
+def main(arguments: Sequence[str]) -> int:
+    """Entry point of the watching process: sends the stalls of one CPU when its parent asks."""
+    settings, parent, _ = connect_to_parent(arguments)
+    if settings["cpu"] is not None:
+        os.sched_setaffinity(0, {settings["cpu"]})
     raise_priority()
     stalls: list[Interval] = []
-    print("started", flush=True)
+    parent.send("started")
     before = time.monotonic()
-    while not select.select([sys.stdin], [], [], _SLEEP)[0]:
+    while not select.select([parent], [], [], _SLEEP)[0]:
         now = time.monotonic()
         if now - before > _SLEEP + _SHORTEST:
             stalls.append((before, now))
         before = now
-    print(json.dumps(stalls))
+    if parent.read():
+        parent.send(stalls)
+        parent.wait()  # until the parent has read them and closes the link
+    return 0
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    sys.exit(main(sys.argv[1:]))

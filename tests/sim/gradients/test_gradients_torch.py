@@ -132,9 +132,9 @@ def test_parameters_of_environments_have_individual_gradients() -> None:
     assert kn.grad is not None and common.grad is not None and common.grad.shape == ()
     sim.params[:, sim.param_index["pad_box.kn"]] = kn.detach()
     trajectory = sim.rollout(controls.numpy())
-    by_v = np.zeros_like(trajectory.v)
-    by_v[-1] = 2 * trajectory.v[-1]
-    expected = sim.rollout_gradient(trajectory, v=by_v, params=True).params
+    grad_v = np.zeros_like(trajectory.v)
+    grad_v[-1] = 2 * trajectory.v[-1]
+    expected = sim.rollout_gradient(trajectory, v=grad_v, params=True).params
     np.testing.assert_array_equal(kn.grad, expected[:, sim.param_index["pad_box.kn"]])
     assert float(common.grad) == pytest.approx(expected[:, sim.param_index["box_ground.mu"]].sum(), rel=1e-12)
 

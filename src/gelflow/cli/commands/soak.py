@@ -85,7 +85,9 @@ def _run_endurance(args: argparse.Namespace) -> int:
     if not 0 < args.egm <= 1440:
         raise UsageError(f"--egm must be above 0 and at most 1440 minutes, got {args.egm:g}")
     output = Output(args.json)
-    result = measure_endurance(60 * args.egm)
+    with progress_bar() as progress:
+        bar = progress.add_task("EGM", total=60 * args.egm)
+        result = measure_endurance(60 * args.egm, lambda elapsed: progress.update(bar, completed=elapsed))
     for line in result.lines():
         output.text(line)
     write_json(args.out / "egm.json", result.to_json())

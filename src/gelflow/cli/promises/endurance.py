@@ -1,5 +1,6 @@
 """Endurance of EGM at 250 Hz: the mock robot in this process; cameras, tracking, motion and recording in another."""
 
+import contextlib
 import itertools
 import json
 import math
@@ -8,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from gelflow.session.recorder import SessionRecorder
 BOUND = 0.001  # largest fraction of missed cycles
 _PERIOD = 0.004  # of EGM [s]
 _STROKE, _SPEED = 2e-3, 1e-3  # of the motion up and down [m], [m/s]
+_PROGRESS_PERIOD = 1.0  # [s]
 _START_LIMIT = 60.0  # of the runner's process in addition to the measured time [s]
 
 
@@ -144,19 +146,18 @@ class Endurance:
         ]
 
 
-def measure_endurance(seconds: float) -> Endurance:
-    """Run for `seconds`. Raises PeerError with its last line when the runner's process ends with an error."""
+def measure_endurance(seconds: float, progress: Callable[[float], object] = lambda elapsed: None) -> Endurance:
+    """Run for `seconds`; `progress` is called with the time since the start [s].
+
+    Raises PeerError with its last line when the runner's process ends with an error.
+    """
     before = load()
     with tempfile.TemporaryDirectory(prefix="gelflow-egm-") as name, Rig(Path(name), seed=near_seed()) as rig:
         save_lab(rig.lab, rig.folder / "lab.toml", title="Written by gelflow soak --egm.")
         arguments = [sys.executable, "-m", "gelflow.cli.promises.endurance", str(rig.folder), repr(seconds)]
         late = rig.robot.arm.report.late
         with StallWatch() as watch:
-            result = subprocess.run(arguments, capture_output=True, timeout=seconds + _START_LIMIT, check=False)
-        if result.returncode != 0:
-            lines = result.stderr.decode(errors="replace").strip().splitlines()
-            raise PeerError(f"the endurance run ended early: {lines[-1] if lines else 'no reason given'}")
-        values = json.loads(result.stdout)
+            values = json.loads(_run(arguments, seconds + _START_LIMIT, progress))
         recorded = os.path.getsize(rig.folder / "session.mcap")
         late = rig.robot.arm.report.late - late
     missed_in_stalls = sum(n for begin, end, n in values["missed"] if overlaps((begin, end), watch.intervals))
@@ -172,6 +173,26 @@ def measure_endurance(seconds: float) -> Endurance:
         before,
         load(),
     )
+
+
+def _run(arguments: list[str], limit: float, progress: Callable[[float], object]) -> bytes:
+    """Standard output of a process that may take `limit` seconds."""
+    begin = time.monotonic()
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        try:
+            while (elapsed := time.monotonic() - begin) < limit:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    output, errors = process.communicate(timeout=_PROGRESS_PERIOD)
+                    break
+                progress(elapsed)
+            else:
+                raise PeerError(f"the endurance run did not end within {limit:.0f} s")
+        finally:
+            process.kill()
+    if process.returncode != 0:
+        lines = errors.decode(errors="replace").strip().splitlines()
+        raise PeerError(f"the endurance run ended early: {lines[-1] if lines else 'no reason given'}")
+    return output
 
 
 def run_devices(folder: Path, seconds: float) -> dict[str, Any]:
