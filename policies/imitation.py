@@ -35,6 +35,7 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
+_MIN_TOLERANCE = 1.5e-3  # [m]
 _SAVE_INTERVAL = 20.0  # [s] between savings of an unfinished run, at the end of an iteration
 
 
@@ -151,8 +152,12 @@ def collect(
 
 
 def part_tolerance(task: InsertionTask) -> tuple[float, float, float]:
-    """The gap beside the part in x and y [m], and the yaw that moves a corner by the smaller one [rad]."""
-    x, y = (clearance / 2 for clearance in task.part.clearance)
+    """The gap beside the part in x and y, but at least 1.5 mm [m], and the yaw that moves a corner by the smaller [rad].
+
+    In a narrow hole, the first attempts of a part show the direction of its misalignment and hardly its length. A loss
+    that is bounded within such a gap is flat over most of the lengths that are possible.
+    """
+    x, y = (max(clearance / 2, _MIN_TOLERANCE) for clearance in task.part.clearance)
     corner = float(np.hypot(*task.part.size[:2])) / 2
     return x, y, min(x, y) / corner
 

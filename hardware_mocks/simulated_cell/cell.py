@@ -104,6 +104,8 @@ class SimulatedCell:
         self._clock, self._task = clock, config.task
         part = replace(config.task.part, clearance=config.world.hole.clearance)
         self._geometry = part_geometry(part)
+        if part.hole_mesh and part.clearance != config.task.part.clearance:
+            raise UsageError("the hole of this part is a mesh, whose clearance a world cannot change")
         # The walls of a box's hole are moved by `CellPhysics`.
         with_hole = config.task.part if part.shape == "box" else part
         scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})

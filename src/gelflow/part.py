@@ -40,17 +40,24 @@ class Part:
     mesh: str = ""  # SHA-256 of the mesh file; empty for box and cylinder
     mesh_scale: float = 1.0  # metres per unit of the mesh file
     mesh_file: str = field(default="", compare=False)  # on this computer; not part of the description
+    # SHA-256 of the mesh around the hole; empty: the hole is the outline of the part, widened by the clearance. With a
+    # mesh, the clearance is twice its smallest gap.
+    hole_mesh: str = ""
+    hole_scale: float = 1.0  # metres per unit of that file
+    hole_origin: tuple[float, float] = (0.0, 0.0)  # of the part's frame in x and y of that file [m]
+    hole_file: str = field(default="", compare=False)  # on this computer
 
     def __post_init__(self) -> None:
         """Raises UsageError, in one line, for values that no gripper and no hole can have."""
         if self.shape not in SHAPES:
             raise UsageError(f"shape must be one of {', '.join(SHAPES)}, got {self.shape!r}")
-        positive = [*self.size, self.grasp_width, self.density, *self.clearance, self.depth, self.mesh_scale]
+        positive = [*self.size, self.grasp_width, self.density, *self.clearance, self.depth]
+        positive += [self.mesh_scale, self.hole_scale]
         if not all(0 < value < np.inf for value in positive):
             raise UsageError(
-                "size, grasp_width, density, clearance, depth and mesh_scale must be above 0, got "
+                "size, grasp_width, density, clearance, depth, mesh_scale and hole_scale must be above 0, got "
                 f"{list(self.size)}, {self.grasp_width}, {self.density}, {list(self.clearance)}, {self.depth}, "
-                f"{self.mesh_scale}"
+                f"{self.mesh_scale}, {self.hole_scale}"
             )
         if self.grasp_width > _FITS_FINGERS:
             raise UsageError(
@@ -75,9 +82,11 @@ class Part:
             raise UsageError(f"the clearance of a {self.shape} must be equal along x and y, got {list(self.clearance)}")
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data, for task descriptions; without the place of the mesh."""
+        """As plain data, for task descriptions; without the places of meshes, and without a mesh that is not there."""
         values = dataclasses.asdict(self)
-        del values["mesh_file"]
+        absent = () if self.hole_mesh else ("hole_mesh", "hole_scale", "hole_origin")
+        for key in ("mesh_file", "hole_file", *absent):
+            del values[key]
         return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from gelflow.sim.scene.contacts import PointsDef
 from gelflow.sim.scene.geometry.sampling import box_surface, cylinder
 from gelflow.sim.scene.mjcf.mechanics import BodyDef
 from gelflow.sim.scene.shapes import ShapeDef
+from gelflow.sim.tasks.parts.hole_mesh import mesh_hole_outline
 from gelflow.sim.tasks.parts.outline import Circle, Outline, Rectangle
 
 Array = NDArray[np.float64]
@@ -62,9 +64,15 @@ class PartGeometry(ABC):
         does not meet the part.
         """
 
-    @property
+    @cached_property
     def hole(self) -> Outline:
-        """Outline of the hole."""
+        """Outline of the hole. Raises UsageError when its mesh cannot be read or has no hole under the part."""
+        if self.part.hole_mesh:
+            return mesh_hole_outline(self.part, self.outline)
+        return self._widened()
+
+    def _widened(self) -> Outline:
+        """The outline of the part, widened by its clearance."""
         x, y = self.part.clearance
         return self.outline.enlarged((x / 2, y / 2))
 
@@ -82,8 +90,7 @@ class Box(PartGeometry):
     def outline(self) -> Outline:
         return Rectangle((float(self.half[0]), float(self.half[1])))
 
-    @property
-    def hole(self) -> Rectangle:
+    def _widened(self) -> Rectangle:
         x, y = ((size + gap) / 2 for size, gap in zip(self.part.size, self.part.clearance, strict=False))
         return Rectangle((x, y))
 

@@ -1,10 +1,7 @@
 """Parts whose shape is a watertight mesh: outline, grasped sides, mass, contact points and symmetry."""
 
-import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,17 +10,19 @@ from gelflow.errors import UsageError
 from gelflow.part import Part
 from gelflow.sim.scene.contacts import PointsDef
 from gelflow.sim.scene.geometry.distance_grid import distance_grid
-from gelflow.sim.scene.geometry.mesh import TriangleMesh, closed_mesh, nearest_points, read_mesh
+from gelflow.sim.scene.geometry.mesh import TriangleMesh, nearest_points
 from gelflow.sim.scene.geometry.sampling import mesh_surface
 from gelflow.sim.scene.mjcf.mechanics import BodyDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.sim.tasks.parts.geometry import PartGeometry, with_points
-from gelflow.sim.tasks.parts.outline import Outline, Polygons
+from gelflow.sim.tasks.parts.mesh_file import described_mesh
+from gelflow.sim.tasks.parts.mesh_picture import OUTLINE_PIXEL, Picture, picture, region_outline
+from gelflow.sim.tasks.parts.outline import Outline
 
 Array = NDArray[np.float64]
 
 PAD_RADIUS = 18e-3  # of the pads of the insertion scene [m]
-_OUTLINE_PIXEL, _SIDE_PIXEL = 0.05e-3, 0.25e-3  # of the pictures of a mesh from below and from the side [m]
+_SIDE_PIXEL = 0.25e-3  # of the picture of a mesh from the side [m]
 _GRID_SPACING = 0.5e-3  # of the distance grid, at most [m]
 _FACE_SPACING, _EDGE_SPACING = 5e-3, 2.7e-3  # of contact points on faces and on sharp edges [m]
 _SHARP = np.cos(np.radians(30.0))  # cosine of the angle between the faces of a sharp edge
@@ -32,68 +31,10 @@ _LARGEST_SYMMETRY = 12
 _ROUND = (2, 3, 5, 7, 11)  # a shape with all of these rotations is round
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A mesh seen along an axis: the lowest and the highest coordinate along it at each pixel, NaN beside the mesh."""
-
-    low: Array  # [m], shape (columns, rows)
-    high: Array
-    origin: Array  # of the first pixel's centre [m], shape (2,)
-    pixel: float  # [m]
-
-    def pixels(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Indices of the pixels at points (…, 2), clipped to the picture, and whether the points are within it."""
-        at = np.round((points - self.origin) / self.pixel).astype(int)
-        last = np.array(self.low.shape) - 1
-        within = np.asarray(((at >= 0) & (at <= last)).all(-1))
-        at = np.clip(at, 0, last)
-        return at[..., 0], at[..., 1], within
-
-
-def picture(mesh: TriangleMesh, *, along: int, pixel: float) -> Picture:
-    """The mesh seen along the axis `along` (0, 1, 2), with a border of two pixels."""
-    first, second = (axis for axis in range(3) if axis != along)
-    flat, depth = mesh.vertices[:, [first, second]], mesh.vertices[:, along]
-    origin = flat.min(0) - 2 * pixel + pixel / 2
-    shape = np.ceil((flat.max(0) - origin) / pixel).astype(int) + 3
-    low, high = np.full(shape, np.inf), np.full(shape, -np.inf)
-    for face in mesh.faces:
-        corners, heights = (flat[face] - origin) / pixel, depth[face]
-        edges = np.column_stack([corners[1] - corners[0], corners[2] - corners[0]])
-        area = np.linalg.det(edges)
-        if abs(area) < 1e-9:  # seen edge-on
-            continue
-        start = np.ceil(corners.min(0)).astype(int)
-        end = np.floor(corners.max(0)).astype(int) + 1
-        x, y = np.meshgrid(*(np.arange(a, b) for a, b in zip(start, end, strict=True)), indexing="ij")
-        share = np.stack([x - corners[0, 0], y - corners[0, 1]], axis=-1) @ np.linalg.inv(edges).T
-        inside = (share >= -1e-9).all(-1) & (share.sum(-1) <= 1 + 1e-9)
-        height = heights[0] + share @ (heights[1:] - heights[0])
-        window = (slice(start[0], end[0]), slice(start[1], end[1]))
-        low[window] = np.where(inside, np.minimum(low[window], height), low[window])
-        high[window] = np.where(inside, np.maximum(high[window], height), high[window])
-    empty = ~np.isfinite(low)
-    return Picture(np.where(empty, np.nan, low), np.where(empty, np.nan, high), origin, pixel)
-
-
-def load_part_mesh(path: Path, scale: float) -> TriangleMesh:
-    """A closed mesh in metres whose bounding box is centred at the origin.
-
-    Raises UsageError when the file cannot be read, or the mesh is not watertight (the message has the number of open
-    edges).
-    """
-    raw = read_mesh(path)
-    mesh = closed_mesh(TriangleMesh(raw.vertices * scale, raw.faces), path.name)
-    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-    return TriangleMesh(mesh.vertices - (low + high) / 2, mesh.faces)
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file. Raises UsageError when it cannot be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise UsageError(f"cannot read the mesh {path}: {error.strerror}") from None
+def centred(mesh: TriangleMesh) -> tuple[TriangleMesh, Array]:
+    """The mesh with its bounding box centred at the origin, and the former place of the centre [m]."""
+    centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    return TriangleMesh(mesh.vertices - centre, mesh.faces), centre
 
 
 def grasped_sides(mesh: TriangleMesh, grasp_height: tuple[float, float]) -> tuple[float, float]:
@@ -135,29 +76,18 @@ class MeshPart(PartGeometry):
     def __init__(self, part: Part) -> None:
         """Raises UsageError when the mesh file is missing, not watertight, or another one than the description's."""
         super().__init__(part)
-        if not part.mesh_file:
-            raise UsageError(
-                f"part {part.name!r} is a mesh, which its description does not contain; give its part file"
-            )
-        path = Path(part.mesh_file)
-        if file_digest(path) != part.mesh:
-            raise UsageError(f"the mesh {path} has changed since part {part.name!r} was described")
-        mesh = load_part_mesh(path, part.mesh_scale)
+        described = described_mesh(f"part {part.name!r}", part.mesh_file, part.mesh, part.mesh_scale)
+        mesh, _ = centred(described)
         left, right = grasped_sides(mesh, part.grasp_height)
         self.mesh = TriangleMesh(mesh.vertices - np.array([(left + right) / 2, 0.0, 0.0]), mesh.faces)
 
     @cached_property
     def outline(self) -> Outline:
         """Outline of what is in the hole, seen from below: accurate to half a pixel of 0.05 mm."""
-        from skimage import measure
-
-        below = picture(self.mesh, along=2, pixel=_OUTLINE_PIXEL)
+        below = picture(self.mesh, along=2, pixel=OUTLINE_PIXEL)
         with np.errstate(invalid="ignore"):
             solid = below.low < self.part.depth - self.half[2]
-        find: Any = measure.find_contours
-        simplify: Any = measure.approximate_polygon
-        loops = [simplify(loop, 0.7)[:-1] * below.pixel + below.origin for loop in find(solid.astype(float), 0.5)]
-        return Polygons(tuple(loop for loop in loops if len(loop) >= 3))
+        return region_outline(solid, below)
 
     @cached_property
     def _side(self) -> Picture:

@@ -1,6 +1,7 @@
 """Reads part files: the TOML description of a part, its hole, its grasp and its misalignment."""
 
 import math
+from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -17,6 +18,7 @@ _DEFAULT_DENSITY = 1000.0  # [kg/m³]
 _TABLES = ("format", "name", "part", "hole", "grasp", "misalignment", "symmetry")
 _PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}
 _WEIGHTS = ("density", "mass")
+_OUTLINE_HOLE, _MESH_HOLE = ("clearance", "depth"), ("file", "scale", "depth")
 
 
 def part_names() -> tuple[str, ...]:
@@ -44,59 +46,105 @@ def _read_part(top: TomlTable, path: Path) -> Part:
     table = top.table("part")
     shape = table.string("shape", choices=SHAPES)
     table.check_keys(("shape", *_PART_KEYS[shape], *_WEIGHTS))
-    if shape == "mesh":
-        return _read_mesh_part(top, path)
-    hole = top.table("hole").check_keys(("clearance", "depth"))
+    hole = _hole_fields(top.table("hole"), path, shape)
+    part = _read_mesh_part(top, path, hole) if shape == "mesh" else _read_solid(top, path, shape, hole)
+    if part.hole_mesh:
+        part = _fitted(part)
+    given = top.table("symmetry")
+    return replace(part, mirror=_mirror(given)) if "mirror" in given.data else part
+
+
+def _mirror(given: TomlTable) -> tuple[str, ...]:
+    return given.strings("mirror") if given.data["mirror"] else ()
+
+
+def _hole_fields(hole: TomlTable, path: Path, shape: str) -> dict[str, Any]:
+    """The fields of a part that describe its hole; with a mesh, the clearance is that of the cuboid for now."""
+    if "file" not in hole.check_keys((*_OUTLINE_HOLE, *_MESH_HOLE)).data:
+        hole.check_keys(_OUTLINE_HOLE)
+        both = shape != "box" or not isinstance(hole.data.get("clearance"), list)
+        clearance = (hole.number("clearance"),) * 2 if both else hole.numbers("clearance", 2)
+        return {"clearance": clearance, "depth": hole.number("depth", CUBOID.depth)}
+    hole.check_keys(_MESH_HOLE)
+    from gelflow.sim.tasks.parts import mesh_file
+
+    file, scale = (path.parent / hole.string("file")).resolve(), hole.number("scale", 1.0, minimum=1e-9)
+    z = mesh_file.load_mesh(file, scale).vertices[:, 2]
+    height = round(float(z.max() - z.min()), 9)
+    depth = hole.number("depth", height)
+    if depth > height:
+        raise UsageError(f"{hole.location}: depth must be at most {height:g}, the height of the mesh, got {depth:g}")
+    return {"depth": depth, "hole_mesh": mesh_file.file_digest(file), "hole_scale": scale, "hole_file": str(file)}
+
+
+def _fitted(part: Part) -> Part:
+    """`part` with what follows from the mesh of its hole: twice the smallest gap as clearance, and common symmetry."""
+    from gelflow.sim.tasks.parts.hole_mesh import mirror_axes, smallest_gap
+    from gelflow.sim.tasks.parts.registry import part_geometry
+
+    geometry = part_geometry(part)
+    gap = round(smallest_gap(geometry.outline, geometry.hole), 6)
+    if gap <= 0:
+        raise UsageError(
+            f"the part overlaps the mesh of its hole by {-1e3 * gap:.2f} mm; x and y of the mesh must be those of the "
+            "part in the hole"
+        )
+    mirror = tuple(axis for axis in part.mirror if axis in mirror_axes(geometry.hole))
+    return replace(part, clearance=(2 * gap, 2 * gap), mirror=mirror)
+
+
+def _read_solid(top: TomlTable, path: Path, shape: str, hole: dict[str, Any]) -> Part:
+    """A part that is a box or a cylinder."""
+    table = top.table("part")
     if shape == "box":
         x, y, z = table.numbers("size", 3)
-        clearance = hole.numbers("clearance", 2) if isinstance(hole.data.get("clearance"), list) else _both(hole)
-        symmetry, volume = 4 if x == y and clearance[0] == clearance[1] else 2, x * y * z
+        square = x == y and "clearance" in hole and hole["clearance"][0] == hole["clearance"][1]
+        symmetry, volume = 4 if square else 2, x * y * z
     else:
         x = y = table.number("diameter", minimum=0)
-        z, clearance, symmetry = table.number("height", minimum=0), _both(hole), 0
+        z, symmetry = table.number("height", minimum=0), 0
         volume = math.pi * x * x / 4 * z
+    top.table("symmetry").check_keys(("mirror",))
     return Part(
         name=top.string("name", path.stem),
         shape=shape,
         size=(x, y, z),
         grasp_width=x,
         density=_density(table, volume),
-        clearance=(clearance[0], clearance[1]),
-        depth=hole.number("depth", CUBOID.depth),
-        symmetry=symmetry,
         grasp_height=_pair(top.table("grasp").check_keys(("height",)), "height", CUBOID.grasp_height),
+        symmetry=symmetry,
+        **hole,
     )
 
 
-def _read_mesh_part(top: TomlTable, path: Path) -> Part:
+def _read_mesh_part(top: TomlTable, path: Path, hole: dict[str, Any]) -> Part:
     """A part whose shape is a mesh; size, grasp width and symmetry are found from it, unless the file gives them."""
-    from gelflow.sim.tasks.parts import mesh_part
+    from gelflow.sim.tasks.parts import mesh_file, mesh_part
 
-    table, hole = top.table("part"), top.table("hole").check_keys(("clearance", "depth"))
+    table = top.table("part")
     file = (path.parent / table.string("file")).resolve()
     scale = table.number("scale", 1.0, minimum=1e-9)
     grasp = _pair(top.table("grasp").check_keys(("height",)), "height", CUBOID.grasp_height)
-    mesh = mesh_part.load_part_mesh(file, scale)
+    mesh, centre = mesh_part.centred(mesh_file.load_mesh(file, scale))
     left, right = mesh_part.grasped_sides(mesh, grasp)
     x, y, z = (float(extent) for extent in mesh.vertices.max(0) - mesh.vertices.min(0))
+    if "hole_mesh" in hole:
+        hole = {**hole, "hole_origin": (round(float(centre[0]) + (left + right) / 2, 9), round(float(centre[1]), 9))}
     given = top.table("symmetry").check_keys(("rotations", "mirror"))
     symmetry, mirror = (1, ()) if len(given.data) == 2 else mesh_part.found_symmetry(mesh, file.name)
-    if "mirror" in given.data:
-        mirror = given.strings("mirror") if given.data["mirror"] else ()
     return Part(
         name=top.string("name", path.stem),
         shape="mesh",
         size=(x, y, z),
         grasp_width=right - left,
         density=_density(table, mesh.volume()),
-        clearance=_both(hole),
-        depth=hole.number("depth", CUBOID.depth),
         grasp_height=grasp,
         symmetry=given.integer("rotations", symmetry, minimum=0),
         mirror=mirror,
-        mesh=mesh_part.file_digest(file),
+        mesh=mesh_file.file_digest(file),
         mesh_file=str(file),
         mesh_scale=scale,
+        **hole,
     )
 
 
@@ -106,11 +154,6 @@ def _density(table: TomlTable, volume: float) -> float:
     if "density" in table.data:
         raise UsageError(f"{table.location}: give either mass or density")
     return table.number("mass") / volume if volume > 0 else 0.0
-
-
-def _both(hole: TomlTable) -> tuple[float, float]:
-    clearance = hole.number("clearance")
-    return clearance, clearance
 
 
 def _pair(table: TomlTable, key: str, default: tuple[float, float]) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from gelflow.sim.scene import Scene
 from gelflow.sim.scene.contacts import ContactDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.sim.tasks.parts.geometry import PartGeometry
+from gelflow.sim.tasks.parts.hole_mesh import mesh_hole_grid
 from gelflow.sim.tasks.parts.outline import hole_grid
 from gelflow.sim.tasks.parts.registry import part_geometry
 
@@ -29,8 +30,8 @@ _WALL_HALF_THICKNESS = 20e-3
 def with_part(scene: Scene, part: Part) -> Scene:
     """`scene`, which is the insertion scene with the cuboid, with `part` and its hole.
 
-    The walls of the hole of a box are four boxes; every other hole is one signed distance grid. Raises UsageError when
-    a mesh cannot be read.
+    The walls of the hole of a box are four boxes; every other hole is one signed distance grid, also a mesh around the
+    hole of a box. Raises UsageError when a mesh cannot be read.
     """
     if part == CUBOID:
         return scene
@@ -39,7 +40,9 @@ def with_part(scene: Scene, part: Part) -> Scene:
     shapes = tuple(geometry.shape(shape) if shape.name == "part" else shape for shape in scene.shapes)
     points = tuple(geometry.points(p) if p.name == "part" else p for p in scene.points)
     scene = replace(scene, bodies=bodies, shapes=shapes, points=points, q0=_start(scene, part))
-    return _with_walls(scene, part) if part.shape == "box" else _with_grid(scene, geometry)
+    if part.shape == "box" and not part.hole_mesh:
+        return _with_walls(scene, part)
+    return _with_grid(scene, geometry)
 
 
 def _start(scene: Scene, part: Part) -> NDArray[np.float64]:
@@ -72,7 +75,8 @@ def _with_walls(scene: Scene, part: Part) -> Scene:
 
 def _with_grid(scene: Scene, geometry: PartGeometry) -> Scene:
     """One distance grid in place of the walls."""
-    grid = hole_grid(geometry.hole, geometry.part.depth, HOLE_SPACING)
+    part = geometry.part
+    grid = mesh_hole_grid(part, HOLE_SPACING) if part.hole_mesh else hole_grid(geometry.hole, part.depth, HOLE_SPACING)
     first = next(shape for shape in scene.shapes if shape.name in WALLS)
     hole = replace(first, name=HOLE, kind="mesh", pose=Pose(), size=np.array([1.0, 0.0, 0.0]), grid=grid)
     shapes = tuple(shape for shape in scene.shapes if shape.name not in WALLS)

@@ -10,7 +10,8 @@ from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.parts import load_part, part_geometry, with_part
-from gelflow.sim.tasks.parts.mesh_part import MeshPart, found_symmetry, grasped_sides, picture
+from gelflow.sim.tasks.parts.mesh_part import MeshPart, found_symmetry, grasped_sides
+from gelflow.sim.tasks.parts.mesh_picture import picture
 from gelflow.sim.tasks.parts.shipped_meshes import connector, hexagon, obj_text, prism
 from gelflow.task import InsertionTask
 
