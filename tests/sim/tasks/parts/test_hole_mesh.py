@@ -31,7 +31,7 @@ def octagon(radius: float) -> np.ndarray:
     return np.asarray(corners * radius / np.cos(np.radians(22.5)))
 
 
-def block(opening: np.ndarray, height: float = 25.0, *, radius: float = 28.0) -> TriangleMesh:
+def block(opening: np.ndarray, height: float = 25.0, *, radius: float = 20.0) -> TriangleMesh:
     """A round block [mm] with a convex opening from top to bottom."""
     count, centre = len(opening), opening.mean(0)
     outward = opening - centre
@@ -72,7 +72,7 @@ def test_the_mesh_of_a_hole_equals_the_outline_with_the_same_clearance(tmp_path:
     corners = np.array([[-10, -15], [10, -15], [10, 15], [-10, 15]], dtype=float)
     shift = np.array([4.0, -7.0])
     (tmp_path / "part.obj").write_text(obj_text(prism(corners + shift, 60.0)))
-    mesh = block(corners * [1.1, 1.2])
+    mesh = block(corners * [1.1, 1.2], radius=30.0)
     mesh = TriangleMesh(mesh.vertices + np.array([*shift, 12.0]), mesh.faces)
     text = PEG.replace('"cylinder"\ndiameter = 0.020\nheight = 0.060', '"mesh"\nfile = "part.obj"\nscale = 0.001')
     part = load_part(written(tmp_path, mesh, text)).part
@@ -115,7 +115,7 @@ def test_a_description_names_its_hole_by_the_digest(tmp_path: Path) -> None:
 )
 def test_an_impossible_hole_is_refused(tmp_path: Path, opening: np.ndarray, text: str, message: str) -> None:
     with pytest.raises(UsageError, match=message) as error:
-        load_part(written(tmp_path, block(opening), text))
+        load_part(written(tmp_path, block(opening, radius=40.0), text))
     assert "\n" not in str(error.value)
 
 
