@@ -152,7 +152,7 @@ def collect(
 
 
 def part_tolerance(task: InsertionTask) -> tuple[float, float, float]:
-    """The gap beside the part in x and y, but at least 1.5 mm [m], and the yaw that moves a corner by the smaller [rad].
+    """The gap beside the part in x and y, at least 1.5 mm [m], and the yaw that moves a corner by the smaller [rad].
 
     In a narrow hole, the first attempts of a part show the direction of its misalignment and hardly its length. A loss
     that is bounded within such a gap is flat over most of the lengths that are possible.
