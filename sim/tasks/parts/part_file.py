@@ -127,7 +127,8 @@ def _read_mesh_part(top: TomlTable, path: Path, hole: dict[str, Any]) -> Part:
     grasp = _pair(top.table("grasp").check_keys(("height",)), "height", CUBOID.grasp_height)
     mesh, centre = mesh_part.centred(mesh_file.load_mesh(file, scale))
     left, right = mesh_part.grasped_sides(mesh, grasp)
-    x, y, z = (float(extent) for extent in mesh.vertices.max(0) - mesh.vertices.min(0))
+    # Rounded: a description, and thus the checkpoints for it, must be equal on computers with other arithmetic.
+    x, y, z = (round(float(extent), 9) for extent in mesh.vertices.max(0) - mesh.vertices.min(0))
     if "hole_mesh" in hole:
         hole = {**hole, "hole_origin": (round(float(centre[0]) + (left + right) / 2, 9), round(float(centre[1]), 9))}
     given = top.table("symmetry").check_keys(("rotations", "mirror"))
@@ -136,8 +137,8 @@ def _read_mesh_part(top: TomlTable, path: Path, hole: dict[str, Any]) -> Part:
         name=top.string("name", path.stem),
         shape="mesh",
         size=(x, y, z),
-        grasp_width=right - left,
-        density=_density(table, mesh.volume()),
+        grasp_width=round(right - left, 9),
+        density=round(_density(table, mesh.volume()), 6),
         grasp_height=grasp,
         symmetry=given.integer("rotations", symmetry, minimum=0),
         mirror=mirror,

@@ -1,5 +1,6 @@
 """The simulated cell with a part of one's own."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from tests.hardware_mocks.simulated_cell.harness import aligned_pose, go
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig, preset_config
-from gelflow.hardware_mocks.simulated_cell.world import World, load_world, training_world
+from gelflow.hardware_mocks.simulated_cell.world import Hole, World, load_world, training_world
 from gelflow.session.records import from_plain, to_plain
 from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
@@ -40,6 +41,15 @@ def test_the_world_of_a_part_has_its_hole_and_mass(tmp_path: Path) -> None:
 def test_a_configuration_with_a_part_reaches_the_process_of_the_cell() -> None:
     config = preset_config("fast", seed=4, task=PEG)
     assert from_plain(SimulatedCellConfig, to_plain(config), what="cell").task == PEG
+
+
+def test_a_world_cannot_change_the_clearance_of_a_hole_that_is_a_mesh() -> None:
+    task = dataclasses.replace(PEG, part=dataclasses.replace(PEG.part, hole_mesh="0" * 64))
+    config = dataclasses.replace(
+        preset_config(None, seed=1, task=PEG), task=task, world=World(hole=Hole(clearance=(2e-3, 2e-3)))
+    )
+    with pytest.raises(UsageError, match="hole of this part is a mesh"):
+        SimulatedCell(ScaledClock(), config)
 
 
 def test_a_peg_is_grasped_shows_its_weight_and_is_inserted() -> None:
