@@ -129,6 +129,11 @@ def test_the_tolerance_is_the_gap_and_the_yaw_of_a_corner() -> None:
     assert x == y == 2.25e-3 and np.hypot(17.5, 25) * yaw == pytest.approx(2.25)
 
 
+def test_the_tolerance_in_a_narrow_hole_is_wider_than_its_gap() -> None:
+    narrow = insertion_task(dataclasses.replace(CUBOID, clearance=(1e-3, 8e-3)))
+    assert part_tolerance(narrow)[:2] == (1.5e-3, 4e-3)
+
+
 def test_the_bounded_loss_prefers_a_mode_and_the_other_one_the_mean() -> None:
     modes = torch.tensor([[-4.0, 0, 0], [-4.0, 0, 0], [4.0, 0, 0]])
     at_mode, at_mean = torch.tensor([-4.0, 0, 0]), modes.mean(0)
