@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from tests.policies.toy_tasks import PointTask
 
+from gelflow.cli.commands.training.task_training import TASKS
 from gelflow.cli.main import main
-from gelflow.cli.task_training import TASKS
 from gelflow.errors import UsageError
 from gelflow.policies.episodes import Episodes, run_episodes
 from gelflow.policies.evaluation_report import OraclePolicy, evaluate_all, failure_ranges

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gelflow.cli.main import COMMANDS, main
+from gelflow.cli.main import COMMANDS, command_module, main
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = ("README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md")))
@@ -43,7 +43,7 @@ def shell_lines(document: str) -> Iterator[list[str]]:
 def command_parser(command: str) -> argparse.ArgumentParser:
     """The argument parser of a sub-command."""
     parser = argparse.ArgumentParser(prog=f"gelflow {command}")
-    importlib.import_module(f"gelflow.cli.commands.{command.replace('-', '_')}").configure(parser)
+    command_module(command).configure(parser)
     return parser
 
 

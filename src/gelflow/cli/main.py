@@ -1,7 +1,7 @@
 """Entry point of the `gelflow` command: runs a sub-command and prints any gelflow error as one line.
 
-A sub-command is a module of `gelflow.cli.commands` with `configure(parser)` and `run(args) -> int`. Only the requested
-one is imported, so that `gelflow --help` loads neither torch nor OpenCV.
+A sub-command is a module below `gelflow.cli.commands` with `configure(parser)` and `run(args) -> int`. Only the
+requested one is imported, so that `gelflow --help` loads neither torch nor OpenCV.
 """
 
 import argparse
@@ -10,13 +10,14 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 from gelflow import __version__
 from gelflow.cli.exit_codes import ERROR, INTERRUPTED, NEGATIVE_RESULT, SIGNALLED
 from gelflow.errors import GelflowError
 from gelflow.interrupts import Interrupted
 
-# Command → description in one line. Its module is gelflow.cli.commands.<command>, with _ for -.
+# Command → description in one line. Its module is gelflow.cli.commands.<command>, with _ for -, see `_FOLDERS`.
 COMMANDS = {
     "train": "train a policy in simulation",
     "sweep": "train many configurations and seeds on this machine, a Ray cluster or SLURM",
@@ -36,6 +37,15 @@ COMMANDS = {
     "demo": "insert five parts with the mock robot, with pictures and a recorded session",
 }
 
+# Commands whose modules are in a folder of gelflow.cli.commands.
+_FOLDERS = {"train": "training", "sweep": "training", "eval": "training"}
+
+
+def command_module(name: str) -> ModuleType:
+    """Imports the module of a command."""
+    path = [*([_FOLDERS[name]] if name in _FOLDERS else []), name.replace("-", "_")]
+    return importlib.import_module(".".join(["gelflow.cli.commands", *path]))
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
@@ -48,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         if name == requested:
-            module = importlib.import_module(f"gelflow.cli.commands.{name.replace('-', '_')}")
+            module = command_module(name)
             module.configure(sub)
     args = parser.parse_args(arguments)
     assert module is not None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
+from gelflow.cli.commands.training.task_training import DEFAULT_RECIPE, TASKS, refuse, train_task
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
     add_json,
@@ -19,7 +20,6 @@ from gelflow.cli.options import (
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
-from gelflow.cli.task_training import DEFAULT_RECIPE, TASKS, refuse, train_task
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:

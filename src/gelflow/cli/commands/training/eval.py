@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from gelflow.cli.commands.training.task_training import TASKS, evaluate_task, refuse
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
     add_checkpoint,
@@ -21,7 +22,6 @@ from gelflow.cli.options import (
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
-from gelflow.cli.task_training import TASKS, evaluate_task, refuse
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 from rich.progress import Progress
 
-from gelflow.cli.commands import train
-from gelflow.cli.commands.sweep.table import summary_table
+from gelflow.cli.commands.training import train
+from gelflow.cli.commands.training.sweep.table import summary_table
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_json, add_out, check_at_least
 from gelflow.cli.output import Output, progress_bar
