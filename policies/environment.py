@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.environments import InsertionVectorEnv
 from gelflow.sim.tasks.insertion import RANDOMIZATIONS
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import INSERTION, InsertionTask
 
 Array = NDArray[np.float64]
@@ -124,6 +125,14 @@ class PolicyEnv:
         return self.noise.apply(images, self._part_noise, self._rng)
 
 
+def insertion_randomization(name: str, task: InsertionTask) -> Randomization:
+    """The table `name` of `RANDOMIZATIONS`, with the grasp height of the task's part. Raises UsageError if unknown."""
+    if name not in RANDOMIZATIONS:
+        raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {name!r}")
+    table = RANDOMIZATIONS[name]
+    return table if name == "nominal" else table.replace(grasp_height=task.part.grasp_height)
+
+
 def make_insertion_env(
     count: int,
     *,
@@ -134,12 +143,8 @@ def make_insertion_env(
 ) -> PolicyEnv:
     """`count` parallel simulated insertions with domain randomization and `noise` on the flow maps.
 
-    `preset` is a preset of the insertion scene, `randomization` one of `RANDOMIZATIONS`; its grasp height is that of
-    the task's part. Raises UsageError for unknown names.
+    `preset` is a preset of the insertion scene; for `randomization` see `insertion_randomization`. Raises UsageError
+    for unknown names.
     """
-    if randomization not in RANDOMIZATIONS:
-        raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {randomization!r}")
-    table = RANDOMIZATIONS[randomization]
-    if randomization != "nominal":
-        table = table.replace(grasp_height=task.part.grasp_height)
+    table = insertion_randomization(randomization, task)
     return PolicyEnv(InsertionVectorEnv(count, task=task, preset=preset, randomization=table), task, noise)

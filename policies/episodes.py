@@ -1,12 +1,13 @@
 """Complete episodes of a policy on a task, for evaluations: their success, length, return and randomized quantities.
 
-An episode counts from its reset. Where a task makes a first attempt before the policy acts (grasp, insertion), an
-episode that this attempt ends counts too; `steps` are the actions of the policy, `attempts` are one more.
+The length of an episode is counted in `TaskBatch.length_unit`. Attempts include the first one, which the task makes
+before the policy acts; an episode that it ends counts too, as in the paper. Corrections do not include it; an episode
+that needs none is drawn again, as in training.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,27 +15,38 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy
-from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Episodes:
     """The episodes of an evaluation; arrays over the episodes, in the order of the environments."""
 
-    success: NDArray[np.bool_]
-    failed: NDArray[np.bool_]  # the simulation failed
-    steps: NDArray[np.int64]  # actions of the policy
+    success: Mask
+    failed: Mask  # the simulation failed
+    length: NDArray[np.int64]
     reward: Array  # return
     quantities: dict[str, Array] = field(default_factory=dict)  # randomized quantities
+    quantity_units: dict[str, str] = field(default_factory=dict)
+    length_unit: str = "steps"
 
-    def result(self, name: str, first: int) -> EvaluationResult:
-        """Means; `first` is the number of attempts before the first action."""
-        steps = self.steps[self.success] + first
-        mean = float(steps.mean()) if len(steps) else float("nan")
-        return EvaluationResult(name, len(self.success), int(self.success.sum()), mean, float(self.reward.mean()))
+    def result(self, name: str) -> EvaluationResult:
+        """Means over the episodes."""
+        lengths = self.length[self.success]
+        mean = float(lengths.mean()) if len(lengths) else float("nan")
+        counts = len(self.success), int(self.success.sum())
+        return EvaluationResult(name, *counts, mean, float(self.reward.mean()), self.length_unit)
+
+
+@dataclass
+class Film:
+    """Pictures of one episode of an evaluation: the first one after its reset, then one after each step."""
+
+    episode: int  # index in the arrays of `Episodes`
+    frames: list[NDArray[np.uint8]] = field(default_factory=list)
 
 
 class RandomPolicy(BatchPolicy):
@@ -44,7 +56,7 @@ class RandomPolicy(BatchPolicy):
         self._count, self._reach = count, reach
         self._rng = np.random.default_rng([seed, 2])
 
-    def reset(self, which: NDArray[np.bool_]) -> None:
+    def reset(self, which: Mask) -> None:
         """Does nothing: random actions have no memory."""
 
     def act(self, observations: NDArray[Any]) -> Array:
@@ -52,9 +64,23 @@ class RandomPolicy(BatchPolicy):
         return self._rng.uniform(-self._reach, self._reach, (self._count, len(self._reach)))
 
 
+class OraclePolicy(BatchPolicy):
+    """The actions of `TaskBatch.oracle`, which knows the true state."""
+
+    def __init__(self, task: TaskBatch) -> None:
+        self._task = task
+
+    def reset(self, which: Mask) -> None:
+        """Does nothing: the true state is enough."""
+
+    def act(self, observations: NDArray[Any]) -> Array:
+        """Actions (n, k) of the oracle."""
+        return np.asarray(self._task.oracle())
+
+
 def evaluate_task(name: str, policy: BatchPolicy, task: TaskBatch, *, episodes: int, seed: int) -> EvaluationResult:
     """The means of `run_episodes`."""
-    return run_episodes(policy, task, episodes=episodes, seed=seed).result(name, first_attempts(task))
+    return run_episodes(policy, task, episodes=episodes, seed=seed).result(name)
 
 
 def run_episodes(
@@ -66,43 +92,83 @@ def run_episodes(
     `seed` determines the episodes; `report` is called with the number of those that ended. Raises UsageError when
     episodes < 1.
     """
+    rows: list[list[tuple[Any, ...]]] = [[] for _ in range(task.num_envs)]
+    first = 1 if task.length_unit == "attempts" else 0
+    length, reward = np.zeros(task.num_envs, dtype=np.int64), np.zeros(task.num_envs)
+    for event, which in _play(policy, task, episodes=episodes, seed=seed):
+        if event == "start":
+            length[which], reward[which] = first, 0
+        elif event == "step":
+            length[which] += 1
+            reward[which] += task.reward[which]
+        else:
+            for row in np.flatnonzero(which):
+                drawn = [values[row] for values in task.quantities.values()]
+                success, failed = task.info["success"][row], task.info["failed"][row]
+                rows[row].append((success, failed, length[row], reward[row], *drawn))
+            if report:
+                report(sum(map(len, rows)))
+    columns = zip(*(row for of_env in rows for row in of_env), strict=True)
+    success, failed, lengths, returns, *drawn = columns
+    table = {name: np.array(values, dtype=float) for name, values in zip(task.quantities, drawn, strict=True)}
+    return Episodes(
+        np.array(success, bool),
+        np.array(failed, bool),
+        np.array(lengths),
+        np.array(returns),
+        table,
+        dict(task.quantity_units),
+        task.length_unit,
+    )
+
+
+def record_films(
+    policy: BatchPolicy, task: TaskBatch, films: Sequence[Film], *, episodes: int, seed: int, max_frames: int
+) -> None:
+    """Repeats the episodes of `run_episodes` with a new policy of the same network, until all `films` have ended."""
+    first = np.cumsum([0, *_quota(task.num_envs, episodes)])
+    present = first[:-1].copy()  # index of the present episode of each environment
+    waiting = {film.episode: film for film in films}
+    for event, which in _play(policy, task, episodes=episodes, seed=seed):
+        for row in np.flatnonzero(which):
+            film = waiting.get(int(present[row]))
+            if film and event != "end" and len(film.frames) < max_frames:
+                film.frames.append(task.render(int(row)))
+            if film and event == "end":
+                del waiting[film.episode]
+        if event == "end":
+            present[which] += 1
+        if not waiting:
+            return
+
+
+def _quota(count: int, episodes: int) -> NDArray[np.int64]:
+    """Number of episodes of each of `count` environments."""
+    return np.full(count, episodes // count) + (np.arange(count) < episodes % count)
+
+
+def _play(
+    policy: BatchPolicy, task: TaskBatch, *, episodes: int, seed: int
+) -> Iterator[tuple[Literal["start", "step", "end"], Mask]]:
+    """Plays `episodes` episodes; yields what has happened in which environments (N,)."""
     if episodes < 1:
         raise UsageError(f"episodes must be at least 1, got {episodes}")
-    n = task.num_envs
-    left = np.full(n, episodes // n) + (np.arange(n) < episodes % n)
+    left = _quota(task.num_envs, episodes)
     rng = np.random.default_rng([seed, 1])
-    rows: list[list[tuple[Any, ...]]] = [[] for _ in range(n)]
-    steps, reward = np.zeros(n, dtype=np.int64), np.zeros(n)
+    keep_ended = task.length_unit != "corrections"
     starting = active = left > 0
     while active.any():
         if starting.any():
-            task.reset(starting, rng, keep_ended=True)
+            task.reset(starting, rng, keep_ended=keep_ended)
             policy.reset(starting)
-            steps[starting] = reward[starting] = 0
+            yield "start", starting
         ended = active & (task.terminated | task.truncated)
         if not ended.any():
             task.step(policy.act(task.observation.copy()), rng, active=active)
-            steps[active] += 1
-            reward[active] += task.reward[active]
+            yield "step", active
             ended = active & (task.terminated | task.truncated)
-        for row in np.flatnonzero(ended):
-            drawn = {key: values[row] for key, values in quantities(task).items()}
-            rows[row].append((task.info["success"][row], task.info["failed"][row], steps[row], reward[row], drawn))
+        if ended.any():
+            yield "end", ended
         left = left - ended
         active = left > 0
         starting = ended & active
-        if report and ended.any():
-            report(episodes - int(left.sum()))
-    success, failed, made, returns, drawn_rows = zip(*(row for of_env in rows for row in of_env), strict=True)
-    table = {key: np.array([values[key] for values in drawn_rows], dtype=float) for key in drawn_rows[0]}
-    return Episodes(np.array(success, bool), np.array(failed, bool), np.array(made), np.array(returns), table)
-
-
-def quantities(task: TaskBatch) -> dict[str, Array]:
-    """The randomized quantities of the present episodes: name → (N,)."""
-    return {name: np.asarray(values, dtype=float) for name, values in getattr(task, "quantities", {}).items()}
-
-
-def first_attempts(task: TaskBatch) -> int:
-    """Attempts of an episode before the first action: 1 for tasks of attempts, 0 for tasks of control."""
-    return 1 if isinstance(task, AttemptTask) else 0

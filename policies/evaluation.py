@@ -1,6 +1,7 @@
 """Evaluation of policies over complete episodes."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,9 @@ class EvaluationResult:
     name: str
     episodes: int
     successes: int
-    attempts: float  # mean over the successful episodes; nan without any
+    length: float  # mean length of the successful episodes; nan without any
     reward: float  # mean return
+    length_unit: str = "corrections"  # "steps"; "attempts", the first included; or "corrections" between attempts
 
     @property
     def success(self) -> float:
@@ -33,6 +35,18 @@ class EvaluationResult:
         middle = (self.success + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * np.sqrt(self.success * (1 - self.success) / n + z * z / (4 * n * n))
         return max(0.0, middle - half), min(1.0, middle + half)
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON data; the length is stored under the name of its unit."""
+        return {
+            "name": self.name,
+            "episodes": self.episodes,
+            "successes": self.successes,
+            "success": self.success,
+            "success_95": list(self.confidence_interval()),
+            self.length_unit: self.length if self.successes else None,
+            "reward": self.reward,
+        }
 
 
 class NetworkActor:

@@ -353,7 +353,7 @@ class _Run:
         episodes = min(settings.evaluate_episodes, settings.attempts)  # limits the evaluations of short runs
         seed = settings.seed + 1_000_003  # differs from the seeds of the training
         result = evaluate("validation", actor, validation, episodes=episodes, seed=seed)
-        if self._best is None or (result.success, -result.attempts) > (self._best.success, -self._best.attempts):
+        if self._best is None or (result.success, -result.length) > (self._best.success, -self._best.length):
             self._best = result
             self._save(result)
         last = self._points[-1]
@@ -368,7 +368,7 @@ class _Run:
             "settings": {k: None if v == float("inf") else v for k, v in dataclasses.asdict(self.settings).items()},
             "noise": None if noise is None else dataclasses.asdict(noise),
             "attempts": self.attempts,
-            "validation": {"episodes": result.episodes, "success": result.success, "attempts": result.attempts},
+            "validation": result.to_json(),
             "versions": {"torch": str(torch.__version__)},
         }
         checkpoint.save_checkpoint(

@@ -49,7 +49,7 @@ def create_folder(out: Path) -> None:
         raise UsageError(f"cannot write into {out}: {error.strerror}") from error
 
 
-COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated attempts")
+COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated corrections")
 
 
 def write_table(path: Path, points: Sequence[LearningCurvePoint]) -> None:
@@ -58,7 +58,7 @@ def write_table(path: Path, points: Sequence[LearningCurvePoint]) -> None:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for p in points:
-            tail = [f"{p.evaluation.success:.4f}", f"{p.evaluation.attempts:.3f}"] if p.evaluation else ["", ""]
+            tail = [f"{p.evaluation.success:.4f}", f"{p.evaluation.length:.3f}"] if p.evaluation else ["", ""]
             numbers = [f"{value:.4f}" for value in (p.minutes, p.reward, p.success, p.spread)]
             writer.writerow([p.attempts, *numbers, *tail])
 

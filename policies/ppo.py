@@ -287,7 +287,7 @@ class _TrainingCallback(BaseCallback):
                 "settings": _to_json(settings),
                 "noise": None if run.noise is None else dataclasses.asdict(run.noise),
                 "attempts": self.num_timesteps,
-                "validation": {"episodes": result.episodes, "success": result.success, "attempts": result.attempts},
+                "validation": result.to_json(),
                 "versions": {"torch": str(torch.__version__), "stable_baselines3": stable_baselines3.__version__},
             }
             path = run.out / curve.CHECKPOINT

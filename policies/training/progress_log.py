@@ -9,7 +9,7 @@ from gelflow.policies.evaluation import EvaluationResult
 
 TABLE, LOGS = "progress.csv", "tensorboard"
 _TIMES = ("steps", "minutes", "simulation_s", "learning_s", "evaluation_s")
-EVALUATION = ("evaluated_success", "success_low", "success_high", "evaluated_attempts", "evaluated_reward")
+EVALUATION = ("evaluated_success", "success_low", "success_high", "evaluated_length", "evaluated_reward")
 
 
 class ProgressLog:
@@ -38,7 +38,7 @@ class ProgressLog:
         row |= {name: seconds.get(name.removesuffix("_s"), 0.0) for name in _TIMES[2:]}
         row |= numbers
         if evaluation is not None:
-            values = (evaluation.success, *evaluation.confidence_interval(), evaluation.attempts, evaluation.reward)
+            values = (evaluation.success, *evaluation.confidence_interval(), evaluation.length, evaluation.reward)
             row |= dict(zip(EVALUATION, values, strict=True))
         self._writer.writerow({"steps": steps, **{name: f"{value:.6g}" for name, value in row.items()}})
         self._file.flush()

@@ -63,6 +63,11 @@ class TrainingResult:
         """The best policy on the validation episodes."""
         return self.folder / POLICY
 
+    @property
+    def curve(self) -> Path:
+        """The numbers after each update, as a table."""
+        return self.folder / PROGRESS
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -95,6 +100,19 @@ class TrainingRun:
     report: Callable[[Progress], None] | None = None
     _best: EvaluationResult | None = field(default=None, init=False)
     _seconds: float = field(default=0.0, init=False)  # of earlier processes
+
+    @property
+    def checkpoint(self) -> Path:
+        """The best policy on the validation episodes, once there is one."""
+        return self.folder / POLICY
+
+    def is_finished(self) -> bool:
+        """Whether the folder holds the result of this run. Raises UsageError when it holds another run."""
+        if not (self.folder / CONFIGURATION).exists():
+            return False
+        stored = read_configuration(self.folder)
+        self._check_same(stored)
+        return bool(stored["finished"])
 
     def train(self) -> TrainingResult:
         """Trains until the steps or the minutes are used up, resuming an unfinished run of the same configuration.
@@ -149,7 +167,7 @@ class TrainingRun:
                 architecture=learner.architecture,
                 tensors=tensors,
                 training={**self._configuration(), "command": list(self.command), "steps": learner.steps}
-                | {"validation": _result_json(result)},
+                | {"validation": result.to_json()},
             )
         return result
 
@@ -167,18 +185,13 @@ class TrainingRun:
     def _prepare(self) -> None:
         """Checks the folder against the configuration, and restores the state of an unfinished run."""
         path = self.folder / CONFIGURATION
-        configuration = json.loads(json.dumps(self._configuration()))
         if path.exists():
             stored = read_configuration(self.folder)
             if stored["finished"]:
                 raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
-            if different := task_differences(_flat(stored["configuration"]), _flat(configuration)):
-                raise UsageError(
-                    f"{self.folder} holds an unfinished run with other settings: {different}; choose another folder, "
-                    "or repeat its command to resume it"
-                )
+            self._check_same(stored)
         else:
-            self._write_configuration(configuration, finished=False)
+            self._write_configuration(self._configuration(), finished=False)
         if (self.folder / STATE).exists():
             state = load_state(self.folder / STATE)
             self.learner.load(state)
@@ -186,6 +199,15 @@ class TrainingRun:
             self._seconds = state.values["run"]["seconds"]
             self._best = EvaluationResult(**state.values["run"]["best"])
             self.learner.restart_episodes()
+
+    def _check_same(self, stored: Mapping[str, Any]) -> None:
+        configuration = json.loads(json.dumps(self._configuration()))
+        if different := task_differences(_flat(stored["configuration"]), _flat(configuration)):
+            kind = "a finished" if stored["finished"] else "an unfinished"
+            advice = "delete it" if stored["finished"] else "repeat its command to resume it"
+            raise UsageError(
+                f"{self.folder} holds {kind} run with other settings: {different}; choose another folder, or {advice}"
+            )
 
     def _save(self, start: float) -> None:
         state = self.learner.state()
@@ -245,10 +267,6 @@ def read_configuration(folder: Path) -> dict[str, Any]:
     if version > FORMAT:
         raise UsageError(f"{path} has format {version}; this gelflow reads format {FORMAT}: update gelflow")
     return dict(stored)
-
-
-def _result_json(result: EvaluationResult) -> dict[str, Any]:
-    return {"episodes": result.episodes, "success": result.success, "attempts": result.attempts}
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -172,12 +172,6 @@ class CapRotation(ControlTask):
         self._thickness = 2 * cap.size[1]
         self._density = body.mass / (np.pi * cap.size[0] ** 2 * self._thickness)
 
-    @property
-    def quantities(self) -> dict[str, Array]:
-        """The randomized quantities of the present episodes, name → (N,)."""
-        names = ("center_x", "center_y", "radius", "damping")
-        return dict(zip(names, self.info["privileged"].T, strict=False))
-
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         check_options(self.description.name, options, _RESET_OPTIONS)
         sim, rows = self.sim, np.flatnonzero(which)
@@ -187,6 +181,8 @@ class CapRotation(ControlTask):
         center = option_rows("center", options["center"], which, (2,)) if "center" in options else center
         radius = option_rows("radius", options["radius"], which) if "radius" in options else drawn["radius"]
         damping = option_rows("damping", options["damping"], which) if "damping" in options else drawn["damping"]
+        drawn |= {"center_x": center[:, 0], "center_y": center[:, 1], "radius": radius, "damping": damping}
+        self._record(which, drawn, self.randomization)
         mass = self._density * np.pi * radius**2 * self._thickness
         across = mass * (3 * radius**2 + self._thickness**2) / 12
         values = {

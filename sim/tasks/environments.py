@@ -48,6 +48,7 @@ class Insertion(AttemptTask):
     """
 
     description: InsertionTask
+    length_unit = "corrections"
 
     def __init__(
         self,
@@ -101,6 +102,8 @@ class Insertion(AttemptTask):
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         self.attempts.draw(rng, which=which, misalignment=_misalignment(options, which))
+        start = dict(zip(("x", "y", "yaw"), self.attempts.pose[which].T, strict=True))
+        self._record(which, self.attempts.drawn | start, self.attempts.randomization, x="m", y="m", yaw="rad")
 
     def _move(self, actions: Array, active: Mask) -> None:
         task, pose = self.description, self.attempts.pose

@@ -168,7 +168,7 @@ class Grasp(AttemptTask):
             getattr(self.sim, name)[0] = values[index]
         info = {name: self.info[name][index] for name in ("attempts", "position", "tilt")}
         title = f"attempt {info['attempts']} at {info['position'] * 1e3:.0f} mm: tilt {info['tilt'] * 1e3:.0f} mrad"
-        return render_scene(self.sim, 0, title=title)
+        return render_scene(self.sim, 0, title=title, side="y")
 
     def _set_geometry(self) -> None:
         """Length of the bar, and the tables below its ends."""
@@ -192,6 +192,7 @@ class Grasp(AttemptTask):
         limit = self.bar.max_center_of_mass
         if (np.abs(drawn["center_of_mass"]) > limit + 1e-9).any() or (drawn["mass"] <= 0).any():
             raise UsageError(f"reset: center_of_mass must be within ±{limit:.4g} m, and mass positive")
+        self._record(which, drawn, self.randomization, center_of_mass="m", start="m")
         self._sensors.draw(which, drawn, rng)
         params = pad_parameters(drawn, elastic=self.scene.friction == "elastic")
         params |= self._draw_bar(which, drawn)

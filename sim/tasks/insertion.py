@@ -162,6 +162,7 @@ class InsertionAttempts:
         self._geometry = part_geometry(task.part)
         self._clear_height = max(_CLEAR_HEIGHT, task.part.depth + task.part.size[2])
         self.pose: Array = np.zeros((num_envs, 3))
+        self.drawn: dict[str, Array] = {}  # quantities of the latest `draw`, one value for each of its environments
         self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
         self._stop_shear: Array = np.full(num_envs, np.inf)
@@ -193,7 +194,7 @@ class InsertionAttempts:
         """
         chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
         rows = np.flatnonzero(chosen)
-        sampled = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
+        self.drawn = sampled = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
         params = simulator_parameters(sampled, elastic=self.scene.friction == "elastic")
         for name, values in hole_parameters(self.scene, params).items():
             self._param(name)[rows] = values

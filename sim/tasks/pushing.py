@@ -35,6 +35,7 @@ _RESET_OPTIONS = {
     "half_size": "x, y of the box [m]",
     "mass": "of the box [kg]",
 }
+_START_UNITS = {"goal_x": "m", "goal_y": "m", "goal_yaw": "rad", "offset": "m"}  # drawn beside the randomization
 
 
 @dataclass(frozen=True)
@@ -253,12 +254,6 @@ class Pushing(ControlTask):
         self._half_size = box.size[:2]
         self._steps_per_force = max(1, round(task.force_period / task.control_period))
 
-    @property
-    def quantities(self) -> dict[str, Array]:
-        """The randomized quantities of the present episodes, name → (N,)."""
-        names = ("goal_x", "goal_y", "goal_yaw", "half_size_x", "half_size_y", "mass")
-        return dict(zip(names, (*self.goal.T, *self.half_size.T, self.mass), strict=True))
-
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         task, rows = self.description, np.flatnonzero(which)
         check_options(task.name, options, _RESET_OPTIONS)
@@ -275,6 +270,11 @@ class Pushing(ControlTask):
         }
         for name, given in options.items():
             values[name] = option_rows(name, given, which, values[name].shape[1:])
+        drawn |= dict(zip(_START_UNITS, (*values["goal"].T, values["offset"]), strict=True))
+        drawn |= dict(
+            zip(("half_size_x", "half_size_y", "mass"), (*values["half_size"].T, values["mass"]), strict=True)
+        )
+        self._record(which, drawn, self.randomization, **_START_UNITS)
         periods = self._external_force.shape[1]
         force = rng.uniform(-task.force, task.force, (len(rows), periods, 2))
         self._external_force[rows] = force * (rng.random((len(rows), periods, 1)) >= task.no_force)

@@ -16,7 +16,6 @@ from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
 
-_VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes of the world along the picture's x and y
 _BODY_COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
 _WORLD_COLOR = "0.6"
 _MAX_ARROWS = 400  # of a pad; more are thinned out
@@ -32,10 +31,13 @@ class Mark:
     label: str
 
 
-def render_scene(sim: Simulator, index: int, *, title: str, marks: Sequence[Mark] = ()) -> NDArray[np.uint8]:
+def render_scene(
+    sim: Simulator, index: int, *, title: str, marks: Sequence[Mark] = (), side: str = "x"
+) -> NDArray[np.uint8]:
     """A picture of environment `index` of a simulator whose scene is a `Scene`; shape (height, width, 3).
 
-    Outlines of bodies from above and from the side, and of each pad the shear forces as arrows.
+    Outlines of bodies from above and from the side, and of each pad the shear forces as arrows. `side` is the
+    horizontal axis of the view from the side, "x" or "y".
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # deferred: slow to import
     from matplotlib.figure import Figure
@@ -47,7 +49,8 @@ def render_scene(sim: Simulator, index: int, *, title: str, marks: Sequence[Mark
     rows = max(1, len(scene.pads))
     left, right = figure.subfigures(1, 2, width_ratios=(3, 1.4 if rows < 3 else 1))
     poses = [Pose(pose[:3].astype(float), pose[3:].astype(float)) for pose in sim.poses()[index]]
-    for axes, (view, plane) in zip(left.subplots(1, 2), _VIEWS.items(), strict=True):
+    views = {"from above": (0, 1), "from the side": ("xy".index(side), 2)}  # axes of the world in each view
+    for axes, (view, plane) in zip(left.subplots(1, 2), views.items(), strict=True):
         _draw_bodies(axes, sim, index, poses, plane)
         for mark in marks:
             axes.plot(*(1e3 * mark.points[:, plane]).T, "k--", linewidth=1.2, label=mark.label)
@@ -131,7 +134,7 @@ def _draw_pad(axes: Any, pad: PadDef, forces: Array) -> None:
     colors = {"c": normal, "cmap": "Greys", "vmin": 0, "vmax": max(1e-6, normal.max(initial=0))}
     axes.scatter(right, down, s=8, edgecolors="0.8", linewidths=0.3, **colors)
     if largest > 0:
-        length = 0.12 * max(np.ptp(down), np.ptp(right)) / largest
+        length = 0.9 * float(np.sqrt(np.ptp(down) * np.ptp(right) / len(down))) / largest  # about the pitch
         axes.quiver(right, down, *(arrows[:, ::-1] * length).T, color=BLUE, angles="xy", scale_units="xy", scale=1)
     axes.set(aspect="equal", xticks=[], yticks=[])
     axes.set_title(f"{pad.name}: shear to {1e3 * largest:.3g} mN, normal {forces[:, 2].sum():.3g} N", fontsize=9)

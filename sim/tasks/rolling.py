@@ -144,11 +144,14 @@ class Rolling(ControlTask):
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         task, rows = self.description, np.flatnonzero(which)
         check_options(task.name, options, {"goal": "x, y from the ball's start [m]"})
-        self._sensors.draw(which, self.randomization.sample(rng, len(rows), friction=self.scene.friction), rng)
+        drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
+        self._sensors.draw(which, drawn, rng)
         distance, angle = rng.uniform(*task.goal_distance, len(rows)), rng.uniform(-np.pi, np.pi, len(rows))
         goal = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         if "goal" in options:
             goal = option_rows("goal", options["goal"], which, (2,))
+        start = {"goal_x": goal[:, 0], "goal_y": goal[:, 1]}
+        self._record(which, drawn | start, self.randomization, goal_x="m", goal_y="m")
         self.sim.reset(which)
         for name, values in self._settled.items():
             getattr(self.sim, name)[rows] = values

@@ -2,13 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import TaskDescription
 
 Array = NDArray[np.float64]
@@ -36,7 +37,10 @@ class TaskBatch(ABC):
     terminated, truncated: (N,) bool; true after `reset` only where the episode ended at once, see `reset`
     info: arrays with first axis N: "success" and "failed" (bool; failed: the simulation stopped), "privileged" (N, p)
         (the true quantities that an oracle or a teacher may use), and those of the task
+    quantities: randomized quantities of the present episodes, name → (N,), and `quantity_units`, their units
     """
+
+    length_unit: ClassVar[str] = "steps"  # what reports count: "steps", "attempts", or "corrections" between attempts
 
     def __init__(
         self,
@@ -63,6 +67,8 @@ class TaskBatch(ABC):
             "failed": np.zeros(num_envs, dtype=bool),
             "privileged": np.zeros((num_envs, privileged)),
         }
+        self.quantities: dict[str, Array] = {}
+        self.quantity_units: dict[str, str] = {}
 
     @property
     def all(self) -> Mask:
@@ -110,6 +116,12 @@ class TaskBatch(ABC):
         if not np.isfinite(wanted).all():
             raise UsageError(f"actions must be finite, got {wanted[~np.isfinite(wanted)][0]}")
         self._step(np.clip(wanted, -1, 1), rng, self.all if active is None else self._mask(active))
+
+    def _record(self, which: Mask, drawn: Mapping[str, Array], table: Randomization, **units: str) -> None:
+        """Keep quantities (n,) of new episodes in `which` for reports; `units` are those that `table` does not have."""
+        for name, values in drawn.items():
+            self.quantities.setdefault(name, np.zeros(self.num_envs))[which] = values
+            self.quantity_units[name] = units[name] if name in units else table[name].unit
 
     @abstractmethod
     def _reset(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:

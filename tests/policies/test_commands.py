@@ -23,7 +23,7 @@ def test_the_shipped_policy_inserts_in_simulation() -> None:
         "policy", NetworkActor(network, 32), make_insertion_env(32, noise=FlowMapNoise()), episodes=48, seed=5
     )
     assert result.successes >= 36  # more than three standard deviations below 48 · 0.9
-    assert result.attempts < 8
+    assert result.length < 8
 
 
 @pytest.mark.parametrize("algorithm", [[], ["--algorithm", "ppo"]])
@@ -43,10 +43,22 @@ def test_evaluation_loads_the_checkpoint_of_a_training(
     printed = json.loads(capsys.readouterr().out)
     rows = printed["results"]
     assert printed["task"] == "insertion" and printed["checkpoint"] == str(made)
-    assert [row["name"].split(",")[0] for row in rows] == ["policy", "policy", "random", "random"]
+    assert [row["name"].split(",")[0] for row in rows] == ["policy", "policy", "oracle", "random", "random"]
+    assert all("corrections" in row and "attempts" not in row for row in rows)
     assert all(row["episodes"] == 4 and 0 <= row["success_95"][0] <= row["success_95"][1] <= 1 for row in rows)
     assert main(["eval", "insertion", "--checkpoint", str(made), "--episodes", "2"]) == 0
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
+def test_the_evaluation_of_the_insertion_writes_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        main(["eval", "insertion", "--episodes", "6", "--envs", "3", "--out", str(tmp_path / "report"), "--json"]) == 0
+    )
+    printed = json.loads(capsys.readouterr().out)
+    names = {Path(name).name for name in printed["files"]}
+    assert {"results.json", "episodes.csv", "failures.csv", "failures.png", "success.gif", "success.png"} <= names
+    quantities = {row["quantity"]: row["unit"] for row in printed["failures"]}
+    assert quantities["yaw"] == "rad" and quantities["grasp_force"] == "N" and quantities["x"] == "m"
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Pa
     random = evaluate("random", RandomActor(SMALL.reach, 32, 0), env, episodes=256, seed=1)
     actor = NetworkActor(load_policy(result.checkpoint).network, 32)
     policy = evaluate("policy", actor, env, episodes=256, seed=1)
-    assert policy.success > 0.95 and policy.attempts < random.attempts
+    assert policy.success > 0.95 and policy.length < random.length
     assert load_checkpoint(result.checkpoint).training["command"] == ["gelflow", "train"]
     assert len(result.curve.read_text().splitlines()) == 1 + len(points)
     assert result.picture.read_bytes().startswith(b"\x89PNG")

@@ -233,7 +233,7 @@ def test_evaluation_counts_complete_episodes_and_is_repeatable(same_step: bool) 
     again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), env, episodes=50, seed=3)
     assert result == again
     assert result.episodes == 50 and 0 < result.successes < 50
-    assert 1 <= result.attempts <= INSERTION.attempts
+    assert 1 <= result.length <= INSERTION.attempts
     low, high = result.confidence_interval()
     assert low < result.success < high
 
@@ -281,7 +281,7 @@ def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Pa
     actor = NetworkActor(PolynomialNetwork(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
     policy = evaluate("policy", actor, PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), episodes=256, seed=1)
     assert policy.success > 0.9 and policy.success > random.success + 0.2
-    assert policy.attempts < random.attempts
+    assert policy.length < random.length
     assert checkpoint.training["command"] == ["gelflow", "train"]
     assert checkpoint.training["validation"]["success"] == result.best.success
     lines = result.curve.read_text().splitlines()

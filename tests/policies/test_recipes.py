@@ -12,12 +12,38 @@ from tests.policies.toy_tasks import PointTask
 from gelflow.cli.commands.training.task_training import TASKS
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.policies.episodes import Episodes, run_episodes
-from gelflow.policies.evaluation_report import OraclePolicy, evaluate_all, failure_ranges
+from gelflow.policies.episodes import Episodes, Film, OraclePolicy, record_films, run_episodes
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
 from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
-from gelflow.sim.tasks.registry import task_names
+from gelflow.policies.reports.evaluation_report import evaluate_all
+from gelflow.policies.reports.failures import failure_ranges, worst_ranges
+from gelflow.sim.tasks.registry import make_task, task_names
+
+
+class Direct(OraclePolicy):
+    """Moves to the target that it observes."""
+
+    def act(self, observations: NDArray[Any]) -> NDArray[np.float64]:
+        return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_every_task_reports_its_randomized_quantities_with_units(task: str) -> None:
+    batch = make_task(task, 2, randomization="full", threads=1)
+    batch.reset(batch.all, np.random.default_rng(0))
+    assert {"noise", "crosstalk", "dead_markers"} < set(batch.quantities) == set(batch.quantity_units)
+    assert all(values.shape == (2,) and np.isfinite(values).all() for values in batch.quantities.values())
+    assert any(values[0] != values[1] for values in batch.quantities.values())
+
+
+def test_attempts_include_the_first_and_corrections_do_not() -> None:
+    grasp = make_task("grasp", 4, threads=1)
+    found = run_episodes(OraclePolicy(grasp), grasp, episodes=8, seed=0).result("oracle").to_json()
+    assert found["success"] == 1 and 1 <= found["attempts"] < 4
+    insertion = make_task("insertion", 4, threads=1, randomization="nominal")
+    found = run_episodes(OraclePolicy(insertion), insertion, episodes=8, seed=0).result("oracle").to_json()
+    assert found["success"] == 1 and found["corrections"] == 1
 
 
 def test_the_commands_know_the_tasks_of_the_recipes() -> None:
@@ -52,6 +78,9 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     assert main(["eval", "cap", *arguments]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in printed["results"]] == ["policy", "random"]
+    assert all("steps" in row and "attempts" not in row for row in printed["results"])
+    assert main(["eval", "cap", *arguments, "--randomization", "fall"]) == 2
+    assert "no randomization 'fall'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -62,7 +91,7 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
         (["train", "grasp", "--steps", "0"], "above 0"),
         (["train", "insertion", "--recipe", "paper"], "--recipe"),
         (["eval", "grasp"], "requires --checkpoint"),
-        (["eval", "insertion", "--out", "x"], "--out"),
+        (["eval", "cap", "--part", "peg.toml"], "--part is for the insertion"),
     ],
 )
 def test_an_invalid_option_gives_a_message_of_one_line(
@@ -84,30 +113,46 @@ def test_a_report_has_tables_and_videos(tmp_path: Path) -> None:
     network = architecture.network(task.description, TorchActor(architecture).tensors())
     report = evaluate_all(network, task, episodes=40, seed=1, out=tmp_path)
     assert [result.name for result in report.results] == ["policy", "random"]
-    assert {"episodes.csv", "failures.csv", "failures.png", "failure.gif"} <= {path.name for path in report.files}
+    names = {path.name for path in report.files}
+    assert {"results.json", "episodes.csv", "failures.csv", "failures.png", "failure.gif", "failure.png"} <= names
     assert all(path.stat().st_size > 0 for path in report.files)
+    assert json.loads((tmp_path / "results.json").read_text())["results"][0]["name"] == "policy"
+    assert (tmp_path / "episodes.csv").read_text().splitlines()[0].endswith("steps,return,target_x [m],target_y [m]")
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="cannot write into"):
+        evaluate_all(network, task, episodes=1, seed=1, out=tmp_path / "file")
+
+
+def test_films_show_the_evaluated_episodes() -> None:
+    def policy(task: PointTask) -> Direct:
+        return Direct(task)
+
+    task = PointTask(3)
+    episodes = run_episodes(policy(task), task, episodes=10, seed=4)
+    films = [Film(0), Film(5), Film(9)]
+    record_films(policy(task), task, films, episodes=10, seed=4, max_frames=100)
+    assert [len(film.frames) for film in films] == [1 + episodes.length[film.episode] for film in films]
+    row, col = np.round(16 + 12 * np.array([episodes.quantities[f"target_{axis}"][5] for axis in "xy"])).astype(int)
+    assert (films[1].frames[0][row, col] == (0, 160, 0)).all()
 
 
 def test_failures_are_counted_in_ranges_of_equally_many_episodes() -> None:
     values = np.linspace(0, 1, 100)
     success = values < 0.7
     table = {"mass": values, "fixed": np.ones(100)}
-    episodes = Episodes(success, ~success, np.ones(100, int), np.zeros(100), table)
+    episodes = Episodes(success, ~success, np.ones(100, int), np.zeros(100), table, {"mass": "kg", "fixed": ""})
     ranges = failure_ranges(episodes)
     assert [entry.quantity for entry in ranges] == ["mass"] * 5
     assert [entry.episodes for entry in ranges] == [20] * 5
     assert [entry.failures for entry in ranges] == [0, 0, 0, 10, 20]
+    assert worst_ranges(ranges) == ["most failures by mass: 20 of 20 between 800 and 1000 g"]
 
 
 def test_every_episode_counts_once_whatever_its_length() -> None:
-    class Direct(OraclePolicy):
-        def act(self, observations: NDArray[Any]) -> NDArray[np.float64]:
-            return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
-
     one, many = (run_episodes(Direct(t), t, episodes=50, seed=2) for t in (PointTask(1), PointTask(7)))
     for episodes in (one, many):
         assert len(episodes.success) == 50 and episodes.success.all()
         assert set(episodes.quantities) == {"target_x", "target_y"}
-        assert (episodes.steps <= 4).all()
+        assert (episodes.length <= 4).all()
     again = run_episodes(Direct(PointTask(7)), PointTask(7), episodes=50, seed=2)
     assert (again.reward == many.reward).all()

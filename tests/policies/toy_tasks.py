@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, TaskBatch
 from gelflow.task import TaskDescription
 
@@ -41,13 +42,10 @@ class PointTask(TaskBatch):
         self._target: Array = np.zeros((num_envs, 2))
         self._steps = np.zeros(num_envs, dtype=np.int64)
 
-    @property
-    def quantities(self) -> dict[str, Array]:
-        """The randomized quantities."""
-        return {"target_x": self._target[:, 0], "target_y": self._target[:, 1]}
-
     def _reset(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         self._target[which] = rng.uniform(-1, 1, (int(which.sum()), 2))
+        drawn = {"target_x": self._target[which, 0], "target_y": self._target[which, 1]}
+        self._record(which, drawn, Randomization(), target_x="m", target_y="m")
         self._point[which] = 0
         self._steps[which] = 0
         self._observe(which)

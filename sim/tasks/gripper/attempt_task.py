@@ -19,6 +19,8 @@ class AttemptTask(TaskBatch):
     (`_move`) and simulates an attempt (`_attempt`).
     """
 
+    length_unit = "attempts"  # the first one included
+
     def __init__(
         self,
         description: TaskDescription,

@@ -7,6 +7,8 @@ from gelflow.errors import UsageError
 from gelflow.part import CUBOID
 from gelflow.task import INSERTION, InsertionTask
 
+DEFAULT_RANDOMIZATION = "default"
+
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """`--json`: the result as one JSON object on standard output."""
@@ -67,9 +69,10 @@ def add_randomization(parser: argparse.ArgumentParser) -> None:
     """`--randomization`: the distribution of the physical parameters."""
     parser.add_argument(
         "--randomization",
-        default="default",
+        default=DEFAULT_RANDOMIZATION,
         metavar="NAME",
-        help="physical parameters: nominal, default, or full, which adds deviations of real pads (default %(default)s)",
+        help="physical parameters: default, full, which adds deviations of real pads, or another table of the task, "
+        "such as nominal of the insertion (default %(default)s)",
     )
 
 

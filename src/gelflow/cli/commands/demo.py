@@ -243,7 +243,7 @@ def _in_simulation(
             progress.advance(bar)
     own, random = results
     output.text(
-        f"in simulation, {_EPISODES} parts: this policy {own.success:.0%} in {own.attempts:.1f} attempts,"
+        f"in simulation, {_EPISODES} parts: this policy {own.success:.0%} in {own.length:.1f} corrections,"
         f" random corrections {random.success:.0%}."
     )
     return results

@@ -1,15 +1,15 @@
-"""`gelflow eval TASK`: success of a policy in simulation, compared with random actions."""
+"""`gelflow eval TASK`: success of a policy in simulation, compared with an oracle and with random actions."""
 
 import argparse
-import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from gelflow.cli.commands.training.task_training import TASKS, evaluate_task, refuse
+from gelflow.cli.commands.training.task_training import TASKS, refuse
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
+    DEFAULT_RANDOMIZATION,
     add_checkpoint,
     add_json,
     add_out,
@@ -26,6 +26,8 @@ from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
+    from gelflow.policies.networks.base import Network
+    from gelflow.sim.tasks.task_batch import TaskBatch
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,73 +35,89 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=["insertion", *TASKS], help="task of the policy")
     add_part(parser)
     add_randomization(parser)
-    add_checkpoint(parser)
+    add_checkpoint(parser, default="the insertion policy shipped with gelflow")
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
     add_seed(parser, default=1)
     add_preset(parser)
-    add_out(parser, "folder for videos, pictures and a table of failures; not for the insertion", folder=True)
+    add_out(parser, "folder for tables, films of a success and a failure, and where failures lie", folder=True)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate the policy and random actions, then print a table."""
+    """Evaluate the policy, the oracle and random actions, then print a table; with --out, films and failures too."""
+    check_at_least(args, envs=1, episodes=1, seed=0)
     if args.task != "insertion":
         refuse(args, part=None)
-        return evaluate_task(args)
-    if args.out is not None:
-        raise UsageError("--out is for other tasks than the insertion")
-    check_at_least(args, envs=1, episodes=1, seed=0)
+    path, network, batch = _insertion(args) if args.task == "insertion" else _recipe_task(args)
+    from gelflow.policies.reports.evaluation_report import evaluate_all
+
+    with progress_bar() as progress:
+        bar = progress.add_task("evaluating", total=None)
+        report = evaluate_all(
+            network,
+            batch,
+            episodes=args.episodes,
+            seed=args.seed,
+            out=args.out,
+            started=lambda name: progress.update(bar, description=f"evaluating: {name}"),
+        )
+    output = Output(args.json)
+    if output.json:
+        rows = [result.to_json() for result in report.results]
+        failures = [entry.to_json() for entry in report.failures]
+        output.result(
+            {"task": args.task, "checkpoint": path, "results": rows, "failures": failures, "files": report.files}
+        )
+        return SUCCESS
+    output.console.print(_table(report.results, args.task, path, args.episodes))
+    for line in report.worst_ranges():
+        output.text(line)
+    for file in report.files:
+        output.text(f"wrote {file}")
+    return SUCCESS
+
+
+def _insertion(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
+    """Checkpoint, network and environments of the insertion."""
     from gelflow.policies.checkpoint import load_policy
 
     task = part_task(args.part)
     path = checkpoint_for(task, args.checkpoint)
     network = load_policy(path, task=task).network
-    from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
-    from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
+    from gelflow.policies.environment import insertion_randomization
+    from gelflow.sim.tasks.registry import make_task
 
-    output = Output(args.json)
+    table = insertion_randomization(args.randomization, task)
     count = min(args.envs, args.episodes)
-    plain, noisy = (
-        make_insertion_env(count, noise=noise, preset=args.preset, task=task, randomization=args.randomization)
-        for noise in (None, FlowMapNoise())
-    )
-    reach = network.reach
-    cases: list[tuple[str, NetworkActor | RandomActor, PolicyEnv]] = [
-        ("policy", NetworkActor(network, count), plain),
-        ("policy, noisy flow maps", NetworkActor(network, count), noisy),
-        ("random, policy's reach", RandomActor(reach, count, args.seed), plain),
-        ("random, full range", RandomActor(task.action_scale, count, args.seed), plain),
-    ]
-    results = []
-    with progress_bar() as progress:
-        bar = progress.add_task("evaluating", total=len(cases))
-        for name, actor, env in cases:
-            progress.update(bar, description=f"evaluating: {name}")
-            results.append(evaluate(name, actor, env, episodes=args.episodes, seed=args.seed))
-            progress.advance(bar)
-    if output.json:
-        output.result({"task": args.task, "checkpoint": path, "results": [_plain(result) for result in results]})
-    else:
-        output.console.print(_table(results, path, args.episodes))
-    return SUCCESS
+    return path, network, make_task("insertion", count, task=task, preset=args.preset, randomization=table)
 
 
-def _plain(result: "EvaluationResult") -> dict[str, object]:
-    return dataclasses.asdict(result) | {
-        "attempts": result.attempts if result.successes else None,
-        "success": result.success,
-        "success_95": list(result.confidence_interval()),
-    }
+def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
+    """Checkpoint, network and environments of a task that a recipe trains, as in the training unless options differ."""
+    if args.checkpoint is None:
+        raise UsageError(f"eval {args.task} requires --checkpoint FILE; create one with: gelflow train {args.task}")
+    from gelflow.policies import recipes
+    from gelflow.policies.checkpoint import load_checkpoint, load_network
+
+    training = load_checkpoint(args.checkpoint).training
+    options: dict[str, Any] = {**training.get("options", {})}
+    if args.preset is not None:
+        options["preset"] = args.preset
+    if args.randomization != DEFAULT_RANDOMIZATION:
+        options["randomization"] = args.randomization
+    recipe = recipes.recipe_for(args.task, training.get("recipe", recipes.DEFAULT))
+    batch = recipe.make_task(min(args.envs, args.episodes), **options)
+    return args.checkpoint, load_network(args.checkpoint, task=batch.description), batch
 
 
-def _table(results: "list[EvaluationResult]", path: Path, episodes: int) -> Table:
-    table = Table(title=f"Insertion in simulation: {episodes} parts, {path.name}")
-    for heading in ("actions", "inserted", "95 % interval", "attempts", "reward"):
+def _table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
+    unit = results[0].length_unit
+    table = Table(title=f"{task} in simulation: {episodes} episodes, {path.name}")
+    for heading in ("actions", "success", "95 % interval", unit, "return"):
         table.add_column(heading, justify="left" if heading == "actions" else "right")
     for result in results:
         low, high = result.confidence_interval()
-        attempts = f"{result.attempts:.1f}" if result.successes else "none"
-        row = (f"{result.success:.1%}", f"{low:.0%} to {high:.0%}", attempts, f"{result.reward:.1f}")
-        table.add_row(result.name, *row)
+        length = f"{result.length:.2f}" if result.successes else "none"
+        table.add_row(result.name, f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", length, f"{result.reward:.1f}")
     return table

@@ -1,15 +1,14 @@
-"""`gelflow train` and `gelflow eval` for the tasks that recipes train; the insertion has options of its own."""
+"""`gelflow train` for the tasks that recipes train; the insertion has options of its own."""
 
 import argparse
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.progress import TaskProgressColumn, TimeElapsedColumn
-from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import check_at_least
+from gelflow.cli.options import DEFAULT_RANDOMIZATION, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 
@@ -36,6 +35,9 @@ def train_task(args: argparse.Namespace) -> int:
     recipe = recipes.recipe_for(args.task, args.recipe)
     steps = recipe.steps if args.attempts is None else args.attempts
     folder = args.out or Path("runs") / args.task
+    options = {} if args.preset is None else {"preset": args.preset}
+    if args.randomization != DEFAULT_RANDOMIZATION:
+        options["randomization"] = args.randomization
     output = Output(args.json)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task("training", total=steps)
@@ -56,7 +58,7 @@ def train_task(args: argparse.Namespace) -> int:
             steps=steps,
             envs=args.envs,
             minutes=float("inf") if args.minutes is None else args.minutes,
-            options={} if args.preset is None else {"preset": args.preset},
+            options=options,
             command=_command(args, steps, folder),
             report=report,
         )
@@ -72,71 +74,22 @@ def train_task(args: argparse.Namespace) -> int:
             "steps": result.steps,
             "minutes": result.minutes,
             "shares": result.shares,
-            "validation": {"success": result.best.success, "attempts": result.best.attempts},
+            "learning_curve": result.curve,
+            "validation": result.best.to_json(),
         }
     )
     return SUCCESS
 
 
-def evaluate_task(args: argparse.Namespace) -> int:
-    """Evaluate a policy, the oracle and random actions, then print a table; with --out, pictures and failures too."""
-    check_at_least(args, envs=1, episodes=1, seed=0)
-    if args.checkpoint is None:
-        raise UsageError(f"eval {args.task} requires --checkpoint FILE; create one with: gelflow train {args.task}")
-    from gelflow.policies import evaluation_report, recipes
-    from gelflow.policies.checkpoint import load_checkpoint, load_network
-
-    training = load_checkpoint(args.checkpoint).training
-    options: dict[str, Any] = {**training.get("options", {})}
-    if args.preset is not None:
-        options["preset"] = args.preset
-    recipe = recipes.recipe_for(args.task, training.get("recipe", recipes.DEFAULT))
-    batch = recipe.make_task(min(args.envs, args.episodes), **options)
-    network = load_network(args.checkpoint, task=batch.description)
-    with progress_bar() as progress:
-        bar = progress.add_task("evaluating", total=None)
-        report = evaluation_report.evaluate_all(
-            network,
-            batch,
-            episodes=args.episodes,
-            seed=args.seed,
-            out=args.out,
-            started=lambda name: progress.update(bar, description=f"evaluating: {name}"),
-        )
-    output = Output(args.json)
-    if output.json:
-        rows = [evaluation_report.plain(result) for result in report.results]
-        output.result({"task": args.task, "checkpoint": args.checkpoint, "results": rows, "files": report.files})
-        return SUCCESS
-    output.console.print(_table(report.results, args.task, args.checkpoint, args.episodes))
-    for line in report.worst_ranges:
-        output.text(line)
-    for file in report.files:
-        output.text(f"wrote {file}")
-    return SUCCESS
-
-
 def _line(result: "EvaluationResult") -> str:
     low, high = result.confidence_interval()
-    return f"success {result.success:.1%} ({low:.1%} to {high:.1%}), {result.attempts:.2f} attempts or steps"
-
-
-def _table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
-    table = Table(title=f"{task} in simulation: {episodes} episodes, {path.name}")
-    for heading in ("actions", "success", "95 % interval", "attempts or steps", "return"):
-        table.add_column(heading, justify="left" if heading == "actions" else "right")
-    for result in results:
-        low, high = result.confidence_interval()
-        attempts = f"{result.attempts:.2f}" if result.successes else "none"
-        table.add_row(
-            result.name, f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", attempts, f"{result.reward:.1f}"
-        )
-    return table
+    return f"success {result.success:.1%} ({low:.1%} to {high:.1%}), {result.length:.2f} {result.length_unit}"
 
 
 def _command(args: argparse.Namespace, steps: int, folder: Path) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
     values = {"recipe": args.recipe, "steps": steps, "minutes": args.minutes, "envs": args.envs, "seed": args.seed}
-    values |= {"preset": args.preset, "out": folder}
-    given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
-    return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]
+    given = None if args.randomization == DEFAULT_RANDOMIZATION else args.randomization
+    values |= {"preset": args.preset, "randomization": given, "out": folder}
+    words = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
+    return ["gelflow", "train", args.task, *(word for pair in words for word in pair)]

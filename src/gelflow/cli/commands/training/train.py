@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         made = _train(args, progress)
     best = made.best
-    output.text(f"best on validation: {best.success:.1%} inserted in {best.attempts:.1f} attempts")
+    output.text(f"best on validation: {best.success:.1%} inserted in {best.length:.2f} corrections")
     seconds = made.simulation_time + made.learning_time
     if seconds > 0:  # not nan
         share = made.simulation_time / seconds
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
             "checkpoint": made.checkpoint,
             "learning_curve": made.curve,
             "picture": made.picture,
-            "validation": {"success": best.success, "attempts": best.attempts},
+            "validation": best.to_json(),
             "seconds": {"simulation": made.simulation_time, "learning": made.learning_time},
         }
     )
@@ -120,7 +120,7 @@ class _TrainingProgress:
         evaluation = point.evaluation
         self._progress.console.print(
             f"after {point.attempts:>9,} attempts, {point.minutes:5.1f} min:"
-            f" inserted {evaluation.success:6.1%} in {evaluation.attempts:.1f} attempts"
+            f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
         )
 
 

@@ -1,0 +1,1 @@
+"""Reports of evaluations: results beside those of other actors, films of episodes, and where failures lie."""
