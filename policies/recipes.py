@@ -140,7 +140,12 @@ def trained_tasks() -> tuple[str, ...]:
     return tuple(_RECIPES)
 
 
-def train(
+def train(task: str, folder: Path, **settings: Any) -> TrainingResult:
+    """Trains a policy on a task into `folder`; the same call resumes an unfinished run. See `training_run`."""
+    return training_run(task, folder, **settings).train()
+
+
+def training_run(
     task: str,
     folder: Path,
     *,
@@ -152,8 +157,8 @@ def train(
     options: Mapping[str, Any] | None = None,
     command: Sequence[str] = (),
     report: Callable[[Progress], None] | None = None,
-) -> TrainingResult:
-    """Trains a policy on a task into `folder`; the same call resumes an unfinished run.
+) -> TrainingRun:
+    """The run that trains a policy on a task into `folder`.
 
     Parameters
     ----------
@@ -164,7 +169,7 @@ def train(
     command: that repeats the run, stored in the folder
     report: called after each update
 
-    Raises UsageError as `TrainingRun.train`, and for an unknown task, recipe or option.
+    Raises UsageError for an unknown task, recipe or option.
     """
     chosen, given = recipe_for(task, recipe), dict(options or {})
     total = chosen.steps if steps is None else steps
@@ -179,4 +184,4 @@ def train(
     learner = chosen.make_learner(batch, seed=seed, steps=total)
     configuration = {"recipe": recipe, "options": given, **chosen.configuration()}
     validation = chosen.make_task(envs, **given)
-    return TrainingRun(learner, validation, folder, settings, configuration, command, report).train()
+    return TrainingRun(learner, validation, folder, settings, configuration, command, report)

@@ -64,7 +64,7 @@ def read_curves(runs: Sequence[Run], records: Mapping[str, RunRecord], column: s
     for run in runs:
         path = records[run.name].result.get(RESULT_KEY)
         if records[run.name].state == "complete" and isinstance(path, str) and Path(path).is_file():
-            tables[run.name] = _read_table(Path(path))
+            tables[run.name] = read_table(Path(path))
     tables = {name: table for name, table in tables.items() if table}
     if not tables:
         return None
@@ -77,10 +77,10 @@ def read_curves(runs: Sequence[Run], records: Mapping[str, RunRecord], column: s
     y_name = column or next((name for name in candidates if np.isfinite(first[name]).any()), names[0])
     found = []
     for values, members in group(runs):
-        series = [_series(tables[run.name], x_name, y_name) for run in members if run.name in tables]
-        series = [pair for pair in series if len(pair[0])]
-        if series:
-            found.append(_combine(values, series))
+        pairs = [series(tables[run.name], x_name, y_name) for run in members if run.name in tables]
+        pairs = [pair for pair in pairs if len(pair[0])]
+        if pairs:
+            found.append(combine(values, pairs))
     return Curves(x_name, y_name, found)
 
 
@@ -105,7 +105,7 @@ def draw(path: Path, curves: Curves, task: str) -> None:
     save(figure, path, dpi=120)
 
 
-def _read_table(path: Path) -> dict[str, Array]:
+def read_table(path: Path) -> dict[str, Array]:
     """The columns of a CSV file; an empty cell is nan, and columns with text are left away."""
     with path.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
@@ -118,7 +118,7 @@ def _read_table(path: Path) -> dict[str, Array]:
     return columns
 
 
-def _series(table: Mapping[str, Array], x_name: str, y_name: str) -> tuple[Array, Array]:
+def series(table: Mapping[str, Array], x_name: str, y_name: str) -> tuple[Array, Array]:
     """The points of a column that have a value; of several at one x the last."""
     if y_name not in table:
         return np.zeros(0), np.zeros(0)
@@ -128,11 +128,11 @@ def _series(table: Mapping[str, Array], x_name: str, y_name: str) -> tuple[Array
     return x, np.array([points[value] for value in x.tolist()])
 
 
-def _combine(values: dict[str, Any], series: Sequence[tuple[Array, Array]]) -> Curve:
+def combine(values: dict[str, Any], pairs: Sequence[tuple[Array, Array]]) -> Curve:
     """Interpolate the seeds to their common range of x, and take median and range at each point."""
-    x = np.unique(np.concatenate([x for x, _ in series]))
-    x = x[(x >= max(s[0] for s, _ in series)) & (x <= min(s[-1] for s, _ in series))]
-    stack = np.array([np.interp(x, *pair) for pair in series])
+    x = np.unique(np.concatenate([x for x, _ in pairs]))
+    x = x[(x >= max(s[0] for s, _ in pairs)) & (x <= min(s[-1] for s, _ in pairs))]
+    stack = np.array([np.interp(x, *pair) for pair in pairs])
     if not x.size:  # no common range
-        return Curve(values, len(series), x, x, x, x)
-    return Curve(values, len(series), x, np.median(stack, 0), stack.min(0), stack.max(0))
+        return Curve(values, len(pairs), x, x, x, x)
+    return Curve(values, len(pairs), x, np.median(stack, 0), stack.min(0), stack.max(0))

@@ -263,9 +263,9 @@ class Grasp(AttemptTask):
         info["success"][rows] = success[rows]
         gain = 100 - (0 if task.force_range is None else task.force_cost * info["force"])
         self.reward[rows] = np.where(success, gain, -10 * info["tilt"])[rows]
-        shell = self._mass - self._load_mass
-        center = (shell * self._shell_center + self._load_mass * self._load_at) / self._mass
-        info["privileged"][rows] = np.column_stack([info["position"] - center, self._mass])[rows]
+        mass, load = self._mass[rows], self._load_mass[rows]
+        center = ((mass - load) * self._shell_center[rows] + load * self._load_at[rows]) / mass
+        info["privileged"][rows] = np.column_stack([info["position"][rows] - center, mass])
 
     def _simulate(self, rows: NDArray[np.int64]) -> Array:
         """Close and lift in the environments `rows`; returns the shear forces (closed and lifted, rows, markers, 2)."""

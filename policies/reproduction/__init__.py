@@ -1,0 +1,1 @@
+"""The published experiments again: trainings with several seeds, evaluations, rows and curves beside the paper's."""

@@ -1,0 +1,112 @@
+"""The picture of a reproduction: learning curves with their bands over the seeds, and the final rows."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gelflow.figures import SERIES, save
+
+
+def draw(record: Mapping[str, Any], path: Path) -> None:
+    """Draws the record of `record.reproduce`."""
+    from matplotlib.figure import Figure  # deferred: slow to import
+
+    variants = record["variants"]
+    figure = Figure(figsize=(11, max(4.5, 1.6 + 0.62 * len(variants))), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    trained = [variant for variant in variants if variant["trained_as"] is None]
+    _draw_curves(left, trained, record["curve"])
+    draw_rows = _draw_success if record["curve"] == "success" else _draw_reward
+    draw_rows(right, variants)
+    right.set_yticks(range(len(variants)), [variant["name"] for variant in variants])
+    right.invert_yaxis()
+    right.grid(axis="x", alpha=0.3)
+    right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, fontsize="small")
+    seeds = len(record["seeds"])
+    figure.suptitle(f"{record['task']}: {_headline(variants[0], record['curve'])} ({seeds} seed{'s' * (seeds > 1)})")
+    save(figure, path, dpi=110)
+
+
+def _headline(variant: Mapping[str, Any], measure: str) -> str:
+    ours, paper = variant["ours"], variant["paper"]
+    if measure != "success":
+        return f"{variant['name']} reaches a return of {ours['reward']:.0f}"
+    text = f"{variant['name']} {100 * ours['success']:.1f} % success"
+    return text if paper is None else f"{text}, in the paper {100 * paper['success']:.1f} %"
+
+
+def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str) -> None:
+    factor = 100 if measure == "success" else 1
+    for i, variant in enumerate(variants):
+        color, marker = SERIES[i % len(SERIES)]
+        curve = {name: np.array(values) for name, values in variant["curve"].items()}
+        x = curve["x"] / 1000
+        axes.plot(
+            x,
+            factor * curve["median"],
+            color=color,
+            marker=marker,
+            markersize=4,
+            markevery=max(1, len(x) // 10),
+            label=variant["name"],
+        )
+        axes.fill_between(x, factor * curve["low"], factor * curve["high"], color=color, alpha=0.2, linewidth=0)
+    unit = "success on validation episodes [%]" if measure == "success" else "return on validation episodes [-]"
+    axes.set(xlabel="environment steps [thousands]", ylabel=unit)
+    axes.set_title("Training: median and range over the seeds", fontsize="medium")
+    axes.legend(fontsize="small")
+    axes.grid(alpha=0.3)
+
+
+def _draw_success(axes: Any, variants: Sequence[Mapping[str, Any]]) -> None:
+    """Success of each variant with its interval, seeds, and the figures to compare with."""
+    for row, variant in enumerate(variants):
+        ours = variant["ours"]
+        at = 100 * ours["success"]
+        bounds = np.abs(100 * np.array([ours["success_95"]]).T - at)
+        color = SERIES[0][0]
+        seeds = [100 * value for value in ours["success_of_seeds"]]
+        axes.scatter(seeds, np.full(len(seeds), row), marker="|", s=120, color=color, label=_once("ours, a seed", row))
+        axes.errorbar(at, row, xerr=bounds, fmt="o", color=color, capsize=4, label=_once("ours, 95 % interval", row))
+        if variant["paper"] is not None:
+            spread = 100 * (variant["paper"]["spread"] or 0)
+            known = axes.get_legend_handles_labels()[1]
+            axes.errorbar(
+                100 * variant["paper"]["success"],
+                row + 0.22,
+                xerr=spread or None,
+                fmt="D",
+                color=SERIES[1][0],
+                capsize=3,
+                label="paper" if "paper" not in known else None,
+            )
+        for offset, (name, marker) in zip((-0.22, 0.0), (("oracle", "^"), ("random", "x")), strict=True):
+            if name in variant:
+                value = 100 * variant[name]["success"]
+                axes.plot(value, row + offset, marker, color="0.4", linestyle="none", label=_once(name, row))
+    axes.set(xlabel="success on evaluation episodes [%]", xlim=(-2, 104))
+    axes.set_title("Evaluation on other episodes", fontsize="medium")
+
+
+def _draw_reward(axes: Any, variants: Sequence[Mapping[str, Any]]) -> None:
+    """Mean return of each variant with the deviation over its seeds; random actions are named in the title."""
+    for row, variant in enumerate(variants):
+        ours = variant["ours"]
+        axes.errorbar(
+            ours["reward"],
+            row,
+            xerr=ours["reward_deviation"],
+            fmt="o",
+            color=SERIES[0][0],
+            capsize=4,
+            label=_once("ours, deviation over the seeds", row),
+        )
+    axes.set(xlabel="return on evaluation episodes [-]")
+    axes.set_title(f"Evaluation on other episodes (random: {variants[0]['random']['reward']:.0f})", fontsize="medium")
+
+
+def _once(label: str, row: int) -> str | None:
+    """A label in the legend for the first row only."""
+    return label if row == 0 else None

@@ -1,0 +1,250 @@
+"""Trials: the training of a variant with one seed, and the evaluation of its policy on episodes of its own.
+
+Both are files in a folder, so that a repeated call does what is missing. A training that was interrupted is resumed.
+"""
+
+import hashlib
+import json
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import UsageError
+from gelflow.measurement.machine import processor, versions
+from gelflow.policies import imitation, recipes
+from gelflow.policies import learning_curve as insertion_curve
+from gelflow.policies.checkpoint import load_checkpoint, load_network
+from gelflow.policies.environment import FlowMapNoise, insertion_randomization, make_insertion_env
+from gelflow.policies.episodes import OraclePolicy, RandomPolicy, run_episodes
+from gelflow.policies.evaluation import EvaluationResult
+from gelflow.policies.networks.base import BatchPolicy
+from gelflow.policies.reports.evaluation_report import has_oracle
+from gelflow.policies.reproduction.variants import Reproduction, Variant, insertion_of
+from gelflow.policies.sweep.curves import read_table, series
+from gelflow.session.records import to_plain
+from gelflow.sim.tasks.registry import make_task
+from gelflow.sim.tasks.task_batch import TaskBatch
+
+EVALUATION = "evaluation.json"
+# Seeds of evaluations are far from those of trainings and of their validations (`TrainingRun`), which start at 0 and at
+# 1 000 003.
+_EVALUATION_SEED = 7_000_003
+_INSERTION_PRESET = "fast"  # of the training; evaluations have the settings of the scene
+
+Report = Callable[[str, float], None]  # text, and completed part of the present training
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is trained and evaluated."""
+
+    seeds: tuple[int, ...]
+    shorter: int = 1  # trainings have this part of their full length
+    max_episodes: int | None = None  # of an evaluation
+    envs: int = 64  # parallel environments of evaluations
+
+    def steps(self, steps: int) -> int:
+        """Length of a training that has `steps` in full."""
+        return max(1, steps // self.shorter)
+
+    def episodes(self, episodes: int) -> int:
+        """Episodes of an evaluation that has `episodes` in full."""
+        return episodes if self.max_episodes is None else min(self.max_episodes, episodes)
+
+
+class Trainer(ABC):
+    """How the policies of a variant are trained, and in which environments they are evaluated."""
+
+    def __init__(self, variant: Variant, effort: Effort, command: Sequence[str]) -> None:
+        self.variant, self.effort, self.command = variant, effort, list(command)
+
+    @abstractmethod
+    def train(self, folder: Path, seed: int, report: Report) -> Path:
+        """Trains what is missing in `folder`; returns the checkpoint."""
+
+    @abstractmethod
+    def environments(self, variant: Variant) -> TaskBatch:
+        """The environments of the evaluation of `variant`."""
+
+    @abstractmethod
+    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
+        """Environment steps and `measure` ("success" or "reward") of the validations of a finished training."""
+
+    @abstractmethod
+    def minutes(self, folder: Path) -> float:
+        """Duration of a finished training."""
+
+
+class RecipeTrainer(Trainer):
+    """Trainings by a recipe."""
+
+    def __init__(self, task: str, variant: Variant, effort: Effort, command: Sequence[str]) -> None:
+        super().__init__(variant, effort, command)
+        self._task, self._recipe = task, recipes.recipe_for(task, variant.recipe)
+
+    def train(self, folder: Path, seed: int, report: Report) -> Path:
+        steps = self.effort.steps(self._recipe.steps)
+        run = recipes.training_run(
+            self._task,
+            folder,
+            recipe=self.variant.recipe,
+            seed=seed,
+            steps=steps,
+            options=self.variant.options,
+            command=self.command,
+            report=lambda progress: report("training", progress.steps / steps),
+        )
+        if not run.is_finished():
+            run.train()
+        return run.checkpoint
+
+    def environments(self, variant: Variant) -> TaskBatch:
+        return self._recipe.make_task(self.effort.envs, **{**variant.options, **variant.evaluation})
+
+    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
+        x, y = series(read_table(folder / "progress.csv"), "steps", f"evaluated_{measure}")
+        return x.tolist(), y.tolist()
+
+    def minutes(self, folder: Path) -> float:
+        return float(read_table(folder / "progress.csv")["minutes"][-1])
+
+
+class InsertionTrainer(Trainer):
+    """Trainings of the insertion by imitation."""
+
+    def train(self, folder: Path, seed: int, report: Report) -> Path:
+        made, finished = folder / insertion_curve.CHECKPOINT, folder / insertion_curve.PICTURE
+        attempts = self.effort.steps(imitation.ImitationSettings().attempts)
+        if made.exists() and finished.exists():
+            if (trained := load_checkpoint(made).training["settings"]["attempts"]) != attempts:
+                raise UsageError(f"{folder} holds a finished training of {trained} attempts, not {attempts}; delete it")
+            return made
+        settings = imitation.ImitationSettings(seed=seed, attempts=attempts)
+        table = self.variant.options.get("randomization", "default")
+        env, validation = (
+            make_insertion_env(
+                32 if self.effort.shorter > 1 else 512,
+                noise=FlowMapNoise(),
+                preset=_INSERTION_PRESET,
+                task=insertion_of(self.variant),
+                randomization=table,
+            )
+            for _ in range(2)
+        )
+        imitation.train(
+            env,
+            validation,
+            out=folder,
+            settings=settings,
+            command=self.command,
+            report=lambda point: report("training", point.attempts / settings.attempts),
+        )
+        return made
+
+    def environments(self, variant: Variant) -> TaskBatch:
+        task = insertion_of(variant)
+        table = insertion_randomization(variant.options.get("randomization", "default"), task)
+        return make_task("insertion", self.effort.envs, task=task, randomization=table)
+
+    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
+        x, y = series(read_table(folder / insertion_curve.CURVE), "attempts", f"evaluated {measure}")
+        return x.tolist(), y.tolist()
+
+    def minutes(self, folder: Path) -> float:
+        return float(read_table(folder / insertion_curve.CURVE)["minutes"][-1])
+
+
+def trainer_for(task: str, variant: Variant, effort: Effort, command: Sequence[str]) -> Trainer:
+    """The trainer of a variant of a task."""
+    if task == "insertion":
+        return InsertionTrainer(variant, effort, command)
+    return RecipeTrainer(task, variant, effort, command)
+
+
+def run_trial(
+    plan: Reproduction,
+    variant: Variant,
+    seed: int,
+    *,
+    folder: Path,
+    effort: Effort,
+    command: Sequence[str],
+    report: Report,
+) -> dict[str, Any]:
+    """Trains and evaluates what is missing of a variant and a seed; returns its rows.
+
+    Parameters
+    ----------
+    folder: of the task; the trial is in VARIANT/seed_N
+    command: that repeats the reproduction, stored with the result
+    report: called with a text and the completed part of a training
+
+    The rows have policy, oracle (where the task has one) and random actions on the same evaluation episodes.
+    """
+    trained = plan.variant(variant.trained_as or variant.name)
+    trainer = trainer_for(plan.task, trained, effort, command)
+    training = folder / folder_name(trained.name) / f"seed_{seed}"
+    checkpoint = trainer.train(training, seed, report)
+    path = folder / folder_name(variant.name) / f"seed_{seed}" / EVALUATION
+    episodes = effort.episodes(plan.episodes)
+    identity = {
+        "checkpoint": hashlib.sha256(checkpoint.read_bytes()).hexdigest(),
+        "episodes": episodes,
+        "evaluation": {**variant.options, **variant.evaluation},
+    }
+    stored = _read(path)
+    if stored is not None and stored["identity"] == json.loads(json.dumps(identity)):
+        return stored
+    report("evaluating", 0.0)
+    start = time.perf_counter()
+    rows = _evaluate(checkpoint, trainer.environments(variant), episodes=episodes, seed=seed)
+    x, y = trainer.curve(training, plan.curve)
+    values = {
+        "format": 1,
+        "identity": identity,
+        "seed": seed,
+        "rows": [row.to_json() for row in rows],
+        "curve": {"steps": x, plan.curve: y},
+        "training_minutes": trainer.minutes(training),
+        "evaluation_minutes": (time.perf_counter() - start) / 60,
+        "processor": processor(),
+        "versions": versions(),
+    }
+    return _write(path, values)
+
+
+def folder_name(variant: str) -> str:
+    """Name of the folder of a variant."""
+    return "".join(letter if letter.isalnum() else "_" for letter in variant)
+
+
+def _evaluate(checkpoint: Path, task: TaskBatch, *, episodes: int, seed: int) -> list[EvaluationResult]:
+    network, n, at = load_network(checkpoint, task=task.description), task.num_envs, _EVALUATION_SEED + seed
+    actors: dict[str, BatchPolicy] = {"policy": network.batch_policy(n)}
+    if has_oracle(task):
+        actors["oracle"] = OraclePolicy(task)
+    actors["random"] = RandomPolicy(n, np.ones(task.action_space.shape), at)
+    return [run_episodes(actor, task, episodes=episodes, seed=at).result(name) for name, actor in actors.items()]
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    if not path.exists():
+        return None
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path} is damaged ({type(error).__name__}); delete it to evaluate again") from error
+
+
+def _write(path: Path, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes JSON atomically; returns it as it will be read."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".part")
+    partial.write_text(json.dumps(to_plain(values), indent=1) + "\n")
+    partial.replace(path)
+    return dict(json.loads(path.read_text()))
