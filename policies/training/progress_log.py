@@ -1,6 +1,7 @@
 """The progress of a training run as a CSV table and as TensorBoard logs, both continued by a resumed run."""
 
 import csv
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,9 +64,10 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 
 def _tensorboard(folder: Path, steps: int) -> Any:
-    """A writer of TensorBoard logs; None if tensorboardX is not installed, since the table has the same numbers."""
+    """A writer of TensorBoard logs; None, with a warning, if tensorboardX is not installed."""
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
+        warnings.warn(f"no TensorBoard logs: install tensorboardX; {TABLE} has the same numbers", stacklevel=2)
         return None
     return SummaryWriter(str(folder), purge_step=steps + 1 if steps else None)

@@ -1,6 +1,7 @@
 """Training runs: one folder, resumed after a kill at any moment, on analytic tasks."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,6 +82,15 @@ def test_a_run_learns_and_its_folder_holds_everything(tmp_path: Path) -> None:
     assert evaluate_task("policy", policy, task, episodes=128, seed=9).success > 0.9
     with pytest.raises(UsageError, match=r"trained for another task: steps 8 \(here 9\)"):
         load_network(result.checkpoint, task=ToyDescription(steps=9))
+
+
+def test_a_missing_tensorboard_is_said_and_the_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.warns(
+        UserWarning, match=r"no TensorBoard logs: install tensorboardX; progress.csv has the same"
+    ) as seen:
+        make_run(tmp_path, settings=RunSettings(steps=256, evaluate_episodes=4)).train()
+    assert len(seen) == 1 and "\n" not in str(seen[0].message)
 
 
 def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
