@@ -23,6 +23,7 @@ COMMANDS = {
     "sweep": "train many configurations and seeds on this machine, a Ray cluster or SLURM",
     "eval": "measure the success of a policy in simulation, and that of random actions",
     "reproduce": "train and evaluate the experiments of the paper again, beside its figures",
+    "export": "export a policy as an ONNX model",
     "track": "track markers in tactile images: a folder, a video, a stream or a camera",
     "calibrate-camera": "calibrate a camera in millimetres from one image of the gel at rest",
     "run": "run the insertion policy on the robot or on the mock robot",
@@ -39,7 +40,7 @@ COMMANDS = {
 }
 
 # Commands whose modules are in a folder of gelflow.cli.commands.
-_FOLDERS = dict.fromkeys(("train", "sweep", "eval", "reproduce"), "training")
+_FOLDERS = dict.fromkeys(("train", "sweep", "eval", "reproduce", "export"), "training")
 
 
 def command_module(name: str) -> ModuleType:
