@@ -10,6 +10,7 @@ from typing import Any
 import script
 
 from gelflow.perception.benchmark import curves
+from gelflow.policies.reproduction import picture as reproduction_picture
 from gelflow.sim.benchmark.speed import growth_picture
 from gelflow.sim.benchmark.tradeoff import picture as tradeoff_picture
 from gelflow.sim.benchmark.tradeoff.run import Errors
@@ -52,12 +53,17 @@ def draw_tradeoff(record: dict[str, Any], file: Path) -> None:
     tradeoff_picture.draw(Tradeoff(measurements=measurements, changes=changes, **fields), file)
 
 
+def draw_reproduction(record: dict[str, Any], file: Path) -> None:
+    reproduction_picture.draw(record, file)
+
+
 # picture → record in benchmarks/results, drawing function
 PICTURES: dict[str, tuple[str, Callable[[dict[str, Any], Path], None]]] = {
     "growth": ("speed", draw_growth),
     "tracking": ("tracking", draw_tracking),
     "mesh_distance": ("mesh_distance", draw_mesh_distance),
     "order": ("order", draw_order),
+    "reproduce_grasp": ("reproduce_grasp", draw_reproduction),
     **{f"tradeoff_{scene}": (f"tradeoff_{scene}", draw_tradeoff) for scene in scene_names()},
 }
 

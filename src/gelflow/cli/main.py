@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from types import ModuleType
 
@@ -49,6 +50,11 @@ def command_module(name: str) -> ModuleType:
     return importlib.import_module(".".join(["gelflow.cli.commands", *path]))
 
 
+def _one_line(message: Warning | str, *_: object, **__: object) -> str:
+    """A warning without the line of code that raised it."""
+    return f"gelflow: {message}\n"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -64,6 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             module.configure(sub)
     args = parser.parse_args(arguments)
     assert module is not None
+    warnings.formatwarning = _one_line
     try:
         status = int(module.run(args))
         sys.stdout.flush()
