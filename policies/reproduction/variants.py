@@ -1,4 +1,4 @@
-"""What is reproduced: the variants of each task, with the figures of the paper (Xu et al., CoRL 2022, appendix B)."""
+"""The variants of each task that are reproduced, with the figures of the paper (Xu et al., CoRL 2022, appendix B)."""
 
 import dataclasses
 from collections.abc import Mapping

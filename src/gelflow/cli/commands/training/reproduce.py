@@ -74,7 +74,8 @@ def _table(record: Mapping[str, Any]) -> Table:
 
     unit = length_of(record["variants"][0]["ours"])[0]
     table = Table(title=f"{record['task']}: success [%] ± deviation over the seeds, {unit} in parentheses")
-    for heading in ("variant", "ours", "95 % interval", "paper", "oracle", "random", "return", "minutes"):
+    last = "return" if record["curve"] == "reward" else "95 % interval"
+    for heading in ("variant", "ours", "paper", "oracle", "random", last, "min"):
         table.add_column(heading, justify="left" if heading == "variant" else "right")
     for variant in record["variants"]:
         ours, paper, minutes = variant["ours"], variant["paper"], variant["training_minutes"]
@@ -82,10 +83,11 @@ def _table(record: Mapping[str, Any]) -> Table:
         table.add_row(
             variant["name"],
             _cell(ours["success"], ours["success_deviation"], length_of(ours)[1]),
-            " to ".join(f"{100 * bound:.1f}" for bound in ours["success_95"]),
             "" if paper is None else _cell(paper["success"], paper["spread"], paper["length"]),
             *("" if row is None else _cell(row["success"], None, length_of(row)[1]) for row in others),
-            f"{ours['reward']:.1f}",
+            f"{ours['reward']:.1f}"
+            if last == "return"
+            else " to ".join(f"{100 * bound:.1f}" for bound in ours["success_95"]),
             f"{sum(minutes) / len(minutes):.1f}" if variant["trained_as"] is None else "",
         )
     return table
