@@ -26,6 +26,7 @@ from gelflow.policies import checkpoint
 from gelflow.policies import learning_curve as curve
 from gelflow.policies.environment import PolicyEnv
 from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
+from gelflow.policies.insertion_expert import expert_correction, part_tolerance
 from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
@@ -35,7 +36,6 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
-_MIN_TOLERANCE = 1.5e-3  # [m]
 _SAVE_INTERVAL = 20.0  # [s] between savings of an unfinished run, at the end of an iteration
 
 
@@ -93,7 +93,7 @@ def train(
     env: environment of the training
     validation: environment of the evaluations
     out: folder of insertion.safetensors, learning_curve.csv and learning_curve.png; created if missing
-    architecture: of the network; None takes the mirror symmetry of the task's part
+    architecture: of the network; None takes the mirror symmetry and the largest turn of the task
     settings: of the algorithm
     command: command line, stored in the checkpoint
     report: called after each iteration and each evaluation
@@ -103,7 +103,9 @@ def train(
     other settings.
     """
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
-    architecture = architecture or PolynomialGRU(mirror=env.task.part.mirror)
+    if architecture is None:
+        reach_x, reach_y, _ = PolynomialGRU.reach
+        architecture = PolynomialGRU(mirror=env.task.part.mirror, reach=(reach_x, reach_y, env.task.action_scale[2]))
     run = _Run(env, validation, architecture, settings or ImitationSettings(), out, command, report)
     settings = run.settings
     while run.attempts < settings.attempts and run.minutes() < settings.minutes:
@@ -131,15 +133,17 @@ def collect(
     policy = network.batch_policy(env.count)
     images = env.reset(seed)
     spread = sigma * rng.uniform(size=(env.count, 1))
+    explored = np.array([1.0, 1.0, 0.0 if env.task.part.is_round else 1.0])
     inputs, targets, starts, rewards = [], [], [], []
     ended = inserted = 0
     for _ in range(settings.rollout):
         starts.append(policy.new.copy())
         inputs.append(policy.observe(images).astype(np.float32))
-        centring = env.task.centring_correction(env.pose) / np.asarray(network.reach)
-        targets.append((centring * policy.signs).astype(np.float32))
+        targets.append(
+            (expert_correction(env.task, env.pose, policy.signs) / np.asarray(network.reach)).astype(np.float32)
+        )
         output = policy.output(inputs[-1].astype(float))
-        corrections = policy.correct(np.clip(output, -1, 1) + spread * rng.standard_normal(output.shape))
+        corrections = policy.correct(np.clip(output, -1, 1) + spread * rng.standard_normal(output.shape) * explored)
         result = env.step(corrections)
         images = result.images
         policy.reset(result.done)
@@ -149,17 +153,6 @@ def collect(
         inserted += int(result.success.sum())
     attempts = Attempts(np.stack(inputs), np.stack(targets), np.stack(starts))
     return attempts, inserted / ended if ended else float("nan"), float(np.mean(rewards))
-
-
-def part_tolerance(task: InsertionTask) -> tuple[float, float, float]:
-    """The gap beside the part in x and y, at least 1.5 mm [m], and the yaw that moves a corner by the smaller [rad].
-
-    In a narrow hole, the first attempts of a part show the direction of its misalignment and hardly its length. A loss
-    that is bounded within such a gap is flat over most of the lengths that are possible.
-    """
-    x, y = (max(clearance / 2, _MIN_TOLERANCE) for clearance in task.part.clearance)
-    corner = float(np.hypot(*task.part.size[:2])) / 2
-    return x, y, min(x, y) / corner
 
 
 def learn(

@@ -161,10 +161,11 @@ INSERTION = InsertionTask()
 def insertion_task(part: Part, *, misalignment: tuple[float, float, float] = INSERTION.misalignment) -> InsertionTask:
     """The insertion of `part` from a misalignment uniform within ± `misalignment` [m, m, rad].
 
-    Heights follow from the depth of the hole. The gripper does not turn for a round part.
+    Heights follow from the depth of the hole. A round part has no yaw at the start, but an action of ±1 turns the
+    gripper from one limit of the workspace to the other, which shows what the pads did not show before.
     """
     x, y, yaw = misalignment
-    room_x, room_y, room_yaw = INSERTION.workspace
+    scale_x, scale_y, scale_yaw = INSERTION.action_scale
     return dataclasses.replace(
         INSERTION,
         part=part,
@@ -172,5 +173,5 @@ def insertion_task(part: Part, *, misalignment: tuple[float, float, float] = INS
         start_height=round(part.depth + _START_ABOVE_RIM, 9),
         success_height=round(part.depth - _SUCCESS_BELOW_RIM, 9),
         misalignment=(x, y, 0.0 if part.is_round else yaw),
-        workspace=(room_x, room_y, 0.0 if part.is_round else room_yaw),
+        action_scale=(scale_x, scale_y, 2 * INSERTION.workspace[2] if part.is_round else scale_yaw),
     )

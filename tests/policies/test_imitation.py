@@ -20,9 +20,9 @@ from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 from gelflow.policies.imitation import (
     ImitationSettings,
     imitation_loss,
-    part_tolerance,
     train,
 )
+from gelflow.policies.insertion_expert import expert_correction, part_tolerance
 from gelflow.policies.networks.polynomial_features import polynomial_basis
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
@@ -132,6 +132,21 @@ def test_the_tolerance_is_the_gap_and_the_yaw_of_a_corner() -> None:
 def test_the_tolerance_in_a_narrow_hole_is_wider_than_its_gap() -> None:
     narrow = insertion_task(dataclasses.replace(CUBOID, clearance=(1e-3, 8e-3)))
     assert part_tolerance(narrow)[:2] == (1.5e-3, 4e-3)
+
+
+def test_the_expert_turns_a_round_part_from_side_to_side_while_it_centres_it() -> None:
+    peg = insertion_task(dataclasses.replace(CUBOID, symmetry=0))
+    rng = np.random.default_rng(0)
+    pose = rng.uniform(-1, 1, (20, 3)) * peg.workspace
+    signs = np.where(rng.uniform(size=(20, 3)) < 0.5, -1.0, 1.0)
+    moved = peg.corrected(pose, expert_correction(peg, pose, signs) * signs)
+    assert np.allclose(moved[:, :2], 0, atol=1e-15)
+    assert np.allclose(np.abs(moved[:, 2]), 0.8 * peg.workspace[2])
+    assert (np.sign(moved[:, 2]) == -np.sign(pose[:, 2])).all()
+    assert (expert_correction(peg, np.zeros((1, 3)), signs[:1])[:, 2] > 0).all()  # in the network's coordinates
+    assert np.abs(expert_correction(peg, pose, signs)[:, 2]).max() < peg.action_scale[2]
+    cuboid = pose[:, :3] * 0.1
+    assert (expert_correction(INSERTION, cuboid, signs) == INSERTION.centring_correction(cuboid) * signs).all()
 
 
 def test_the_bounded_loss_prefers_a_mode_and_the_other_one_the_mean() -> None:

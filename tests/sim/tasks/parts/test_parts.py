@@ -143,7 +143,8 @@ def test_yaw_errors_follow_from_the_symmetry() -> None:
     np.testing.assert_array_equal(CUBOID.yaw_error(yaw[:3]), yaw[:3])
     turned = np.array([[1e-3, 0, 0.2]])
     assert PEG.reward(turned) == pytest.approx(-0.01)
-    assert PEG.corrected(np.zeros(3), np.array([1e-3, 0, 0.1]))[2] == 0  # a gripper does not turn a round part
+    assert PEG.misalignment[2] == 0  # a round part has no yaw, but the gripper may turn it
+    assert PEG.correction(np.array([0, 0, 1]))[2] == pytest.approx(2 * PEG.workspace[2])
 
 
 def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
