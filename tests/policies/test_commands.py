@@ -37,7 +37,7 @@ def test_the_shipped_policy_of_the_peg_inserts_it_with_a_stiff_arm() -> None:
     env = PolicyEnv(InsertionVectorEnv(32, task=task, preset="fast", randomization=stiff), task, FlowMapNoise())
     result = evaluate("policy", NetworkActor(network, 32), env, episodes=48, seed=5)
     assert result.successes >= 42  # more than three standard deviations below 48 · 0.97
-    assert result.attempts < 8
+    assert result.length < 8
 
 
 @pytest.mark.parametrize("algorithm", [[], ["--algorithm", "ppo"]])
