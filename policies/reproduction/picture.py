@@ -41,21 +41,21 @@ def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str)
     factor = 100 if measure == "success" else 1
     for i, variant in enumerate(variants):
         color, marker = SERIES[i % len(SERIES)]
-        curve = {name: np.array(values) for name, values in variant["curve"].items()}
-        x = curve["x"] / 1000
-        axes.plot(
-            x,
-            factor * curve["median"],
-            color=color,
-            marker=marker,
-            markersize=4,
-            markevery=max(1, len(x) // 10),
-            label=variant["name"],
-        )
-        axes.fill_between(x, factor * curve["low"], factor * curve["high"], color=color, alpha=0.2, linewidth=0)
-    unit = "success on validation episodes [%]" if measure == "success" else "return on validation episodes [-]"
-    axes.set(xlabel="environment steps [thousands]", ylabel=unit)
-    axes.set_title("Training: median and range over the seeds", fontsize="medium")
+        for name, style in (("validation", "-"), ("training", ":")):
+            if (values := variant["curves"][name]) is None:
+                continue
+            x, median, low, high = (np.array(values[key]) for key in ("x", "median", "low", "high"))
+            every, marks = max(1, len(x) // 10), marker if name == "validation" else None
+            label = variant["name"] if name == "validation" else None
+            axes.plot(
+                x / 1000, factor * median, style, color=color, marker=marks, markersize=4, markevery=every, label=label
+            )
+            axes.fill_between(x / 1000, factor * low, factor * high, color=color, alpha=0.18, linewidth=0)
+    axes.set(xlabel="environment steps [thousands]", ylabel="success [%]" if factor == 100 else "return [-]")
+    if factor == 100:
+        axes.set_ylim(0, 103)
+    title = "Validation (solid) and training with exploration (dotted):\nmedian and range over the seeds"
+    axes.set_title(title, fontsize="medium")
     axes.legend(fontsize="small")
     axes.grid(alpha=0.3)
 

@@ -5,11 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gelflow.measurement.machine import processor, versions
 from gelflow.policies.evaluation import EvaluationResult
-from gelflow.policies.reproduction.trials import Effort, run_trial
+from gelflow.policies.reproduction.trials import Curve, Effort, run_trial
 from gelflow.policies.reproduction.variants import Reproduction, Variant
 from gelflow.policies.sweep.curves import combine
 from gelflow.policies.training.run import locked
@@ -63,8 +61,6 @@ def variant_row(plan: Reproduction, variant: Variant, trials: Sequence[Mapping[s
     """The row of a variant: our policies over the seeds, the paper's figure, oracle and random actions."""
     actors = {row["name"]: [trial["rows"][i] for trial in trials] for i, row in enumerate(trials[0]["rows"])}
     ours = over_seeds(actors["policy"])
-    pairs = [(np.array(trial["curve"]["steps"]), np.array(trial["curve"][plan.curve])) for trial in trials]
-    curve = combine({}, [pair for pair in pairs if len(pair[0])])
     return {
         "name": variant.name,
         "recipe": variant.recipe,
@@ -76,8 +72,17 @@ def variant_row(plan: Reproduction, variant: Variant, trials: Sequence[Mapping[s
         **{name: over_seeds(rows) for name, rows in actors.items() if name != "policy"},
         "training_minutes": [trial["training_minutes"] for trial in trials],
         "processors": sorted({trial["processor"] for trial in trials}),
-        "curve": {name: getattr(curve, name).tolist() for name in ("x", "median", "low", "high")},
+        "curves": {name: _over_seeds([trial["curves"][name] for trial in trials]) for name in trials[0]["curves"]},
     }
+
+
+def _over_seeds(curves: Sequence[Curve]) -> dict[str, list[float]] | None:
+    """Median and range over the seeds; None without points."""
+    pairs = [pair for pair in curves if len(pair[0])]
+    if not pairs:
+        return None
+    curve = combine({}, pairs)
+    return {name: getattr(curve, name).tolist() for name in ("x", "median", "low", "high")}
 
 
 def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

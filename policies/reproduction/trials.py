@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor, versions
@@ -36,6 +37,7 @@ EVALUATION = "evaluation.json"
 _EVALUATION_SEED = 7_000_003
 _INSERTION_PRESET = "fast"  # of the training; evaluations have the settings of the scene
 
+Curve = tuple[NDArray[np.float64], NDArray[np.float64]]  # environment steps, values
 Report = Callable[[str, float], None]  # text, and completed part of the present training
 
 
@@ -72,8 +74,11 @@ class Trainer(ABC):
         """The environments of the evaluation of `variant`."""
 
     @abstractmethod
-    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
-        """Environment steps and `measure` ("success" or "reward") of the validations of a finished training."""
+    def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
+        """Environment steps and `measure` ("success" or "reward") of a finished training.
+
+        "validation" is that of the evaluations, "training" that of the episodes with exploration.
+        """
 
     @abstractmethod
     def minutes(self, folder: Path) -> float:
@@ -106,9 +111,13 @@ class RecipeTrainer(Trainer):
     def environments(self, variant: Variant) -> TaskBatch:
         return self._recipe.make_task(self.effort.envs, **{**variant.options, **variant.evaluation})
 
-    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
-        x, y = series(read_table(folder / "progress.csv"), "steps", f"evaluated_{measure}")
-        return x.tolist(), y.tolist()
+    def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
+        table = read_table(folder / "progress.csv")
+        explored = "return" if measure == "reward" else measure  # "reward" is the mean of a step
+        return {
+            "validation": series(table, "steps", f"evaluated_{measure}"),
+            "training": series(table, "steps", explored),
+        }
 
     def minutes(self, folder: Path) -> float:
         return float(read_table(folder / "progress.csv")["minutes"][-1])
@@ -151,9 +160,12 @@ class InsertionTrainer(Trainer):
         table = insertion_randomization(variant.options.get("randomization", "default"), task)
         return make_task("insertion", self.effort.envs, task=task, randomization=table)
 
-    def curve(self, folder: Path, measure: str) -> tuple[list[float], list[float]]:
-        x, y = series(read_table(folder / insertion_curve.CURVE), "attempts", f"evaluated {measure}")
-        return x.tolist(), y.tolist()
+    def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
+        table = read_table(folder / insertion_curve.CURVE)
+        return {
+            "validation": series(table, "attempts", f"evaluated {measure}"),
+            "training": series(table, "attempts", measure),
+        }
 
     def minutes(self, folder: Path) -> float:
         return float(read_table(folder / insertion_curve.CURVE)["minutes"][-1])
@@ -176,7 +188,7 @@ def run_trial(
     command: Sequence[str],
     report: Report,
 ) -> dict[str, Any]:
-    """Trains and evaluates what is missing of a variant and a seed; returns its rows.
+    """Trains and evaluates what is missing of a variant and a seed; returns its rows and learning curves.
 
     Parameters
     ----------
@@ -197,25 +209,23 @@ def run_trial(
         "episodes": episodes,
         "evaluation": {**variant.options, **variant.evaluation},
     }
+    of_training = {"curves": trainer.curves(training, plan.curve), "training_minutes": trainer.minutes(training)}
     stored = _read(path)
     if stored is not None and stored["identity"] == json.loads(json.dumps(identity)):
-        return stored
+        return stored | of_training
     report("evaluating", 0.0)
     start = time.perf_counter()
     rows = _evaluate(checkpoint, trainer.environments(variant), episodes=episodes, seed=seed)
-    x, y = trainer.curve(training, plan.curve)
     values = {
         "format": 1,
         "identity": identity,
         "seed": seed,
         "rows": [row.to_json() for row in rows],
-        "curve": {"steps": x, plan.curve: y},
-        "training_minutes": trainer.minutes(training),
         "evaluation_minutes": (time.perf_counter() - start) / 60,
         "processor": processor(),
         "versions": versions(),
     }
-    return _write(path, values)
+    return _write(path, values) | of_training
 
 
 def folder_name(variant: str) -> str:

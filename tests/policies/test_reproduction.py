@@ -91,7 +91,7 @@ def test_the_insertion_is_trained_by_imitation(tmp_path: Path) -> None:
     plan = Reproduction("insertion", reproduction_for("insertion").variants[:1])
     effort = Effort((0,), shorter=10**9, max_episodes=2, envs=2)
     row = reproduce(plan, tmp_path, effort=effort, command=COMMAND)["variants"][0]
-    assert row["oracle"]["corrections"] == 1 and row["curve"]["x"] == [512.0]
+    assert row["oracle"]["corrections"] == 1 and row["curves"]["validation"]["x"] == [512.0]
     assert (insertion_of(plan.variants[0]).corrected_axes == [0, 0, 1]).all()
     assert reproduce(plan, tmp_path, effort=effort, command=COMMAND)["variants"][0] == row
 
