@@ -1,6 +1,7 @@
 """The progress of a training run as a CSV table and as TensorBoard logs, both continued by a resumed run."""
 
 import csv
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -46,7 +47,8 @@ class ProgressLog:
         if self._board is not None:
             for name, value in row.items():
                 group = "evaluation" if name in EVALUATION else "time" if name in _TIMES else "training"
-                self._board.add_scalar(f"{group}/{name}", value, steps)
+                if math.isfinite(value):  # without an episode that ended there is no rate of success
+                    self._board.add_scalar(f"{group}/{name}", value, steps)
 
     def close(self) -> None:
         """Closes the files."""
