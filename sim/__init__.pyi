@@ -4,6 +4,7 @@ from .reductions import center_of_pressure as center_of_pressure
 from .reductions import mean_shear as mean_shear
 from .reductions import pad_forces as pad_forces
 from .reductions import pad_moments as pad_moments
+from .reductions import pad_pressures as pad_pressures
 from .reductions import shear_features as shear_features
 from .scene.loader import load_scene as load_scene
 from .scene.loader import scene_names as scene_names
@@ -67,6 +68,7 @@ __all__ = [
     "mean_shear",
     "pad_forces",
     "pad_moments",
+    "pad_pressures",
     "scene_names",
     "shear_features",
     "task_names",

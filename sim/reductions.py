@@ -88,6 +88,21 @@ def pad_moments(scene: "Scene", pads: Sequence[str] | None = None) -> TactileRed
     return _per_pad(scene, pads, [f"moment.{axis}" for axis in _AXES], rows)
 
 
+def pad_pressures(scene: "Scene", pads: Sequence[str] | None = None) -> TactileReduction:
+    """The sum of the normal forces of each pad [N] and their first moment about its site [N m]: four rows a pad.
+
+    The rows are `PAD.pressure` and `PAD.pressure_moment.x` and so on, in the frame of the site. Moment / sum is the
+    centre of pressure of a pad of any shape; `center_of_pressure` is that of flat pads.
+    """
+
+    def rows(pad: "PadDef") -> Array:
+        positions = _positions(pad)
+        weights = np.concatenate([np.ones((1, len(positions))), positions.T])
+        return np.asarray(weights[:, :, None] * np.array([0.0, 0.0, 1.0]))
+
+    return _per_pad(scene, pads, ["pressure", *(f"pressure_moment.{axis}" for axis in _AXES)], rows)
+
+
 def mean_shear(scene: "Scene", pads: Sequence[str] | None = None) -> TactileReduction:
     """The mean of the shear x and of the shear y over the markers of each pad [N]: two rows a pad."""
 

@@ -9,38 +9,34 @@ Terminated: the cap is turned by `goal_angle` (success), or a fingertip is above
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.geometry import rotation_matrices
-from gelflow.sim.scene import load_scene
-from gelflow.sim.scene.pads import PadDef
-from gelflow.sim.tasks.control_task import ControlTask
+from gelflow.sim.reductions import TactileReduction, pad_forces, pad_pressures
+from gelflow.sim.scene import Scene
+from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Quantity, Randomization, Uniform
 from gelflow.sim.tasks.rendering import Mark, render_scene
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
-from gelflow.task import TaskDescription
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
 FINGERS = (1, 2, 3)
 JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "bend", "curl"))
+TIPS = tuple(f"tip{finger}" for finger in FINGERS)  # names of the pads and of their sites
 REWARDS = ("paper", "progress")
 _RESET_OPTIONS = {"center": "x, y of the cap [m]", "radius": "of the cap [m]", "damping": "of the cap [N m s]"}
 
 
 @dataclass(frozen=True)
-class CapRotationTask(TaskDescription):
+class CapRotationTask(ControlDescription):
     """Rotation of a cap by three fingers. Lengths in metres, angles in radians, times in seconds."""
 
     name: str = "cap"
     touch: bool = True  # the observation has the readings of the fingertips
     commanded: bool = False  # the observation has the commanded minus the measured joint angles
-    control_period: float = 0.025
-    max_steps: int = 100
     goal_angle: float = np.pi / 4
     reward: str = "paper"  # "paper", eq. 26, or "progress", see `CapRotationTask.rewards`
     action_scale: float = 0.06  # change of the commanded joint angles for an action of ±1
@@ -110,9 +106,8 @@ class CapRotation(ControlTask):
     ----------
     num_envs: number of environments
     task: task description
-    preset, friction: of the scene "dclaw"
     randomization: distributions of the cap
-    threads: of the simulator
+    options: of the scene "dclaw" and its simulator, see `SceneOptions`
 
     Options of `reset`: "center" (2,) [m], "radius" [m] and "damping" [N m s] of the cap. Info, with first axis N:
     "angle" [rad] and "rate" [rad/s] of the cap, "touching" (3) fingertips, "above": a fingertip is above the cap;
@@ -126,25 +121,12 @@ class CapRotation(ControlTask):
         num_envs: int,
         *,
         task: CapRotationTask = CAP_ROTATION,
-        preset: str | None = None,
-        friction: str | None = None,
         randomization: Randomization = DEFAULT_RANDOMIZATION,
-        threads: int | None = None,
+        **options: Unpack[SceneOptions],
     ) -> None:
-        super().__init__(
-            task,
-            num_envs,
-            scene=load_scene("dclaw", preset=preset, friction=friction),
-            control_period=task.control_period,
-            max_steps=task.max_steps,
-            observation_space=Box(-np.inf, np.inf, (task.observation_size,), np.float32),
-            action_space=Box(-1, 1, (len(JOINTS),), np.float32),
-            privileged=6,
-            threads=threads,
-        )
-        self.randomization = randomization
+        super().__init__(task, num_envs, randomization, scene="dclaw", actions=len(JOINTS), privileged=6, **options)
         self._find_indices()
-        self._sensors = SensorModel([pad.positions for pad in self._pads], num_envs)
+        self._reduction = _fingertip_rows(self.scene)
         self._commanded: Array = np.zeros((num_envs, len(JOINTS)))
         self._action: Array = np.zeros((num_envs, len(JOINTS)))
         self.info |= {
@@ -162,9 +144,7 @@ class CapRotation(ControlTask):
         ranges = {joint.name: joint.range for joint in scene.joints}
         limits = np.array([ranges[joint] or (-np.inf, np.inf) for joint in JOINTS])
         self._lower, self._upper = limits[:, 0], limits[:, 1]
-        pads = {pad.name: pad for pad in scene.pads}
-        self._pads = [pads[f"tip{finger}"] for finger in FINGERS]
-        self._markers = [scene.marker_slice(pad.name) for pad in self._pads]
+        self._tip_sites = [scene.site(tip) for tip in TIPS]
         self._cap_q, self._cap_v = scene.q("cap").start, scene.v("cap").start
         cap = next(shape for shape in scene.shapes if shape.name == "cap")
         body = scene.bodies[scene.body("cap")]
@@ -214,14 +194,17 @@ class CapRotation(ControlTask):
 
     def _observe(self, active: Mask, rng: np.random.Generator) -> None:
         task, info = self.description, self.info
-        forces = self.sim.tactile()[active]
         tips = self.fingertips()[active]
+        readings = touch = self._by_fingertip(self.sim.tactile(active=active, reduction=self._reduction)[active])
+        if task.touch and not self._sensors.ideal:
+            forces = self.sim.tactile(active=active)[active]
+            forces = self._sensors.read(forces, active, rng, interval=task.control_period)
+            readings = self._by_fingertip(self._reduction(forces))
         last_angle = info["angle"].copy()
         info["angle"][active] = self.sim.q[active, self._cap_q]
         info["rate"][active] = self.sim.v[active, self._cap_v]
-        info["touching"][active] = np.column_stack([forces[:, markers, 2].any(1) for markers in self._markers])
+        info["touching"][active] = touch[..., 3] > 0
         info["above"][active] = (tips[..., 2] > self._top).any(1)
-        readings = self._sensors.read(forces, active, rng, interval=task.control_period) if task.touch else forces
         info["privileged"][active, 4] = info["angle"][active]
         info["privileged"][active, 5] = info["rate"][active]
         info["success"][active] = (info["angle"] > task.goal_angle)[active]
@@ -231,28 +214,27 @@ class CapRotation(ControlTask):
         self.observation[active] = self._observation(active, tips, readings)
 
     def _observation(self, active: Mask, tips: Array, readings: Array) -> Array:
-        """Observations of the environments `active` (n): fingertips (n, 3, 3) [m], readings (n, markers, 3) [N]."""
+        """Observations of the environments `active` (n): fingertips (n, 3, 3) [m], readings (n, 3, 7)."""
         task = self.description
         measured = self.sim.q[active][:, self._joint_q]
         parts = [measured, tips.reshape(len(tips), -1) / task.length_unit]
         if task.touch:
-            for pad, markers in zip(self._pads, self._markers, strict=True):
-                force, pressure, moment = reduced(pad, readings[:, markers])
-                center = moment / np.maximum(pressure, task.contact_force)[:, None]
-                parts += [
-                    force / task.force_unit,
-                    (pressure > task.contact_force)[:, None],
-                    center / task.pressure_unit,
-                ]
+            force, pressure, moment = readings[..., :3], readings[..., 3:4], readings[..., 4:]
+            center = moment / np.maximum(pressure, task.contact_force)
+            felt = [force / task.force_unit, pressure > task.contact_force, center / task.pressure_unit]
+            parts.append(np.concatenate(felt, axis=2).reshape(len(tips), -1))
         if task.commanded:
             parts.append((self._commanded[active] - measured) / task.command_unit)
         return np.concatenate(parts, axis=1)
 
     def fingertips(self) -> Array:
         """Positions of the fingertips in the world, (N, 3, 3) [m]."""
-        poses = self.sim.poses()[:, [pad.body for pad in self._pads]]
-        offsets = np.array([pad.pose.position for pad in self._pads])
-        return np.asarray(poses[..., :3] + np.einsum("nfij,fj->nfi", rotation_matrices(poses[..., 3:]), offsets))
+        return np.asarray(self.sim.site_poses()[:, self._tip_sites, :3])
+
+    @staticmethod
+    def _by_fingertip(rows: Array) -> Array:
+        """Rows (n, 21) of `_fingertip_rows` as (n, 3, 7)."""
+        return rows.reshape(len(rows), len(TIPS), -1)
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`; a dashed line on the cap shows its rotation."""
@@ -265,13 +247,7 @@ class CapRotation(ControlTask):
         return render_scene(self.sim, index, title=title, marks=[mark])
 
 
-def reduced(pad: PadDef, forces: Array) -> tuple[Array, Array, Array]:
-    """Force on a pad (n, 3) [N], sum of its normal forces (n,) [N] and their first moment (n, 3) [N m].
-
-    Vectors are in the frame of the pad's body, positions relative to the pad's site; moment / sum is the centre of
-    pressure. `forces` are marker forces, (n, markers, 3): shear x, shear y, normal.
-    """
-    columns = pad.axes * np.array([1.0, 1.0, -1.0])  # the normal force is positive in compression, along −z
-    force = np.einsum("mij,nmj->ni", columns, forces)
-    normal = forces[..., 2]
-    return force, normal.sum(1), normal @ (pad.positions - pad.pose.position)
+def _fingertip_rows(scene: Scene) -> TactileReduction:
+    """Force (3) [N], sum of the normal forces (1) [N] and its first moment (3) [N m] of each fingertip."""
+    parts = [part(scene, [tip]) for tip in TIPS for part in (pad_forces, pad_pressures)]
+    return TactileReduction.concatenate(parts)

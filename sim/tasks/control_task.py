@@ -5,15 +5,31 @@ import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.spaces import Box
 
-from gelflow.sim.scene import Scene
+from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.task_batch import Array, Mask, TaskBatch
+from gelflow.sim.tasks.randomization import Randomization
+from gelflow.sim.tasks.sensor_model import SensorModel
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, TaskBatch
 from gelflow.task import TaskDescription
+
+
+@dataclass(frozen=True)
+class ControlDescription(TaskDescription):
+    """Base of the descriptions of tasks of control."""
+
+    control_period: float = 0.025  # [s]
+    max_steps: int = 100  # control periods of an episode, after which it is truncated
+
+    @property
+    def observation_size(self) -> int:
+        """Number of values of an observation, a vector."""
+        raise NotImplementedError
 
 
 def adapt_step(scene: Scene, period: float) -> Scene:
@@ -35,10 +51,11 @@ class ControlTask(TaskBatch):
 
     Parameters
     ----------
-    scene: its step is adapted to the control period, see `adapt_step`
-    control_period: [s]
-    max_steps: control periods of an episode, after which it is truncated
-    threads: of the simulator; None uses all available cores. Results do not depend on it.
+    randomization: distributions of the task's quantities and of the effects of real pads
+    scene: name; the step of the scene is adapted to the control period, see `adapt_step`
+    actions: number of actions
+    overrides: values of the scene file, see `load_scene`
+    options: preset and friction of the scene; threads of the simulator, on which results do not depend
 
     A subclass starts episodes (`_draw`), converts actions to controls (`_controls`), and reads the state after a period
     (`_observe`): observation, reward, `terminated`, `info["success"]`. The episode is truncated after `max_steps` or
@@ -47,25 +64,32 @@ class ControlTask(TaskBatch):
 
     def __init__(
         self,
-        description: TaskDescription,
+        description: ControlDescription,
         num_envs: int,
+        randomization: Randomization,
         *,
-        scene: Scene,
-        control_period: float,
-        max_steps: int,
-        observation_space: Box,
-        action_space: Box,
+        scene: str,
+        actions: int,
         privileged: int,
-        threads: int | None = None,
+        overrides: Mapping[str, Any] | None = None,
+        **options: Unpack[SceneOptions],
     ) -> None:
         super().__init__(
-            description, num_envs, observation_space=observation_space, action_space=action_space, privileged=privileged
+            description,
+            num_envs,
+            observation_space=Box(-np.inf, np.inf, (description.observation_size,), np.float32),
+            action_space=Box(-1, 1, (actions,), np.float32),
+            privileged=privileged,
         )
-        self.scene = adapt_step(scene, control_period)
-        self.sim = Simulator(self.scene, num_envs=num_envs, threads=threads)
-        self.frames_per_second = 1 / control_period
-        self.steps_per_period = round(control_period / self.scene.step)
-        self._max_steps = max_steps
+        preset, friction = options.get("preset"), options.get("friction")
+        loaded = load_scene(scene, preset=preset, friction=friction, overrides=overrides)
+        self.scene = adapt_step(loaded, description.control_period)
+        self.sim = Simulator(self.scene, num_envs=num_envs, threads=options.get("threads"))
+        self.randomization = randomization
+        self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
+        self.frames_per_second = 1 / description.control_period
+        self.steps_per_period = round(description.control_period / self.scene.step)
+        self._max_steps = description.max_steps
         self.info["steps"] = np.zeros(num_envs, dtype=np.int64)
 
     @abstractmethod

@@ -27,8 +27,10 @@ from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
 from gelflow.sim.tasks.insertion import RANDOMIZATIONS as RANDOMIZATIONS  # found by the registry beside `Insertion`
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import Randomization
-from gelflow.sim.tasks.task_batch import Array, Mask
+from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, InsertionTask
+
+_RESET_OPTIONS = {"misalignment": "x, y, yaw of the gripper [m, m, rad]"}
 
 
 class Insertion(AttemptTask):
@@ -101,7 +103,10 @@ class Insertion(AttemptTask):
         return render_scene(sim, 0, title=title + (": inserted" if self.info["success"][index] else ""))
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        self.attempts.draw(rng, which=which, misalignment=_misalignment(options, which))
+        check_options(self.description.name, options, _RESET_OPTIONS)
+        given = options.get("misalignment")
+        misalignment = None if given is None else option_rows("misalignment", given, which, (3,))
+        self.attempts.draw(rng, which=which, misalignment=misalignment)
         start = dict(zip(("x", "y", "yaw"), self.attempts.pose[which].T, strict=True))
         self._record(which, self.attempts.drawn | start, self.attempts.randomization, x="m", y="m", yaw="rad")
 
@@ -116,18 +121,6 @@ class Insertion(AttemptTask):
             self.info[name][active] = getattr(result, name)
         self.info["pose"][active] = self.attempts.pose[active]
         self.reward[active] = self.attempts.reward()[active]
-
-
-def _misalignment(options: Mapping[str, Any], which: Mask) -> Array | None:
-    """The misalignment in the options of `reset` for the environments `which`, shape (n, 3), or None."""
-    if not options:
-        return None
-    if unknown := set(options) - {"misalignment"}:
-        raise UsageError(f"reset: unknown option {sorted(unknown)[0]!r}; there is 'misalignment': (x, y, yaw) [m, rad]")
-    given, count = np.asarray(options["misalignment"], dtype=float), len(which)
-    if given.shape not in ((3,), (count, 3)) or not np.isfinite(given).all():
-        raise UsageError(f"reset: misalignment must be 3 finite numbers, or ({count}, 3), got {given.tolist()}")
-    return np.array(np.broadcast_to(given, (count, 3))[which])
 
 
 class InsertionEnv(TaskEnv):

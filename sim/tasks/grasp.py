@@ -6,7 +6,7 @@ the next attempt. The bar is put down between attempts; this is not simulated.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -21,7 +21,7 @@ from gelflow.sim.tasks.gripper.bar import BLOCK, SCENE_BLOCKS, Bar, with_load
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PADS, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 from gelflow.sim.trajectory import Trajectory
 from gelflow.task import TaskDescription
 
@@ -97,9 +97,8 @@ class Grasp(AttemptTask):
     task: task description
     blocks: of the bar, 25 mm each
     moving_load: a part of the mass slides inside the bar where the bar tilts, and stays there
-    preset, friction: of the scene "grasp"
     randomization: distributions of bar, pads and sensors
-    threads: of the simulator; None uses all available cores. Results do not depend on it.
+    options: of the scene "grasp" and its simulator, see `SceneOptions`
 
     Observation: normalized flow map of the lifted bar against the closed grasp. Action: displacement along the bar, and
     the force of the fingers if the task has a `force_range`. Reward: 100 on success (less the cost of a chosen force),
@@ -117,10 +116,8 @@ class Grasp(AttemptTask):
         task: GraspTask = GRASP,
         blocks: int = SCENE_BLOCKS,
         moving_load: bool = False,
-        preset: str | None = None,
-        friction: str | None = None,
         randomization: Randomization = DEFAULT_RANDOMIZATION,
-        threads: int | None = None,
+        **options: Unpack[SceneOptions],
     ) -> None:
         super().__init__(
             task,
@@ -132,8 +129,8 @@ class Grasp(AttemptTask):
         )
         self.randomization = randomization
         self.bar = Bar(blocks)
-        self.scene = _scene(task, preset, friction, moving_load)
-        self.sim = Simulator(self.scene, num_envs=min(num_envs, _CHUNK), threads=threads)
+        self.scene = _scene(task, options, moving_load)
+        self.sim = Simulator(self.scene, num_envs=min(num_envs, _CHUNK), threads=options.get("threads"))
         self._moving_load = moving_load
         self._workspace = min(task.workspace, self.bar.half_length - BLOCK / 2)
         self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
@@ -325,7 +322,7 @@ class Grasp(AttemptTask):
         return u
 
 
-def _scene(task: GraspTask, preset: str | None, friction: str | None, moving_load: bool) -> Scene:
+def _scene(task: GraspTask, options: SceneOptions, moving_load: bool) -> Scene:
     """The grasp scene with the marker grid of the task's observations."""
     grid = task.grid
     overrides = {
@@ -334,6 +331,7 @@ def _scene(task: GraspTask, preset: str | None, friction: str | None, moving_loa
         "pads.*.pitch": grid.pitch * 1e-3,
         "pads.*.center": [grid.center[0] * 1e-3, grid.center[1] * 1e-3],
     }
+    preset, friction = options.get("preset"), options.get("friction")
     scene = load_scene("grasp", preset=preset, friction=friction, overrides=overrides)
     return with_load(scene) if moving_load else scene
 

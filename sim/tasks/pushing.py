@@ -10,21 +10,18 @@ The functions of reward, observation and controls work on NumPy arrays and on to
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.scene import load_scene
-from gelflow.sim.tasks.control_task import ControlTask
+from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization
 from gelflow.sim.tasks.rendering import Mark, render_scene
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
-from gelflow.task import TaskDescription
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
 OBSERVATIONS = ("tactile", "privileged", "none")
 _BODIES = ("gripper", "box")
@@ -39,15 +36,13 @@ _START_UNITS = {"goal_x": "m", "goal_y": "m", "goal_yaw": "rad", "offset": "m"} 
 
 
 @dataclass(frozen=True)
-class PushingTask(TaskDescription):
+class PushingTask(ControlDescription):
     """Pushing of a box by one finger. Lengths in metres, angles in radians, times in seconds."""
 
     name: str = "pushing"
     observation: str = "tactile"  # "tactile", "privileged" or "none"
     history: int = 1  # number of the latest observations that an observation holds, the present one first
     grid: Grid = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))  # of the markers [mm]
-    control_period: float = 0.025
-    max_steps: int = 100
     # Force and torque for an action of ±1, the limits of the actuators.
     action_scale: tuple[float, float, float] = (1.0, 1.0, 3.0)  # [N, N, N m]
     goal_x: tuple[float, float] = (0.15, 0.25)
@@ -195,9 +190,8 @@ class Pushing(ControlTask):
     ----------
     num_envs: number of environments
     task: task description
-    preset, friction: of the scene "pushing"
     randomization: distributions of the box
-    threads: of the simulator
+    options: of the scene "pushing" and its simulator, see `SceneOptions`
 
     Options of `reset`: "goal" (3,) x, y [m] and yaw [rad] of the box; "offset" [m] of the box along the finger;
     "half_size" (2,) [m] and "mass" [kg] of the box. Info, with first axis N: "position_error" [m] and "yaw_error" [rad]
@@ -211,28 +205,14 @@ class Pushing(ControlTask):
         num_envs: int,
         *,
         task: PushingTask = PUSHING,
-        preset: str | None = None,
-        friction: str | None = None,
         randomization: Randomization = DEFAULT_RANDOMIZATION,
-        threads: int | None = None,
+        **options: Unpack[SceneOptions],
     ) -> None:
-        super().__init__(
-            task,
-            num_envs,
-            scene=load_scene("pushing", preset=preset, friction=friction),
-            control_period=task.control_period,
-            max_steps=task.max_steps,
-            observation_space=Box(-np.inf, np.inf, (task.observation_size,), np.float32),
-            action_space=Box(-1, 1, (3,), np.float32),
-            privileged=6,
-            threads=threads,
-        )
+        super().__init__(task, num_envs, randomization, scene="pushing", actions=3, privileged=6, **options)
         if self.scene.grids != (task.grid,):
             raise UsageError(f"the scene's pad must have the task's markers {task.grid}, got {self.scene.grids}")
-        self.randomization = randomization
         self._find_indices()
         periods = -(-task.max_steps // self._steps_per_force)
-        self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self.goal: Array = np.zeros((num_envs, 3))
         self.half_size: Array = np.zeros((num_envs, 2))
         self.mass: Array = np.zeros(num_envs)

@@ -11,33 +11,29 @@ Terminated: the ball is at rest at its goal (success), or it leaves the pad. Tru
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from gelflow.observation import Grid
-from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.control_task import ControlTask
+from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.rendering import Mark, render_scene
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
-from gelflow.task import TaskDescription
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
 SETTLE_TIME = 0.5  # [s] until the pad rests on the ball, as in B.1
 _STATE = ("q", "v", "anchors", "anchored", "history")
 
 
 @dataclass(frozen=True)
-class RollingTask(TaskDescription):
+class RollingTask(ControlDescription):
     """Rolling of a ball below a pad. Lengths in metres, times in seconds, forces in newtons."""
 
     name: str = "rolling"
     grid: Grid = Grid(rows=10, cols=10, pitch=5.0)  # of the markers on the pad [mm]
-    control_period: float = 0.025
     max_steps: int = 80
     force: float = 0.2  # along x and y, for an action of ±1
     lift: float = 0.2  # vertical force on the pad
@@ -74,9 +70,8 @@ class Rolling(ControlTask):
     ----------
     num_envs: number of environments
     task: task description
-    preset, friction: of the scene "rolling"
     randomization: deviations of the pads
-    threads: of the simulator
+    options: of the scene "rolling" and its simulator, see `SceneOptions`
 
     Option of `reset`: "goal" (2,), x and y from the ball's start [m]. Info, with first axis N: "error", distance of the
     ball to the goal [m]; "privileged": goal from the ball, velocity of the ball, ball from the pad, x and y each, in
@@ -90,10 +85,8 @@ class Rolling(ControlTask):
         num_envs: int,
         *,
         task: RollingTask = ROLLING,
-        preset: str | None = None,
-        friction: str | None = None,
         randomization: Randomization = DEFAULT_RANDOMIZATION,
-        threads: int | None = None,
+        **options: Unpack[SceneOptions],
     ) -> None:
         grid = task.grid
         markers = {
@@ -104,21 +97,14 @@ class Rolling(ControlTask):
         super().__init__(
             task,
             num_envs,
-            scene=load_scene(
-                "rolling",
-                preset=preset,
-                friction=friction,
-                overrides={f"pads.pad.{key}": value for key, value in markers.items()},
-            ),
-            control_period=task.control_period,
-            max_steps=task.max_steps,
-            observation_space=Box(-np.inf, np.inf, (task.observation_size,), np.float32),
-            action_space=Box(-1, 1, (2,), np.float32),
+            randomization,
+            scene="rolling",
+            actions=2,
             privileged=6,
-            threads=threads,
+            overrides={f"pads.pad.{key}": value for key, value in markers.items()},
+            **options,
         )
         scene = self.scene
-        self.randomization = randomization
         self._pad_q = [scene.q(joint).start for joint in ("pad_x", "pad_y")]
         self._pad_v = [scene.v(joint).start for joint in ("pad_x", "pad_y")]
         self._ball_q = [scene.q("ball").start + axis for axis in (0, 1)]
@@ -126,7 +112,6 @@ class Rolling(ControlTask):
         self._force_u = [scene.u(name) for name in ("pad_x", "pad_y")]
         self._lift_u = scene.u("pad_z")
         self._settled = self._settle()
-        self._sensors = SensorModel([pad.positions for pad in scene.pads], num_envs)
         self.goal: Array = np.zeros((num_envs, 2))  # in the world [m]
         self._action: Array = np.zeros((num_envs, 2))
         self.info["error"] = np.zeros(num_envs)

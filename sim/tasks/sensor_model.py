@@ -5,6 +5,7 @@ cost no time and use no random numbers.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ class SensorModel:
         self._sizes = [len(pad) for pad in positions]
         total, pads = sum(self._sizes), len(positions)
         self._pad_of = np.repeat(np.arange(pads), self._sizes)
-        self._near, self._closeness = _nearest(positions)
+        self._positions = positions
         self._level = {name: np.zeros(num_envs) for name in SENSOR_QUANTITIES}
         self._gain = np.ones((num_envs, pads))
         self._turn = np.zeros((num_envs, pads))
@@ -59,6 +60,16 @@ class SensorModel:
         self._input: Array | None = None  # forces of the last reading, (N, markers, k)
         self._delayed: Array | None = None  # delayed part of the gel's deformation, as a force
         self._at_rest = np.ones(num_envs, dtype=bool)  # no reading since `clear`
+
+    @cached_property
+    def _neighbours(self) -> tuple[NDArray[np.int64], Array]:
+        """Nearest markers of each marker and their inverse distances; computed when an effect needs them."""
+        return _nearest(self._positions)
+
+    @property
+    def ideal(self) -> bool:
+        """True while no environment has an effect: readings are the marker forces."""
+        return not any(level.any() for name, level in self._level.items() if name != "gel_time")
 
     def draw(self, which: NDArray[np.bool_], sampled: Mapping[str, Array], rng: np.random.Generator) -> None:
         """New pads in the environments `which`; `sampled` has the levels of all effects, (n,) each."""
@@ -107,7 +118,7 @@ class SensorModel:
         if self._level["gel_creep"][rows].any():
             reading = self._lag(reading, rows, interval)
         if (crosstalk := self._level["crosstalk"][rows]).any():
-            near = reading[:, self._near[:, :_NEIGHBOURS]].mean(2)
+            near = reading[:, self._neighbours[0][:, :_NEIGHBOURS]].mean(2)
             reading += crosstalk[:, None, None] * (near - reading)
         if not (self._gain[rows] == 1).all() or self._turn[rows].any():
             reading = self._transformed(reading, rows)
@@ -155,10 +166,11 @@ class SensorModel:
         env, marker = np.nonzero(~self._found[rows])
         if not len(env):
             return reading
-        near = self._near[marker]
+        nearest, closeness = self._neighbours
+        near = nearest[marker]
         found = self._found[rows[env][:, None], near]
         found &= found.cumsum(1) <= _SUBSTITUTES
-        weight = self._closeness[marker] * found
+        weight = closeness[marker] * found
         total = weight.sum(1)
         mean = np.einsum("dc,dck->dk", weight, reading[env[:, None], near]) / np.where(total > 0, total, 1)[:, None]
         reading[env, marker] = mean

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -17,6 +17,14 @@ Mask = NDArray[np.bool_]
 
 # Rounds of sampling until an episode does not end at once; one or two are nearly always enough.
 _MAX_RESET_ROUNDS = 100
+
+
+class SceneOptions(TypedDict, total=False):
+    """Options that the batches of all tasks have; None or missing: the default."""
+
+    preset: str | None  # of the task's scene
+    friction: str | None  # law of the task's scene
+    threads: int | None  # of the simulator; by default all available cores. Results do not depend on it.
 
 
 class TaskBatch(ABC):

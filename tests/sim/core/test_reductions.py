@@ -111,6 +111,17 @@ def test_center_of_pressure_is_the_mean_position_weighted_by_normal_force() -> N
     np.testing.assert_allclose(reductions.center_of_pressure(force, moment), expected, rtol=1e-9, atol=1e-12)
 
 
+def test_pressure_of_curved_pads_is_the_sum_of_normal_forces_and_its_moment(scene: Scene) -> None:
+    sim, _ = in_contact(scene)
+    rows = sim.tactile(reduction=reductions.pad_pressures(scene)).reshape(ENVS, len(scene.pads), 4)
+    assert rows[..., 0].max() > 0
+    for pad, row in zip(scene.pads, rows.transpose(1, 0, 2), strict=True):
+        normal = sim.tactile()[:, sim.marker_slice(pad.name), 2]
+        positions = (pad.positions - pad.pose.position) @ pad.pose.matrix()
+        np.testing.assert_allclose(row[:, 0], normal.sum(1), rtol=1e-9, atol=1e-14)
+        np.testing.assert_allclose(row[:, 1:], normal @ positions, rtol=1e-9, atol=1e-14)
+
+
 def test_shear_features_are_projections_of_the_shear_maps() -> None:
     scene = load_scene("insertion")
     sim, _ = in_contact(scene)

@@ -96,6 +96,23 @@ def test_observation_has_the_parts_of_the_task() -> None:
     np.testing.assert_allclose(batch.observation[:, :9], batch.sim.q[:, :9], rtol=1e-6)
 
 
+def test_touch_of_the_observation_follows_from_the_markers_with_and_without_effects_of_real_pads() -> None:
+    table = DEFAULT_RANDOMIZATION.replace(pad_gain=1e-9)  # an effect, so small that the reading is the same
+    for randomization in (DEFAULT_RANDOMIZATION, table):
+        batch, rng = CapRotation(2, randomization=randomization, threads=1), np.random.default_rng(0)
+        batch.reset(batch.all, rng, options=CAP)
+        for _ in range(20):
+            batch.step(np.tile(CLOSE, (2, 1)), rng)
+        pad = batch.scene.pads[0]
+        forces = batch.sim.tactile()[:, batch.scene.marker_slice("tip1")]
+        axes = pad.pose.matrix().T @ pad.axes * [1, 1, -1]
+        np.testing.assert_allclose(batch.observation[:, 18:21], np.einsum("mij,nmj->ni", axes, forces), rtol=1e-5)
+        center = forces[..., 2] @ (pad.positions - pad.pose.position) @ pad.pose.matrix()
+        pressure = forces[..., 2].sum(1, keepdims=True)
+        assert (pressure > 0.02).all() and batch.info["touching"][:, 0].all()
+        np.testing.assert_allclose(batch.observation[:, 22:25], center / pressure / 0.01, rtol=1e-5, atol=1e-6)
+
+
 def test_episodes_repeat_bit_for_bit_with_any_number_of_threads() -> None:
     runs = []
     for threads in (1, 2):

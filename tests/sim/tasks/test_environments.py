@@ -145,9 +145,9 @@ def test_vector_environment_equals_single_environments() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"misaligned": (0, 0, 0)}, "unknown option 'misaligned'"),
-        ({"misalignment": (0, 0)}, "must be 3 finite numbers"),
-        ({"misalignment": (0, 0, np.nan)}, "must be 3 finite numbers"),
+        ({"misaligned": (0, 0, 0)}, "insertion: reset has no option 'misaligned'"),
+        ({"misalignment": (0, 0)}, r"reset: misalignment must be finite, of shape \(3,\) or"),
+        ({"misalignment": (0, 0, np.nan)}, "reset: misalignment must be finite"),
     ],
 )
 def test_invalid_reset_options_raise(options: dict[str, Any], message: str) -> None:

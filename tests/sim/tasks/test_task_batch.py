@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import load_scene
-from gelflow.sim.tasks.control_task import ControlTask, adapt_step
+from gelflow.sim.tasks.control_task import ControlDescription, ControlTask, adapt_step
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, InsertionTask, TaskDescription
 
@@ -59,20 +60,24 @@ class Line(AttemptTask):
         return np.zeros((2, 2, 3), np.uint8)
 
 
+@dataclass(frozen=True)
+class BallTask(ControlDescription):
+    """A short task of control."""
+
+    name: str = "ball"
+    max_steps: int = 3
+
+    @property
+    def observation_size(self) -> int:
+        return 3
+
+
 class Ball(ControlTask):
     """The pad of the rolling scene, pushed along x; success beyond 10 mm."""
 
     def __init__(self, num_envs: int, preset: str | None = None) -> None:
         super().__init__(
-            TaskDescription(name="ball"),
-            num_envs,
-            scene=load_scene("rolling", preset=preset),
-            control_period=0.025,
-            max_steps=3,
-            observation_space=Box(-np.inf, np.inf, (3,), np.float32),
-            action_space=Box(-1, 1, (3,), np.float32),
-            privileged=3,
-            threads=1,
+            BallTask(), num_envs, Randomization(), scene="rolling", actions=3, privileged=3, preset=preset, threads=1
         )
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
