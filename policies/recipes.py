@@ -110,7 +110,7 @@ def _pushing(observation: str, *, recurrent: int = 0) -> Recipe:
 
 
 _RECIPES: dict[str, dict[str, Recipe]] = {
-    "grasp": {DEFAULT: _grasp(40_960, _GRASP), PAPER: _grasp(20_480, _TABLE_6)},
+    "grasp": {DEFAULT: _grasp(20_480, _GRASP), PAPER: _grasp(20_480, _TABLE_6)},
     "pushing": {
         DEFAULT: _pushing("tactile", recurrent=64),
         PAPER: _pushing("tactile"),
