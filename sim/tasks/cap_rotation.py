@@ -135,6 +135,7 @@ class CapRotation(ControlTask):
             "touching": np.zeros((num_envs, len(FINGERS)), dtype=bool),
             "above": np.zeros(num_envs, dtype=bool),
         }
+        self.metrics = {"largest rate [rad/s]": np.zeros(num_envs), "turned without touch [°]": np.zeros(num_envs)}
 
     def _find_indices(self) -> None:
         """Indices, limits and sizes of the scene's elements."""
@@ -200,10 +201,11 @@ class CapRotation(ControlTask):
             forces = self.sim.tactile(active=active)[active]
             forces = self._sensors.read(forces, active, rng, interval=task.control_period)
             readings = self._by_fingertip(self._reduction(forces))
-        last_angle = info["angle"].copy()
+        last_angle, last_touching = info["angle"].copy(), info["touching"].any(1)
         info["angle"][active] = self.sim.q[active, self._cap_q]
         info["rate"][active] = self.sim.v[active, self._cap_v]
         info["touching"][active] = touch[..., 3] > 0
+        self._add_metrics(active, last_angle, last_touching)
         info["above"][active] = (tips[..., 2] > self._top).any(1)
         info["privileged"][active, 4] = info["angle"][active]
         info["privileged"][active, 5] = info["rate"][active]
@@ -212,6 +214,16 @@ class CapRotation(ControlTask):
         self.reward[active] = rewards[active]
         self.terminated[active] = (info["success"] | info["above"])[active]
         self.observation[active] = self._observation(active, tips, readings)
+
+    def _add_metrics(self, active: Mask, last_angle: Array, last_touching: Mask) -> None:
+        """Largest rate of the cap, and its rotation in periods that begin and end without touch: a thrown cap."""
+        rate, coasted = self.metrics.values()
+        info = self.info
+        started = active & (info["steps"] == 0)
+        rate[active] = np.maximum(rate, np.abs(info["rate"]))[active]
+        free = active & ~last_touching & ~info["touching"].any(1)
+        coasted[free] += np.degrees(np.abs(info["angle"] - last_angle))[free]
+        rate[started] = coasted[started] = 0
 
     def _observation(self, active: Mask, tips: Array, readings: Array) -> Array:
         """Observations of the environments `active` (n): fingertips (n, 3, 3) [m], readings (n, 3, 7)."""

@@ -220,6 +220,7 @@ class Pushing(ControlTask):
         self._action: Array = np.zeros((num_envs, 3))
         self.frames: Array = np.zeros((num_envs, task.history, task.frame_size))
         self.info |= {"position_error": np.zeros(num_envs), "yaw_error": np.zeros(num_envs)}
+        self.metrics = {"position error [mm]": np.zeros(num_envs), "yaw error [°]": np.zeros(num_envs)}
 
     def _find_indices(self) -> None:
         """Indices and sizes of the scene's elements."""
@@ -313,6 +314,8 @@ class Pushing(ControlTask):
         squared, yaw = state.goal_error()
         info["position_error"][active] = np.sqrt(squared)[active]
         info["yaw_error"][active] = np.abs(yaw)[active]
+        self.metrics["position error [mm]"][active] = 1e3 * info["position_error"][active]
+        self.metrics["yaw error [°]"][active] = np.degrees(info["yaw_error"][active])
         near = (info["position_error"] < task.position_tolerance) & (info["yaw_error"] < task.yaw_tolerance)
         info["success"][active] = near[active]
         info["privileged"][active] = state.privileged(task)[active]

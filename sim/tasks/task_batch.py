@@ -46,6 +46,7 @@ class TaskBatch(ABC):
     info: arrays with first axis N: "success" and "failed" (bool; failed: the simulation stopped), "privileged" (N, p)
         (the true quantities that an oracle or a teacher may use), and those of the task
     quantities: randomized quantities of the present episodes, name → (N,), and `quantity_units`, their units
+    metrics: results of the present episodes beyond success, name and unit → (N,); evaluations report their means
     """
 
     length_unit: ClassVar[str] = "steps"  # what reports count: "steps", "attempts", or "corrections" between attempts
@@ -77,6 +78,7 @@ class TaskBatch(ABC):
         }
         self.quantities: dict[str, Array] = {}
         self.quantity_units: dict[str, str] = {}
+        self.metrics: dict[str, Array] = {}
 
     @property
     def all(self) -> Mask:

@@ -57,6 +57,18 @@ def test_closed_fingers_turn_the_cap_to_success() -> None:
     assert (batch.info["angle"] > 0.3).all() and (batch.reward > 45).all()
     # A cap turns no faster than fingertips that move by an action in each period: 0.16 m × 0.06 rad / 25 ms at 50 mm.
     assert rate < 0.16 * 0.06 * 3**0.5 / 0.025 / 0.05
+    assert batch.metrics["largest rate [rad/s]"].max() >= rate > 0
+
+
+def test_rotation_without_touch_is_counted() -> None:
+    batch, rng = started()
+    batch.sim.v[0, batch.scene.v("cap")] = 30.0  # a thrown cap coasts until its damping has stopped it
+    for _ in range(8):
+        batch.step(np.zeros((2, 9)), rng)
+    coasted = batch.metrics["turned without touch [°]"]
+    assert coasted[0] == pytest.approx(np.degrees(batch.info["angle"][0])) and coasted[0] > 1 and coasted[1] == 0
+    batch.reset(np.array([True, False]), rng)
+    assert coasted[0] == 0
 
 
 def test_fingertip_above_the_cap_ends_the_episode() -> None:
