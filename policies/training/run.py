@@ -29,6 +29,7 @@ from gelflow.policies.training.state import load_state, save_state
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 FORMAT = 1
+BEST_BY = ("success", "return")
 POLICY, STATE, CONFIGURATION = "policy.safetensors", "state.safetensors", "run.json"
 PROGRESS, PICTURE, TENSORBOARD = "progress.csv", "learning_curve.png", "tensorboard"
 
@@ -42,10 +43,13 @@ class RunSettings:
     minutes: float = float("inf")  # time limit; a run that reaches it is not repeatable
     evaluate_every: int = 10_000  # steps; the state is saved after each evaluation
     evaluate_episodes: int = 256
+    best_by: str = "success"  # of the evaluations: "success", then return, or "return" alone
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.evaluate_every < 1 or self.evaluate_episodes < 1 or not self.minutes > 0:
             raise UsageError(f"training requires steps, minutes and evaluations above 0, got {self}")
+        if self.best_by not in BEST_BY:
+            raise UsageError(f"best_by must be one of {', '.join(BEST_BY)}, got {self.best_by!r}")
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,7 @@ class TrainingRun:
             policy = network.batch_policy(self.validation.num_envs)
             seed = s.seed + 1_000_003  # differs from the seed of the training
             result = evaluate_task("validation", policy, self.validation, episodes=s.evaluate_episodes, seed=seed)
-        if self._best is None or (result.success, result.reward) >= (self._best.success, self._best.reward):
+        if self._best is None or self._order(result) >= self._order(self._best):
             self._best = result
             save_checkpoint(
                 self.folder / POLICY,
@@ -170,6 +174,10 @@ class TrainingRun:
                 | {"validation": result.to_json()},
             )
         return result
+
+    def _order(self, result: EvaluationResult) -> tuple[float, float]:
+        """Evaluations in the order of this value are better and better."""
+        return (result.success if self.settings.best_by == "success" else 0.0, result.reward)
 
     def _configuration(self) -> dict[str, Any]:
         """Everything that determines the result, as JSON data."""
