@@ -32,13 +32,15 @@ class Episodes:
     quantities: dict[str, Array] = field(default_factory=dict)  # randomized quantities
     quantity_units: dict[str, str] = field(default_factory=dict)
     length_unit: str = "steps"
+    metrics: dict[str, Array] = field(default_factory=dict)  # at the end
 
     def result(self, name: str) -> EvaluationResult:
         """Means over the episodes."""
         lengths = self.length[self.success]
         mean = float(lengths.mean()) if len(lengths) else float("nan")
         counts = len(self.success), int(self.success.sum())
-        return EvaluationResult(name, *counts, mean, float(self.reward.mean()), self.length_unit)
+        metrics = {metric: float(values.mean()) for metric, values in self.metrics.items()}
+        return EvaluationResult(name, *counts, mean, float(self.reward.mean()), self.length_unit, metrics)
 
 
 @dataclass
@@ -103,22 +105,24 @@ def run_episodes(
             reward[which] += task.reward[which]
         else:
             for row in np.flatnonzero(which):
-                drawn = [values[row] for values in task.quantities.values()]
+                kept = [values[row] for values in (*task.quantities.values(), *task.metrics.values())]
                 success, failed = task.info["success"][row], task.info["failed"][row]
-                rows[row].append((success, failed, length[row], reward[row], *drawn))
+                rows[row].append((success, failed, length[row], reward[row], *kept))
             if report:
                 report(sum(map(len, rows)))
     columns = zip(*(row for of_env in rows for row in of_env), strict=True)
-    success, failed, lengths, returns, *drawn = columns
-    table = {name: np.array(values, dtype=float) for name, values in zip(task.quantities, drawn, strict=True)}
+    success, failed, lengths, returns, *kept = columns
+    names = (*task.quantities, *task.metrics)
+    table = {name: np.array(values, dtype=float) for name, values in zip(names, kept, strict=True)}
     return Episodes(
         np.array(success, bool),
         np.array(failed, bool),
         np.array(lengths),
         np.array(returns),
-        table,
+        {name: table[name] for name in task.quantities},
         dict(task.quantity_units),
         task.length_unit,
+        {name: table[name] for name in task.metrics},
     )
 
 

@@ -1,6 +1,7 @@
 """Evaluation of policies over complete episodes."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ class EvaluationResult:
     length: float  # mean length of the successful episodes; nan without any
     reward: float  # mean return
     length_unit: str = "corrections"  # "steps"; "attempts", the first included; or "corrections" between attempts
+    metrics: Mapping[str, float] = field(default_factory=dict)  # means of `TaskBatch.metrics` at the end
 
     @property
     def success(self) -> float:
@@ -46,6 +48,7 @@ class EvaluationResult:
             "success_95": list(self.confidence_interval()),
             self.length_unit: self.length if self.successes else None,
             "reward": self.reward,
+            **({"metrics": dict(self.metrics)} if self.metrics else {}),
         }
 
 

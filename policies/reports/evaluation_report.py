@@ -126,8 +126,9 @@ def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
     with (out / EPISODES).open("w", newline="") as file:
         writer = csv.writer(file)
         names = [_with_unit(name, episodes.quantity_units[name]) for name in episodes.quantities]
-        writer.writerow(["success", "failed", episodes.length_unit, "return", *names])
-        columns = (episodes.success, episodes.failed, episodes.length, episodes.reward, *episodes.quantities.values())
+        writer.writerow(["success", "failed", episodes.length_unit, "return", *episodes.metrics, *names])
+        results = (episodes.success, episodes.failed, episodes.length, episodes.reward, *episodes.metrics.values())
+        columns = (*results, *episodes.quantities.values())
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
     rows = [entry.to_json() for entry in report.failures]
     values = {"results": [result.to_json() for result in report.results], "failures": rows}

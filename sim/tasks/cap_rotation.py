@@ -201,7 +201,7 @@ class CapRotation(ControlTask):
             forces = self.sim.tactile(active=active)[active]
             forces = self._sensors.read(forces, active, rng, interval=task.control_period)
             readings = self._by_fingertip(self._reduction(forces))
-        last_angle, last_touching = info["angle"].copy(), info["touching"].any(1)
+        last_angle, last_touching = info["angle"].copy(), np.asarray(info["touching"].any(1))
         info["angle"][active] = self.sim.q[active, self._cap_q]
         info["rate"][active] = self.sim.v[active, self._cap_v]
         info["touching"][active] = touch[..., 3] > 0

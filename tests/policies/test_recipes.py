@@ -12,7 +12,7 @@ from tests.policies.toy_tasks import PointTask
 from gelflow.cli.commands.training.task_training import TASKS
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.policies.episodes import Episodes, Film, OraclePolicy, record_films, run_episodes
+from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
 from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
@@ -156,3 +156,20 @@ def test_every_episode_counts_once_whatever_its_length() -> None:
         assert (episodes.length <= 4).all()
     again = run_episodes(Direct(PointTask(7)), PointTask(7), episodes=50, seed=2)
     assert (again.reward == many.reward).all()
+
+
+def test_the_metrics_of_a_task_are_means_over_the_ends_of_the_episodes() -> None:
+    class Measured(PointTask):
+        def _observe(self, which: NDArray[np.bool_]) -> None:
+            super()._observe(which)
+            self.metrics.setdefault("distance [m]", np.zeros(self.num_envs))[which] = np.linalg.norm(
+                self._target - self._point, axis=1
+            )[which]
+
+    task = Measured(5)
+    episodes = run_episodes(RandomPolicy(5, np.ones(2), 0), task, episodes=20, seed=2)
+    distance = episodes.metrics["distance [m]"]
+    assert len(distance) == 20 and (distance[episodes.success] < 0.15).all() and (distance[~episodes.success] > 0).all()
+    result = episodes.result("random")
+    assert result.metrics == {"distance [m]": pytest.approx(distance.mean())}
+    assert result.to_json()["metrics"] == dict(result.metrics)

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from gelflow.cli.commands.training.task_training import TASKS, refuse
@@ -114,10 +115,11 @@ def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
 def _table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
     unit = results[0].length_unit
     table = Table(title=f"{task} in simulation: {episodes} episodes, {path.name}")
-    for heading in ("actions", "success", "95 % interval", unit, "return"):
-        table.add_column(heading, justify="left" if heading == "actions" else "right")
+    for heading in ("actions", "success", "95 % interval", unit, "return", *results[0].metrics):
+        table.add_column(escape(heading), justify="left" if heading == "actions" else "right")
     for result in results:
         low, high = result.confidence_interval()
         length = f"{result.length:.2f}" if result.successes else "none"
-        table.add_row(result.name, f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", length, f"{result.reward:.1f}")
+        row = (f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", length, f"{result.reward:.1f}")
+        table.add_row(result.name, *row, *(f"{value:.2f}" for value in result.metrics.values()))
     return table
