@@ -87,6 +87,7 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     ("arguments", "message"),
     [
         (["train", "grasp", "--recipe", "none"], "no recipe 'none'"),
+        (["train", "rolling"], "no recipe trains 'rolling': the paper measures in this scene"),
         (["train", "cap", "--part", "peg.toml"], "--part is for the insertion"),
         (["train", "grasp", "--steps", "0"], "above 0"),
         (["train", "insertion", "--recipe", "paper"], "--recipe"),

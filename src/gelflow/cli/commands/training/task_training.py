@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 DEFAULT_RECIPE = "default"
 TASKS = ("cap", "grasp", "pushing")  # those of `gelflow.policies.recipes`, which is slow to import
+UNTRAINED = ("rolling",)  # without a recipe; the error says why
 
 
 def refuse(args: argparse.Namespace, **unset: object) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
-from gelflow.cli.commands.training.task_training import DEFAULT_RECIPE, TASKS, refuse, train_task
+from gelflow.cli.commands.training.task_training import DEFAULT_RECIPE, TASKS, UNTRAINED, refuse, train_task
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
     add_json,
@@ -31,7 +31,7 @@ _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algor
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion", *TASKS], help="task to learn")
+    parser.add_argument("task", choices=["insertion", *TASKS, *UNTRAINED], help="task to learn")
     parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
     text = "environment steps in total, for the insertion attempts (default: docs/guide/training.md)"
     parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=text)
