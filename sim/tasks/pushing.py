@@ -62,7 +62,7 @@ class PushingTask(ControlDescription):
     # Units of the observation, so that its numbers are near 1.
     goal_unit: float = 0.1
     yaw_unit: float = 0.5
-    # Of marker forces [N]: ten times their usual size, so that the feedback through the stiff contact is gentle at first.
+    # Of marker forces [N]: ten times their usual size, so that feedback through the stiff contact is gentle at first.
     marker_unit: float = 0.1
     box_unit: float = 0.02  # of positions and sizes of the box
     mass_unit: float = 0.1  # [kg]
