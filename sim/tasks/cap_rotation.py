@@ -233,8 +233,8 @@ class CapRotation(ControlTask):
         if task.touch:
             force, pressure, moment = readings[..., :3], readings[..., 3:4], readings[..., 4:]
             center = moment / np.maximum(pressure, task.contact_force)
-            felt = [force / task.force_unit, pressure > task.contact_force, center / task.pressure_unit]
-            parts.append(np.concatenate(felt, axis=2).reshape(len(tips), -1))
+            readouts = [force / task.force_unit, pressure > task.contact_force, center / task.pressure_unit]
+            parts.append(np.concatenate(readouts, axis=2).reshape(len(tips), -1))
         if task.commanded:
             parts.append((self._commanded[active] - measured) / task.command_unit)
         return np.concatenate(parts, axis=1)

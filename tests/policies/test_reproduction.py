@@ -78,7 +78,7 @@ def test_a_folder_with_other_settings_or_a_damaged_evaluation_is_rejected(tmp_pa
     plan = Reproduction("grasp", PLAN.variants[:1])
     reproduce(plan, tmp_path, effort=single, command=COMMAND)
     longer = Effort((0,), shorter=4, max_episodes=2, envs=2)
-    with pytest.raises(UsageError, match=r"holds a finished run with other settings: .*run.steps 1 \(here 2560\)"):
+    with pytest.raises(UsageError, match=r"holds a finished run with other settings: .*run.steps 1 \(here 5120\)"):
         reproduce(plan, tmp_path, effort=longer, command=COMMAND)
     more = Effort((0,), shorter=10**9, max_episodes=3, envs=2)
     assert reproduce(plan, tmp_path, effort=more, command=COMMAND)["variants"][0]["ours"]["episodes"] == 3
