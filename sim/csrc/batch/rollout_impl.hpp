@@ -12,7 +12,9 @@ void copy_state(const Model& m, const StateView<T>& from, const StateView<T>& to
   std::copy_n(from.q, m.nq, to.q);
   std::copy_n(from.v, m.nv, to.v);
   std::copy_n(from.anchored, m.na, to.anchored);
-  for_each_set(from.anchored, m.na, [&](int i) { to.anchors[i] = from.anchors[i]; });
+  const V3<T>* const source = from.anchors;
+  V3<T>* const target = to.anchors;
+  for_each_set(from.anchored, m.na, [=](int i) { target[i] = source[i]; });
   std::copy_n(from.history, m.nh, to.history);
 }
 
