@@ -1,9 +1,9 @@
-"""Training of the insertion policy by imitation of the true pose along its own attempts (DAgger).
+"""Training of the insertion policy by imitation (DAgger) of an expert that knows the true pose.
 
-The simulation knows the misalignment, so the correct correction after any attempt is known. The policy makes attempts,
-with exploration; every attempt is stored with the correction that would have centred the part; the network learns to
-predict it. Because the attempts are those of the policy itself, it learns from the situations that it gets into (Ross,
-Gordon and Bagnell, A Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning, 2011).
+The misalignment is available in simulation, so each attempt is labelled with the correction that centres the part. The
+policy makes attempts, with exploration, and the network is fitted to the labels. Because the attempts are those of the
+policy itself, the training data cover the states that the policy visits (Ross, Gordon and Bagnell, A Reduction of
+Imitation Learning and Structured Prediction to No-Regret Online Learning, 2011).
 
 The first attempts of a part often allow several explanations. The mean of the corrections inserts none of them, so the
 loss is bounded: the network learns to correct the most probable one (a mode), and the next attempt shows the error.
@@ -44,7 +44,7 @@ class ImitationSettings:
     """Settings of a training run, stored in the checkpoint."""
 
     attempts: int = 400_000  # total number of attempts
-    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not repeatable
+    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not reproducible
     seed: int = 0
     rollout: int = 16  # attempts per environment in an iteration, which starts with new parts
     updates: int = 60  # of the network per iteration
@@ -98,8 +98,8 @@ def train(
     command: command line, stored in the checkpoint
     report: called after each iteration and each evaluation
 
-    A run that was killed continues where its folder stands, at most an iteration or 20 s before the kill, and gives the
-    result of an uninterrupted one. Raises UsageError when `out` contains a trained policy, or an unfinished run with
+    A run that was killed resumes from the last saved state, at most 20 s or one iteration old, and gives the result of
+    an uninterrupted one. Raises UsageError when `out` contains a trained policy, or an unfinished run with
     other settings.
     """
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable

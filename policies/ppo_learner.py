@@ -1,8 +1,8 @@
 """Proximal policy optimization (PPO, Schulman et al. 2017) with a Gaussian actor, feedforward or recurrent.
 
 Each iteration collects a rollout of all environments (`_collect`), estimates advantages (`_advantages`), and improves
-actor and critic by several epochs over minibatches (`_learn`). The memory of a recurrent actor starts each rollout with
-its value at that time, and gradients flow back to the start of the rollout.
+actor and critic by several epochs over minibatches (`_learn`). The hidden state of a recurrent actor is carried over
+between rollouts; gradients are truncated at the start of a rollout.
 """
 
 from dataclasses import dataclass

@@ -53,7 +53,7 @@ DEFAULT_RANDOMIZATION = Randomization(
         **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is None},
         **_HOLE_QUANTITIES,
         **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is not None},
-        "arm_stiffness": Quantity(LogUniform(200.0, 3e5), "N/m", "of the arm, published servo to industrial arm"),
+        "arm_stiffness": Quantity(LogUniform(200.0, 3e5), "N/m", "servo stiffness of the arm, paper to industrial arm"),
         "grasp_force": Quantity(Uniform(2.5, 16.0), "N", "of each finger"),
         "grasp_height": Quantity(Uniform(-10e-3, 5e-3), "m", "of the pad centres above the part's centre"),
         # The robot stops at a marker displacement; the force at that displacement depends on the gel.
@@ -85,15 +85,15 @@ RANDOMIZATIONS = {"nominal": NOMINAL, "default": DEFAULT_RANDOMIZATION, "full": 
 
 @dataclass(frozen=True)
 class AttemptResult:
-    """Results of one attempt in every environment."""
+    """Results of one attempt, one row for each of the n environments that made it."""
 
-    image: NDArray[np.float32]  # flow maps, shape (N, frames * sensors * 2, rows, cols)
-    divisor: Array  # [N], shape (N,): normalization of the flow maps
-    height: Array  # [m], shape (N,): highest corner of the part's lower face above the hole's floor
-    # Shape (N,): the lower face is inside the hole and below the task's success height, contact did not stop the
+    image: NDArray[np.float32]  # flow maps, shape (n, frames * sensors * 2, rows, cols)
+    divisor: Array  # shape (n,), in newtons: normalization of the flow maps
+    height: Array  # [m], shape (n,): highest corner of the part's lower face above the hole's floor
+    # Shape (n,): the lower face is inside the hole and below the task's success height, contact did not stop the
     # descent, and no step failed.
     inserted: NDArray[np.bool_]
-    failed: NDArray[np.bool_]  # shape (N,): a simulation step failed
+    failed: NDArray[np.bool_]  # shape (n,): a simulation step failed
 
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:

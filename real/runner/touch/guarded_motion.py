@@ -78,16 +78,16 @@ class GuardedMotion:
 
     @property
     def free_speed(self) -> float:
-        """Largest speed where contact is not expected [m/s]: the arm is at rest 0.5 mm after contact."""
+        """Largest speed where contact is not expected [m/s], such that the arm stops within 0.5 mm after contact."""
         return self._speed(_FREE_OVERSHOOT)
 
     def speed_towards(self, target: Pose) -> float:
-        """Largest speed of a motion to `target` [m/s]; downward, at rest `descent.max_overshoot` after contact."""
+        """Largest speed of a motion to `target` [m/s]; downward, the arm stops within `descent.max_overshoot`."""
         downward_motion = self._motion.pose().position[2] - target.position[2] > _DOWNWARD
         return self._speed(self._lab.descent.max_overshoot) if downward_motion else self.free_speed
 
     def _speed(self, overshoot: float) -> float:
-        """Speed at which the latency and the period of the images and the reaction time are `overshoot` [m] long."""
+        """Speed at which the arm travels `overshoot` [m] during image latency, image period and reaction time."""
         delay = self._latency + self.observer.image_period + _REACTION_TIME
         return min(self._lab.arm.max_speed, overshoot / delay)
 
@@ -152,7 +152,7 @@ class GuardedMotion:
     def _wait_until_readable(self) -> None:
         """Hold until both pads are readable again. Raises TouchLost after `limits.stale_frame`.
 
-        Images that all arrive late are readable, but never young enough: the time of the hold is limited too.
+        Late images may be readable and still too old, so the duration of the hold is limited as well.
         """
         phases = self._motion.supervisor.phases
         before = phases.phase

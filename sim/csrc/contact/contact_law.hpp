@@ -7,8 +7,8 @@
 // In the shape's frame, x the point, X its anchor, e = x − X (0 at a new contact point), v its velocity relative to the
 // shape, d, n, H the distance there (d < 0 inside) with its gradient and Hessian, ḋ = n·v, v_t = v − ḋ n:
 //     normal      N = max(k_n − k_d ḋ, 0) (−d)          Hunt-Crossley: scaled by depth (eq. 8 has no max and can pull)
-//                 N = max(−k_n d − r k_d ḋ, 0)          linear damping, for grounds; r = min(−d / 1 µm, 1), since a
-//                                                       light body that arrives fast has no solution without the ramp
+//                 N = max(−k_n d − r k_d ḋ, 0)          linear damping, for ground contacts; r = min(−d / 1 µm, 1):
+//                                                       without the ramp the step of a light, fast body has no solution
 //     trial       f* = −k_t v_t                         viscous friction
 //                 f* = −k_s s − k_t v_t                 elastic friction, s = tangential part of e
 //     friction    f_t = f* · min(1, µN/‖f*‖)            v_t → 0 lies in the stick branch, without division; under the
@@ -27,7 +27,7 @@
 
 namespace gelflow {
 
-// Coefficients of several points, times their weights: the force at weight 0 is 0. P is a pack type (simd_pack.hpp).
+// Coefficients of several points; kn, kt, kd and ks times the weight of the point, so the force at weight 0 is 0. P is a pack type (simd_pack.hpp).
 template <class P>
 struct PointLaw {
   P kn, kt, mu, kd, ks;

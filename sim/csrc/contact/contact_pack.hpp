@@ -17,7 +17,7 @@ struct ContactPack {
   int first = 0;               // index in the cloud of the first point, if the points are consecutive
   const int* index = nullptr;  // else the indices of all
   Mask<P> active;              // the point is in contact
-  PointLaw<P> law;             // coefficients times the point's weight, 0 where it is not active
+  PointLaw<P> law;             // coefficients, weighted; zero if the point is not active
   Distance<P> at;
   Vec3<P> center, x;   // material point (the centre of a rolling sphere); contact point
   Vec3<P> v;           // velocity relative to the shape

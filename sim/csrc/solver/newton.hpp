@@ -1,5 +1,5 @@
-// Newton's method for the velocity after a step: full steps first, then a backtracking line search, and continuation in
-// the stiff saturating forces where both fail.
+// Newton's method for the velocity after a step: full steps first, then a backtracking line search and, if both fail,
+// continuation in the stiffness of friction and servos.
 #pragma once
 
 #include <algorithm>
@@ -11,7 +11,7 @@ namespace gelflow {
 
 enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
 
-// √Σ (g_k / s_k)², the residual relative to impulses s; infinity where it is not finite.
+// √Σ (g_k / s_k)², the residual relative to impulses s; infinity if it is not finite.
 template <class T>
 double relative_norm(const VX<T>& residual, const VX<T>& impulses, int n) {
   double total = 0;
@@ -81,10 +81,10 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& star
 // ends nearer to the tolerance, so double precision tightens the tolerance by a safety factor; single precision has no
 // room for one. Tight tolerances disable Jacobian reuse.
 //
-// Unverified last iteration. Where the residual is within the tolerance, or is expected to be within a tenth of it
-// after an update with the reused Jacobian, one more update is applied without evaluating its residual, unless the
-// residual is far below the tolerance already or anchors depend on the result. It is cheap and removes an error that
-// would otherwise accumulate over many steps.
+// Unverified last iteration. One more update is applied without evaluating its residual if the residual is within the
+// tolerance, or is expected to be within a tenth of it after an update with the reused Jacobian. It is not applied if
+// the residual is far below the tolerance already, or if anchors depend on the result. The update is cheap and removes
+// an error that would otherwise accumulate over many steps.
 template <class T>
 class NewtonSolver {
  public:
@@ -272,7 +272,7 @@ Status newton(const Model& m, const T* params, const StepStart<T>& start, int po
 }
 
 // Continuation (homotopy), where Newton's method did not converge. The usual cause is saturation: points stick below a
-// tiny slip speed and slide above it; a servo follows within a tiny error and pulls with its force limit beyond. Full
+// tiny slip speed and slide above it; a servo saturates at its force limit beyond a tiny error. Full
 // steps jump back and forth over that narrow range, and a line search gets stuck beside it. So k_t, k_s and the gains
 // are scaled by a factor that starts small, which widens the range, and grows to 1; each solution is the next initial
 // guess.
