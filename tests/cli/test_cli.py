@@ -20,6 +20,8 @@ COMMON_OPTIONS = {
     "train": {"--json", "--out", "--seed", "--preset"},
     "sweep": {"--json", "--out"},
     "eval": {"--json", "--seed", "--preset", "--checkpoint", "--out"},
+    "reproduce": {"--json", "--out", "--seed", "--quick"},
+    "export": {"--json", "--out"},
     "track": {"--json", "--out"},
     "calibrate-camera": {"--json", "--out"},
     "run": {"--json", "--out", "--checkpoint"},
