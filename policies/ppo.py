@@ -40,7 +40,7 @@ class PPOSettings:
     """Settings of a training run, stored in the checkpoint."""
 
     attempts: int = 200_000  # total number of attempts
-    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not repeatable
+    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not reproducible
     seed: int = 0
     rollout: int = 16  # attempts per environment between updates
     batch: int = 256  # minibatch size

@@ -178,7 +178,7 @@ def training_run(
     ----------
     task, recipe: names, see `recipe_for`
     steps, envs: environment steps in total and parallel environments; None: those of the recipe
-    minutes: time limit; a run that reaches it is not repeatable
+    minutes: time limit; a run that reaches it is not reproducible
     options: of the task's batch, such as `preset` and `friction`; JSON data
     command: that repeats the run, stored in the folder
     report: called after each update

@@ -40,7 +40,7 @@ class RunSettings:
 
     steps: int
     seed: int = 0
-    minutes: float = float("inf")  # time limit; a run that reaches it is not repeatable
+    minutes: float = float("inf")  # time limit; a run that reaches it is not reproducible
     evaluate_every: int = 10_000  # steps; the state is saved after each evaluation
     evaluate_episodes: int = 256
     best_by: str = "success"  # of the evaluations: "success", then return, or "return" alone
