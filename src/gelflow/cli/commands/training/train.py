@@ -35,7 +35,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
     text = "environment steps in total, for the insertion attempts (default: docs/guide/training.md)"
     parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=text)
-    parser.add_argument("--minutes", type=float, metavar="M", help="stop after this time; such a run is not reproducible")
+    parser.add_argument(
+        "--minutes", type=float, metavar="M", help="stop after this time; such a run is not reproducible"
+    )
     parser.add_argument(
         "--algorithm", choices=list(_ENVS), default=_DEFAULT, help="learning algorithm (default %(default)s)"
     )
