@@ -5,6 +5,7 @@ A checkpoint is one safetensors file with a JSON header. Reading it executes no 
 
 import hashlib
 import json
+import os
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -80,8 +81,16 @@ def save_checkpoint(
             f"checkpoint would have {len(data)} bytes, more than {MAX_BYTES}; reduce the number of hidden units"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(path, data)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Writes a file as a whole: a process that is killed meanwhile leaves the previous file intact."""
     partial = path.with_name(path.name + ".part")
-    partial.write_bytes(data)
+    with partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(path)
 
 

@@ -234,7 +234,7 @@ class _Run:
         self._env, self._validation, self._out, self._command, self._report = env, validation, out, command, report
         unfinished = load_state(out)
         if unfinished is None:
-            curve.create_folder(out)
+            curve.create_training_folder(out)
         with torch.random.fork_rng():
             torch.manual_seed(settings.seed)
             self.layers = TorchPolynomialGRU(architecture, self.task)

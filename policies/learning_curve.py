@@ -10,6 +10,7 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.figures import BLUE, VERMILION, save
 from gelflow.policies.evaluation import EvaluationResult
+from gelflow.policies.training.folder import create_folder
 
 # Files in the folder of a training of the insertion.
 CHECKPOINT, CURVE, PICTURE = "insertion.safetensors", "learning_curve.csv", "learning_curve.png"
@@ -39,14 +40,11 @@ class TrainingResult:
     learning_time: float = float("nan")  # [s]
 
 
-def create_folder(out: Path) -> None:
+def create_training_folder(out: Path) -> None:
     """Creates the folder of a new training. Raises UsageError if it contains a trained policy or cannot be written."""
     if (out / CHECKPOINT).exists():  # never overwrite the result of another run
         raise UsageError(f"{out} already holds a trained policy; choose another folder or delete it")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}") from error
+    create_folder(out)
 
 
 COLUMNS = ("attempts", "minutes", "reward", "success", "spread", "evaluated success", "evaluated corrections")

@@ -166,7 +166,7 @@ def train(
     architecture = architecture or PolynomialMLP()
     settings = settings or PPOSettings()
     _check_settings(settings, env)
-    curve.create_folder(out)
+    curve.create_training_folder(out)
     torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
     basis = polynomial_basis(env.task.grid, architecture.degree)
     scale = feature_scale(env, architecture, basis, settings)

@@ -11,6 +11,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import replace_file
 
 STATE = "training_state.safetensors"
 _KEY = "gelflow_state"
@@ -21,9 +22,7 @@ def save_state(folder: Path, arrays: Mapping[str, NDArray[Any]], facts: Mapping[
     """Writes arrays and facts (JSON data) atomically: a kill leaves the former state."""
     header = json.dumps({"format": _FORMAT, **facts})
     stored = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    partial = folder / (STATE + ".part")
-    partial.write_bytes(safetensors.numpy.save(stored, metadata={_KEY: header}))
-    partial.replace(folder / STATE)
+    replace_file(folder / STATE, safetensors.numpy.save(stored, metadata={_KEY: header}))
 
 
 def load_state(folder: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:

@@ -17,6 +17,7 @@ from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy, Network
 from gelflow.policies.networks.flow_map_policy import FlowMapNetwork
 from gelflow.policies.reports.failures import FailureRange, draw_failures, failure_ranges, worst_ranges
+from gelflow.policies.training.folder import create_folder
 from gelflow.session.records import to_plain
 from gelflow.sim.tasks.task_batch import TaskBatch
 
@@ -72,7 +73,7 @@ def evaluate_all(
     Raises UsageError when the folder cannot be written.
     """
     if out is not None:
-        _create(out)
+        create_folder(out)
     report = Report()
     for name, actor in actors(network, task, seed=seed).items():
         started(name)
@@ -113,13 +114,6 @@ def has_oracle(task: TaskBatch) -> bool:
     except UsageError:
         return False
     return True
-
-
-def _create(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"cannot write into {out}: {error.strerror}") from error
 
 
 def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:

@@ -1,6 +1,7 @@
 """Trials: the training of a variant with one seed, and the evaluation of its policy on episodes of its own.
 
-Both are files in a folder, so that a repeated call does what is missing. A training that was interrupted is resumed.
+Checkpoint and evaluation are stored in a folder: a repeated call computes only what is missing, and resumes a training
+that was interrupted.
 """
 
 import hashlib
@@ -19,7 +20,7 @@ from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor, versions
 from gelflow.policies import imitation, recipes
 from gelflow.policies import learning_curve as insertion_curve
-from gelflow.policies.checkpoint import load_checkpoint, load_network
+from gelflow.policies.checkpoint import load_checkpoint, load_network, replace_file
 from gelflow.policies.environment import FlowMapNoise, insertion_randomization, make_insertion_env
 from gelflow.policies.episodes import OraclePolicy, RandomPolicy, run_episodes
 from gelflow.policies.evaluation import EvaluationResult
@@ -254,7 +255,6 @@ def _read(path: Path) -> dict[str, Any] | None:
 def _write(path: Path, values: Mapping[str, Any]) -> dict[str, Any]:
     """Writes JSON atomically; returns it as it will be read."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(json.dumps(to_plain(values), indent=1) + "\n")
-    partial.replace(path)
-    return dict(json.loads(path.read_text()))
+    text = json.dumps(to_plain(values), indent=1) + "\n"
+    replace_file(path, text.encode())
+    return dict(json.loads(text))

@@ -19,7 +19,7 @@ import torch
 
 from gelflow import __version__
 from gelflow.errors import UsageError
-from gelflow.policies.checkpoint import save_checkpoint, task_differences
+from gelflow.policies.checkpoint import replace_file, save_checkpoint, task_differences
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.training import progress_curve
@@ -232,9 +232,8 @@ class TrainingRun:
         versions = {"gelflow": __version__, "python": platform.python_version()}
         versions |= {"numpy": np.__version__, "torch": str(torch.__version__)}
         values = {"format": FORMAT, "finished": finished, "command": list(self.command), "versions": versions}
-        partial = self.folder / f"{CONFIGURATION}.part"
-        partial.write_text(json.dumps({**values, "configuration": configuration}, indent=2) + "\n")
-        partial.replace(self.folder / CONFIGURATION)
+        text = json.dumps({**values, "configuration": configuration}, indent=2) + "\n"
+        replace_file(self.folder / CONFIGURATION, text.encode())
 
     def _finish(self, start: float) -> TrainingResult:
         """Draws the learning curve and marks the run as finished."""

@@ -1,7 +1,6 @@
 """The state of an unfinished training run: tensors and JSON values in one file that is replaced atomically."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 from safetensors.torch import load_file, save
 
 from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import replace_file
 
 _KEY = "gelflow-run"
 FORMAT = 1
@@ -39,12 +39,7 @@ def save_state(path: Path, state: RunState) -> None:
     """Writes the state; a process that is killed meanwhile leaves the previous file intact."""
     tensors = {name: tensor.detach().contiguous().clone() for name, tensor in state.tensors.items()}
     data = save(tensors, metadata={_KEY: json.dumps({"format": FORMAT, **state.values}, sort_keys=True)})
-    partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    replace_file(path, data)
 
 
 def load_state(path: Path) -> RunState:

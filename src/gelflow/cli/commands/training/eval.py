@@ -2,15 +2,14 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.table import Table
 
-from gelflow.cli.commands.training.task_training import TASKS, refuse
+from gelflow.cli.commands.training.task_training import TASKS, refuse, task_options
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
-    DEFAULT_RANDOMIZATION,
     add_checkpoint,
     add_json,
     add_out,
@@ -102,11 +101,7 @@ def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
     from gelflow.policies.checkpoint import load_checkpoint, load_network
 
     training = load_checkpoint(args.checkpoint).training
-    options: dict[str, Any] = {**training.get("options", {})}
-    if args.preset is not None:
-        options["preset"] = args.preset
-    if args.randomization != DEFAULT_RANDOMIZATION:
-        options["randomization"] = args.randomization
+    options = {**training.get("options", {}), **task_options(args)}
     recipe = recipes.recipe_for(args.task, training.get("recipe", recipes.DEFAULT))
     batch = recipe.make_task(min(args.envs, args.episodes), **options)
     return args.checkpoint, load_network(args.checkpoint, task=batch.description), batch

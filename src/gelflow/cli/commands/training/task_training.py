@@ -3,7 +3,7 @@
 import argparse
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import TaskProgressColumn, TimeElapsedColumn
 
@@ -28,6 +28,14 @@ def refuse(args: argparse.Namespace, **unset: object) -> None:
             raise UsageError(f"--{name.replace('_', '-')} is for the insertion, not for {args.task}")
 
 
+def task_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Options of the environments that `--preset` and `--randomization` set; empty where they have their defaults."""
+    options = {} if args.preset is None else {"preset": args.preset}
+    if args.randomization != DEFAULT_RANDOMIZATION:
+        options["randomization"] = args.randomization
+    return options
+
+
 def train_task(args: argparse.Namespace) -> int:
     """Train a policy with a progress bar, then print the result."""
     check_at_least(args, envs=1, seed=0)
@@ -36,9 +44,7 @@ def train_task(args: argparse.Namespace) -> int:
     recipe = recipes.recipe_for(args.task, args.recipe)
     steps = recipe.steps if args.attempts is None else args.attempts
     folder = args.out or Path("runs") / args.task
-    options = {} if args.preset is None else {"preset": args.preset}
-    if args.randomization != DEFAULT_RANDOMIZATION:
-        options["randomization"] = args.randomization
+    options = task_options(args)
     output = Output(args.json)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task("training", total=steps)
@@ -90,7 +96,6 @@ def _line(result: "EvaluationResult") -> str:
 def _command(args: argparse.Namespace, steps: int, folder: Path) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
     values = {"recipe": args.recipe, "steps": steps, "minutes": args.minutes, "envs": args.envs, "seed": args.seed}
-    given = None if args.randomization == DEFAULT_RANDOMIZATION else args.randomization
-    values |= {"preset": args.preset, "randomization": given, "out": folder}
+    values |= {**task_options(args), "out": folder}
     words = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
     return ["gelflow", "train", args.task, *(word for pair in words for word in pair)]
