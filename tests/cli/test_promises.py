@@ -76,6 +76,14 @@ def test_missed_cycles_and_jitter_are_counted() -> None:
     assert summary["latency_max_ms"] == pytest.approx(0.2)
 
 
+def test_a_stop_before_the_first_message_counts_too() -> None:
+    statistics = CycleStatistics()
+    statistics.stop(0.02)
+    statistics.stop(0.02)
+    assert statistics.lost == 10
+    assert statistics.missed == [(math.inf, math.inf, 5)] * 2
+
+
 def replace_cycle(cycle: EgmCycle, stamp: float, sequence: int) -> EgmCycle:
     return cycle._replace(stamp=stamp, sequence=sequence, answered=stamp + 0.0002)
 

@@ -67,8 +67,8 @@ class CycleStatistics:
 
     def stop(self, silence: float) -> None:
         """Count a stop after `silence` [s] without a message: its cycles are lost, the next one is a new start."""
-        if self._last is not None:
-            self._miss(self._last.stamp, self._last.stamp + silence, lost=round(silence / _PERIOD))
+        begin = math.inf if self._last is None else self._last.stamp  # inf: before any message, overlaps no stall
+        self._miss(begin, begin + silence, lost=round(silence / _PERIOD))
         self._last = None
 
     def _miss(self, begin: float, end: float, *, lost: int = 0, unanswered: int = 0) -> None:
