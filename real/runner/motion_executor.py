@@ -165,14 +165,17 @@ class MotionExecutor:
 
     def height_at(self, stamp: float) -> float:
         """Measured height of the gripper frame in the base frame at a robot time [m]."""
-        now = self._arm.state()
+        state = self._arm.state()
+        later = state.stamp, float(self._lab.gripper_pose(state.position, state.quaternion).position[2])
+        if stamp >= later[0]:
+            return later[1]
         with self._lock:
-            history = list(self._heights)
-        # Interpolate between the last cycle fetched by the thread and the newest feedback.
-        if not history or history[-1][0] < now.stamp:
-            history.append((now.stamp, float(self._lab.gripper_pose(now.position, now.quaternion).position[2])))
-        times, heights = zip(*history, strict=True)
-        return float(np.interp(stamp, times, heights))
+            for earlier in reversed(self._heights):  # an image is recent: few of the cycles are newer
+                if earlier[0] <= stamp:
+                    fraction = (stamp - earlier[0]) / (later[0] - earlier[0])
+                    return earlier[1] + fraction * (later[1] - earlier[1])
+                later = earlier
+        return later[1]
 
     # Thread
 

@@ -36,12 +36,10 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
             speed=0.05,
             home_at_start=True,
         ),
-        # EGM's own limit is 1°/s per joint: the arm could not follow faster references.
+        # The speeds are the defaults of a lab file: the joint speed of the controller, 1 °/s, limits the motion.
         arm=lab.ArmSettings(
             egm_port=robot.config.egm_port,
             host=robot.config.host,
-            max_speed=5e-3,
-            max_turn_speed_deg=0.9,
             connect_timeout=min(60.0, 5.0 * factor),
         ),
         cameras=lab.CamerasSettings(_camera(robot, 0), _camera(robot, 1)),
