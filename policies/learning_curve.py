@@ -1,8 +1,8 @@
 """The learning curve of a training run, as a CSV table and as a picture."""
 
 import csv
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +30,13 @@ class LearningCurvePoint:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """The files of a training run, its best validation result, and the time it took."""
+    """The files of a training with stable-baselines3, its best validation result, and the time it took."""
 
     checkpoint: Path
     best: EvaluationResult
     curve: Path
     picture: Path
-    simulation_time: float = float("nan")  # [s]; nan if not measured
-    learning_time: float = float("nan")  # [s]
+    seconds: Mapping[str, float] = field(default_factory=dict)  # "simulation", "learning"; empty if not measured
 
 
 def create_training_folder(out: Path) -> None:

@@ -8,14 +8,17 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.backpropagation import Backpropagation, BackpropagationSettings
+from gelflow.policies.imitation import Imitation, ImitationSettings, architecture_for
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.cnn import CNN
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.ppo_learner import PPO, PPOSettings
 from gelflow.policies.training.learner import Learner
-from gelflow.policies.training.run import Progress, RunSettings, TrainingResult, TrainingRun
+from gelflow.policies.training.run import POLICY, Progress, RunSettings, TrainingResult, TrainingRun
 from gelflow.sim.tasks.cap_rotation import CapRotationTask
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
+from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.pushing import Pushing, PushingTask
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.task_batch import TaskBatch
@@ -38,10 +41,11 @@ class Recipe:
     network: Mapping[str, Any] = field(default_factory=dict)  # settings of the architecture
     options: Mapping[str, Any] = field(default_factory=dict)  # of the task's batch
     best_by: str = "success"  # which evaluation is the best, see `RunSettings`
+    policy_name: str = POLICY  # of the checkpoint
 
     def make_task(self, envs: int | None = None, **options: Any) -> TaskBatch:
         """A batch of environments of the recipe; `options` are those of the task."""
-        return make_task(self.task, envs or self.envs, threads=1, **{**self.options, **options})
+        return make_task(self.task, envs or self.envs, **{"threads": 1, **self.options, **options})
 
     def make_learner(self, task: TaskBatch, *, seed: int, steps: int) -> Learner:
         """The learner on `task`; `steps` is the length of the whole training."""
@@ -49,7 +53,9 @@ class Recipe:
 
     def configuration(self) -> dict[str, Any]:
         """The settings that determine the result, as JSON data."""
-        return {"algorithm": self.algorithm, "settings": dataclasses.asdict(self.settings)}
+        noise = self.options.get("noise")
+        of_noise = {} if noise is None else {"noise": dataclasses.asdict(noise)}
+        return {"algorithm": self.algorithm, "settings": dataclasses.asdict(self.settings), **of_noise}
 
 
 def actor_for(task: TaskBatch, settings: Mapping[str, Any]) -> ActorArchitecture:
@@ -67,6 +73,11 @@ def _backpropagation(recipe: Recipe, task: TaskBatch, seed: int, steps: int) -> 
     assert isinstance(task, Pushing)
     episodes, architecture = DifferentiablePushing(task), actor_for(task, recipe.network)
     return Backpropagation(episodes, architecture, recipe.settings, seed=seed, steps=steps)
+
+
+def _imitation(recipe: Recipe, task: TaskBatch, seed: int, steps: int) -> Learner:
+    assert isinstance(task, Insertion)
+    return Imitation(task, architecture_for(task.description), recipe.settings, seed=seed, steps=steps)
 
 
 # Table 6 of the paper: 32 environments, 32 steps a rollout.
@@ -112,6 +123,19 @@ def _pushing(observation: str, *, recurrent: int = 0) -> Recipe:
     return dataclasses.replace(recipe, best_by="return")
 
 
+_INSERTION = Recipe(
+    "insertion",
+    400_000,
+    512,
+    50_000,
+    512,
+    "imitation",
+    ImitationSettings(),
+    _imitation,
+    options={"noise": FlowMapNoise(), "threads": None},
+    policy_name="insertion.safetensors",
+)
+
 _RECIPES: dict[str, dict[str, Recipe]] = {
     "grasp": {DEFAULT: _grasp(20_480, _GRASP), PAPER: _grasp(20_480, _TABLE_6)},
     "pushing": {
@@ -128,6 +152,7 @@ _RECIPES: dict[str, dict[str, Recipe]] = {
         "paper-observation-no-touch": _cap(_LONG_ROLLOUTS, 64, touch=False, reward="progress"),
         PAPER: _cap(_TABLE_6, 32),
     },
+    "insertion": {DEFAULT: _INSERTION},
 }
 
 
@@ -179,7 +204,7 @@ def training_run(
     task, recipe: names, see `recipe_for`
     steps, envs: environment steps in total and parallel environments; None: those of the recipe
     minutes: time limit; a run that reaches it is not reproducible
-    options: of the task's batch, such as `preset` and `friction`; JSON data
+    options: of the task's batch, such as `preset` and `friction`; JSON data, except `task`, the description
     command: that repeats the run, stored in the folder
     report: called after each update
 
@@ -197,6 +222,7 @@ def training_run(
     )
     batch = chosen.make_task(envs, **given)
     learner = chosen.make_learner(batch, seed=seed, steps=total)
-    configuration = {"recipe": recipe, "options": given, **chosen.configuration()}
+    stored = {name: value for name, value in given.items() if name != "task"}  # the run stores the description
+    configuration = {"recipe": recipe, "options": stored, **chosen.configuration()}
     validation = chosen.make_task(envs, **given)
-    return TrainingRun(learner, validation, folder, settings, configuration, command, report)
+    return TrainingRun(learner, validation, folder, settings, configuration, command, report, chosen.policy_name)

@@ -7,7 +7,6 @@ that was interrupted.
 import hashlib
 import json
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +17,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor, versions
-from gelflow.policies import imitation, recipes
-from gelflow.policies import learning_curve as insertion_curve
-from gelflow.policies.checkpoint import load_checkpoint, load_network, replace_file
-from gelflow.policies.environment import FlowMapNoise, insertion_randomization, make_insertion_env
+from gelflow.policies import recipes
+from gelflow.policies.checkpoint import load_network, replace_file
 from gelflow.policies.episodes import OraclePolicy, RandomPolicy, run_episodes
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy
@@ -60,40 +57,15 @@ class Effort:
         return episodes if self.max_episodes is None else min(self.max_episodes, episodes)
 
 
-class Trainer(ABC):
+class Trainer:
     """How the policies of a variant are trained, and in which environments they are evaluated."""
 
-    def __init__(self, variant: Variant, effort: Effort, command: Sequence[str]) -> None:
-        self.variant, self.effort, self.command = variant, effort, list(command)
-
-    @abstractmethod
-    def train(self, folder: Path, seed: int, report: Report) -> Path:
-        """Trains what is missing in `folder`; returns the checkpoint."""
-
-    @abstractmethod
-    def environments(self, variant: Variant) -> TaskBatch:
-        """The environments of the evaluation of `variant`."""
-
-    @abstractmethod
-    def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
-        """Environment steps and `measure` ("success" or "reward") of a finished training.
-
-        "validation" is that of the evaluations, "training" that of the episodes with exploration.
-        """
-
-    @abstractmethod
-    def minutes(self, folder: Path) -> float:
-        """Duration of a finished training."""
-
-
-class RecipeTrainer(Trainer):
-    """Trainings by a recipe."""
-
     def __init__(self, task: str, variant: Variant, effort: Effort, command: Sequence[str]) -> None:
-        super().__init__(variant, effort, command)
+        self.variant, self.effort, self.command = variant, effort, list(command)
         self._task, self._recipe = task, recipes.recipe_for(task, variant.recipe)
 
     def train(self, folder: Path, seed: int, report: Report) -> Path:
+        """Trains what is missing in `folder`; returns the checkpoint."""
         steps = self.effort.steps(self._recipe.steps)
         run = recipes.training_run(
             self._task,
@@ -101,18 +73,27 @@ class RecipeTrainer(Trainer):
             recipe=self.variant.recipe,
             seed=seed,
             steps=steps,
-            options=self.variant.options,
             command=self.command,
             report=lambda progress: report("training", progress.steps / steps),
+            **self._run_options(),
         )
         if not run.is_finished():
             run.train()
         return run.checkpoint
 
+    def _run_options(self) -> dict[str, Any]:
+        """Options of `recipes.training_run` that determine the environments."""
+        return {"options": self.variant.options}
+
     def environments(self, variant: Variant) -> TaskBatch:
+        """The environments of the evaluation of `variant`."""
         return self._recipe.make_task(self.effort.envs, **{**variant.options, **variant.evaluation})
 
     def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
+        """Environment steps and `measure` ("success" or "reward") of a finished training.
+
+        "validation" is that of the evaluations, "training" that of the episodes with exploration.
+        """
         table = read_table(folder / "progress.csv")
         explored = "return" if measure == "reward" else measure  # "reward" is the mean of a step
         return {
@@ -121,62 +102,24 @@ class RecipeTrainer(Trainer):
         }
 
     def minutes(self, folder: Path) -> float:
+        """Duration of a finished training."""
         return float(read_table(folder / "progress.csv")["minutes"][-1])
 
 
 class InsertionTrainer(Trainer):
-    """Trainings of the insertion by imitation."""
+    """Trainings of the insertion, whose part and misalignment belong to the variant."""
 
-    def train(self, folder: Path, seed: int, report: Report) -> Path:
-        made, finished = folder / insertion_curve.CHECKPOINT, folder / insertion_curve.PICTURE
-        attempts = self.effort.steps(imitation.ImitationSettings().attempts)
-        if made.exists() and finished.exists():
-            if (trained := load_checkpoint(made).training["settings"]["attempts"]) != attempts:
-                raise UsageError(f"{folder} holds a finished training of {trained} attempts, not {attempts}; delete it")
-            return made
-        settings = imitation.ImitationSettings(seed=seed, attempts=attempts)
-        table = self.variant.options.get("randomization", "default")
-        env, validation = (
-            make_insertion_env(
-                32 if self.effort.shorter > 1 else 512,
-                noise=FlowMapNoise(),
-                preset=_INSERTION_PRESET,
-                task=insertion_of(self.variant),
-                randomization=table,
-            )
-            for _ in range(2)
-        )
-        imitation.train(
-            env,
-            validation,
-            out=folder,
-            settings=settings,
-            command=self.command,
-            report=lambda point: report("training", point.attempts / settings.attempts),
-        )
-        return made
+    def _run_options(self) -> dict[str, Any]:
+        options = {**self.variant.options, "task": insertion_of(self.variant), "preset": _INSERTION_PRESET}
+        return {"options": options, "envs": 32 if self.effort.shorter > 1 else None}
 
     def environments(self, variant: Variant) -> TaskBatch:
-        task = insertion_of(variant)
-        table = insertion_randomization(variant.options.get("randomization", "default"), task)
-        return make_task("insertion", self.effort.envs, task=task, randomization=table)
-
-    def curves(self, folder: Path, measure: str) -> dict[str, Curve]:
-        table = read_table(folder / insertion_curve.CURVE)
-        return {
-            "validation": series(table, "attempts", f"evaluated {measure}"),
-            "training": series(table, "attempts", measure),
-        }
-
-    def minutes(self, folder: Path) -> float:
-        return float(read_table(folder / insertion_curve.CURVE)["minutes"][-1])
+        return make_task("insertion", self.effort.envs, **{**variant.options, "task": insertion_of(variant)})
 
 
 def trainer_for(task: str, variant: Variant, effort: Effort, command: Sequence[str]) -> Trainer:
     """The trainer of a variant of a task."""
-    if task == "insertion":
-        return InsertionTrainer(variant, effort, command)
-    return RecipeTrainer(task, variant, effort, command)
+    return (InsertionTrainer if task == "insertion" else Trainer)(task, variant, effort, command)
 
 
 def run_trial(

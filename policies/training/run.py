@@ -60,12 +60,18 @@ class TrainingResult:
     best: EvaluationResult
     steps: int
     minutes: float
-    shares: dict[str, float]  # of the time: "simulation", "learning", "evaluation"
+    seconds: dict[str, float]  # of the time: "simulation", "learning", "evaluation"
+    checkpoint: Path  # the best policy on the validation episodes
 
     @property
-    def checkpoint(self) -> Path:
-        """The best policy on the validation episodes."""
-        return self.folder / POLICY
+    def shares(self) -> dict[str, float]:
+        """Shares of the time by name of `seconds`."""
+        return {name: value / sum(self.seconds.values()) for name, value in self.seconds.items()}
+
+    @property
+    def picture(self) -> Path:
+        """The learning curve."""
+        return self.folder / PICTURE
 
     @property
     def curve(self) -> Path:
@@ -93,6 +99,7 @@ class TrainingRun:
     configuration: all other values that determine the result, as JSON data: task options, algorithm
     command: command line that repeats the run, stored in the folder and in the checkpoint
     report: called after each update and each evaluation
+    policy_name: of the checkpoint
     """
 
     learner: Learner
@@ -102,13 +109,14 @@ class TrainingRun:
     configuration: Mapping[str, Any]
     command: Sequence[str] = ()
     report: Callable[[Progress], None] | None = None
+    policy_name: str = POLICY
     _best: EvaluationResult | None = field(default=None, init=False)
     _seconds: float = field(default=0.0, init=False)  # of earlier processes
 
     @property
     def checkpoint(self) -> Path:
         """The best policy on the validation episodes, once there is one."""
-        return self.folder / POLICY
+        return self.folder / self.policy_name
 
     def is_finished(self) -> bool:
         """Whether the folder holds the result of this run. Raises UsageError when it holds another run."""
@@ -136,7 +144,7 @@ class TrainingRun:
     def _train(self, log: ProgressLog, start: float) -> None:
         learner, s = self.learner, self.settings
         next_evaluation = (learner.steps // s.evaluate_every + 1) * s.evaluate_every
-        while learner.steps < s.steps and self._minutes(start) < s.minutes:
+        while learner.steps < s.steps and (self._best is None or self._minutes(start) < s.minutes):
             numbers = learner.update()
             over = learner.steps >= s.steps or self._minutes(start) >= s.minutes
             evaluation = None
@@ -166,7 +174,7 @@ class TrainingRun:
         if self._best is None or self._order(result) >= self._order(self._best):
             self._best = result
             save_checkpoint(
-                self.folder / POLICY,
+                self.checkpoint,
                 task=self.validation.description,
                 architecture=learner.architecture,
                 tensors=tensors,
@@ -192,11 +200,10 @@ class TrainingRun:
 
     def _prepare(self) -> None:
         """Checks the folder against the configuration, and restores the state of an unfinished run."""
-        path = self.folder / CONFIGURATION
-        if path.exists():
-            stored = read_configuration(self.folder)
-            if stored["finished"]:
-                raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
+        stored = read_configuration(self.folder) if (self.folder / CONFIGURATION).exists() else None
+        if stored["finished"] if stored else self.checkpoint.exists():  # a policy of another origin is kept, too
+            raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
+        if stored:
             self._check_same(stored)
         else:
             self._write_configuration(self._configuration(), finished=False)
@@ -241,9 +248,8 @@ class TrainingRun:
         progress_curve.draw(self.folder / PICTURE, self.folder / PROGRESS, title=self.learner.task.description.name)
         self._write_configuration(self._configuration(), finished=True)
         (self.folder / STATE).unlink(missing_ok=True)
-        seconds = self.learner.clock.seconds
-        shares = {name: value / sum(seconds.values()) for name, value in seconds.items()}
-        return TrainingResult(self.folder, self._best, self.learner.steps, self._minutes(start), shares)
+        seconds, minutes = dict(self.learner.clock.seconds), self._minutes(start)
+        return TrainingResult(self.folder, self._best, self.learner.steps, minutes, seconds, self.checkpoint)
 
 
 @contextlib.contextmanager

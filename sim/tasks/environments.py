@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim.scene import Scene
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
 from gelflow.sim.tasks.insertion import RANDOMIZATIONS as RANDOMIZATIONS  # found by the registry beside `Insertion`
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
@@ -43,6 +44,7 @@ class Insertion(AttemptTask):
     scene: scene to simulate; None takes `insertion_scene(task, preset=preset, friction=friction)`
     preset, friction: of the task's scene
     randomization: distribution of the physical parameters; None: the default, with the grasp height of the task's part
+    noise: on the flow maps; None: none beyond the sensor effects of the randomization
     threads: of the simulator
 
     `reset` with the option "misalignment": (x, y, yaw), or one for each environment, starts at the given gripper pose
@@ -61,6 +63,7 @@ class Insertion(AttemptTask):
         preset: str | None = None,
         friction: str | None = None,
         randomization: Randomization | None = None,
+        noise: FlowMapNoise | None = None,
         threads: int | None = None,
     ) -> None:
         super().__init__(
@@ -81,6 +84,8 @@ class Insertion(AttemptTask):
         self.attempts = InsertionAttempts(
             num_envs, task=task, scene=scene, randomization=randomization, threads=threads
         )
+        self._noise = noise
+        self._part_noise: Array = np.zeros((num_envs, 1 + 2 * task.sensors))
         self.info |= {
             "inserted": self.info["success"],
             "pose": self.info["privileged"],
@@ -108,6 +113,8 @@ class Insertion(AttemptTask):
         misalignment = None if given is None else option_rows("misalignment", given, which, (3,))
         self.attempts.draw(rng, which=which, misalignment=misalignment)
         start = dict(zip(("x", "y", "yaw"), self.attempts.pose[which].T, strict=True))
+        if self._noise is not None:
+            self._part_noise[which] = self._noise.sample(int(which.sum()), self.description.sensors, rng)
         self._record(which, self.attempts.drawn | start, self.attempts.randomization, x="m", y="m", yaw="rad")
 
     def _move(self, actions: Array, active: Mask) -> None:
@@ -116,7 +123,10 @@ class Insertion(AttemptTask):
 
     def _attempt(self, active: Mask, rng: np.random.Generator) -> None:
         result = self.attempts.attempt(rng, which=active)
-        self.observation[active] = result.image
+        image = result.image
+        if self._noise is not None:
+            image = self._noise.apply(image, self._part_noise[active], rng)
+        self.observation[active] = image
         for name in ("divisor", "height", "inserted", "failed"):
             self.info[name][active] = getattr(result, name)
         self.info["pose"][active] = self.attempts.pose[active]

@@ -83,6 +83,14 @@ NOMINAL = DEFAULT_RANDOMIZATION.replace(
 RANDOMIZATIONS = {"nominal": NOMINAL, "default": DEFAULT_RANDOMIZATION, "full": FULL_RANDOMIZATION}
 
 
+def insertion_randomization(name: str, task: InsertionTask) -> Randomization:
+    """The table `name` of `RANDOMIZATIONS`, with the grasp height of the task's part. Raises UsageError if unknown."""
+    if name not in RANDOMIZATIONS:
+        raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {name!r}")
+    table = RANDOMIZATIONS[name]
+    return table if name == "nominal" else table.replace(grasp_height=task.part.grasp_height)
+
+
 @dataclass(frozen=True)
 class AttemptResult:
     """Results of one attempt, one row for each of the n environments that made it."""

@@ -7,6 +7,7 @@ from typing import Any
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import TaskBatch
+from gelflow.task import INSERTION, InsertionTask, TaskDescription
 from gelflow.toml_tables import suggestion
 
 # name → module and class of its batch
@@ -39,13 +40,21 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
     """
     batch_class = getattr(_module(name), _TASKS[name][1])
     if isinstance(table := options.get("randomization"), str):
-        tables = randomizations(name)
-        if table not in tables:
-            raise UsageError(f"{name} has no randomization {table!r}; {suggestion(table, tables)}")
-        options["randomization"] = tables[table]
+        options["randomization"] = _named_randomization(name, table, options.get("task"))
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch
+
+
+def _named_randomization(name: str, table: str, task: TaskDescription | None) -> Randomization:
+    if name == "insertion":
+        from gelflow.sim.tasks.insertion import insertion_randomization  # deferred: loads the simulator
+
+        return insertion_randomization(table, task if isinstance(task, InsertionTask) else INSERTION)
+    tables = randomizations(name)
+    if table not in tables:
+        raise UsageError(f"{name} has no randomization {table!r}; {suggestion(table, tables)}")
+    return tables[table]
 
 
 def _module(name: str) -> ModuleType:

@@ -1,6 +1,7 @@
 """The recurrent network and its training by imitation, on an analytic environment that replaces the simulator."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,25 +9,21 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from tests.policies.toy_insertion import Toy, images, mirrored
+from tests.policies.toy_insertion import ToyInsertion, images, mirrored
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.part import CUBOID
-from gelflow.policies import imitation
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
-from gelflow.policies.environment import FlowMapNoise, PolicyEnv
-from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
-from gelflow.policies.imitation import (
-    ImitationSettings,
-    imitation_loss,
-    train,
-)
+from gelflow.policies.episodes import RandomPolicy, evaluate_task
+from gelflow.policies.imitation import Imitation, ImitationSettings, imitation_loss
 from gelflow.policies.insertion_expert import expert_correction, part_tolerance
 from gelflow.policies.networks.polynomial_features import polynomial_basis
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
-from gelflow.policies.training_state import STATE, load_state
+from gelflow.policies.training.progress_log import read_table
+from gelflow.policies.training.run import STATE, Progress, RunSettings, TrainingRun
+from gelflow.policies.training.state import load_state
 from gelflow.task import INSERTION, insertion_task
 
 SMALL = PolynomialGRU(degree=1, units=24, head=12)
@@ -156,64 +153,91 @@ def test_the_bounded_loss_prefers_a_mode_and_the_other_one_the_mean() -> None:
     assert imitation_loss(torch.zeros(5, 3), 0.5) == 0
 
 
-SHORT = ImitationSettings(attempts=8_192, updates=40, evaluate_every=4_000, evaluate_episodes=128)
+SETTINGS = ImitationSettings(updates=40)
+SHORT = RunSettings(steps=8_192, evaluate_every=4_000, evaluate_episodes=128)
 
 
-def sides() -> tuple[PolicyEnv, PolicyEnv]:
-    return PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), PolicyEnv(Toy(32), INSERTION, FlowMapNoise())
+def make_run(
+    folder: Path,
+    *,
+    settings: ImitationSettings = SETTINGS,
+    run: RunSettings = SHORT,
+    report: Callable[[Progress], None] | None = None,
+) -> TrainingRun:
+    learner = Imitation(ToyInsertion(32), SMALL, settings, seed=run.seed, steps=run.steps)
+    configuration = {"algorithm": "imitation", "settings": dataclasses.asdict(settings)}
+    command = ["gelflow", "train"]
+    return TrainingRun(learner, ToyInsertion(32), folder, run, configuration, command, report, "insertion.safetensors")
 
 
 def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Path) -> None:
-    points: list[Any] = []
-    result = train(
-        *sides(), out=tmp_path, architecture=SMALL, settings=SHORT, command=["gelflow", "train"], report=points.append
-    )
-    env = PolicyEnv(Toy(32), INSERTION, FlowMapNoise())
-    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), env, episodes=256, seed=1)
-    actor = NetworkActor(load_policy(result.checkpoint).network, 32)
-    policy = evaluate("policy", actor, env, episodes=256, seed=1)
+    points: list[Progress] = []
+    result = make_run(tmp_path, report=points.append).train()
+    task = ToyInsertion(32)
+    reach = np.asarray(SMALL.reach) / INSERTION.action_scale
+    random = evaluate_task("random", RandomPolicy(32, reach, 0), task, episodes=256, seed=1)
+    trained = load_policy(result.checkpoint).network.batch_policy(32)
+    policy = evaluate_task("policy", trained, task, episodes=256, seed=1)
     assert policy.success > 0.95 and policy.length < random.length
     assert load_checkpoint(result.checkpoint).training["command"] == ["gelflow", "train"]
+    assert result.checkpoint.name == "insertion.safetensors"
     assert len(result.curve.read_text().splitlines()) == 1 + len(points)
     assert result.picture.read_bytes().startswith(b"\x89PNG")
-    assert result.simulation_time > 0 and result.learning_time > 0
+    assert result.seconds["simulation"] > 0 and result.seconds["learning"] > 0
     assert not (tmp_path / STATE).exists()
     with pytest.raises(UsageError, match="already holds a trained policy"):
-        train(*sides(), out=tmp_path, architecture=SMALL, settings=SHORT)
+        make_run(tmp_path).train()
+    (tmp_path / "run.json").unlink()  # as a folder of an earlier version
+    with pytest.raises(UsageError, match="already holds a trained policy"):
+        make_run(tmp_path).train()
 
 
 class Killed(Exception):
     pass
 
 
-def test_a_killed_training_continues_to_the_result_of_an_uninterrupted_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(imitation, "_SAVE_INTERVAL", 0.0)
-    settings = dataclasses.replace(SHORT, attempts=3_072, updates=5, memory=3, evaluate_every=1_000)
+def test_a_killed_training_continues_to_the_result_of_an_uninterrupted_one(tmp_path: Path) -> None:
+    settings = dataclasses.replace(SETTINGS, updates=5, memory=3)
+    run = RunSettings(steps=3_072, evaluate_every=500, evaluate_episodes=128)
 
-    def run(folder: Path, settings: ImitationSettings, stop_at: float = np.inf) -> dict[str, NDArray[Any]]:
-        def report(point: Any) -> None:
-            if point.attempts >= stop_at:
+    def train(folder: Path, stop_at: float = np.inf, **changes: Any) -> dict[str, NDArray[Any]]:
+        def report(progress: Progress) -> None:
+            if progress.steps >= stop_at:
                 raise Killed
 
-        result = train(*sides(), out=folder, architecture=SMALL, settings=settings, report=report)
+        result = make_run(folder, **{"settings": settings, "run": run, "report": report, **changes}).train()
         return dict(load_checkpoint(result.checkpoint).tensors)
 
-    whole = run(tmp_path / "whole", settings)
+    whole = train(tmp_path / "whole")
     with pytest.raises(Killed):
-        run(tmp_path / "killed", settings, stop_at=2_000)
-    state = load_state(tmp_path / "killed")
-    assert state is not None and state[1]["attempts"] == 1_536
-    with pytest.raises(UsageError, match=r"unfinished training with settings .*'updates': '5'.*'updates': '6'"):
-        run(tmp_path / "killed", dataclasses.replace(settings, updates=6))
-    continued = run(tmp_path / "killed", settings)
+        train(tmp_path / "killed", stop_at=2_000)
+    state = load_state(tmp_path / "killed" / STATE)
+    assert state.values["steps"] == 1_536 and state.values["memory"] == 3
+    with pytest.raises(UsageError, match=r"unfinished run with other settings: settings.updates 5 \(here 6\)"):
+        train(tmp_path / "killed", settings=dataclasses.replace(settings, updates=6))
+    continued = train(tmp_path / "killed")
     assert all((continued[name] == whole[name]).all() for name in whole)
-    other = run(tmp_path / "other", dataclasses.replace(settings, seed=1))
+    tables = [
+        [{name: value for name, value in row.items() if name != "minutes" and not name.endswith("_s")} for row in table]
+        for table in (read_table(tmp_path / name / "progress.csv") for name in ("whole", "killed"))
+    ]
+    assert tables[0] == tables[1]
+    other = train(tmp_path / "other", run=dataclasses.replace(run, seed=1))
     assert any((other[name] != whole[name]).any() for name in whole)
+
+
+def test_a_training_stops_at_the_time_limit_after_one_iteration(tmp_path: Path) -> None:
+    result = make_run(tmp_path, run=dataclasses.replace(SHORT, minutes=1e-9)).train()
+    assert result.steps == 512 and load_policy(result.checkpoint)
 
 
 def test_a_damaged_state_is_rejected(tmp_path: Path) -> None:
     (tmp_path / STATE).write_bytes(b"nothing")
     with pytest.raises(UsageError, match="damaged"):
-        train(*sides(), out=tmp_path, settings=SHORT)
+        make_run(tmp_path).train()
+
+
+def test_impossible_settings_are_rejected() -> None:
+    for changes in ({"updates": 0}, {"memory": 0}, {"learning_rate": 0.0}):
+        with pytest.raises(UsageError, match="above 0"):
+            ImitationSettings(**changes)

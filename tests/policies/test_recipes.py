@@ -18,6 +18,10 @@ from gelflow.policies.networks.torch_actor import TorchActor
 from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
 from gelflow.policies.reports.evaluation_report import evaluate_all
 from gelflow.policies.reports.failures import failure_ranges, worst_ranges
+from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
+from gelflow.sim.tasks.parts import load_part
+from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names
 
 
@@ -44,6 +48,26 @@ def test_attempts_include_the_first_and_corrections_do_not() -> None:
     insertion = make_task("insertion", 4, threads=1, randomization="nominal")
     found = run_episodes(OraclePolicy(insertion), insertion, episodes=8, seed=0).result("oracle").to_json()
     assert found["success"] == 1 and found["corrections"] == 1
+
+
+def test_the_named_tables_of_the_insertion_have_the_grasp_height_of_the_part() -> None:
+    peg = load_part("peg")
+    batch = make_task("insertion", 1, task=peg, randomization="full", threads=1)
+    assert isinstance(batch, Insertion)
+    low, high = peg.part.grasp_height
+    assert batch.attempts.randomization["grasp_height"].distribution == Uniform(low, high)
+
+
+def test_noise_on_flow_maps_is_an_option_of_the_insertion() -> None:
+    def observed(noise: FlowMapNoise | None) -> NDArray[np.float32]:
+        batch = make_task("insertion", 3, noise=noise, randomization="nominal", threads=1)
+        batch.reset(batch.all, np.random.default_rng(0), options={"misalignment": [2e-3, 1e-3, 0.05]})
+        return batch.observation.copy()
+
+    plain, noisy = observed(None), observed(FlowMapNoise())
+    assert (noisy == observed(FlowMapNoise())).all() and np.abs(noisy - plain).max() > 0.01
+    before, after = (np.sqrt((maps.reshape(3, 2, 2, 130) ** 2).sum(2)).max((1, 2)) for maps in (plain, noisy))
+    assert np.allclose(before, after, rtol=1e-5)
 
 
 def test_the_commands_know_the_tasks_of_the_recipes() -> None:

@@ -20,7 +20,7 @@ def test_a_sweep_of_real_trainings_collects_and_resumes(tmp_path: Path, capsys: 
     assert [row["seed"] for row in printed["runs"]] == [0, 1]
     for row in printed["runs"]:
         checkpoint = load_checkpoint(Path(row["checkpoint"]))
-        assert checkpoint.training["settings"]["seed"] == row["seed"]
+        assert checkpoint.training["run"]["seed"] == row["seed"]
     assert all(Path(path).stat().st_size > 0 for path in printed["files"].values())
     assert set(printed["files"]) == {"runs", "summary", "curves", "picture"}
     (configuration,) = printed["configurations"]

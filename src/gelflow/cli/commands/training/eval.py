@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion", *TASKS], help="task of the policy")
+    parser.add_argument("task", choices=list(TASKS), help="task of the policy")
     add_part(parser)
     add_randomization(parser)
     add_checkpoint(parser, default="the insertion policy shipped with gelflow")
@@ -85,12 +85,10 @@ def _insertion(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
     task = part_task(args.part)
     path = checkpoint_for(task, args.checkpoint)
     network = load_policy(path, task=task).network
-    from gelflow.policies.environment import insertion_randomization
     from gelflow.sim.tasks.registry import make_task
 
-    table = insertion_randomization(args.randomization, task)
-    count = min(args.envs, args.episodes)
-    return path, network, make_task("insertion", count, task=task, preset=args.preset, randomization=table)
+    options = {"preset": args.preset, "randomization": args.randomization}
+    return path, network, make_task("insertion", min(args.envs, args.episodes), task=task, **options)
 
 
 def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":

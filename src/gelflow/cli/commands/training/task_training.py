@@ -1,4 +1,4 @@
-"""`gelflow train` for the tasks that recipes train; the insertion has options of its own."""
+"""`gelflow train` for the tasks that recipes train; the insertion has options and an output of its own."""
 
 import argparse
 import shlex
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gelflow.policies.training.run import Progress
 
 DEFAULT_RECIPE = "default"
-TASKS = ("cap", "grasp", "pushing")  # those of `gelflow.policies.recipes`, which is slow to import
+TASKS = ("cap", "grasp", "insertion", "pushing")  # those of `gelflow.policies.recipes`, which is slow to import
 UNTRAINED = ("rolling",)  # without a recipe; the error says why
 
 

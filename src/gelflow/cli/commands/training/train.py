@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
-from gelflow.cli.commands.training.task_training import DEFAULT_RECIPE, TASKS, UNTRAINED, refuse, train_task
+from gelflow.cli.commands.training.task_training import (
+    DEFAULT_RECIPE,
+    TASKS,
+    UNTRAINED,
+    refuse,
+    task_options,
+    train_task,
+)
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
     add_json,
@@ -21,9 +28,15 @@ from gelflow.cli.options import (
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from gelflow.policies.evaluation import EvaluationResult
     from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
+    from gelflow.policies.training.run import Progress as RunProgress
+    from gelflow.policies.training.run import TrainingResult as RunResult
 
 _DEFAULT = "imitation"
 _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algorithm
@@ -31,7 +44,7 @@ _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algor
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=["insertion", *TASKS, *UNTRAINED], help="task to learn")
+    parser.add_argument("task", choices=[*TASKS, *UNTRAINED], help="task to learn")
     parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
     text = "environment steps in total, for the insertion attempts (default: docs/guide/training.md)"
     parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=text)
@@ -67,10 +80,11 @@ def run(args: argparse.Namespace) -> int:
         made = _train(args, progress)
     best = made.best
     output.text(f"best on validation: {best.success:.1%} inserted in {best.length:.2f} corrections")
-    seconds = made.simulation_time + made.learning_time
-    if seconds > 0:  # not nan
-        share = made.simulation_time / seconds
-        output.text(f"{seconds / 60:.1f} min: simulation {share:.0%}, learning {1 - share:.0%}")
+    seconds = {name: made.seconds.get(name, float("nan")) for name in ("simulation", "learning")}
+    if made.seconds:
+        total = sum(seconds.values())
+        share = seconds["simulation"] / total
+        output.text(f"{total / 60:.1f} min: simulation {share:.0%}, learning {1 - share:.0%}")
     output.text(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}")
     of_part = "" if args.part is None else f" --part {shlex.quote(args.part)}"
     output.text(f"evaluate it with: gelflow eval insertion{of_part} --checkpoint {shlex.quote(str(made.checkpoint))}")
@@ -80,30 +94,43 @@ def run(args: argparse.Namespace) -> int:
             "learning_curve": made.curve,
             "picture": made.picture,
             "validation": best.to_json(),
-            "seconds": {"simulation": made.simulation_time, "learning": made.learning_time},
+            "seconds": seconds,
         }
     )
     return SUCCESS
 
 
-def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
-    from gelflow.policies.environment import FlowMapNoise, make_insertion_env  # deferred: torch is slow to import
+def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult | RunResult":
+    task = part_task(args.part)
+    if args.algorithm == "ppo":
+        return _train_with_ppo(args, task, progress)
+    from gelflow.policies import recipes  # deferred: torch is slow to import
+
+    attempts = recipes.recipe_for("insertion").steps if args.attempts is None else args.attempts
+    bar = _TrainingProgress(progress, attempts)
+    return recipes.train(
+        "insertion",
+        args.out,
+        seed=args.seed,
+        steps=attempts,
+        envs=args.envs,
+        minutes=float("inf") if args.minutes is None else args.minutes,
+        options={"task": task, **task_options(args)},
+        command=_command(args, attempts),
+        report=bar.report_run,
+    )
+
+
+def _train_with_ppo(args: argparse.Namespace, task: InsertionTask, progress: Progress) -> "TrainingResult":
+    from gelflow.policies import ppo  # deferred: torch is slow to import
+    from gelflow.policies.environment import FlowMapNoise, make_insertion_env
 
     given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
-    task = part_task(args.part)
     options = {"preset": args.preset, "task": task, "randomization": args.randomization}
     env, validation = (make_insertion_env(args.envs, noise=FlowMapNoise(), **options) for _ in range(2))
-    if args.algorithm == "ppo":
-        from gelflow.policies import ppo
-
-        ppo_settings = ppo.PPOSettings(seed=args.seed, **given)
-        command, bar = _command(args, ppo_settings.attempts), _TrainingProgress(progress, ppo_settings.attempts)
-        return ppo.train(env, validation, out=args.out, settings=ppo_settings, command=command, report=bar.report)
-    from gelflow.policies import imitation
-
-    settings = imitation.ImitationSettings(seed=args.seed, **given)
+    settings = ppo.PPOSettings(seed=args.seed, **given)
     command, bar = _command(args, settings.attempts), _TrainingProgress(progress, settings.attempts)
-    return imitation.train(env, validation, out=args.out, settings=settings, command=command, report=bar.report)
+    return ppo.train(env, validation, out=args.out, settings=settings, command=command, report=bar.report)
 
 
 class _TrainingProgress:
@@ -114,16 +141,29 @@ class _TrainingProgress:
         self._task = progress.add_task("training", total=attempts)
 
     def report(self, point: "LearningCurvePoint") -> None:
-        """Called by `train` for each point of the learning curve."""
-        if point.evaluation is None:
-            text = f"reward {point.reward:6.2f}  inserted {point.success:4.0%}"
-            self._progress.update(self._task, completed=point.attempts, description=text)
-            return
-        evaluation = point.evaluation
-        self._progress.console.print(
-            f"after {point.attempts:>9,} attempts, {point.minutes:5.1f} min:"
-            f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
-        )
+        """Called for each point of a learning curve."""
+        numbers = None if point.evaluation else {"reward": point.reward, "success": point.success}
+        self._show(point.attempts, point.minutes, numbers, point.evaluation)
+
+    def report_run(self, point: "RunProgress") -> None:
+        """Called after each update of a run."""
+        self._show(point.steps, point.minutes, point.numbers, point.evaluation)
+
+    def _show(
+        self,
+        attempts: int,
+        minutes: float,
+        numbers: "Mapping[str, float] | None",
+        evaluation: "EvaluationResult | None",
+    ) -> None:
+        if numbers:
+            text = f"reward {numbers['reward']:6.2f}  inserted {numbers['success']:4.0%}"
+            self._progress.update(self._task, completed=attempts, description=text)
+        if evaluation:
+            self._progress.console.print(
+                f"after {attempts:>9,} attempts, {minutes:5.1f} min:"
+                f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
+            )
 
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
