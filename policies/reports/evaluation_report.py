@@ -91,7 +91,7 @@ def evaluate_all(
 
 
 def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPolicy]:
-    """The policy and what it is compared with, by name."""
+    """The policy and what it is compared with, by name: "policy", "oracle" where there is one, "random", and others."""
     n = task.num_envs
     found: dict[str, BatchPolicy] = {"policy": network.batch_policy(n)}
     full = np.ones(task.action_space.shape)
@@ -101,7 +101,7 @@ def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPo
         noisy = NoisyPolicy(network.batch_policy(n), FlowMapNoise(), n, insertion.sensors, seed)
         found["policy, noisy flow maps"] = noisy
         reach = np.asarray(network.reach) / np.asarray(insertion.action_scale)
-        random = {"random, policy's reach": RandomPolicy(n, reach, seed), "random, full range": random["random"]}
+        random = {"random, policy's reach": RandomPolicy(n, reach, seed), **random}
     if has_oracle(task):
         found["oracle"] = OraclePolicy(task)
     return found | random

@@ -19,10 +19,9 @@ from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor, versions
 from gelflow.policies import recipes
 from gelflow.policies.checkpoint import load_network, replace_file
-from gelflow.policies.episodes import OraclePolicy, RandomPolicy, run_episodes
+from gelflow.policies.episodes import run_episodes
 from gelflow.policies.evaluation import EvaluationResult
-from gelflow.policies.networks.base import BatchPolicy
-from gelflow.policies.reports.evaluation_report import has_oracle
+from gelflow.policies.reports.evaluation_report import actors
 from gelflow.policies.reproduction.variants import Reproduction, Variant, insertion_of
 from gelflow.policies.sweep.curves import read_table, series
 from gelflow.session.records import to_plain
@@ -140,7 +139,7 @@ def run_trial(
     command: that repeats the reproduction, stored with the result
     report: called with a text and the completed part of a training
 
-    The rows have policy, oracle (where the task has one) and random actions on the same evaluation episodes.
+    The rows are those of `gelflow eval`, on the same evaluation episodes.
     """
     trained = plan.variant(variant.trained_as or variant.name)
     trainer = trainer_for(plan.task, trained, effort, command)
@@ -178,12 +177,9 @@ def folder_name(variant: str) -> str:
 
 
 def _evaluate(checkpoint: Path, task: TaskBatch, *, episodes: int, seed: int) -> list[EvaluationResult]:
-    network, n, at = load_network(checkpoint, task=task.description), task.num_envs, _EVALUATION_SEED + seed
-    actors: dict[str, BatchPolicy] = {"policy": network.batch_policy(n)}
-    if has_oracle(task):
-        actors["oracle"] = OraclePolicy(task)
-    actors["random"] = RandomPolicy(n, np.ones(task.action_space.shape), at)
-    return [run_episodes(actor, task, episodes=episodes, seed=at).result(name) for name, actor in actors.items()]
+    at = _EVALUATION_SEED + seed
+    compared = actors(load_network(checkpoint, task=task.description), task, seed=at)
+    return [run_episodes(actor, task, episodes=episodes, seed=at).result(name) for name, actor in compared.items()]
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -23,7 +23,7 @@ class Variant:
     """A training and its evaluation."""
 
     name: str
-    recipe: str = "default"  # see `gelflow.policies.recipes`; the insertion is trained by imitation
+    recipe: str = "default"  # see `gelflow.policies.recipes`
     options: Mapping[str, Any] = field(default_factory=dict)  # of the environments, JSON data
     evaluation: Mapping[str, Any] = field(default_factory=dict)  # options that differ in the evaluation
     trained_as: str | None = None  # the variant whose policies are evaluated; None: its own
@@ -74,6 +74,7 @@ _REPRODUCTIONS = (
             Variant("touch and memory"),
             Variant("touch", "paper"),
             Variant("no touch", "no-touch"),
+            Variant("touch, PPO", "ppo"),
         ),
         curve="reward",
     ),

@@ -27,6 +27,9 @@ FINGERS = (1, 2, 3)
 JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "bend", "curl"))
 TIPS = tuple(f"tip{finger}" for finger in FINGERS)  # names of the pads and of their sites
 REWARDS = ("paper", "progress")
+# Of the oracle: how far before the line to its finger a fingertip first touches [rad], its clearance until then, how
+# far its commanded position is inside of the wall and ahead of it, and its largest step [m].
+_FIRST_TOUCH, _CLEARANCE, _PRESS, _LEAD, _TIP_STEP = 0.3, 0.004, 0.02, 0.02, 0.007
 _RESET_OPTIONS = {"center": "x, y of the cap [m]", "radius": "of the cap [m]", "damping": "of the cap [N m s]"}
 
 
@@ -152,6 +155,9 @@ class CapRotation(ControlTask):
         self._top = body.pose.position[2] + cap.pose.position[2] + cap.size[1]
         self._thickness = 2 * cap.size[1]
         self._density = body.mass / (np.pi * cap.size[0] ** 2 * self._thickness)
+        self._fingers = [scene.bodies[scene.body(f"finger{finger}")].pose for finger in FINGERS]
+        self._link = -scene.bodies[scene.body(TIPS[0])].pose.position[2]  # length of both links of a finger
+        self._tip_radius = np.linalg.norm(scene.pads[0].positions - scene.pads[0].pose.position, axis=1).max()
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         check_options(self.description.name, options, _RESET_OPTIONS)
@@ -247,6 +253,53 @@ class CapRotation(ControlTask):
     def _by_fingertip(rows: Array) -> Array:
         """Rows (n, 21) of `_fingertip_rows` as (n, 3, 7)."""
         return rows.reshape(len(rows), len(TIPS), -1)
+
+    def oracle(self) -> Array:
+        """Actions of a hand that knows centre and radius of the cap: its fingertips close on it and push along it.
+
+        Each fingertip first goes to a point beside the wall. Then its commanded position is inside of the wall and
+        ahead of the fingertip, so that the servo presses and pushes.
+        """
+        task, privileged = self.description, self.info["privileged"]
+        center, radius = privileged[:, None, :2], privileged[:, None, 2]
+        base = np.array([finger.position for finger in self._fingers])
+        middle = np.full((self.num_envs, len(FINGERS), 1), self._top - self._thickness / 2)
+        outward = base[:, :2] - center
+        first = np.arctan2(outward[..., 1], outward[..., 0]) - _FIRST_TOUCH
+        wall = radius + self._tip_radius
+
+        def beside(direction: Array, distance: Array, ahead: float) -> Array:
+            cos, sin = np.cos(direction)[..., None], np.sin(direction)[..., None]
+            out, along = np.concatenate([cos, sin], axis=2), np.concatenate([-sin, cos], axis=2)
+            return np.concatenate([center + distance[..., None] * out + ahead * along, middle], axis=2)
+
+        start = self._tips(np.tile(task.start_angles, (1, len(FINGERS))))
+        clear = beside(first, wall + _CLEARANCE, 0.0)
+        periods = np.ceil(np.linalg.norm(clear - start, axis=2).max(1) / _TIP_STEP) + 1
+        closing = (self.info["steps"] < periods)[:, None, None]
+        reached = self.fingertips()[..., :2] - center
+        direction = np.arctan2(reached[..., 1], reached[..., 0])
+        target = np.where(closing, clear, beside(direction, wall - _PRESS, _LEAD))
+        commanded = self._tips(self._commanded)
+        step = target - commanded
+        step *= np.minimum(1, _TIP_STEP / np.maximum(np.linalg.norm(step, axis=2, keepdims=True), 1e-9))
+        change = self._joint_angles(commanded + step) - self._commanded
+        return np.asarray(np.clip(change / task.action_scale, -1, 1))
+
+    def _tips(self, angles: Array) -> Array:
+        """Positions (n, 3, 3) [m] of the fingertips at joint angles (n, 9)."""
+        swing, bend, curl = np.moveaxis(angles.reshape(len(angles), len(FINGERS), 3), 2, 0)
+        x = -self._link * (np.sin(bend) + np.sin(bend + curl))
+        down = self._link * (np.cos(bend) + np.cos(bend + curl))
+        local = np.stack([x, down * np.sin(swing), -down * np.cos(swing)], axis=2)
+        return np.stack([pose.apply(local[:, i]) for i, pose in enumerate(self._fingers)], axis=1)
+
+    def _joint_angles(self, tips: Array) -> Array:
+        """Joint angles (n, 9) at which the fingertips are at `tips` (n, 3, 3) [m]; the inverse of `_tips`."""
+        x, y, z = np.stack([pose.inverse().apply(tips[:, i]) for i, pose in enumerate(self._fingers)], axis=1).T
+        down = np.hypot(y, z)
+        half = np.arccos(np.clip(np.hypot(x, down) / (2 * self._link), 0, 1))
+        return np.stack([np.arctan2(y, -z), np.arctan2(-x, down) - half, 2 * half]).T.reshape(len(tips), -1)
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`; a dashed line on the cap shows its rotation."""

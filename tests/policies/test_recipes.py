@@ -101,7 +101,7 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     arguments = ["--checkpoint", made["checkpoint"], "--episodes", "2", "--envs", "2", "--json"]
     assert main(["eval", "cap", *arguments]) == 0
     printed = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in printed["results"]] == ["policy", "random"]
+    assert [row["name"] for row in printed["results"]] == ["policy", "oracle", "random"]
     assert all("steps" in row and "attempts" not in row for row in printed["results"])
     assert main(["eval", "cap", *arguments, "--randomization", "fall"]) == 2
     assert "no randomization 'fall'" in capsys.readouterr().err

@@ -40,6 +40,28 @@ def test_mass_of_the_cap_follows_its_radius() -> None:
     np.testing.assert_allclose(inertia, mass * np.array([0.05, 0.025]) ** 2 / 2)
 
 
+# Viscous fingertips slip; those on the smallest and stiffest caps may reach the end of their stroke.
+@pytest.mark.parametrize(("friction", "success"), [("elastic", 1.0), ("viscous", 0.9)])
+@pytest.mark.filterwarnings("ignore:scene dclaw")
+def test_the_oracle_turns_caps_with_its_fingers(friction: str, success: float) -> None:
+    batch, rng = CapRotation(32, friction=friction, preset="fast", threads=1), np.random.default_rng(4)
+    batch.reset(batch.all, rng)
+    while not (done := batch.terminated | batch.truncated).all():
+        batch.step(batch.oracle(), rng, active=~done)
+    assert batch.info["success"].mean() >= success
+    assert batch.metrics["turned without touch [°]"].max() < 1
+
+
+def test_joint_angles_of_the_oracle_are_the_inverse_of_its_fingertips() -> None:
+    batch, rng = CapRotation(8, threads=1), np.random.default_rng(0)
+    batch.reset(batch.all, rng)
+    for _ in range(3):
+        batch.step(rng.uniform(-1, 1, (8, 9)), rng)
+    angles = batch.sim.q[:, batch._joint_q]
+    np.testing.assert_allclose(batch._tips(angles), batch.fingertips(), atol=1e-12)
+    np.testing.assert_allclose(batch._joint_angles(batch._tips(angles)), angles, atol=1e-12)
+
+
 def test_closed_fingers_turn_the_cap_to_success() -> None:
     batch, rng = started(task=CapRotationTask(goal_angle=0.3))  # one sweep of all fingers together turns it by 0.4 rad
     for _ in range(25):

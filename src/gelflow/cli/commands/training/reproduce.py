@@ -84,7 +84,7 @@ def _table(record: Mapping[str, Any]) -> Table:
             variant["name"],
             _cell(ours["success"], ours["success_deviation"], length_of(ours)[1]),
             "" if paper is None else _cell(paper["success"], paper["spread"], paper["length"]),
-            *("" if row is None else _cell(row["success"], None, length_of(row)[1]) for row in others),
+            *("-" if row is None else _cell(row["success"], None, length_of(row)[1]) for row in others),
             f"{ours['reward']:.1f}"
             if last == "return"
             else " to ".join(f"{100 * bound:.1f}" for bound in ours["success_95"]),
