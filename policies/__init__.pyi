@@ -12,8 +12,6 @@ from .evaluation import NetworkActor as NetworkActor
 from .evaluation import RandomActor as RandomActor
 from .evaluation import evaluate as evaluate
 from .imitation import ImitationSettings as ImitationSettings
-from .learning_curve import LearningCurvePoint as LearningCurvePoint
-from .learning_curve import TrainingResult as TrainingResult
 from .networks.base import Architecture as Architecture
 from .networks.base import BatchPolicy as BatchPolicy
 from .networks.base import Network as Network
@@ -23,7 +21,9 @@ from .networks.polynomial_gru import PolynomialGRUNetwork as PolynomialGRUNetwor
 from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
 from .networks.polynomial_mlp import PolynomialNetwork as PolynomialNetwork
 from .ppo import PPOSettings as PPOSettings
-from .ppo import train as train
+from .recipes import train as train
+from .training.run import Progress as Progress
+from .training.run import TrainingResult as TrainingResult
 
 __all__ = [
     "Architecture",
@@ -32,7 +32,6 @@ __all__ = [
     "EvaluationResult",
     "FlowMapNoise",
     "ImitationSettings",
-    "LearningCurvePoint",
     "Network",
     "NetworkActor",
     "NetworkPolicy",
@@ -42,6 +41,7 @@ __all__ = [
     "PolynomialGRUNetwork",
     "PolynomialMLP",
     "PolynomialNetwork",
+    "Progress",
     "RandomActor",
     "TrainingResult",
     "default_checkpoint",

@@ -1,326 +1,312 @@
-"""Training of the insertion policy with PPO of stable-baselines3, exported to a checkpoint.
+"""Proximal policy optimization (PPO, Schulman et al. 2017) with a Gaussian actor, feedforward or recurrent.
 
-PPO receives the features of the flow maps instead of the maps, which keeps its buffers and updates small. The training
-reward is the improvement by a correction: the reward of the pose after it minus that of the pose before. It is
-immediate, so the discount is small, and its variance does not depend on the initial misalignment.
+Each iteration collects a rollout of all environments (`_collect`), estimates advantages (`_advantages`), and improves
+actor and critic by several epochs over minibatches (`_learn`). The hidden state of a recurrent actor is carried over
+between rollouts; gradients are truncated at the start of a rollout.
 """
 
-import dataclasses
-import time
-from collections import deque
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stable_baselines3
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
+from torch import Tensor, nn
 
 from gelflow.errors import UsageError
-from gelflow.policies import checkpoint
-from gelflow.policies import learning_curve as curve
-from gelflow.policies.environment import FlowMapNoise, PolicyEnv
-from gelflow.policies.evaluation import EvaluationResult, NetworkActor, evaluate
-from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
-from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
-from gelflow.policies.networks.polynomial_mlp import PolynomialMLP, PolynomialNetwork
-
-Array = NDArray[np.float64]
+from gelflow.policies.networks.actor import ActorArchitecture
+from gelflow.policies.networks.mlp import MLP
+from gelflow.policies.networks.torch_actor import TorchActor, VectorEncoder
+from gelflow.policies.training.learner import Learner
+from gelflow.policies.training.state import (
+    RunState,
+    generator_from,
+    generator_value,
+    load_optimizer_tensors,
+    optimizer_tensors,
+)
+from gelflow.sim.tasks.task_batch import TaskBatch
 
 
 @dataclass(frozen=True)
 class PPOSettings:
-    """Settings of a training run, stored in the checkpoint."""
+    """Settings of PPO."""
 
-    attempts: int = 200_000  # total number of attempts
-    minutes: float = float("inf")  # time limit [min]; a run that reaches it is not reproducible
-    seed: int = 0
-    rollout: int = 16  # attempts per environment between updates
-    batch: int = 256  # minibatch size
-    epochs: int = 10  # per update
-    learning_rate: float = 2e-3  # decreases linearly to a tenth
-    discount: float = 0.5
-    gae: float = 0.95  # λ of the generalized advantage estimation (GAE), 0 to 1
-    clip: float = 0.2  # clip range of the policy ratio
+    rollout: int = 32  # steps of each environment between updates
+    batch: int = 256  # steps of a minibatch
+    epochs: int = 10  # passes over a rollout
+    learning_rate: float = 3e-4  # decreases linearly
+    last_learning_rate: float = 0.0  # at the end, relative to the first
+    discount: float = 0.99
+    trace: float = 0.95  # λ of the generalized advantage estimation
+    clip: float = 0.2  # largest change of the ratio of probabilities
     value: float = 0.5  # coefficient of the value loss
-    entropy: float = 0.0  # coefficient of the entropy loss
-    gradient_norm: float = 0.5  # largest norm of the gradient
-    spread: float = 0.4  # initial standard deviation of the actions, whose range is ±1
-    calibration: int = (
-        2_000  # random attempts that determine the scale of the features (`feature_scale`), not camera calibration
-    )
-    evaluate_every: int = 20_000  # attempts
-    evaluate_episodes: int = 512
+    entropy: float = 0.01  # coefficient of the entropy
+    gradient_norm: float = 0.5  # largest norm of a gradient
+    deviation: float = 0.6  # initial standard deviation of the actions, whose range is ±1
+    privileged_critic: bool = False  # the critic observes `info["privileged"]`
+
+    def __post_init__(self) -> None:
+        if min(self.rollout, self.batch, self.epochs) < 1 or min(self.learning_rate, self.deviation) <= 0:
+            raise UsageError(f"PPO requires a positive rollout, batch, epochs, learning rate and deviation, got {self}")
 
 
-class HistoryVecEnv(VecEnv):
-    """`PolicyEnv` as an environment of stable-baselines3.
+@dataclass
+class Rollout:
+    """Steps of all environments; tensors (T, N, …)."""
 
-    Observations are canonical inputs of the network, actions of ±1 correspond to `PolynomialMLP.reach`.
-    """
+    observations: Tensor
+    critic_inputs: Tensor
+    starts: Tensor  # true where an episode starts with this observation
+    actions: Tensor
+    log_probs: Tensor
+    values: Tensor
+    advantages: Tensor
+    actor_memory: Tensor  # (N, h), before the first step
+    critic_memory: Tensor
 
-    render_mode = None
+    def sequences(self) -> list[Tensor]:
+        """All but the memories, in the order of the fields."""
+        return list(vars(self).values())[:-2]
 
-    def __init__(self, env: PolicyEnv, architecture: PolynomialMLP, basis: Array, scale: Array, *, seed: int) -> None:
-        size = architecture.inputs(env.task)
-        super().__init__(
-            env.count,
-            spaces.Box(-np.inf, np.inf, (size,), np.float32),
-            spaces.Box(-1.0, 1.0, (3,), np.float32),
+
+class PPO(Learner):
+    """PPO on a task."""
+
+    columns = ("reward", "success", "deviation", "value_loss", "clipped")
+
+    def __init__(
+        self, task: TaskBatch, architecture: ActorArchitecture, settings: PPOSettings, *, seed: int, steps: int
+    ) -> None:
+        """`steps` is the number of environment steps until the learning rate has decreased to its last value."""
+        super().__init__(task, architecture)
+        self._recurrent = architecture.recurrent > 0
+        self._actions = architecture.actions
+        torch.manual_seed(seed)  # initial weights
+        self._settings, self._total = settings, steps
+        self._actor = TorchActor(architecture)
+        self._critic = TorchActor(_critic_architecture(task, architecture, settings))
+        self._log_deviation = nn.Parameter(torch.full((architecture.actions,), float(np.log(settings.deviation))))
+        self._parameters = [*self._actor.parameters(), *self._critic.parameters(), self._log_deviation]
+        self._optimizer = torch.optim.Adam(self._parameters, settings.learning_rate, eps=1e-5)
+        self._rng = np.random.default_rng([seed, 0])
+        self._noise = torch.Generator().manual_seed(seed)
+        self._return = np.zeros(task.num_envs)  # discounted return so far, whose deviation scales the rewards
+        self._return_moments = np.zeros(3)  # count, sum, sum of squares
+        self.restart_episodes()
+
+    def restart_episodes(self) -> None:
+        """Starts new episodes in all environments."""
+        n = self.task.num_envs
+        self.task.reset(self.task.all, self._rng)
+        self._starts = torch.ones(n, dtype=torch.bool)
+        self._actor_memory, self._critic_memory = self._actor.initial_memory(n), self._critic.initial_memory(n)
+        self._return[:] = 0
+
+    def update(self) -> dict[str, float]:
+        """Collects one rollout and learns from it."""
+        if self.steps == 0 and isinstance(self._actor.encoder, VectorEncoder):
+            self._calibrate()
+        with self.clock.share("simulation"):
+            rollout, numbers = self._collect()
+        with self.clock.share("learning"):
+            return numbers | self._learn(rollout)
+
+    @torch.no_grad()
+    def _calibrate(self) -> None:
+        """Initializes the normalization of the observations by one rollout of random actions."""
+        with self.clock.share("simulation"):
+            n, k = self.task.num_envs, self._actions
+            for _ in range(self._settings.rollout):
+                self._actor.absorb(torch.from_numpy(self.task.observation))
+                self._critic.absorb(self._critic_inputs())
+                self.task.step(self._rng.uniform(-1, 1, (n, k)), self._rng)
+                if (done := self.task.terminated | self.task.truncated).any():
+                    self.task.reset(done, self._rng)
+        self.steps += n * self._settings.rollout
+        self.restart_episodes()
+
+    @torch.no_grad()
+    def _collect(self) -> tuple[Rollout, dict[str, float]]:
+        """Acts for `rollout` steps in all environments."""
+        task, s = self.task, self._settings
+        rows: list[tuple[Tensor, ...]] = []
+        rewards, final_values, rates = [], [], []
+        successes: list[bool] = []
+        memories = self._actor_memory, self._critic_memory
+        deviation = self._log_deviation.exp()
+        for _ in range(s.rollout):
+            observation, critic_input = torch.from_numpy(task.observation.copy()), self._critic_inputs()
+            mean, self._actor_memory = self._actor(observation, self._actor_memory)
+            value, self._critic_memory = self._critic(critic_input, self._critic_memory)
+            action = mean + deviation * torch.randn(mean.shape, generator=self._noise)
+            rows.append((observation, critic_input, self._starts, action, self._log_prob(mean, action), value[:, 0]))
+            task.step(action.clamp(-1, 1).numpy(), self._rng)
+            done = task.terminated | task.truncated
+            rates.append(task.reward.mean())
+            successes.extend(task.info["success"][done])
+            rewards.append(self._scaled_reward(done))
+            final_values.append(self._value_after_truncation())
+            self._begin(done)
+        self.steps += task.num_envs * s.rollout
+        columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+        last_value = self._critic(self._critic_inputs(), self._critic_memory)[0][None, :, 0]
+        ends = torch.cat([columns[2][1:], self._starts[None]])
+        next_values = torch.where(ends, torch.stack(final_values), torch.cat([columns[5][1:], last_value]))
+        advantages = _advantages(torch.stack(rewards), columns[5], next_values, ends, s)
+        numbers = {
+            "reward": float(np.mean(rates)),
+            "success": float(np.mean(successes)) if successes else float("nan"),
+            "deviation": float(deviation.mean()),
+        }
+        return Rollout(*columns, advantages, *memories), numbers  # type: ignore[call-arg]
+
+    def _value_after_truncation(self) -> Tensor:
+        """Values (N,) of the last observations: a truncated episode would have continued, other ends have value 0."""
+        continues = self.task.truncated & ~self.task.info["failed"]
+        if not continues.any():
+            return torch.zeros(self.task.num_envs)
+        values: Tensor = self._critic(self._critic_inputs(), self._critic_memory)[0][:, 0]
+        return values * torch.from_numpy(continues)
+
+    def _begin(self, done: NDArray[np.bool_]) -> None:
+        """Starts new episodes in the environments that are `done`."""
+        if done.any():
+            self.task.reset(done, self._rng)
+        self._starts = torch.from_numpy(done.copy())
+        going = (~self._starts)[:, None]
+        self._actor_memory, self._critic_memory = self._actor_memory * going, self._critic_memory * going
+
+    def _scaled_reward(self, done: NDArray[np.bool_]) -> Tensor:
+        """The rewards divided by the standard deviation of the discounted return, so that values are of order 1."""
+        self._return = self._settings.discount * self._return + self.task.reward
+        self._return_moments += [self._return.size, self._return.sum(), (self._return**2).sum()]
+        self._return[done] = 0
+        count, total, squares = self._return_moments
+        deviation = np.sqrt(max(squares / count - (total / count) ** 2, 1e-8))
+        return torch.from_numpy((self.task.reward / deviation).astype(np.float32))
+
+    def _critic_inputs(self) -> Tensor:
+        """Observations of the critic: those of the actor, or privileged quantities (with the actor's, if vectors)."""
+        observation = torch.from_numpy(self.task.observation.copy())
+        if not self._settings.privileged_critic:
+            return observation
+        privileged = torch.from_numpy(self.task.info["privileged"].astype(np.float32))
+        return torch.cat([observation, privileged], 1) if observation.ndim == 2 else privileged
+
+    def _log_prob(self, mean: Tensor, action: Tensor) -> Tensor:
+        """Logarithm of the probability density of actions, up to a constant."""
+        return -(0.5 * ((action - mean) / self._log_deviation.exp()) ** 2 + self._log_deviation).sum(-1)
+
+    def _learn(self, rollout: Rollout) -> dict[str, float]:
+        """Improves actor and critic on a rollout."""
+        s = self._settings
+        progress = min(1.0, self.steps / self._total)
+        for group in self._optimizer.param_groups:
+            group["lr"] = s.learning_rate * (1 + progress * (s.last_learning_rate - 1))
+        losses, clipped = [], []
+        for _ in range(s.epochs):
+            for sample in self._minibatches(rollout):
+                mean, value = self._evaluate(sample)
+                ratio = (self._log_prob(mean, sample.actions) - sample.log_probs).exp()
+                advantage = (sample.advantages - sample.advantages.mean()) / (sample.advantages.std() + 1e-8)
+                gain = torch.min(ratio * advantage, ratio.clamp(1 - s.clip, 1 + s.clip) * advantage)
+                value_loss = (value - sample.values - sample.advantages).square().mean()
+                loss = -gain.mean() + s.value * value_loss - s.entropy * self._log_deviation.sum()
+                self._optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(self._parameters, s.gradient_norm)
+                self._optimizer.step()
+                losses.append(value_loss.item())
+                clipped.append(((ratio - 1).abs() > s.clip).float().mean().item())
+        # The statistics change after the update, since the ratio of probabilities requires those of the rollout.
+        self._actor.absorb(rollout.observations.flatten(0, 1))
+        self._critic.absorb(rollout.critic_inputs.flatten(0, 1))
+        return {"value_loss": float(np.mean(losses)), "clipped": float(np.mean(clipped))}
+
+    def _minibatches(self, rollout: Rollout) -> list[Rollout]:
+        """Random parts of a rollout: single steps (1, batch, …), or whole sequences (T, n, …) if recurrent."""
+        steps, envs = rollout.log_probs.shape
+        size = self._settings.batch
+        if self._recurrent:
+            order = torch.randperm(envs, generator=self._noise).split(max(1, size // steps))
+            parts = [[value[:, i] for value in rollout.sequences()] for i in order]
+            memories = [(rollout.actor_memory[i], rollout.critic_memory[i]) for i in order]
+        else:
+            order = torch.randperm(steps * envs, generator=self._noise).split(size)
+            flat = [value.flatten(0, 1) for value in rollout.sequences()]
+            parts = [[value[None, i] for value in flat] for i in order if len(i) > 1]
+            memories = [(torch.zeros(0), torch.zeros(0))] * len(parts)
+        return [Rollout(*part, *memory) for part, memory in zip(parts, memories, strict=True)]  # type: ignore[call-arg]
+
+    def _evaluate(self, sample: Rollout) -> tuple[Tensor, Tensor]:
+        """Means of the actions (T, n, k) and values (T, n) under the present networks."""
+        actor_memory, critic_memory = sample.actor_memory, sample.critic_memory
+        means, values = [], []
+        for t in range(len(sample.starts)):
+            if self._recurrent:
+                going = (~sample.starts[t])[:, None]
+                actor_memory, critic_memory = actor_memory * going, critic_memory * going
+            mean, actor_memory = self._actor(sample.observations[t], actor_memory)
+            value, critic_memory = self._critic(sample.critic_inputs[t], critic_memory)
+            means.append(mean)
+            values.append(value[:, 0])
+        return torch.stack(means), torch.stack(values)
+
+    def tensors(self) -> dict[str, NDArray[np.float32]]:
+        """The tensors of the actor."""
+        return self._actor.tensors()
+
+    def state(self) -> RunState:
+        """Everything that determines the next updates, except the episodes, which are restarted."""
+        state = RunState()
+        state.add("actor", self._actor.state_dict())
+        state.add("critic", self._critic.state_dict())
+        state.add("optimizer", optimizer_tensors(self._optimizer))
+        state.add(
+            "other",
+            {
+                "log_deviation": self._log_deviation,
+                "noise": self._noise.get_state(),
+                "return_moments": torch.from_numpy(self._return_moments.copy()),
+            },
         )
-        tensors = _zero_tensors(architecture, env) | {"basis": basis, "scale": scale}
-        self._env = env
-        self._network = PolynomialNetwork(architecture, env.task, tensors)
-        self._history = self._network.history(env.count)
-        self._reach = np.asarray(architecture.reach)
-        self._seed = seed
-        self._actions: Array = np.zeros((env.count, 3))
-        self._signs: Array = np.ones((env.count, 3))
-        self.pose_rewards: list[float] = []  # mean `InsertionTask.reward` of the poses after each step
-        self.successes: deque[bool] = deque(maxlen=512)
+        state.values |= {"rng": generator_value(self._rng), "steps": self.steps}
+        return state
 
-    def reset(self) -> NDArray[np.float32]:
-        self._history.reset()
-        return self._observe(self._env.reset(self._seed))
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        self._actions = np.asarray(actions, dtype=float) * self._signs * self._reach
-
-    def step_wait(self) -> VecEnvStepReturn:
-        self._history.record(self._actions)
-        result = self._env.step(self._actions)
-        self.pose_rewards.append(float(result.reward.mean()))
-        self.successes.extend(bool(value) for value in result.success[result.done])
-        self._history.reset(result.done)
-        # The number of attempts is part of the observation, so the last attempt is a regular end of the episode.
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self._observe(result.images), result.improvement.astype(np.float32), result.done, infos
-
-    def _observe(self, images: NDArray[np.float32]) -> NDArray[np.float32]:
-        inputs, self._signs = self._network.canonical(self._history.observe(self._network.encode(images)))
-        return inputs.astype(np.float32)
-
-    def close(self) -> None:
-        self._env.env.close()
-
-    def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        return [False] * self.num_envs
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        return [getattr(self, attr_name)] * self.num_envs
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
+    def load(self, state: RunState) -> None:
+        """Restores `state`."""
+        self._actor.load_state_dict(state.part("actor"))
+        self._critic.load_state_dict(state.part("critic"))
+        load_optimizer_tensors(self._optimizer, state.part("optimizer"))
+        other = state.part("other")
+        with torch.no_grad():
+            self._log_deviation.copy_(other["log_deviation"])
+        self._noise.set_state(other["noise"])
+        self._return_moments = other["return_moments"].numpy().copy()
+        self._rng = generator_from(state.values["rng"])
+        self.steps = state.values["steps"]
 
 
-@dataclass(frozen=True)
-class _Run:
-    """The inputs of a training run."""
-
-    env: HistoryVecEnv
-    validation: PolicyEnv
-    architecture: PolynomialMLP
-    basis: Array
-    scale: Array
-    settings: PPOSettings
-    noise: FlowMapNoise | None
-    out: Path
-    command: Sequence[str]
-    report: Callable[[LearningCurvePoint], None] | None
+def _advantages(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, s: PPOSettings) -> Tensor:
+    """Generalized advantage estimation (Schulman et al. 2016); `ends[t]` is true where step t ended an episode."""
+    errors = rewards + s.discount * next_values - values
+    advantages = torch.zeros_like(errors)
+    advantage = torch.zeros_like(errors[0])
+    for t in reversed(range(len(errors))):
+        advantage = errors[t] + s.discount * s.trace * advantage * ~ends[t]
+        advantages[t] = advantage
+    return advantages
 
 
-def train(
-    env: PolicyEnv,
-    validation: PolicyEnv,
-    *,
-    out: Path,
-    architecture: PolynomialMLP | None = None,
-    settings: PPOSettings | None = None,
-    command: Sequence[str] = (),
-    report: Callable[[LearningCurvePoint], None] | None = None,
-) -> TrainingResult:
-    """Trains a policy on `env` and keeps the checkpoint with the best result on `validation`.
-
-    Parameters
-    ----------
-    env: environment of the training
-    validation: environment of the evaluations
-    out: folder of insertion.safetensors, learning_curve.csv and learning_curve.png; created if missing
-    architecture: of the network
-    settings: of PPO
-    command: command line, stored in the checkpoint
-    report: called after each update and each evaluation
-
-    Raises UsageError for inconsistent settings, and when `out` already contains a trained policy.
-    """
-    architecture = architecture or PolynomialMLP()
-    settings = settings or PPOSettings()
-    _check_settings(settings, env)
-    curve.create_training_folder(out)
-    torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
-    basis = polynomial_basis(env.task.grid, architecture.degree)
-    scale = feature_scale(env, architecture, basis, settings)
-    history_env = HistoryVecEnv(env, architecture, basis, scale, seed=settings.seed)
-    run = _Run(
-        history_env, validation, architecture, basis, scale, settings, env.noise, out, command=command, report=report
-    )
-    callback = _TrainingCallback(run)
-    _make_model(history_env, architecture, settings).learn(settings.attempts, callback=callback)
-    return callback.finish()
-
-
-def _make_model(env: HistoryVecEnv, architecture: PolynomialMLP, settings: PPOSettings) -> PPO:
-    return PPO(
-        "MlpPolicy",
-        env,
-        n_steps=settings.rollout,
-        batch_size=min(settings.batch, settings.rollout * env.num_envs),
-        n_epochs=settings.epochs,
-        learning_rate=lambda left: settings.learning_rate * (0.1 + 0.9 * left),
-        gamma=settings.discount,
-        gae_lambda=settings.gae,
-        clip_range=settings.clip,
-        vf_coef=settings.value,
-        ent_coef=settings.entropy,
-        max_grad_norm=settings.gradient_norm,
-        policy_kwargs={
-            "net_arch": {"pi": list(architecture.hidden), "vf": list(architecture.hidden)},
-            "activation_fn": torch.nn.Tanh,
-            "log_std_init": float(np.log(settings.spread)),
-        },
-        seed=settings.seed,
-        device="cpu",
-    )
-
-
-def export_actor(model: PPO, architecture: PolynomialMLP, basis: Array, scale: Array) -> dict[str, NDArray[Any]]:
-    """The tensors of a `PolynomialNetwork` from the actor of a PPO model."""
-    modules = [*model.policy.mlp_extractor.policy_net.modules(), model.policy.action_net]
-    linear = [module for module in modules if isinstance(module, torch.nn.Linear)]
-    tensors: dict[str, NDArray[Any]] = {"basis": basis, "scale": scale}
-    for i, layer in enumerate(linear):
-        tensors[f"{i}.weight"] = layer.weight.detach().numpy().astype(np.float32)
-        tensors[f"{i}.bias"] = layer.bias.detach().numpy().astype(np.float32)
-    return tensors
-
-
-def feature_scale(env: PolicyEnv, architecture: PolynomialMLP, basis: Array, settings: PPOSettings) -> Array:
-    """Root mean square of each feature over random attempts with noise, the divisor of the features.
-
-    It is common to both pads and at least 1e-3, so that features without signal stay small.
-    """
-    rng = np.random.default_rng([settings.seed, 1])
-    images = env.reset(settings.seed)
-    squares = []
-    for _ in range(max(1, min(settings.calibration, settings.attempts) // env.count)):
-        squares.append(reduce_maps(images, basis) ** 2)
-        reach = np.asarray(architecture.reach)
-        images = env.step(rng.uniform(-reach, reach, (env.count, 3)) / 2).images
-    mean = np.concatenate(squares).mean(0)
-    pads = mean.reshape(-1, env.task.sensors, 2, basis.shape[1])
-    mean = np.broadcast_to(pads.mean(axis=(0, 1), keepdims=True), pads.shape).reshape(-1)
-    return np.asarray(np.maximum(np.sqrt(mean), 1e-3))
-
-
-class _TrainingCallback(BaseCallback):
-    """Records the learning curve, evaluates, saves the best checkpoint, and stops at the time limit."""
-
-    def __init__(self, run: _Run) -> None:
-        super().__init__()
-        self._run = run
-        self._start = time.monotonic()
-        self._next_evaluation = run.settings.evaluate_every
-        self._best: EvaluationResult | None = None
-        self._points: list[LearningCurvePoint] = []
-
-    def _on_step(self) -> bool:
-        return self._minutes() < self._run.settings.minutes
-
-    def _on_rollout_end(self) -> None:
-        self._add_point(None)
-
-    def _on_rollout_start(self) -> None:
-        if self.num_timesteps >= self._next_evaluation:
-            self._next_evaluation += self._run.settings.evaluate_every
-            self._evaluate()
-
-    def _on_training_end(self) -> None:
-        self._evaluate()
-
-    def _minutes(self) -> float:
-        return (time.monotonic() - self._start) / 60
-
-    def _add_point(self, evaluation: EvaluationResult | None) -> None:
-        env = self._run.env
-        spread = float(torch.as_tensor(self.model.policy.log_std).detach().exp().mean())
-        reward = float(np.mean(env.pose_rewards)) if env.pose_rewards else float("nan")
-        success = float(np.mean(env.successes)) if env.successes else float("nan")
-        env.pose_rewards.clear()
-        point = LearningCurvePoint(self.num_timesteps, self._minutes(), reward, success, spread, evaluation)
-        self._points.append(point)
-        if self._run.report:
-            self._run.report(point)
-
-    def _evaluate(self) -> None:
-        run, settings = self._run, self._run.settings
-        assert isinstance(self.model, PPO)
-        tensors = export_actor(self.model, run.architecture, run.basis, run.scale)
-        task = run.validation.task
-        actor = NetworkActor(PolynomialNetwork(run.architecture, task, tensors), run.validation.count)
-        seed = settings.seed + 1_000_003  # differs from the seed of the training
-        episodes = min(settings.evaluate_episodes, settings.attempts)  # limits the evaluations of short runs
-        result = evaluate("validation", actor, run.validation, episodes=episodes, seed=seed)
-        if self._best is None or (result.success, result.reward) > (self._best.success, self._best.reward):
-            self._best = result
-            training = {
-                "command": list(run.command),
-                "settings": _to_json(settings),
-                "noise": None if run.noise is None else dataclasses.asdict(run.noise),
-                "attempts": self.num_timesteps,
-                "validation": result.to_json(),
-                "versions": {"torch": str(torch.__version__), "stable_baselines3": stable_baselines3.__version__},
-            }
-            path = run.out / curve.CHECKPOINT
-            checkpoint.save_checkpoint(
-                path, task=task, architecture=run.architecture, tensors=tensors, training=training
-            )
-        self._add_point(result)
-        curve.write_table(run.out / curve.CURVE, self._points)
-
-    def finish(self) -> TrainingResult:
-        """Draws the learning curve and returns the result."""
-        assert self._best is not None
-        curve.draw(self._run.out / curve.PICTURE, self._points)
-        out = self._run.out
-        return TrainingResult(out / curve.CHECKPOINT, self._best, out / curve.CURVE, out / curve.PICTURE)
-
-
-def _to_json(settings: PPOSettings) -> dict[str, Any]:
-    """JSON data of the settings; infinity becomes None."""
-    return {key: None if value == float("inf") else value for key, value in dataclasses.asdict(settings).items()}
-
-
-def _zero_tensors(architecture: PolynomialMLP, env: PolicyEnv) -> dict[str, NDArray[Any]]:
-    return {name: np.zeros(shape) for name, shape in architecture.tensor_shapes(env.task).items()}
-
-
-def _check_settings(settings: PPOSettings, env: PolicyEnv) -> None:
-    """Raises UsageError for settings that stable-baselines3 misinterprets or rejects with a traceback."""
-    collected = settings.rollout * env.count
-    if settings.attempts < 1 or not settings.minutes > 0:
-        raise UsageError(f"training requires attempts and minutes above 0, got {settings.attempts}, {settings.minutes}")
-    if collected < 2 or collected % min(settings.batch, collected):
-        raise UsageError(
-            f"{env.count} environments × {settings.rollout} attempts must be a multiple of the batch,"
-            f" {settings.batch}: choose another number of environments"
-        )
+def _critic_architecture(task: TaskBatch, actor: ActorArchitecture, settings: PPOSettings) -> ActorArchitecture:
+    """The architecture of the actor with one output, or a perceptron of privileged quantities."""
+    values: dict[str, Any] = {**vars(actor), "actions": 1}
+    if not settings.privileged_critic:
+        return type(actor)(**values)
+    privileged = task.info["privileged"].shape[1]
+    if not privileged:
+        raise UsageError(f"task {task.description.name} has no privileged quantities for a critic")
+    size = privileged + (actor.observation_shape[0] if len(actor.observation_shape) == 1 else 0)
+    hidden = actor.hidden if isinstance(actor, MLP) else (64, 64)
+    return MLP(observation_shape=(size,), actions=1, hidden=hidden)

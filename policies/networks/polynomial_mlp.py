@@ -84,33 +84,44 @@ class History:
         for array in (self._features, self._corrections, self._pose, self._attempts_made):
             array[mask] = 0
 
-    def observe(self, features: Array) -> Array:
-        """Adds one attempt of each part; returns the perceptron input, shape (count, inputs).
+    def observe(self, features: Array, which: NDArray[np.bool_] | None = None) -> Array:
+        """Adds one attempt of each part, or of those marked in `which`; returns their perceptron inputs, (n, inputs).
 
         Per part: features of the latest and the previous attempts (zero if missing); corrections between them, latest
         first; flags of the existing previous attempts; displacement from the start in the current gripper frame;
         fraction of the attempts made. Corrections and displacement are in units of `PolynomialMLP.reach`.
         """
-        self._features = np.roll(self._features, 1, axis=1)
-        self._features[:, 0] = features
-        count, earlier = self._corrections.shape[:2]
-        existing = (self._attempts_made[:, None] > np.arange(earlier)).astype(float)
-        self._attempts_made += 1
-        cos, sin = np.cos(self._pose[:, 2]), np.sin(self._pose[:, 2])
-        x, y, yaw = self._pose.T
+        rows = _rows(len(self._features), which)
+        past = np.roll(self._features[rows], 1, axis=1)
+        past[:, 0] = features
+        self._features[rows] = past
+        existing = (self._attempts_made[rows, None] > np.arange(self._corrections.shape[1])).astype(float)
+        self._attempts_made[rows] += 1
+        x, y, yaw = self._pose[rows].T
+        cos, sin = np.cos(yaw), np.sin(yaw)
         displacement = np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1) / self._reach
-        progress = self._attempts_made[:, None] / self._max_attempts
-        flat = [self._features.reshape(count, -1), self._corrections.reshape(count, -1)]
+        progress = self._attempts_made[rows, None] / self._max_attempts
+        flat = [values[rows].reshape(len(rows), -1) for values in (self._features, self._corrections)]
         return np.concatenate([*flat, existing, displacement, progress], axis=1)
 
-    def record(self, corrections: Array) -> None:
-        """Records the corrections (count, 3) after the latest attempt [m, m, rad], in the gripper frame."""
+    def record(self, corrections: Array, which: NDArray[np.bool_] | None = None) -> None:
+        """Records the corrections (count, 3) after the latest attempt [m, m, rad], in the gripper frame.
+
+        Those of parts that are not marked in `which` are ignored.
+        """
+        rows = _rows(len(self._features), which)
         if self._corrections.shape[1]:
-            self._corrections = np.roll(self._corrections, 1, axis=1)
-            self._corrections[:, 0] = corrections / self._reach
-        cos, sin = np.cos(self._pose[:, 2]), np.sin(self._pose[:, 2])
-        dx, dy, dyaw = corrections.T
-        self._pose += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
+            past = np.roll(self._corrections[rows], 1, axis=1)
+            past[:, 0] = corrections[rows] / self._reach
+            self._corrections[rows] = past
+        yaw = self._pose[rows, 2]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        dx, dy, dyaw = corrections[rows].T
+        self._pose[rows] += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
+
+
+def _rows(count: int, which: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+    return np.arange(count) if which is None else np.flatnonzero(which)
 
 
 class PolynomialNetwork(FlowMapNetwork):

@@ -48,7 +48,7 @@ def test_evaluation_loads_the_checkpoint_of_a_training(
     arguments = ["train", "insertion", *algorithm, *limits]
     assert main(arguments) == 0
     out = capsys.readouterr().out
-    assert "checkpoint" in out and ("simulation" in out) == (not algorithm)
+    assert "checkpoint" in out and "simulation" in out
     made = tmp_path / "run" / "insertion.safetensors"
     assert load_checkpoint(made).training["command"] == ["gelflow", *arguments]
     assert main(arguments) == 2
@@ -88,7 +88,7 @@ def test_the_evaluation_of_the_insertion_writes_a_report(tmp_path: Path, capsys:
         (["train", "insertion", "--attempts", "0"], "above 0"),
         (["train", "insertion", "--minutes", "nan"], "above 0"),
         (["train", "insertion", "--seed", "-1"], "--seed"),
-        (["train", "insertion", "--algorithm", "ppo", "--envs", "17"], "multiple of the batch"),
+        (["train", "insertion", "--algorithm", "ppo", "--attempts", "0"], "above 0"),
         (["train", "insertion", "--out", "pyproject.toml"], "pyproject.toml"),
     ],
 )

@@ -9,18 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 import safetensors.numpy
+import torch
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from tests.policies.toy_insertion import Toy, images, mirrored
+from tests.policies.toy_insertion import Toy, ToyInsertion, images, mirrored
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
 from gelflow.policies.environment import FlowMapNoise, PolicyEnv
+from gelflow.policies.episodes import RandomPolicy, evaluate_task
 from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
+from gelflow.policies.insertion_ppo import HistoryTask, InsertionPPO
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_mlp import History, PolynomialMLP, PolynomialNetwork
-from gelflow.policies.ppo import PPOSettings, train
+from gelflow.policies.ppo import PPOSettings
+from gelflow.policies.training.run import Progress, RunSettings, TrainingRun
 from gelflow.protocols import Policy
 from gelflow.task import INSERTION
 
@@ -261,48 +265,80 @@ def test_noise_preserves_the_length_of_the_longest_vector() -> None:
     assert not np.abs(noise.apply(zero, noise.sample(50, 2, rng), rng)).max() > 0
 
 
-SHORT = PPOSettings(attempts=20_480, batch=256, evaluate_every=5_000, evaluate_episodes=128, calibration=500)
+SETTINGS = PPOSettings(rollout=16, learning_rate=2e-3, last_learning_rate=0.1, discount=0.5, entropy=0.0, deviation=0.4)
+SHORT = RunSettings(steps=20_480, evaluate_every=5_000, evaluate_episodes=128)
+
+
+def make_run(folder: Path, run: RunSettings = SHORT, report: Callable[[Progress], None] | None = None) -> TrainingRun:
+    learner = InsertionPPO(ToyInsertion(32), SMALL, SETTINGS, seed=run.seed, steps=run.steps)
+    return TrainingRun(learner, ToyInsertion(32), folder, run, {"algorithm": "ppo"}, ["gelflow", "train"], report)
 
 
 def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Path) -> None:
-    points: list[Any] = []
-    result = train(
-        PolicyEnv(Toy(32), INSERTION, FlowMapNoise()),
-        PolicyEnv(Toy(32, same_step=False), INSERTION, FlowMapNoise()),
-        out=tmp_path / "run",
-        architecture=SMALL,
-        settings=SHORT,
-        command=["gelflow", "train"],
-        report=points.append,
-    )
-    random = evaluate("random", RandomActor(SMALL.reach, 32, 0), PolicyEnv(Toy(32), INSERTION), episodes=256, seed=1)
+    points: list[Progress] = []
+    result = make_run(tmp_path / "run", report=points.append).train()
+    task, reach = ToyInsertion(32), np.asarray(SMALL.reach) / INSERTION.action_scale
+    random = evaluate_task("random", RandomPolicy(32, reach, 0), task, episodes=256, seed=1)
     checkpoint = load_checkpoint(result.checkpoint)
-    assert isinstance(checkpoint.architecture, PolynomialMLP)
-    actor = NetworkActor(PolynomialNetwork(checkpoint.architecture, INSERTION, checkpoint.tensors), 32)
-    policy = evaluate("policy", actor, PolicyEnv(Toy(32), INSERTION, FlowMapNoise()), episodes=256, seed=1)
+    assert checkpoint.architecture == SMALL
+    trained = load_policy(result.checkpoint).network.batch_policy(32)
+    policy = evaluate_task("policy", trained, task, episodes=256, seed=1)
     assert policy.success > 0.9 and policy.success > random.success + 0.2
     assert policy.length < random.length
     assert checkpoint.training["command"] == ["gelflow", "train"]
     assert checkpoint.training["validation"]["success"] == result.best.success
     lines = result.curve.read_text().splitlines()
-    assert lines[0].startswith("attempts,minutes,reward,success") and len(lines) == 1 + len(points)
+    assert lines[0].startswith("steps,minutes") and len(lines) == 1 + len(points)
     assert result.picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_training_is_repeatable_and_stops_at_the_time_limit(tmp_path: Path) -> None:
     def run(name: str, **changes: Any) -> Any:
-        settings = dataclasses.replace(SHORT, attempts=2048, evaluate_episodes=32, **changes)
-        sides = [PolicyEnv(Toy(32), INSERTION, FlowMapNoise()) for _ in range(2)]
-        return load_checkpoint(train(*sides, out=tmp_path / name, architecture=SMALL, settings=settings).checkpoint)
+        settings = dataclasses.replace(SHORT, steps=2048, evaluate_episodes=32, **changes)
+        return load_checkpoint(make_run(tmp_path / name, settings).train().checkpoint)
 
     first, second, other = run("a"), run("b"), run("c", seed=1)
     assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
     assert any((first.tensors[name] != other.tensors[name]).any() for name in first.tensors)
-    assert run("d", minutes=1e-9).training["attempts"] <= 64
+    assert run("d", minutes=1e-9).training["steps"] <= 1024  # the first update, with the calibration before it
 
 
-def test_inconsistent_settings_are_rejected(tmp_path: Path) -> None:
-    for changes in ({"attempts": 0}, {"minutes": 0.0}, {"batch": 300}):
-        with pytest.raises(UsageError):
-            sides = [PolicyEnv(Toy(32), INSERTION) for _ in range(2)]
-            train(*sides, out=tmp_path, settings=dataclasses.replace(SHORT, **changes))
+def test_the_exported_perceptron_acts_as_the_trained_one() -> None:
+    learner = InsertionPPO(ToyInsertion(32), SMALL, SETTINGS, seed=0, steps=4096)
+    for _ in range(2):
+        learner.update()
+    observed = learner.task.observation.astype(float)
+    with torch.no_grad():
+        expected = learner._actor(torch.from_numpy(observed).float(), torch.zeros(32, 0))[0].clamp(-1, 1).numpy()
+    network = SMALL.network(INSERTION, learner.tensors())
+    values, signs = network.canonical(observed)
+    assert np.allclose(network.corrections(observed) / SMALL.reach * signs, expected, atol=1e-4)
+    assert np.allclose(values, observed)  # the learner sees canonical inputs
+
+
+def test_the_reward_of_the_training_is_the_improvement() -> None:
+    toy = ToyInsertion(8)
+    task, rng = HistoryTask(toy, SMALL), np.random.default_rng(0)
+    task.reset(task.all, rng)
+    for _ in range(3):
+        before = INSERTION.reward(toy.error)
+        task.step(rng.uniform(-0.3, 0.3, (8, 3)), rng)
+        assert np.allclose(task.reward, INSERTION.reward(toy.error) - before)
+        done = task.terminated | task.truncated
+        kept = task.observation[~done].copy()
+        task.reset(done, rng)
+        assert (task.observation[~done] == kept).all()
+        assert not (task.terminated | task.truncated).any()
+
+
+def test_parts_are_recorded_apart_in_a_history() -> None:
+    rng = np.random.default_rng(0)
+    together, alone = History(SMALL, INSERTION, count=3), History(SMALL, INSERTION)
+    which = np.array([True, False, True])
+    for i in range(4):
+        features, corrections = rng.normal(size=(3, SMALL.features(INSERTION))), rng.normal(0, 1e-3, (3, 3))
+        every = which if i % 2 else np.ones(3, dtype=bool)
+        inputs = together.observe(features[every], every)
+        assert (inputs[0] == alone.observe(features[:1])[0]).all() and len(inputs) == every.sum()
+        together.record(corrections, every)
+        alone.record(corrections[:1])

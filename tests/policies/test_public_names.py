@@ -13,7 +13,7 @@ def test_every_public_name_is_listed_and_resolves() -> None:
 
 
 def test_importing_the_package_imports_no_heavy_dependency() -> None:
-    heavy = ("torch", "cv2", "mujoco", "matplotlib", "scipy", "gymnasium", "stable_baselines3", "gelflow.sim._core")
+    heavy = ("torch", "cv2", "mujoco", "matplotlib", "scipy", "gymnasium", "gelflow.sim._core")
     code = f"import sys, gelflow.policies; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -14,7 +14,7 @@ from gelflow.policies.checkpoint import load_checkpoint, load_network
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.networks.cnn import CNN
 from gelflow.policies.networks.mlp import MLP
-from gelflow.policies.ppo_learner import PPO, PPOSettings
+from gelflow.policies.ppo import PPO, PPOSettings
 from gelflow.policies.training.progress_log import read_table
 from gelflow.policies.training.run import Progress, RunSettings, TrainingRun, locked
 from gelflow.policies.training.state import load_state

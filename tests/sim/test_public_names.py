@@ -34,7 +34,7 @@ def test_a_simulator_of_a_named_scene_takes_a_step() -> None:
 
 @pytest.mark.parametrize("package", ["gelflow", "gelflow.sim", "gelflow.sim.scene"])
 def test_importing_a_package_imports_no_heavy_dependency(package: str) -> None:
-    heavy = ("torch", "cv2", "mujoco", "matplotlib", "stable_baselines3", "gymnasium", "scipy", "gelflow.sim._core")
+    heavy = ("torch", "cv2", "mujoco", "matplotlib", "gymnasium", "scipy", "gelflow.sim._core")
     assert python(f"import sys, {package}; print([name for name in {heavy} if name in sys.modules])") == "[]"
 
 

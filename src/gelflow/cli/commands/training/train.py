@@ -28,15 +28,10 @@ from gelflow.cli.options import (
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
-from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from gelflow.policies.evaluation import EvaluationResult
-    from gelflow.policies.learning_curve import LearningCurvePoint, TrainingResult
     from gelflow.policies.training.run import Progress as RunProgress
-    from gelflow.policies.training.run import TrainingResult as RunResult
+    from gelflow.policies.training.run import TrainingResult
 
 _DEFAULT = "imitation"
 _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algorithm
@@ -80,11 +75,10 @@ def run(args: argparse.Namespace) -> int:
         made = _train(args, progress)
     best = made.best
     output.text(f"best on validation: {best.success:.1%} inserted in {best.length:.2f} corrections")
-    seconds = {name: made.seconds.get(name, float("nan")) for name in ("simulation", "learning")}
-    if made.seconds:
-        total = sum(seconds.values())
-        share = seconds["simulation"] / total
-        output.text(f"{total / 60:.1f} min: simulation {share:.0%}, learning {1 - share:.0%}")
+    seconds = {name: made.seconds[name] for name in ("simulation", "learning")}
+    total = sum(seconds.values())
+    share = seconds["simulation"] / total
+    output.text(f"{total / 60:.1f} min: simulation {share:.0%}, learning {1 - share:.0%}")
     output.text(f"checkpoint {made.checkpoint}, learning curve {made.picture} and {made.curve.name}")
     of_part = "" if args.part is None else f" --part {shlex.quote(args.part)}"
     output.text(f"evaluate it with: gelflow eval insertion{of_part} --checkpoint {shlex.quote(str(made.checkpoint))}")
@@ -100,70 +94,34 @@ def run(args: argparse.Namespace) -> int:
     return SUCCESS
 
 
-def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult | RunResult":
-    task = part_task(args.part)
-    if args.algorithm == "ppo":
-        return _train_with_ppo(args, task, progress)
+def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     from gelflow.policies import recipes  # deferred: torch is slow to import
 
-    attempts = recipes.recipe_for("insertion").steps if args.attempts is None else args.attempts
-    bar = _TrainingProgress(progress, attempts)
+    recipe = DEFAULT_RECIPE if args.algorithm == _DEFAULT else args.algorithm
+    attempts = recipes.recipe_for("insertion", recipe).steps if args.attempts is None else args.attempts
+    bar = progress.add_task("training", total=attempts)
+
+    def report(point: "RunProgress") -> None:
+        text = f"reward {point.numbers['reward']:6.2f}  inserted {point.numbers['success']:4.0%}"
+        progress.update(bar, completed=point.steps, description=text)
+        if evaluation := point.evaluation:
+            progress.console.print(
+                f"after {point.steps:>9,} attempts, {point.minutes:5.1f} min:"
+                f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
+            )
+
     return recipes.train(
         "insertion",
         args.out,
+        recipe=recipe,
         seed=args.seed,
         steps=attempts,
         envs=args.envs,
         minutes=float("inf") if args.minutes is None else args.minutes,
-        options={"task": task, **task_options(args)},
+        options={"task": part_task(args.part), **task_options(args)},
         command=_command(args, attempts),
-        report=bar.report_run,
+        report=report,
     )
-
-
-def _train_with_ppo(args: argparse.Namespace, task: InsertionTask, progress: Progress) -> "TrainingResult":
-    from gelflow.policies import ppo  # deferred: torch is slow to import
-    from gelflow.policies.environment import FlowMapNoise, make_insertion_env
-
-    given = {name: getattr(args, name) for name in ("attempts", "minutes") if getattr(args, name) is not None}
-    options = {"preset": args.preset, "task": task, "randomization": args.randomization}
-    env, validation = (make_insertion_env(args.envs, noise=FlowMapNoise(), **options) for _ in range(2))
-    settings = ppo.PPOSettings(seed=args.seed, **given)
-    command, bar = _command(args, settings.attempts), _TrainingProgress(progress, settings.attempts)
-    return ppo.train(env, validation, out=args.out, settings=settings, command=command, report=bar.report)
-
-
-class _TrainingProgress:
-    """Shows the newest point of the learning curve, and a line for each evaluation."""
-
-    def __init__(self, progress: Progress, attempts: int) -> None:
-        self._progress = progress
-        self._task = progress.add_task("training", total=attempts)
-
-    def report(self, point: "LearningCurvePoint") -> None:
-        """Called for each point of a learning curve."""
-        numbers = None if point.evaluation else {"reward": point.reward, "success": point.success}
-        self._show(point.attempts, point.minutes, numbers, point.evaluation)
-
-    def report_run(self, point: "RunProgress") -> None:
-        """Called after each update of a run."""
-        self._show(point.steps, point.minutes, point.numbers, point.evaluation)
-
-    def _show(
-        self,
-        attempts: int,
-        minutes: float,
-        numbers: "Mapping[str, float] | None",
-        evaluation: "EvaluationResult | None",
-    ) -> None:
-        if numbers:
-            text = f"reward {numbers['reward']:6.2f}  inserted {numbers['success']:4.0%}"
-            self._progress.update(self._task, completed=attempts, description=text)
-        if evaluation:
-            self._progress.console.print(
-                f"after {attempts:>9,} attempts, {minutes:5.1f} min:"
-                f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
-            )
 
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
