@@ -4,13 +4,10 @@ from .checkpoint import load_checkpoint as load_checkpoint
 from .checkpoint import load_policy as load_policy
 from .checkpoint import save_checkpoint as save_checkpoint
 from .checkpoint import shipped_checkpoints as shipped_checkpoints
-from .environment import FlowMapNoise as FlowMapNoise
-from .environment import PolicyEnv as PolicyEnv
-from .environment import make_insertion_env as make_insertion_env
+from .episodes import OraclePolicy as OraclePolicy
+from .episodes import RandomPolicy as RandomPolicy
+from .episodes import evaluate_task as evaluate_task
 from .evaluation import EvaluationResult as EvaluationResult
-from .evaluation import NetworkActor as NetworkActor
-from .evaluation import RandomActor as RandomActor
-from .evaluation import evaluate as evaluate
 from .imitation import ImitationSettings as ImitationSettings
 from .networks.base import Architecture as Architecture
 from .networks.base import BatchPolicy as BatchPolicy
@@ -30,25 +27,22 @@ __all__ = [
     "BatchPolicy",
     "Checkpoint",
     "EvaluationResult",
-    "FlowMapNoise",
     "ImitationSettings",
     "Network",
-    "NetworkActor",
     "NetworkPolicy",
+    "OraclePolicy",
     "PPOSettings",
-    "PolicyEnv",
     "PolynomialGRU",
     "PolynomialGRUNetwork",
     "PolynomialMLP",
     "PolynomialNetwork",
     "Progress",
-    "RandomActor",
+    "RandomPolicy",
     "TrainingResult",
     "default_checkpoint",
-    "evaluate",
+    "evaluate_task",
     "load_checkpoint",
     "load_policy",
-    "make_insertion_env",
     "save_checkpoint",
     "shipped_checkpoints",
     "train",

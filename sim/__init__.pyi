@@ -13,6 +13,7 @@ from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
 from .tasks.environments import InsertionEnv as InsertionEnv
 from .tasks.environments import InsertionVectorEnv as InsertionVectorEnv
+from .tasks.gripper.flow_map_noise import FlowMapNoise as FlowMapNoise
 from .tasks.gymnasium_envs import TaskEnv as TaskEnv
 from .tasks.gymnasium_envs import TaskVectorEnv as TaskVectorEnv
 from .tasks.insertion import InsertionAttempts as InsertionAttempts
@@ -42,6 +43,7 @@ __all__ = [
     "Energy",
     "EnergyGauge",
     "Fixed",
+    "FlowMapNoise",
     "InsertionAttempts",
     "InsertionEnv",
     "InsertionVectorEnv",

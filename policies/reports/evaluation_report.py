@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.environment import FlowMapNoise
 from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy, Network
@@ -19,6 +18,7 @@ from gelflow.policies.networks.flow_map_policy import FlowMapNetwork
 from gelflow.policies.reports.failures import FailureRange, draw_failures, failure_ranges, worst_ranges
 from gelflow.policies.training.folder import create_folder
 from gelflow.session.records import to_plain
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 RESULTS, EPISODES, FAILURES, FAILURE_PICTURE = "results.json", "episodes.csv", "failures.csv", "failures.png"

@@ -8,9 +8,9 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.cli.options import checkpoint_for
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
-from gelflow.policies.environment import FlowMapNoise, PolicyEnv, make_insertion_env
-from gelflow.policies.evaluation import NetworkActor, evaluate
-from gelflow.sim.tasks.environments import InsertionVectorEnv
+from gelflow.policies.episodes import evaluate_task
+from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
 from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
@@ -23,9 +23,8 @@ def test_the_shipped_policy_inserts_in_simulation() -> None:
     assert checkpoint.training["command"][:3] == ["gelflow", "train", "insertion"]
     assert checkpoint.training["validation"]["success"] > 0.8
     network = load_policy(path, task=INSERTION).network
-    result = evaluate(
-        "policy", NetworkActor(network, 32), make_insertion_env(32, noise=FlowMapNoise()), episodes=48, seed=5
-    )
+    batch = Insertion(32, noise=FlowMapNoise())
+    result = evaluate_task("policy", network.batch_policy(32), batch, episodes=48, seed=5)
     assert result.successes >= 36  # more than three standard deviations below 48 · 0.9
     assert result.length < 8
 
@@ -34,8 +33,8 @@ def test_the_shipped_policy_of_the_peg_inserts_it_with_a_stiff_arm() -> None:
     task = load_part("peg")
     network = load_policy(checkpoint_for(task, None), task=task).network
     stiff = DEFAULT_RANDOMIZATION.replace(arm_stiffness=(5e3, 3e5), grasp_height=task.part.grasp_height)
-    env = PolicyEnv(InsertionVectorEnv(32, task=task, preset="fast", randomization=stiff), task, FlowMapNoise())
-    result = evaluate("policy", NetworkActor(network, 32), env, episodes=48, seed=5)
+    batch = Insertion(32, task=task, preset="fast", randomization=stiff, noise=FlowMapNoise())
+    result = evaluate_task("policy", network.batch_policy(32), batch, episodes=48, seed=5)
     assert result.successes >= 42  # more than three standard deviations below 48 · 0.97
     assert result.length < 8
 

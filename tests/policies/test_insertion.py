@@ -10,22 +10,20 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from tests.policies.toy_insertion import Toy, ToyInsertion, images, mirrored
+from tests.policies.toy_insertion import ToyInsertion, images, mirrored
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import load_checkpoint, load_policy, save_checkpoint
-from gelflow.policies.environment import FlowMapNoise, PolicyEnv
 from gelflow.policies.episodes import RandomPolicy, evaluate_task
-from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
 from gelflow.policies.insertion_ppo import HistoryTask, InsertionPPO
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_mlp import History, PolynomialMLP, PolynomialNetwork
 from gelflow.policies.ppo import PPOSettings
 from gelflow.policies.training.run import Progress, RunSettings, TrainingRun
 from gelflow.protocols import Policy
+from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.task import INSERTION
 
 SMALL = PolynomialMLP(hidden=(16, 16))
@@ -55,10 +53,10 @@ def stored(tmp_path: Path) -> Path:
 
 
 def test_a_saved_policy_acts_identically_after_loading_and_reset(stored: Path) -> None:
-    before = NetworkActor(
-        PolynomialNetwork(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}), 1
+    before = PolynomialNetwork(SMALL, INSERTION, {k: v.astype(np.float32) for k, v in tensors().items()}).batch_policy(
+        1
     )
-    expected = [before.act(image[None])[0] for image in images(5)]
+    expected = [before.corrections(image[None])[0] for image in images(5)]
     policy = load_policy(stored)
     assert isinstance(load_checkpoint(stored).digest, str) and load_checkpoint(stored).training["command"] == [
         "made",
@@ -199,56 +197,36 @@ def test_history_layout_and_displacement_in_the_gripper_frame() -> None:
 
 def test_parallel_histories_are_independent() -> None:
     network = PolynomialNetwork(SMALL, INSERTION, tensors())
-    together, alone = NetworkActor(network, 3), NetworkActor(network, 1)
+    together, alone = network.batch_policy(3), network.batch_policy(1)
     for i in range(6):
         if i == 2:
             together.reset(np.array([True, False, True]))
         stack = images(3, seed=i)
-        both = together.act(stack)
-        assert np.allclose(both[1], alone.act(stack[1:2])[0], rtol=1e-12, atol=1e-15)
+        both = together.corrections(stack)
+        assert np.allclose(both[1], alone.corrections(stack[1:2])[0], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize(("in_x", "in_y"), [(False, True), (True, False), (True, True)])
 def test_mirrored_flow_maps_give_mirrored_corrections(in_x: bool, in_y: bool) -> None:
     network = PolynomialNetwork(SMALL, INSERTION, tensors())
-    one, other = NetworkActor(network, 8), NetworkActor(network, 8)
+    one, other = network.batch_policy(8), network.batch_policy(8)
     signs = np.array([-1 if in_x else 1, -1 if in_y else 1, -1 if in_x != in_y else 1])
     for i in range(5):
         stack = images(8, seed=i)
         reflected = np.stack([mirrored(image, in_x, in_y) for image in stack])
-        assert np.allclose(other.act(reflected), one.act(stack) * signs, atol=1e-9)
+        assert np.allclose(other.corrections(reflected), one.corrections(stack) * signs, atol=1e-9)
 
 
-def test_the_improvements_sum_to_the_change_of_the_reward() -> None:
-    toy = Toy(4)
-    env = PolicyEnv(toy, INSERTION)
-    env.reset(0)
-    total = INSERTION.reward(toy.error)
-    for _ in range(3):
-        result = env.step(np.full((4, 3), 1e-3))
-        total = np.where(result.done, INSERTION.reward(toy.error), total + result.improvement)
-        assert np.allclose(total[~result.done], result.reward[~result.done])
-
-
-@pytest.mark.parametrize("same_step", [True, False])
-def test_evaluation_counts_complete_episodes_and_is_repeatable(same_step: bool) -> None:
-    env = PolicyEnv(Toy(16, same_step=same_step), INSERTION)
-    result = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), env, episodes=50, seed=3)
-    again = evaluate("random", RandomActor((8e-3, 8e-3, 0.2), 16, 0), env, episodes=50, seed=3)
+def test_evaluation_counts_complete_episodes_and_is_repeatable() -> None:
+    task, reach = ToyInsertion(16), np.array([8e-3, 8e-3, 0.2]) / INSERTION.action_scale
+    result, again = (
+        evaluate_task("random", RandomPolicy(16, np.minimum(reach, 1), 0), task, episodes=50, seed=3) for _ in range(2)
+    )
     assert result == again
     assert result.episodes == 50 and 0 < result.successes < 50
     assert 1 <= result.length <= INSERTION.attempts
     low, high = result.confidence_interval()
     assert low < result.success < high
-
-
-def test_environments_with_another_shape_or_reset_mode_are_rejected() -> None:
-    with pytest.raises(UsageError, match=r"observes \(4, 13, 10\); the task describes \(8, 13, 10\)"):
-        PolicyEnv(Toy(2), dataclasses.replace(INSERTION, frame_depths=(5e-4, 1.1e-3)))
-    late = Toy(2)
-    late.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
-    with pytest.raises(UsageError, match="same step"):
-        PolicyEnv(late, INSERTION)
 
 
 def test_noise_preserves_the_length_of_the_longest_vector() -> None:

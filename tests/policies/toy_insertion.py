@@ -3,11 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
@@ -16,7 +13,7 @@ from gelflow.task import INSERTION
 
 
 class ToyInsertion(AttemptTask):
-    """The insertion of `Toy` as a batch, with noise on its flow maps."""
+    """Insertions whose flow maps follow from the pose error, with noise; see `flow_maps` and `inserted`."""
 
     length_unit = "corrections"
 
@@ -66,43 +63,6 @@ def flow_maps(error: NDArray[np.float64]) -> NDArray[np.float32]:
     x, y, yaw = (error / np.array(INSERTION.misalignment)).T / 2
     flow = np.stack([1 + x, yaw + y, 1 - x, yaw - y], axis=1)[:, :, None, None] * np.ones((1, 1, 13, 10))
     return np.asarray(flow / np.abs(flow).max(axis=(1, 2, 3), keepdims=True), dtype=np.float32)
-
-
-class Toy(VectorEnv[Any, Any, Any]):
-    """Analytic insertion as a vector environment; see `inserted` and `flow_maps`."""
-
-    def __init__(self, count: int, *, same_step: bool = True) -> None:
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP if same_step else AutoresetMode.DISABLED}
-        self.num_envs = count
-        self.single_observation_space = gymnasium.spaces.Box(-1, 1, INSERTION.observation_shape, np.float32)
-        self.single_action_space = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, count)
-        self.action_space = batch_space(self.single_action_space, count)
-        self.error = np.zeros((count, 3))
-        self.attempts = np.zeros(count, dtype=int)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        mask = np.ones(self.num_envs, dtype=bool) if options is None else options["reset_mask"]
-        self._restart(mask)
-        return self._observe(), {"pose": self.error.copy()}
-
-    def step(self, actions: NDArray[Any]) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        self.error += actions * np.array(INSERTION.action_scale)
-        self.attempts += 1
-        reward = INSERTION.reward(self.error)
-        success = inserted(self.error)
-        ended = ~success & (self.attempts >= INSERTION.attempts)
-        if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP:
-            self._restart(success | ended)
-        return self._observe(), reward, success, ended, {"pose": self.error.copy()}
-
-    def _restart(self, mask: NDArray[np.bool_]) -> None:
-        self.error[mask] = self.np_random.uniform(-1, 1, (int(mask.sum()), 3)) * np.array(INSERTION.misalignment)
-        self.attempts[mask] = 0
-
-    def _observe(self) -> NDArray[np.float32]:
-        return flow_maps(self.error)
 
 
 def images(count: int, seed: int = 0) -> NDArray[np.float32]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
@@ -227,19 +228,21 @@ def _in_simulation(
     output: Output, policy: "NetworkPolicy", task: InsertionTask, *, preset: str | None
 ) -> "list[EvaluationResult]":
     """Success in simulation without protocols and cameras, of the policy and of random corrections."""
-    from gelflow.policies.environment import make_insertion_env
-    from gelflow.policies.evaluation import NetworkActor, RandomActor, evaluate
+    from gelflow.policies.episodes import RandomPolicy, evaluate_task
+    from gelflow.policies.networks.base import BatchPolicy
+    from gelflow.sim.tasks.environments import Insertion
 
-    env = make_insertion_env(_EPISODES, preset=preset, task=task)
-    actors: dict[str, NetworkActor | RandomActor] = {
-        "policy": NetworkActor(policy.network, _EPISODES),
-        "random": RandomActor(policy.network.reach, _EPISODES, 0),
+    batch, network = Insertion(_EPISODES, task=task, preset=preset), policy.network
+    reach = np.asarray(network.reach) / np.asarray(task.action_scale)
+    actors: dict[str, BatchPolicy] = {
+        "policy": network.batch_policy(_EPISODES),
+        "random": RandomPolicy(_EPISODES, reach, 0),
     }
     results = []
     with progress_bar() as progress:
         bar = progress.add_task("the same policy in simulation", total=len(actors))
         for name, actor in actors.items():
-            results.append(evaluate(name, actor, env, episodes=_EPISODES, seed=1))
+            results.append(evaluate_task(name, actor, batch, episodes=_EPISODES, seed=1))
             progress.advance(bar)
     own, random = results
     output.text(
