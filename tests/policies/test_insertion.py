@@ -21,7 +21,9 @@ from gelflow.policies.insertion_ppo import HistoryTask, InsertionPPO
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_mlp import History, PolynomialMLP, PolynomialNetwork
 from gelflow.policies.ppo import PPOSettings
-from gelflow.policies.training.run import Progress, RunSettings, TrainingRun
+from gelflow.policies.training.progress_log import read_table
+from gelflow.policies.training.run import STATE, Progress, RunSettings, TrainingRun
+from gelflow.policies.training.state import load_state
 from gelflow.protocols import Policy
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.task import INSERTION
@@ -279,6 +281,28 @@ def test_training_is_repeatable_and_stops_at_the_time_limit(tmp_path: Path) -> N
     assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
     assert any((first.tensors[name] != other.tensors[name]).any() for name in first.tensors)
     assert run("d", minutes=1e-9).training["steps"] <= 1024  # the first update, with the calibration before it
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_killed_training_continues_to_the_result_of_an_uninterrupted_one(tmp_path: Path) -> None:
+    run = RunSettings(steps=4096, evaluate_every=1000, evaluate_episodes=32)
+
+    def kill(progress: Progress) -> None:
+        if progress.steps > 3000:
+            raise Killed
+
+    whole = make_run(tmp_path / "whole", run).train()
+    with pytest.raises(Killed):
+        make_run(tmp_path / "killed", run, kill).train()
+    assert load_state(tmp_path / "killed" / STATE).values["steps"] >= 2000
+    continued = make_run(tmp_path / "killed", run).train()
+    first, second = load_checkpoint(whole.checkpoint), load_checkpoint(continued.checkpoint)
+    assert all((first.tensors[name] == second.tensors[name]).all() for name in first.tensors)
+    rewards = [[row["reward"] for row in read_table(result.curve)] for result in (whole, continued)]
+    assert rewards[0] == rewards[1]
 
 
 def test_the_exported_perceptron_acts_as_the_trained_one() -> None:
