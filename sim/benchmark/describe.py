@@ -12,10 +12,10 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene import Scene
+from gelflow.sim.scene.loader import scene_tables
 from gelflow.sim.scene.mjcf.mechanics import WORLD, JointDef, Mechanics, read_mechanics
 from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
 from gelflow.sim.simulator import Simulator
-from gelflow.toml_tables import read_toml
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def describe(scene: Scene) -> Description:
 
     Raises UsageError when the scene's files changed after it was loaded.
     """
-    path = scene.path.parent / str(read_toml(scene.path).get("model"))
+    path = scene.path.parent / str(scene_tables(scene.path).get("model"))
     mechanics = read_mechanics(path)
     if [b.name for b in mechanics.bodies] != [b.name for b in scene.bodies]:
         raise UsageError(f"{path} has other bodies than the loaded scene; load the scene again")

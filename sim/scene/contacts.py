@@ -144,8 +144,7 @@ def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
     size = geom.size.tolist()
     if geom.kind == "box":
         table.check_keys(("geom", "resolution", "faces", "stiffness"))
-        resolution = [int(n) for n in table.numbers("resolution", 3)]
-        return box_surface(size, resolution, faces=table.strings("faces", FACES))
+        return box_surface(size, table.integers("resolution", 3), faces=table.strings("faces", FACES))
     if geom.kind == "cylinder":
         table.check_keys(("geom", "angles", "radii", "heights", "faces", "stiffness"))
         angles, radii = table.integer("angles", 8), table.integer("radii", 4)

@@ -1,6 +1,5 @@
 """Loading of scenes from a TOML file and the MJCF or URDF file that it names (docs/guide/scenes.md)."""
 
-import copy
 from collections.abc import Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -18,6 +17,7 @@ from gelflow.sim.scene.shapes import used_shapes
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 INTEGRATORS = ("bdf1", "bdf2")
+MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")  # of model files that are loaded without a TOML file
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
@@ -43,7 +43,8 @@ def load_scene(
 
     Parameters
     ----------
-    scene: name of a scene of gelflow, or path of a TOML file
+    scene: name of a scene of gelflow, or path of a TOML file; the path of an MJCF or URDF file gives a scene without
+        contacts and pads, with the time step of that file
     preset: name of a preset of the file, such as "fast", which trades accuracy for speed
     friction: "viscous" or "elastic", instead of the default friction law of the file
     overrides: values that replace those of the file and of the preset, by dotted key, such as {"pads.pad.rows": 50};
@@ -52,7 +53,7 @@ def load_scene(
     Raises UsageError, in one line, on an unknown key or name, a missing file, or an element that is not supported.
     """
     path = _find(scene)
-    data = copy.deepcopy(read_toml(path))
+    data = scene_tables(path)
     presets = read_presets(TomlTable(data, str(path)), top_level_keys=_SOLVER_KEYS, element_tables=_ELEMENT_TABLES)
     if preset is not None:
         apply_preset(data, presets, preset, str(path))
@@ -61,6 +62,11 @@ def load_scene(
     if friction is not None:
         data["friction"] = friction
     return _read_scene(path, TomlTable(data, str(path)), presets)
+
+
+def scene_tables(path: Path) -> dict[str, Any]:
+    """The tables of a scene file; for a model file those of a scene that has nothing but the model."""
+    return {"format": 1, "model": path.name} if path.suffix in MODEL_SUFFIXES else read_toml(path)
 
 
 def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
@@ -80,7 +86,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
     return Scene(
         name=path.stem,
         path=path,
-        step=top.number("step", minimum=1e-6),
+        step=top.number("step", mechanics.step if path.suffix in MODEL_SUFFIXES else None, minimum=1e-6),
         integrator=top.string("integrator", "bdf1", choices=INTEGRATORS),
         tolerance=top.number("tolerance", DEFAULT_TOLERANCE, minimum=1e-15),
         precision=cast("Precision", top.string("precision", "double", choices=PRECISIONS)),
@@ -103,11 +109,13 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
 
 def _find(scene: str | Path) -> Path:
     path = Path(scene)
-    if path.suffix == ".toml" or path.is_file():
+    if path.suffix in (".toml", *MODEL_SUFFIXES) or path.is_file():
         return path
     shipped = Path(str(_shipped_scenes())) / f"{scene}.toml"
     if not shipped.is_file():
-        raise UsageError(f"no scene {str(scene)!r}; {suggestion(str(scene), scene_names())} (or give a .toml file)")
+        raise UsageError(
+            f"no scene {str(scene)!r}; {suggestion(str(scene), scene_names())} (or give a .toml, .xml or .urdf file)"
+        )
     return shipped
 
 

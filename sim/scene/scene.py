@@ -37,7 +37,7 @@ class Scene:
     """
 
     name: str
-    path: Path  # of the TOML file; names the scene in error messages
+    path: Path  # of the TOML file, or of a model file without one; names the scene in error messages
     step: float  # time step [s]
     bodies: tuple[BodyDef, ...]  # parents before children
     joints: tuple[JointDef, ...]

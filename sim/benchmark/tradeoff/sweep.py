@@ -16,8 +16,8 @@ import numpy as np
 from gelflow.errors import SimulationError
 from gelflow.sim.benchmark.tradeoff.run import FRAME, Errors, MotionBenchmark, MotionResult, compare, randomized
 from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.loader import scene_tables
 from gelflow.sim.validation.reference_motions import reference_motion
-from gelflow.toml_tables import read_toml
 
 STEPS = (1, 2, 4, 8, 16, 32)  # steps per frame of 10 ms: steps of 10 to 0.3125 ms
 TOLERANCES = (1e-2, 1e-3, 1e-5, 1e-9)
@@ -125,7 +125,7 @@ def _markers(scene: Scene) -> dict[str, Overrides]:
     grid = scene.pads[0].grid
     if grid is None or any(pad.grid is None for pad in scene.pads):
         return {}
-    table = read_toml(scene.path)["pads"][scene.pads[0].name]
+    table = scene_tables(scene.path)["pads"][scene.pads[0].name]
     found: dict[str, Overrides] = {}
     if "size" in table:
         common = math.gcd(grid.rows, grid.cols)
@@ -148,7 +148,7 @@ def contact_density(scene: Scene, density: float) -> Overrides:
 
     Parameters per point are divided by the area of a point of the scene, so that the total stiffness is unchanged.
     """
-    data = read_toml(scene.path)
+    data = scene_tables(scene.path)
     found: Overrides = {}
     clouds = {p.name: p for p in scene.points if p.radius == 0 and len(p.points) > _CORNERS}
     for name in clouds:

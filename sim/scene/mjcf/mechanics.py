@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import UsageError
 from gelflow.geometry import Pose
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef, actuator_addition, default_limit, read_actuators
@@ -98,6 +99,7 @@ class Mechanics:
     actuators: tuple[ActuatorDef, ...]
     gravity: Array  # [m/s²], shape (3,)
     q0: Array  # initial positions, shape (nq,)
+    step: float  # time step of the file, MuJoCo's 0.002 if it has none [s]
     not_modelled: tuple[str, ...]  # elements without effect, with the reason
 
 
@@ -115,6 +117,8 @@ def read_mechanics(path: Path) -> Mechanics:
     Raises UsageError, in one line, if a file is missing or invalid, or has an element that is not supported.
     """
     model, urdf = compile_model(path)
+    if model.njnt == 0:
+        raise UsageError(f"{path}: the model has no joint, so nothing can move; add a joint, or a free joint to a body")
     apply_disable_flags(model)
     check_supported(model, path.name)
     moving_body, poses = _merge(model)
@@ -135,6 +139,7 @@ def read_mechanics(path: Path) -> Mechanics:
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
         q0=_initial_positions(model),
+        step=float(model.opt.timestep),
         not_modelled=not_modelled(model),
     )
 

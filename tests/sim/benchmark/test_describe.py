@@ -255,7 +255,7 @@ def test_printed_times_fit_the_terminal(capsys: pytest.CaptureFixture[str]) -> N
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["insertin"], "no scene 'insertin'; did you mean 'insertion'? (or give a .toml file)"),
+        (["insertin"], "no scene 'insertin'; did you mean 'insertion'? (or give a .toml, .xml or .urdf file)"),
         (["nowhere.toml"], "no such file: nowhere.toml"),
         (["rolling", "--repeats", "0"], "--repeats must be at least 1, got 0"),
     ],

@@ -1,0 +1,142 @@
+"""Additions to the URDF reader of MuJoCo: files of meshes, motors, and repair of inertia that no rigid body has."""
+
+import os
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+
+_PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # rows and columns of xx, yy, zz, xy, xz, yz
+_ROUNDING = 1e-9  # relative violation of the triangle inequality that printed decimals of a thin body can cause
+_MARGIN = 1e-12  # relative, so that MuJoCo's exact comparison holds after its own rounding
+
+
+def read_urdf(path: Path) -> ElementTree.Element | None:
+    """The root element of a URDF file; None for MJCF and for invalid XML, which MuJoCo reports.
+
+    Raises UsageError, in one line, if the file has macros or mimic joints.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except (ElementTree.ParseError, OSError):
+        return None
+    if root.tag != "robot":
+        return None
+    if any("xacro" in str(element.tag) for element in root.iter()):
+        raise UsageError(f"{path}: has xacro macros, which are not expanded; run xacro and load its output")
+    for joint in root.iter("joint"):
+        if (mimic := joint.find("mimic")) is not None:
+            raise UsageError(
+                f"{path}: joint {joint.get('name')!r} mimics {mimic.get('joint')!r}, which is not supported: remove "
+                "<mimic> and drive the joint by its own actuator"
+            )
+    return root
+
+
+def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
+    """Resolve mesh files, repair inertia and add motors in a parsed URDF file (mujoco.MjSpec)."""
+    spec.compiler.fusestatic = False  # keep the link frames: a pad may refer to them as sites
+    for mesh in spec.meshes:
+        mesh.file = _mesh_file(mesh.file, path)
+    for body in spec.bodies:
+        if body.explicitinertial and np.isfinite(body.fullinertia).all():
+            body.fullinertia = _repaired(body.fullinertia, f"{path.name}: link {body.name!r}")
+    _add_motors(spec, robot)
+
+
+def _mesh_file(address: str, path: Path) -> str:
+    """The file of a mesh, or the address itself if there is none.
+
+    A relative address is searched in the folder of the model and in those above it, a package:// address also in the
+    folders of ROS_PACKAGE_PATH.
+    """
+    scheme, separator, rest = address.partition("://")
+    if scheme == "file":
+        return rest
+    if scheme != "package" and (separator or (path.parent / address).is_file()):
+        return address  # as MuJoCo reads it
+    package, _, inside = rest.partition("/") if separator else ("", "", address)
+    return next((str(file) for file in _candidates(package, inside, path) if file.is_file()), address)
+
+
+def _candidates(package: str, inside: str, path: Path) -> Iterator[Path]:
+    """Where a mesh of a package may be, best first; an empty package stands for a relative address."""
+    above = path.resolve().parents
+    if package:
+        ros = [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+        for folder in (*above, *ros):
+            yield folder / package / inside
+            if folder.name == package:
+                yield folder / inside
+    for folder in above:  # also a package whose folder has another name, such as that of a branch
+        yield folder / inside
+
+
+def _repaired(packed: NDArray[np.float64], owner: str) -> NDArray[np.float64]:
+    """The nearest inertia that a rigid body can have, with a warning if it differs; both packed [kg m²].
+
+    The second moments of the mass, Σ = tr(I)/2 E − I, are not negative in a rigid body; negative ones are set to 0.
+    """
+    inertia = np.zeros((3, 3))
+    inertia[_PACKED] = packed
+    inertia.T[_PACKED] = packed
+    principal, axes = np.linalg.eigh(inertia)
+    if not principal[0] > 0:
+        raise UsageError(f"{owner}: principal inertias must be positive, got {_text(principal)} kg m²")
+    moments = principal.sum() / 2 - principal
+    excess = -2 * float(moments.min())
+    smallest = _MARGIN * principal[2]
+    if moments.min() >= smallest:
+        return packed
+    moments = moments.clip(min=smallest)
+    repaired = moments.sum() - moments
+    repaired_inertia: NDArray[np.float64] = axes @ np.diag(repaired) @ axes.T
+    if excess <= _ROUNDING * principal[2]:
+        return repaired_inertia[_PACKED]
+    warnings.warn(
+        f"{owner}: principal inertias {_text(principal)} kg m² break the triangle inequality by {excess:.3g} kg m² "
+        f"({100 * excess / principal[2]:.2g} % of the largest); simulated with {_text(repaired)} kg m²",
+        stacklevel=2,
+    )
+    return repaired_inertia[_PACKED]
+
+
+def _text(values: NDArray[np.float64]) -> str:
+    return ", ".join(f"{value:.4g}" for value in values)
+
+
+def _add_motors(spec: Any, robot: ElementTree.Element) -> None:
+    """Add a motor for each joint of a <transmission> or <ros2_control>, or for all joints if the file has neither.
+
+    The control is the joint force, as in the effort interface of ROS, within the effort limit of the joint.
+    """
+    driven = _driven_joints(robot)
+    scalar_types = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+    for joint in spec.joints:
+        if joint.type in scalar_types and (not driven or joint.name in driven):
+            name = driven.get(joint.name, joint.name)
+            spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
+
+
+def _driven_joints(robot: ElementTree.Element) -> dict[str, str]:
+    """Names of the actuators by joint. An actuator of several joints becomes one of each: "actuator/joint"."""
+    pairs: dict[str, str] = {}
+    for transmission in robot.iter("transmission"):
+        joints = [joint.get("name", "") for joint in transmission.findall("joint")]
+        actuators = [actuator.get("name", "") for actuator in transmission.findall("actuator")]
+        if len(actuators) != len(joints):
+            actuators = actuators[:1] * len(joints) or joints
+        pairs.update({joint: name or joint for joint, name in zip(joints, actuators, strict=True)})
+    for control in robot.iter("ros2_control"):
+        for joint in control.findall("joint"):
+            if joint.find("command_interface") is not None:
+                pairs.setdefault(joint.get("name", ""), joint.get("name", ""))
+    names = list(pairs.values())
+    return {joint: name if names.count(name) == 1 else f"{name}/{joint}" for joint, name in pairs.items()}

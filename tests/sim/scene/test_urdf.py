@@ -1,0 +1,127 @@
+"""URDF files as found in the wild: addresses of meshes, impossible inertia, transmissions; model files as scenes."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.sim.scene.test_mjcf import write_stl
+
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.sim.scene import load_scene
+from gelflow.sim.simulator import Simulator
+
+LINK = """<link name="{name}"><inertial><mass value="1"/><origin xyz="0 0 0.1" rpy="0.3 0.2 0.1"/>
+  <inertia ixx="{ixx}" iyy="0.02" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial>{geometry}</link>"""
+MESH = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
+JOINT = """<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/>
+  <limit lower="-1" upper="1" effort="2" velocity="1"/></joint>"""
+
+
+def robot(path: Path, *, mesh: str = "", ixx: float = 0.02, more: str = "") -> Path:
+    """A URDF file of two links on a base."""
+    geometry = MESH.format(mesh) if mesh else ""
+    links = LINK.format(name="a", ixx=ixx, geometry=geometry) + LINK.format(name="b", ixx=0.02, geometry="")
+    joints = JOINT.format(name="ja", parent="base", child="a") + JOINT.format(name="jb", parent="a", child="b")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'<robot name="r"><link name="base"/>{links}{joints}{more}</robot>')
+    return path
+
+
+def matrix(packed: NDArray[np.float64]) -> NDArray[np.float64]:
+    xx, yy, zz, xy, xz, yz = packed
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+@pytest.mark.parametrize(
+    ("address", "file"),
+    [
+        ("meshes/link.stl", "ws/arm/urdf/meshes/link.stl"),
+        ("meshes/link.stl", "ws/arm/meshes/link.stl"),
+        ("package://arm/meshes/link.stl", "ws/arm/meshes/link.stl"),
+        ("package://arm/meshes/link.stl", "ws/arm/urdf/meshes/link.stl"),
+        ("package://other/meshes/link.stl", "ws/other/meshes/link.stl"),
+        ("package://renamed/meshes/link.stl", "ws/arm/meshes/link.stl"),
+        ("package://far/meshes/link.stl", "ros/far/meshes/link.stl"),
+        ("package://ros/meshes/link.stl", "ros/meshes/link.stl"),
+    ],
+)
+def test_mesh_is_found(address: str, file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_stl(tmp_path / file)
+    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path / 'none'}:{tmp_path / 'ros'}")
+    scene = load_scene(robot(tmp_path / "ws/arm/urdf/arm.urdf", mesh=address))
+    assert [j.name for j in scene.joints] == ["ja", "jb"]
+
+
+def test_missing_mesh_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no file package://arm/link\.stl"):
+        load_scene(robot(tmp_path / "arm.urdf", mesh="package://arm/link.stl"))
+
+
+def test_inertia_that_breaks_the_triangle_inequality_is_repaired(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"link 'a'.* by 0\.009 kg m² \(30 % of the largest\)"):
+        scene = load_scene(robot(tmp_path / "arm.urdf", ixx=0.001))
+    repaired = np.linalg.eigvalsh(matrix(scene.bodies[0].inertia))
+    np.testing.assert_allclose(repaired, [0.0055, 0.0245, 0.03], rtol=1e-9)  # a + b = c, the excess shared equally
+    sim = Simulator(scene)
+    sim.step(np.zeros(2), 100)
+    assert (sim.status == 0).all()
+
+
+def test_possible_inertia_is_kept(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf", ixx=0.01)  # a + b = c
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = load_scene(path)
+    np.testing.assert_allclose(np.linalg.eigvalsh(matrix(scene.bodies[0].inertia)), [0.01, 0.02, 0.03], rtol=1e-9)
+
+
+def test_inertia_that_is_not_positive_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"link 'a': principal inertias must be positive, got -0\.01, 0\.02, 0\.03"):
+        load_scene(robot(tmp_path / "arm.urdf", ixx=-0.01))
+
+
+TRANSMISSION = '<transmission name="t"><joint name="ja"/><joint name="jb"/>{}</transmission>'
+
+
+@pytest.mark.parametrize(
+    ("actuators", "names"),
+    [
+        ('<actuator name="m1"/><actuator name="m2"/>', ["m1", "m2"]),
+        ('<actuator name="m"/>', ["m/ja", "m/jb"]),
+        ('<actuator name="m"/><actuator name="m"/>', ["m/ja", "m/jb"]),
+        ("", ["ja", "jb"]),
+    ],
+)
+def test_joints_of_a_transmission_have_actuators_of_their_own(actuators: str, names: list[str], tmp_path: Path) -> None:
+    scene = load_scene(robot(tmp_path / "arm.urdf", more=TRANSMISSION.format(actuators)))
+    assert [a.name for a in scene.actuators] == names
+    assert Simulator(scene).model.nu == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("still.urdf", '<robot name="r"><link name="base"/></robot>'),
+        ("still.xml", '<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'),
+    ],
+)
+def test_model_without_a_joint_is_refused(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(UsageError, match="the model has no joint"):
+        load_scene(tmp_path / name)
+
+
+def test_model_file_is_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "robot.xml"
+    body = '<body><joint name="j"/><geom size="0.1"/></body>'
+    path.write_text(f'<mujoco><option timestep="0.004"/><worldbody>{body}</worldbody></mujoco>')
+    scene = load_scene(path)
+    assert (scene.name, scene.step, scene.contacts, scene.pads) == ("robot", 0.004, (), ())
+    assert load_scene(path, overrides={"step": 0.001, "integrator": "bdf2"}).step == 0.001
+    assert main(["describe", str(path), "--no-timing"]) == 0
+    assert "robot" in capsys.readouterr().out
+    with pytest.raises(UsageError, match="no such model file"):
+        load_scene(tmp_path / "missing.urdf")
