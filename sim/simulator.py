@@ -1,6 +1,6 @@
 """Batched simulation of one scene: state and parameters as NumPy arrays, steps, rollouts and their gradients."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.measurement.machine import default_threads
 from gelflow.sim import _core
+from gelflow.sim.arguments import check_state, checked, fill, flags, number_array
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.site_poses import site_poses
@@ -62,6 +63,8 @@ class Simulator:
         threads: int | None = None,
         precision: Literal["double", "single"] | None = None,
     ) -> None:
+        if not isinstance(num_envs, int | np.integer):
+            raise UsageError(f"num_envs must be an integer, got {num_envs!r}")
         if num_envs < 1:
             raise UsageError(f"num_envs must be at least 1, got {num_envs}")
         if precision is None:
@@ -69,7 +72,9 @@ class Simulator:
         if precision not in ("double", "single"):
             raise UsageError(f"precision must be 'double' or 'single', got {precision!r}")
         self.scene: Any = scene  # attributes of a `Scene` are used where present
-        self.model = scene if isinstance(scene, _core.Model) else scene.build()
+        if not isinstance(scene, _core.Model) and not hasattr(scene, "build"):
+            raise UsageError(f"scene must be a Scene (see load_scene) or a core model, got {scene!r}")
+        self.model = scene if isinstance(scene, _core.Model) else checked(scene.build)
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
         workers = max(1, min(num_envs, threads or default_threads()))
         batch = _core.Batch if precision == "double" else _core.BatchFloat
@@ -97,7 +102,7 @@ class Simulator:
         Raises UsageError for an unknown name.
         """
         if name not in self.param_index:
-            owner = name.split(".")[0]
+            owner = str(name).split(".")[0]
             near = [n for n in self.param_index if n.startswith(owner + ".")] or sorted(
                 {n.split(".")[0] for n in self.param_index}
             )
@@ -116,14 +121,11 @@ class Simulator:
         """Flags of the environments in `mask` for the core; None: all of them."""
         if mask is None:
             return None
-        flags = np.ascontiguousarray(mask, dtype=bool)
-        if flags.shape != (self.num_envs,):
-            raise UsageError(f"{name} must have shape ({self.num_envs},), got {flags.shape}")
-        return flags.view(np.uint8)
+        return flags(name, mask, self.num_envs).view(np.uint8)
 
     def clear_history(self, which: ArrayLike | None = None) -> None:
         """Clear friction anchors and the BDF2 history; required after `q` or `v` were written directly."""
-        chosen = slice(None) if which is None else np.asarray(which, dtype=bool)
+        chosen = slice(None) if which is None else flags("which", which, self.num_envs)
         self.anchored[chosen] = 0
         self.history[chosen] = 0
 
@@ -142,23 +144,14 @@ class Simulator:
                 self._batch.step(self._controls(u), steps, self._mask("active", active))
         except ValueError as error:
             raise UsageError(str(error)) from None
+        except TypeError:
+            raise UsageError(f"steps must be an integer, got {steps!r}") from None
 
     def _controls(self, u: ArrayLike) -> NDArray[Any]:
         """Controls in the simulator's precision; the core checks their shape."""
         if isinstance(u, np.ndarray) and u.dtype == self.dtype:
             return u
-        try:
-            return np.asarray(u, dtype=self.dtype)
-        except (TypeError, ValueError) as error:
-            raise UsageError(f"u must be numeric: {error}") from None
-
-    @staticmethod
-    def _checked(function: Callable[..., Any], *arguments: Any) -> Any:
-        """The result of a function of the core, whose ValueError becomes a UsageError."""
-        try:
-            return function(*arguments)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        return number_array("u", u, self.dtype)
 
     def check(self) -> None:
         """Raises SimulationError that names the first failed environment, if any."""
@@ -173,7 +166,7 @@ class Simulator:
         BDF2, whose half steps use BDF1, it is an upper estimate. A step that needs substeps is compared with substeps
         of half their length. Raises SimulationError when a step fails.
         """
-        estimate, status = self._checked(self._batch.error_estimate, self._controls(u))
+        estimate, status = checked(self._batch.error_estimate, self._controls(u))
         if failed := np.flatnonzero(status).tolist():
             raise SimulationError(f"environment {failed[0]}: {STATUS_MESSAGES[int(status[failed[0]])]}")
         return np.asarray(estimate)
@@ -195,10 +188,10 @@ class Simulator:
         mask = None if active is None else self._mask("active", active)
         if reduction is not None:
             target = np.zeros((self.num_envs, len(reduction.names)), self.dtype) if out is None else out
-            self._checked(self._batch.reduced_tactile, reduction.core, target, mask)
+            checked(self._batch.reduced_tactile, reduction.core, target, mask)
             return target
         if out is not None:
-            self._batch.tactile(out, mask)
+            checked(self._batch.tactile, out, mask)
             return out
         self._batch.update_readings(mask)
         if self._tactile is None:
@@ -239,7 +232,7 @@ class Simulator:
     def poses(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """World poses of the moving bodies, (N, bodies, 7): position [m], quaternion w x y z; a new array, or `out`."""
         target = np.empty((self.num_envs, len(self.model.body_names), 7), self.dtype) if out is None else out
-        self._batch.poses(target)
+        checked(self._batch.poses, target)
         return target
 
     def site_poses(self, q: ArrayLike | None = None) -> NDArray[Any]:
@@ -257,7 +250,7 @@ class Simulator:
         Moment [N m], then force [N]; a new array, or `out`.
         """
         target = np.empty((self.num_envs, len(self.model.contact_names), 6), self.dtype) if out is None else out
-        self._batch.wrenches(target)
+        checked(self._batch.wrenches, target)
         return target
 
     def contact_forces(self) -> NDArray[Any]:
@@ -307,7 +300,7 @@ class Simulator:
 
         Raises UsageError for wrong shapes and for values that are not finite.
         """
-        controls = np.ascontiguousarray(u, dtype=self.dtype)
+        controls = np.ascontiguousarray(number_array("u", u, self.dtype))
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
             raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
         if stop is not None and not self.model.num_markers:
@@ -325,18 +318,15 @@ class Simulator:
             **{name: self._along_time(name, value, steps, out) for name, value in start.items()},
             u=controls,
             tactile=out.tactile if out is not None else empty(tactile_shape, self.dtype),
-            read_after=np.asarray(read_after, dtype=np.int32),
+            read_after=number_array("read_after", read_after, np.int32),
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),
             active=np.ones(n, np.uint8) if mask is None else mask.copy(),
             stopped_at=np.full(n, -1, np.int32),
             reduction=reduction,
         )
-        for name in ("q", "v"):
-            bad = ~np.isfinite(getattr(result, name)[0]) & (result.active[:, None] == 1)
-            if bad.any():
-                raise UsageError(f"{name}{np.argwhere(bad)[0].tolist()} is not finite")
-        self._checked(self._batch.rollout, result.core(), None if stop is None else stop.core(n, steps))
+        check_state(self.model, result.q[0], result.v[0], result.active)
+        checked(self._batch.rollout, result.core(), None if stop is None else stop.core(n, steps))
         return result
 
     def _along_time(self, name: str, start: ArrayLike | None, steps: int, out: Trajectory | None) -> NDArray[Any]:
@@ -346,7 +336,7 @@ class Simulator:
             array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
         else:
             array = getattr(out, name)
-        array[0] = present if start is None else start
+        fill(name, array[0], present if start is None else start)
         return array
 
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:
@@ -384,9 +374,11 @@ class Simulator:
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:
                 return np.zeros(like.shape, self.dtype)
-            array = np.asarray(value, self.dtype)
-            if array.shape != like.shape:  # np.broadcast_to is slower
-                array = np.full(like.shape, array)
+            array = number_array("a gradient", value, self.dtype)
+            if array.shape != like.shape:
+                full = np.empty(like.shape, self.dtype)
+                fill("a gradient", full, array)
+                array = full
             return np.ascontiguousarray(array)
 
         cotangent = _core.TrajectoryCotangent(

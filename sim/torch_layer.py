@@ -87,6 +87,8 @@ def torch_rollout(
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
     for name, tensor in named.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise UsageError(f"{name} must be a tensor of {expected}, got {type(tensor).__name__}")
         if tensor.dtype != expected or tensor.device.type != "cpu":
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
     numbers = None if params is None else _all_params(sim, params)

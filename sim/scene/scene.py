@@ -136,10 +136,15 @@ class Scene:
         return spec
 
     def build(self) -> "_core.Model":
-        """The model of the scene in the C++ core."""
+        """The model of the scene in the C++ core. Raises UsageError if elements are inconsistent."""
         from gelflow.sim import _core
 
-        return _core.Model(self.model_spec())
+        try:
+            return _core.Model(self.model_spec())
+        except UsageError:
+            raise
+        except ValueError as error:
+            raise UsageError(f"{self.path}: {error}") from None
 
     def _joint(self, name: str) -> JointDef:
         return self.joints[_index("joint", name, [joint.name for joint in self.joints])]
