@@ -13,6 +13,7 @@ from gelflow.sim import _core
 from gelflow.sim.arguments import check_state, checked, fill, flags, number_array
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
+from gelflow.sim.simulator_copy import contents, rebuilt
 from gelflow.sim.site_poses import site_poses
 from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
 
@@ -80,6 +81,7 @@ class Simulator:
         batch = _core.Batch if precision == "double" else _core.BatchFloat
         self._batch = batch(self.model, num_envs, workers)
         self.num_envs = num_envs
+        self._threads = threads
         self.q: NDArray[Any] = self._batch.q
         self.v: NDArray[Any] = self._batch.v
         self.params: NDArray[Any] = self._batch.params
@@ -90,6 +92,9 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._tactile: NDArray[Any] | None = None  # created by the first call of `tactile`
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return rebuilt, contents(self, self._threads)
 
     @cached_property
     def param_index(self) -> dict[str, int]:

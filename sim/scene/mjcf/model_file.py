@@ -19,6 +19,8 @@ def compile_model(path: Path) -> tuple[Any, bool]:
         raise UsageError(f"no such model file: {path}")
     robot = read_urdf(path)
     spec = None
+    if hasattr(mujoco, "mj_clearCache"):  # its cache does not notice a mesh that changes within a second
+        mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if robot is not None:

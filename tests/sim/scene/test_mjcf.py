@@ -370,3 +370,20 @@ def test_full_motor_force_deflects_the_default_limit_by_10_mrad(tmp_path: Path) 
     sim.step(np.array([1e3]), 1000)
     sim.check()
     assert sim.q[0, 0] == pytest.approx(0.51, abs=1e-6)
+
+
+def test_changed_mesh_is_read_again_at_once(tmp_path: Path) -> None:
+    write_stl(tmp_path / "large.stl")
+    body = '<body><joint/><geom type="mesh" mesh="m"/></body>'
+    (tmp_path / "robot.xml").write_text(
+        f'<mujoco><asset><mesh name="m" file="m.stl"/></asset><worldbody>{body}</worldbody></mujoco>'
+    )
+    data = (tmp_path / "large.stl").read_bytes()
+    (tmp_path / "m.stl").write_bytes(data)
+    large = load_scene(tmp_path / "robot.xml").bodies[0].mass
+    halved = bytearray(data)
+    for face in range((len(data) - 84) // 50):
+        vertices = slice(84 + 50 * face + 12, 84 + 50 * face + 48)
+        halved[vertices] = (np.frombuffer(data[vertices], "<f4") / 2).tobytes()
+    (tmp_path / "m.stl").write_bytes(halved)
+    assert load_scene(tmp_path / "robot.xml").bodies[0].mass == pytest.approx(large / 8)
