@@ -75,7 +75,7 @@ class Simulator:
         self.scene: Any = scene  # attributes of a `Scene` are used where present
         if not isinstance(scene, _core.Model) and not hasattr(scene, "build"):
             raise UsageError(f"scene must be a Scene (see load_scene) or a core model, got {scene!r}")
-        self.model = scene if isinstance(scene, _core.Model) else checked(scene.build)
+        self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
         workers = max(1, min(num_envs, threads or default_threads()))
         batch = _core.Batch if precision == "double" else _core.BatchFloat

@@ -91,7 +91,11 @@ def evaluate_all(
 
 
 def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPolicy]:
-    """The policy and what it is compared with, by name: "policy", "oracle" where there is one, "random", and others."""
+    """The policies of an evaluation by the name of their row.
+
+    The names are "policy", "oracle" if the task has one, and "random". A network of flow maps adds the policy under
+    noise and random corrections within the reach of the network.
+    """
     n = task.num_envs
     found: dict[str, BatchPolicy] = {"policy": network.batch_policy(n)}
     full = np.ones(task.action_space.shape)

@@ -27,9 +27,12 @@ FINGERS = (1, 2, 3)
 JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "bend", "curl"))
 TIPS = tuple(f"tip{finger}" for finger in FINGERS)  # names of the pads and of their sites
 REWARDS = ("paper", "progress")
-# Of the oracle: how far before the line to its finger a fingertip first touches [rad], its clearance until then, how
-# far its commanded position is inside of the wall and ahead of it, and its largest step [m].
-_FIRST_TOUCH, _CLEARANCE, _PRESS, _LEAD, _TIP_STEP = 0.3, 0.004, 0.02, 0.02, 0.007
+# Settings of the oracle. The direction of a finger is that from the centre of the cap to the base of the finger.
+_FIRST_TOUCH = 0.3  # angle between the first contact point and the direction of the finger, against the rotation [rad]
+_CLEARANCE = 0.004  # gap between fingertip and wall before the first contact [m]
+_PRESS = 0.02  # depth of the commanded position inside the wall [m]
+_LEAD = 0.02  # distance of the commanded position ahead of the fingertip, along the wall [m]
+_TIP_STEP = 0.007  # largest step of the commanded position in a control period [m]
 _RESET_OPTIONS = {"center": "x, y of the cap [m]", "radius": "of the cap [m]", "damping": "of the cap [N m s]"}
 
 

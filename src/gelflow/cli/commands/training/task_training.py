@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,6 +97,10 @@ def _line(result: "EvaluationResult") -> str:
 def _command(args: argparse.Namespace, steps: int, folder: Path) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
     values = {"recipe": args.recipe, "steps": steps, "minutes": args.minutes, "envs": args.envs, "seed": args.seed}
-    values |= {**task_options(args), "out": folder}
+    return command_with(args.task, {**values, **task_options(args), "out": folder})
+
+
+def command_with(task: str, values: Mapping[str, Any]) -> list[str]:
+    """The words of `gelflow train` with these options; an option that is None is omitted."""
     words = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
-    return ["gelflow", "train", args.task, *(word for pair in words for word in pair)]
+    return ["gelflow", "train", task, *(word for pair in words for word in pair)]

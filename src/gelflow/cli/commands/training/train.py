@@ -11,6 +11,7 @@ from gelflow.cli.commands.training.task_training import (
     DEFAULT_RECIPE,
     TASKS,
     UNTRAINED,
+    command_with,
     refuse,
     task_options,
     train_task,
@@ -129,6 +130,4 @@ def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     names = ("part", "minutes", "envs", "seed", "preset", "out")
     defaults = {"algorithm": _DEFAULT, "randomization": "default"}
     chosen = {name: getattr(args, name) for name, value in defaults.items() if getattr(args, name) != value}
-    values = chosen | {"attempts": attempts} | {name: getattr(args, name) for name in names}
-    given = [(f"--{name}", str(value)) for name, value in values.items() if value is not None]
-    return ["gelflow", "train", args.task, *(word for pair in given for word in pair)]
+    return command_with(args.task, chosen | {"attempts": attempts} | {name: getattr(args, name) for name in names})
