@@ -78,33 +78,40 @@ def events(path: Path) -> list[tuple[str, Any]]:
         return [(record.value["name"], record.value["values"]) for record in session.records(["/event"])]
 
 
-def in_background(work: Callable[[], Any]) -> Callable[[], Any]:
-    """Run `work` in a thread; the returned function waits for it and raises its exception."""
-    outcome: list[Any] = []
+class BackgroundRun:
+    """Work in a thread; a call waits for its end and gives its result or raises its exception."""
 
-    def run() -> None:
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self._outcome: list[Any] = []
+        self._work = work
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    @property
+    def ended(self) -> bool:
+        return not self._thread.is_alive()
+
+    def __call__(self) -> Any:
+        self._thread.join(120)
+        assert self.ended, "the run did not end"
+        if isinstance(self._outcome[0], BaseException):
+            raise self._outcome[0]
+        return self._outcome[0]
+
+    def _run(self) -> None:
         try:
-            outcome.append(work())
+            self._outcome.append(self._work())
         except BaseException as error:  # noqa: BLE001 - raised in the test's thread
-            outcome.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-
-    def finish() -> Any:
-        thread.join(120)
-        assert not thread.is_alive(), "the run did not end"
-        if isinstance(outcome[0], BaseException):
-            raise outcome[0]
-        return outcome[0]
-
-    return finish
+            self._outcome.append(error)
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 120.0) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 120.0, *, during: BackgroundRun | None = None) -> None:
+    """Wait until `condition` holds; a run that ends before is an error, its own if it has one."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "the condition was not met in time"
+        if during is not None and during.ended:
+            raise AssertionError(f"the run ended before the condition was met, with {during()!r}")
         time.sleep(0.01)
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
+from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
 from gelflow.errors import PeerTimeout
 from gelflow.hardware_mocks.robot import MockRobot
@@ -15,8 +15,8 @@ def test_cameras_that_freeze_while_a_part_is_moved_end_the_run(
     robot: MockRobot, tmp_path: Path, fingers: tuple[int, ...], loop: int
 ) -> None:
     plan = plan_for(robot, tmp_path, OraclePolicy(robot))
-    finish = in_background(lambda: run_insertions(plan))
-    wait_for(lambda: moving(robot))
+    finish = BackgroundRun(lambda: run_insertions(plan))
+    wait_for(lambda: moving(robot), during=finish)
     for finger in fingers:
         robot.cameras[finger].begin_fault(1, "freeze", {"loop": loop})
     begun, height = robot.clock.now(), robot.cell.truth()["part"]["height"]

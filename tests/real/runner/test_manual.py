@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
+from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 from tests.real.wsg.harness import Relay, unmodified
 
 from gelflow.cli.main import main
@@ -76,8 +76,8 @@ def height(robot: MockRobot) -> float:
 
 def stopped_in_mid_descent(robot: MockRobot, folder: Path) -> str:
     """A run that motors off ended while a part was held; the motors are on again. Returns its error."""
-    finish = in_background(lambda: run_insertions(plan_for(robot, folder, OraclePolicy(robot))))
-    wait_for(lambda: moving(robot))
+    finish = BackgroundRun(lambda: run_insertions(plan_for(robot, folder, OraclePolicy(robot))))
+    wait_for(lambda: moving(robot), during=finish)
     robot.arm.motors(False)
     with pytest.raises(GelflowError) as error:
         finish()

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.real.runner.harness import OraclePolicy, events, in_background, moving, plan_for, wait_for
+from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
 from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import PeerError, SafetyError
@@ -59,8 +59,8 @@ def test_controller_without_an_answer_ends_the_run_before_it_begins(robot: MockR
 def test_change_during_a_run_latches(robot: MockRobot, tmp_path: Path, name: str, value: str, message: str) -> None:
     with MockWebServices() as server:
         plan = plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab_with(robot, server.url))
-        finish = in_background(lambda: run_insertions(plan))
-        wait_for(lambda: moving(robot))
+        finish = BackgroundRun(lambda: run_insertions(plan))
+        wait_for(lambda: moving(robot), during=finish)
         setattr(server, name, value)
         with pytest.raises(SafetyError, match=message):
             finish()

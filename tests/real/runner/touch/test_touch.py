@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.real.runner.harness import OraclePolicy, events, free_port, in_background, plan_for, wait_for
+from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, free_port, plan_for, wait_for
 
 from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError
@@ -72,8 +72,8 @@ DESCENT, LOWERING = 24.2e-3, 20e-3  # heights of the part at which the fault beg
 def test_part_is_not_moved_without_readable_images(
     robot: MockRobot, tmp_path: Path, fault: Fault, height: float
 ) -> None:
-    finish = in_background(lambda: insert(robot, tmp_path))
-    wait_for(lambda: lowered_to(robot, height), 280)
+    finish = BackgroundRun(lambda: insert(robot, tmp_path))
+    wait_for(lambda: lowered_to(robot, height), 280, during=finish)
     for camera in robot.cameras:
         camera.begin_fault(1, *fault)
     before = part(robot)["height"]
@@ -95,8 +95,8 @@ def test_image_that_is_live_but_never_changes_is_no_touch(robot: MockRobot, tmp_
 
 
 def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, tmp_path: Path) -> None:
-    finish = in_background(lambda: insert(robot, tmp_path))
-    wait_for(lambda: lowered_to(robot, 24.4e-3), 280)
+    finish = BackgroundRun(lambda: insert(robot, tmp_path))
+    wait_for(lambda: lowered_to(robot, 24.4e-3), 280, during=finish)
     present = [robot.cell.marker_displacement(finger).copy() for finger in (0, 1)]
     robot.cell.marker_displacement = lambda finger: present[finger]  # type: ignore[method-assign]
     with pytest.raises(GelflowError, match=r"no change at the release .* is not believed"):
@@ -148,8 +148,8 @@ def test_pads_with_little_friction_let_no_part_slip_unnoticed(tmp_path: Path) ->
 @pytest.mark.slow
 def test_part_that_slides_out_of_a_slippery_grip_is_not_called_inserted(robot: MockRobot, tmp_path: Path) -> None:
     """The friction of the pads falls so far that the grip no longer carries the weight of the part."""
-    finish = in_background(lambda: insert(robot, tmp_path))
-    wait_for(lambda: lowered_to(robot, 25.2e-3), 280)
+    finish = BackgroundRun(lambda: insert(robot, tmp_path))
+    wait_for(lambda: lowered_to(robot, 25.2e-3), 280, during=finish)
     robot.cell.change_world(gel_stiffness=1.0, pad_friction=0.05)
     result = finish()
     assert not result.inserted and not part(robot)["inserted"]
