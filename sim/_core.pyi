@@ -1,5 +1,6 @@
 """Types of the C++ core. Units are SI, quaternions w x y z; N is the number of environments."""
 
+from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -243,11 +244,98 @@ class PadDef:
         collides: bool = False,
     ) -> None: ...
 
-class ActuatorDef:
-    """An actuator of a slide or hinge."""
+class TendonDef:
+    """A fixed tendon: its length is the sum of coefficient × position over slides and hinges."""
+
+    name: str
+    joints: list[int]
+    coefficients: list[float]  # one per joint
+    damping: float
+    armature: float
+    stiffness: float
+    springref: float
+    lower: float
+    upper: float
+    limit_stiffness: float
+    limit_damping: float
+    frictionloss: float
+    def __init__(
+        self,
+        *,
+        name: str,
+        joints: Sequence[int],
+        coefficients: Sequence[float],
+        damping: float = 0.0,
+        armature: float = 0.0,
+        stiffness: float = 0.0,
+        springref: float = 0.0,
+        lower: float = ...,
+        upper: float = ...,
+        limit_stiffness: float = 0.0,
+        limit_damping: float = 0.0,
+        frictionloss: float = 0.0,
+    ) -> None: ...
+
+class CouplingDef:
+    """A slide or hinge whose position is a polynomial of that of another one, or fixed (leader -1).
+
+    Up to degree 1 the joint is eliminated from the unknowns, above a damped spring keeps the coupling.
+    """
 
     name: str
     joint: int
+    leader: int
+    coefficients: list[float]  # of the powers 0, 1, …
+    stiffness: float
+    damping: float
+    def __init__(
+        self,
+        *,
+        name: str,
+        joint: int,
+        leader: int = -1,
+        coefficients: Sequence[float],
+        stiffness: float = 0.0,
+        damping: float = 0.0,
+    ) -> None: ...
+
+class LoopClosureDef:
+    """Two points of two bodies that coincide; of a weld also the orientations. Damped springs keep them."""
+
+    name: str
+    first: int  # index of a body; -1: the world
+    second: int
+    weld: bool
+    @property
+    def quat(self) -> Floats: ...  # (4,), of a weld: the first body in the frame of the second
+    @quat.setter
+    def quat(self, value: ArrayLike) -> None: ...
+    stiffness: float  # [N/m]
+    damping: float  # [N s/m]
+    turn_stiffness: float  # of a weld [N m/rad]
+    turn_damping: float  # of a weld [N m s/rad]
+    def __init__(
+        self,
+        *,
+        name: str,
+        first: int = -1,
+        second: int = -1,
+        first_pos: ArrayLike = ...,
+        second_pos: ArrayLike = ...,
+        weld: bool = False,
+        quat: ArrayLike = ...,
+        stiffness: float,
+        damping: float = 0.0,
+        turn_stiffness: float = 0.0,
+        turn_damping: float = 0.0,
+    ) -> None: ...
+
+class ActuatorDef:
+    """An actuator of a slide, a hinge or a tendon."""
+
+    name: str
+    joint: int  # -1: on a tendon
+    tendon: int  # -1: on a joint
     kind: str  # motor, position, velocity or general
     gear: float
     kp: float
@@ -262,7 +350,8 @@ class ActuatorDef:
         self,
         *,
         name: str,
-        joint: int,
+        joint: int = -1,
+        tendon: int = -1,
         kind: str,
         gear: float = 1.0,
         kp: float = 0.0,
@@ -296,6 +385,9 @@ class ModelSpec:
     def add_points(self, definition: PointsDef) -> int: ...
     def add_contact(self, definition: ContactDef) -> int: ...
     def add_pad(self, definition: PadDef) -> int: ...
+    def add_tendon(self, definition: TendonDef) -> int: ...
+    def add_coupling(self, definition: CouplingDef) -> int: ...
+    def add_loop_closure(self, definition: LoopClosureDef) -> int: ...
     def add_actuator(self, definition: ActuatorDef) -> int: ...
     @property
     def bodies(self) -> list[BodyDef]: ...
@@ -309,6 +401,12 @@ class ModelSpec:
     def contacts(self) -> list[ContactDef]: ...
     @property
     def pads(self) -> list[PadDef]: ...
+    @property
+    def tendons(self) -> list[TendonDef]: ...
+    @property
+    def couplings(self) -> list[CouplingDef]: ...
+    @property
+    def loop_closures(self) -> list[LoopClosureDef]: ...
     @property
     def actuators(self) -> list[ActuatorDef]: ...
 
@@ -344,6 +442,10 @@ class Model:
     def contact_names(self) -> list[str]: ...
     @property
     def pad_names(self) -> list[str]: ...
+    @property
+    def tendon_names(self) -> list[str]: ...
+    @property
+    def loop_closure_names(self) -> list[str]: ...
     @property
     def actuator_names(self) -> list[str]: ...
     @property

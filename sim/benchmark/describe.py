@@ -20,7 +20,7 @@ from gelflow.sim.simulator import Simulator
 
 @dataclass(frozen=True)
 class ActuatorPart:
-    """An actuator of a joint."""
+    """An actuator of a joint, or of a tendon with the joint."""
 
     name: str
     kind: str  # "motor", "position", "velocity" or "general"
@@ -236,7 +236,7 @@ def _actuators(scene: Scene, joint: JointDef) -> tuple[ActuatorPart, ...]:
     return tuple(
         ActuatorPart(a.name, a.kind, a.gear, a.kp, a.kd, a.gain, a.bias, bounds(a.force_range), bounds(a.ctrl_range))
         for a in scene.actuators
-        if scene.joints[a.joint] is joint
+        if any(driven is joint for driven, _ in scene.driven_joints(a))
     )
 
 

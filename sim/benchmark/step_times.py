@@ -59,7 +59,7 @@ class StepTimes:
 
 def holding_controls(scene: Scene) -> Array:
     """Controls that hold position servos at the start of the scene; others are 0. Shape (nu,)."""
-    lengths = [a.gear * scene.q0[scene.joints[a.joint].q_start] for a in scene.actuators]
+    lengths = [a.gear * sum(c * scene.q0[j.q_start] for j, c in scene.driven_joints(a)) for a in scene.actuators]
     servo = [a.kind == "position" for a in scene.actuators]
     return np.where(servo, lengths, 0.0)
 

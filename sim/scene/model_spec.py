@@ -9,6 +9,7 @@ from gelflow.sim.scene.contacts import ContactDef, PointsDef
 from gelflow.sim.scene.geometry.distance_grid import DistanceGrid
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef
+from gelflow.sim.scene.mjcf.couplings import RELAXATION, STIFFNESS, CouplingDef, LoopClosureDef, TendonDef
 from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
@@ -41,8 +42,23 @@ def add_contacts(
         spec.add_pad(_pad(pad, shape_index))
 
 
+def add_couplings(
+    spec: _core.ModelSpec,
+    tendons: Sequence[TendonDef],
+    couplings: Sequence[CouplingDef],
+    loop_closures: Sequence[LoopClosureDef],
+) -> None:
+    """Add tendons, couplings and loop closures, after the joints and bodies that they refer to."""
+    for tendon in tendons:
+        spec.add_tendon(_tendon(tendon))
+    for coupling in couplings:
+        spec.add_coupling(_coupling(coupling))
+    for closure in loop_closures:
+        spec.add_loop_closure(_loop_closure(closure))
+
+
 def add_actuators(spec: _core.ModelSpec, actuators: Sequence[ActuatorDef]) -> None:
-    """Add the actuators, after the joints that they drive."""
+    """Add the actuators, after the joints and tendons that they drive."""
     for actuator in actuators:
         spec.add_actuator(_actuator(actuator))
 
@@ -139,10 +155,57 @@ def _pad(pad: PadDef, shapes: Mapping[str, int]) -> _core.PadDef:
     )
 
 
+def _tendon(tendon: TendonDef) -> _core.TendonDef:
+    lower, upper = tendon.range or (-np.inf, np.inf)
+    return _core.TendonDef(
+        name=tendon.name,
+        joints=tendon.joints,
+        coefficients=tendon.coefficients,
+        damping=tendon.damping,
+        armature=tendon.armature,
+        stiffness=tendon.stiffness,
+        springref=tendon.springref,
+        lower=lower,
+        upper=upper,
+        limit_stiffness=tendon.limit[0],
+        limit_damping=tendon.limit[1],
+        frictionloss=tendon.frictionloss,
+    )
+
+
+def _coupling(coupling: CouplingDef) -> _core.CouplingDef:
+    stiffness = STIFFNESS[coupling.kind]
+    return _core.CouplingDef(
+        name=coupling.name,
+        joint=coupling.joint,
+        leader=coupling.leader,
+        coefficients=coupling.coefficients,
+        stiffness=stiffness,
+        damping=RELAXATION * stiffness,
+    )
+
+
+def _loop_closure(closure: LoopClosureDef) -> _core.LoopClosureDef:
+    return _core.LoopClosureDef(
+        name=closure.name,
+        first=closure.bodies[0],
+        second=closure.bodies[1],
+        first_pos=closure.points[0],
+        second_pos=closure.points[1],
+        weld=closure.weld,
+        quat=(1, 0, 0, 0) if closure.quaternion is None else closure.quaternion,
+        stiffness=STIFFNESS["slide"],
+        damping=RELAXATION * STIFFNESS["slide"],
+        turn_stiffness=STIFFNESS["hinge"],
+        turn_damping=RELAXATION * STIFFNESS["hinge"],
+    )
+
+
 def _actuator(actuator: ActuatorDef) -> _core.ActuatorDef:
     return _core.ActuatorDef(
         name=actuator.name,
         joint=actuator.joint,
+        tendon=actuator.tendon,
         kind=actuator.kind,
         gear=actuator.gear,
         kp=actuator.kp,

@@ -13,6 +13,7 @@ from gelflow.observation import Grid
 from gelflow.sim.scene.contacts import ContactDef, PointsDef
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef
+from gelflow.sim.scene.mjcf.couplings import CouplingDef, LoopClosureDef, TendonDef
 from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef, SiteDef
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
@@ -48,6 +49,9 @@ class Scene:
     precision: Precision = "double"  # default precision of a `Simulator` of this scene
     friction: str = "viscous"  # friction law of contacts and pads that set none: "viscous" or "elastic"
     gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -9.81]))  # [m/s²], shape (3,)
+    tendons: tuple[TendonDef, ...] = ()  # the fixed ones
+    couplings: tuple[CouplingDef, ...] = ()
+    loop_closures: tuple[LoopClosureDef, ...] = ()
     actuators: tuple[ActuatorDef, ...] = ()
     shapes: tuple[ShapeDef, ...] = ()
     points: tuple[PointsDef, ...] = ()
@@ -98,6 +102,13 @@ class Scene:
         """The index of an actuator in u. Raises UsageError on an unknown name."""
         return _index("actuator", actuator, [actuator.name for actuator in self.actuators])
 
+    def driven_joints(self, actuator: ActuatorDef) -> tuple[tuple[JointDef, float], ...]:
+        """The joints that an actuator drives, each with its coefficient: 1, or that of the actuator's tendon."""
+        if actuator.tendon < 0:
+            return ((self.joints[actuator.joint], 1.0),)
+        tendon = self.tendons[actuator.tendon]
+        return tuple((self.joints[j], c) for j, c in zip(tendon.joints, tendon.coefficients, strict=True))
+
     def body(self, name: str) -> int:
         """The index of a moving body. Raises UsageError on an unknown name."""
         return _index("moving body", name, [body.name for body in self.bodies])
@@ -123,7 +134,7 @@ class Scene:
         Raises ValueError if they are inconsistent.
         """
         from gelflow.sim import _core  # lazy: loading a scene does not need the compiled core
-        from gelflow.sim.scene.model_spec import add_actuators, add_bodies, add_contacts
+        from gelflow.sim.scene.model_spec import add_actuators, add_bodies, add_contacts, add_couplings
 
         spec = _core.ModelSpec()
         spec.gravity = self.gravity
@@ -132,6 +143,7 @@ class Scene:
         spec.tolerance = self.tolerance
         add_bodies(spec, self.bodies, self.joints, self.limits)
         add_contacts(spec, self.shapes, self.points, self.contacts, self.pads)
+        add_couplings(spec, self.tendons, self.couplings, self.loop_closures)
         add_actuators(spec, self.actuators)
         return spec
 

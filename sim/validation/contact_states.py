@@ -178,7 +178,7 @@ def pressed_cloud(kind: str, law: str, integrator: str, rng: np.random.Generator
     shape = spec.add_shape(
         _core.ShapeDef(name="shape", body=turret, kind=core_kind, pos=(1e-3, 0, 0), size=SHAPES[kind], grid=grid)
     )
-    _add_cloud(spec, hand, {"press": shape}, law, rng)
+    add_cloud(spec, hand, {"press": shape}, law, rng)
     spec.add_actuator(_core.ActuatorDef(name="turn", joint=hinge, kind="velocity", kd=2e-3))
     spec.add_actuator(_core.ActuatorDef(name="x", joint=slides[0], kind="general", gain=3.0, bias=2e-3, kp=2.0, kd=0.1))
     spec.add_actuator(
@@ -207,7 +207,7 @@ def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Sim
     slide = spec.add_joint(_core.JointDef(name="x", body=pusher, type="slide", axis=(1, 0, 0), damping=0.5))
     ground = spec.add_shape(_core.ShapeDef(name="ground", kind="plane", quat=(0.98, 0.14, 0.14, 0.02)))
     ball = spec.add_shape(_core.ShapeDef(name="ball", body=pusher, kind="sphere", size=(0.02, 0, 0)))
-    _add_cloud(spec, body, {"on ground": ground, "on pusher": ball}, law, rng)
+    add_cloud(spec, body, {"on ground": ground, "on pusher": ball}, law, rng)
     spec.add_actuator(_core.ActuatorDef(name="push", joint=slide, kind="motor"))
     sim = Simulator(_core.Model(spec))
     sim.q[0, :3] = 0, 0, 0.011
@@ -217,7 +217,7 @@ def free_cloud(law: str, integrator: str, rng: np.random.Generator) -> tuple[Sim
     return sim, 0.3 + rng.normal(size=(STEPS, 1)) * 0.1
 
 
-def _add_cloud(spec: Any, body: int, contacts: dict[str, int], law: str, rng: np.random.Generator) -> None:
+def add_cloud(spec: Any, body: int, contacts: dict[str, int], law: str, rng: np.random.Generator) -> None:
     """Add points around a body, their contacts with shapes (contact name → shape), and markers just outside of them."""
     cloud = rng.normal(size=(60, 3))
     cloud *= 0.012 / np.linalg.norm(cloud, axis=1)[:, None]

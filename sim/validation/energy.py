@@ -102,14 +102,14 @@ class EnergyGauge:
 
 
 def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
-    """Joint forces of the actuators at the present state with controls u (nu,), shape (N, nu) [N, N m].
+    """Forces of the actuators on their joints or tendons with controls u (nu,), shape (N, nu) [N, N m].
 
     Times the displacement of a step it is the work of the actuator, since the forces of a step are those at its end.
     """
     controls, forces = np.asarray(u, float), np.zeros((sim.num_envs, scene.nu))
     for i, a in enumerate(scene.actuators):
-        length = a.gear * sim.q[:, sim.model.joint_q[a.joint]]
-        speed = a.gear * sim.v[:, sim.model.joint_v[a.joint]]
+        length = a.gear * sum(c * sim.q[:, joint.q_start] for joint, c in scene.driven_joints(a))
+        speed = a.gear * sum(c * sim.v[:, joint.v_start] for joint, c in scene.driven_joints(a))
         control = np.clip(controls[i], *a.ctrl_range)
         pull = {
             "motor": control + 0 * length,

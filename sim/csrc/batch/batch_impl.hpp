@@ -95,6 +95,7 @@ void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active)
   check_controls(u.u, u.shared ? 1 : n, u.shared ? nullptr : active);
   check_state(active);
   for_active(active, [&](int e, int thread) {
+    follow_leaders<T>(*model, state(e));
     for (int i = 0; i < steps && status[e] == 0; ++i) {
       const StepReport report =
           gelflow::step<T>(*model, params_of(e), controls_of(u, e), model->polish, state(e), memory_[thread], i > 0);
@@ -128,6 +129,7 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
   pool_.run(n, [&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
     const T* const control = controls_of(u, e);
+    follow_leaders<T>(m, state(e));
     StateCopy<T> whole(m, state(e)), halves(m, state(e));
     const StepReport taken = gelflow::step<T>(m, params_of(e), control, m.polish, whole.view(), memory, false);
     Status status = taken.status;
@@ -235,7 +237,9 @@ void Batch<T>::mass_matrix(T* out) {
     w.residual.setZero();
     w.dg_dq.setZero();
     w.dg_dv.setZero();
+    if (!model->tendons.empty()) w.mass.setZero();
     add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
+    add_tendon_mass<T>(*model, params_of(e), w);
     for (const Joint& joint : model->joints) {
       for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += joint.params.in(params_of(e)).armature;
     }

@@ -66,6 +66,7 @@ DirectionalRollout directional_rollout(const Model& m, int steps, const RolloutI
     for (int a = 0; a < 3; ++a) anchors[i][a] = dual(start.anchors[3 * i + a], direction.anchors[3 * i + a]);
   }
   const StateView<Dual> state{q.data(), v.data(), anchors.data(), anchored.data(), history.data()};
+  follow_leaders<Dual>(m, state);
   StepMemory<Dual> memory(m);
   DirectionalRollout out;
   for (int t = 0; t < steps; ++t) {

@@ -27,6 +27,7 @@ void Batch<T>::rollout_one(const Trajectory<T>& r, const TouchStop* stop, int en
   VX<T> rounding = VX<T>::Zero(std::is_same_v<T, PositionScalar<T>> ? 0 : m.nq);  // of q in the last state
   T* const q_rounding = rounding.size() == 0 ? nullptr : rounding.data();
   bool moving = true;
+  follow_leaders<T>(m, r.state(m, 0, e, q_rounding));
   for (int t = 0;; ++t) {
     const StateView<T> now = r.state(m, t, e, q_rounding);
     if (readings.read(t, now, moving) && moving) {

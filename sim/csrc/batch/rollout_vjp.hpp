@@ -86,6 +86,7 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
       });
     }
   }
+  if (r.active[e] != 0) follow_leaders_vjp<T>(m, gradient);
   add_from_tangent<T>(m, r.q + e * m.nq, gradient.q, out.q + e * m.nq);
   std::copy_n(gradient.v.data(), m.nv, out.v + e * m.nv);
   std::copy_n(gradient.anchors.data(), m.na, reinterpret_cast<V3<T>*>(out.anchors) + e * m.na);

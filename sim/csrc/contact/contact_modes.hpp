@@ -45,21 +45,34 @@ void add_contact_modes(const PairFrame<T>& frame, const PointCloud& cloud, const
   });
 }
 
-// Adds which controls and actuator forces are clipped, the modes of dry friction, and the joint limits that are active.
+template <class T>
+void add_friction_mode(const JointParams<T>& p, const T& speed, ModeHash& hash) {
+  if (p.frictionloss != T(0)) hash.add(speed > T(friction_creep) ? 1 : speed < T(-friction_creep) ? 2 : 0);
+}
+template <class T>
+void add_limit_mode(const JointParams<T>& p, const T& position, const T& speed, ModeHash& hash) {
+  const LimitForce<T> limit = limit_force<T>(p, position, speed);
+  hash.add(limit.force > T(0) ? 1 : limit.force < T(0) ? 2 : 0);
+}
+
+// Adds which controls and actuator forces are clipped, the modes of dry friction, and the limits that are active.
 template <class T>
 void add_joint_modes(const Model& m, const T* params, const T* q, const T* v, const T* u, ModeHash& hash) {
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     const Actuator& actuator = m.actuators[a];
-    hash.add(static_cast<std::uint64_t>(actuator_force<T>(actuator, actuator.params.in(params), u[a], q, v).clipped));
+    const Transmission<T> at = transmission<T>(m, actuator, q, v);
+    hash.add(static_cast<std::uint64_t>(actuator_force<T>(actuator, actuator.params.in(params), u[a], at).clipped));
+  }
+  for (const Tendon& tendon : m.tendons) {
+    const JointParams<T>& p = tendon.params.in(params);
+    const Transmission<T> at = tendon_motion<T>(tendon, q, v);
+    add_friction_mode(p, at.speed, hash);
+    add_limit_mode(p, at.position, at.speed, hash);
   }
   for (const Joint& joint : m.joints) {
     const JointParams<T>& p = joint.params.in(params);
-    for (int k = joint.v; p.frictionloss != T(0) && k < joint.v + joint.dofs; ++k) {
-      hash.add(v[k] > T(friction_creep) ? 1 : v[k] < T(-friction_creep) ? 2 : 0);
-    }
-    if (joint.has_quaternion()) continue;
-    const LimitForce<T> limit = limit_force<T>(p, q[joint.q], v[joint.v]);
-    hash.add(limit.force > T(0) ? 1 : limit.force < T(0) ? 2 : 0);
+    for (int k = joint.v; k < joint.v + joint.dofs; ++k) add_friction_mode(p, v[k], hash);
+    if (!joint.has_quaternion()) add_limit_mode(p, q[joint.q], v[joint.v], hash);
   }
 }
 

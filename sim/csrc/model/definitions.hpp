@@ -82,9 +82,36 @@ struct PadDef {
   bool collides = false;                       // the markers are contact points too
 };
 
+// A fixed tendon: its length is the sum of coefficient × position over slides and hinges.
+struct TendonDef {
+  std::string name;
+  std::vector<int> joints;
+  std::vector<double> coefficients;                                        // one per joint
+  JointParams<double> params{0, 0, 0, 0, -unlimited, unlimited, 0, 0, 0};  // of its length
+};
+
+// A slide or hinge whose position is a polynomial of that of another one.
+struct CouplingDef {
+  std::string name;
+  int joint = 0;
+  int leader = -1;                    // −1: the position is fixed
+  std::vector<double> coefficients;   // of the powers 0, 1, … of the leader's position
+  SpringParams<double> params{0, 0};  // above degree 1, where a damped spring keeps the coupling
+};
+
+// Two points of two bodies that coincide; of a weld also the orientations of the bodies.
+struct LoopClosureDef {
+  std::string name;
+  int first = world, second = world;  // bodies
+  bool weld = false;
+  V4<double> quat = V4<double>::Unit(0);  // of a weld: the first body in the frame of the second
+  LoopClosureParams<double> params{0, 0, 0, 0, V3<double>::Zero(), V3<double>::Zero()};
+};
+
 struct ActuatorDef {
   std::string name;
   int joint = 0;
+  int tendon = -1;   // driven instead of the joint
   std::string kind;  // motor, position, velocity or general
   ActuatorParams<double> params{1, 0, 0, -unlimited, unlimited, -unlimited, unlimited, 1, 0};
 };

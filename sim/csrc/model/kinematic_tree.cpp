@@ -1,5 +1,5 @@
 // The parts of a model that follow from all its elements together: the dofs that move each body, which dofs move the
-// axes of others, and the dofs that change the relative motion of each contact pair.
+// axes of others, the dofs that change the relative motion of each pair of bodies, and the leaders of couplings.
 #include <algorithm>
 
 #include "model/definition_checks.hpp"
@@ -105,6 +105,7 @@ void build_kinematic_tree(Model& model) {
 }
 
 void build_contact_pairs(Model& model) {
+  for (LoopClosure& closure : model.loop_closures) closure.pair = pair_dofs(model, closure.first, closure.second);
   for (Contact& contact : model.contacts) {
     const PointSet& set = model.point_sets[contact.points];
     const Shape& shape = model.shapes[contact.shape];
@@ -116,6 +117,31 @@ void build_contact_pairs(Model& model) {
   for (Pad& pad : model.pads) {
     for (const int s : pad.shapes) pad.pairs.push_back(pair_dofs(model, pad.mount.body, model.shapes[s].body));
   }
+}
+
+// A leader that follows another joint is replaced by that joint's leader.
+void build_couplings(Model& model) {
+  std::vector<const Coupling*> of_dof(model.nv, nullptr);
+  for (const Coupling& coupling : model.couplings) {
+    const Joint& joint = model.joints[model.dof_joint[coupling.dof]];
+    if (of_dof[coupling.dof] != nullptr) reject("joint '" + joint.name + "' follows two joints");
+    of_dof[coupling.dof] = &coupling;
+  }
+  std::vector<Coupling> resolved = model.couplings;
+  for (Coupling& coupling : resolved) {
+    std::size_t hops = 0;
+    while (coupling.leader_dof >= 0 && of_dof[coupling.leader_dof] != nullptr) {
+      if (++hops > model.couplings.size()) reject("coupling '" + coupling.name + "': the joint follows itself");
+      const Coupling& next = *of_dof[coupling.leader_dof];
+      coupling.offset += coupling.ratio * next.offset;
+      coupling.ratio *= next.ratio;
+      coupling.leader_q = next.leader_q;
+      coupling.leader_dof = next.leader_dof;
+    }
+    const double leader = coupling.leader_q < 0 ? 0 : model.q0[coupling.leader_q];
+    model.q0[coupling.q] = coupling.offset + coupling.ratio * leader;
+  }
+  model.couplings = resolved;
 }
 
 }  // namespace gelflow

@@ -134,10 +134,50 @@ struct Pad {
   std::vector<PairDofs> pairs;  // one per shape
 };
 
+// A fixed tendon: its length is the sum of coefficient × position over slides and hinges.
+struct Tendon {
+  struct Term {
+    int q, dof;
+    double coefficient;
+  };
+  std::string name;
+  std::vector<Term> terms;
+  ParamBlock<JointParams> params;  // of its length
+};
+
+// A slide or hinge whose position is offset + ratio × that of a leader, or fixed. It is no unknown of a step
+// (couplings.hpp).
+struct Coupling {
+  std::string name;
+  int q, dof;
+  int leader_q, leader_dof;  // −1: the position is fixed, and the ratio 0
+  double ratio, offset;
+};
+
+// A slide or hinge whose position is a polynomial of that of a leader (polynomial_couplings.hpp).
+struct PolynomialCoupling {
+  std::string name;
+  int q, dof;
+  int leader_q, leader_dof;
+  std::vector<double> coefficients;  // of the powers 0, 1, …
+  ParamBlock<SpringParams> params;
+};
+
+// Two points that coincide, and of a weld the orientations of their bodies (loop_closures.hpp).
+struct LoopClosure {
+  std::string name;
+  int first, second;  // bodies
+  bool weld;
+  M3<double> rotation;  // of a weld: the first body in the frame of the second
+  ParamBlock<LoopClosureParams> params;
+  PairDofs pair;
+};
+
 struct Actuator {
   std::string name;
   ActuatorKind kind;
-  int dof, q;
+  int dof, q;  // of the joint that it drives
+  int tendon;  // that it drives instead, or −1
   ParamBlock<ActuatorParams> params;
 };
 
@@ -158,6 +198,10 @@ struct Model : SolverOptions {
   std::vector<PointSet> point_sets;
   std::vector<Contact> contacts;
   std::vector<Pad> pads;
+  std::vector<Tendon> tendons;
+  std::vector<Coupling> couplings;  // whose leaders follow no other joint
+  std::vector<PolynomialCoupling> polynomial_couplings;
+  std::vector<LoopClosure> loop_closures;
   std::vector<Actuator> actuators;
 
   std::vector<std::string> param_names;

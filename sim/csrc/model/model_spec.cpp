@@ -252,19 +252,94 @@ void ModelSpec::add_pad_contacts(const Pad& pad) {
   }
 }
 
+const Joint& ModelSpec::scalar_joint(const std::string& owner, int joint) const {
+  if (joint < 0 || joint >= count(model_.joints)) reject(owner + ": no such joint");
+  if (model_.joints[joint].has_quaternion())
+    reject(owner + ": joint '" + model_.joints[joint].name + "' is no slide or hinge");
+  return model_.joints[joint];
+}
+
+int ModelSpec::add_tendon(const TendonDef& def) {
+  const std::string owner = "tendon '" + def.name + "'";
+  if (def.joints.empty()) reject(owner + ": at least one joint is needed");
+  if (def.joints.size() != def.coefficients.size()) reject(owner + ": as many coefficients as joints are needed");
+  if (!(def.params.lower < def.params.upper)) reject(owner + ": lower limit must be below upper");
+  Tendon tendon;
+  tendon.name = def.name;
+  for (std::size_t i = 0; i < def.joints.size(); ++i) {
+    const Joint& joint = scalar_joint(owner, def.joints[i]);
+    if (!std::isfinite(def.coefficients[i])) reject(owner + ": coefficients must be finite");
+    tendon.terms.push_back({joint.q, joint.v, def.coefficients[i]});
+  }
+  tendon.params = add_params(def.name, def.params);
+  model_.tendons.push_back(tendon);
+  definitions_.tendons.push_back(def);
+  return count(model_.tendons) - 1;
+}
+
+int ModelSpec::add_coupling(const CouplingDef& def) {
+  const std::string owner = "coupling '" + def.name + "'";
+  const Joint& joint = scalar_joint(owner, def.joint);
+  if (def.leader == def.joint) reject(owner + ": a joint cannot follow itself");
+  std::vector<double> coefficients = def.coefficients;
+  for (const double c : coefficients) {
+    if (!std::isfinite(c)) reject(owner + ": coefficients must be finite");
+  }
+  coefficients.resize(std::max<std::size_t>(coefficients.size(), 2), 0.0);
+  while (coefficients.size() > 2 && coefficients.back() == 0) coefficients.pop_back();
+  int leader_q = -1, leader_dof = -1;
+  if (def.leader >= 0) {
+    const Joint& leader = scalar_joint(owner, def.leader);
+    leader_q = leader.q;
+    leader_dof = leader.v;
+  } else if (coefficients.size() > 2 || coefficients[1] != 0) {
+    reject(owner + ": without a leader only the coefficient of power 0 can be given");
+  }
+  if (coefficients.size() == 2) {
+    model_.couplings.push_back({def.name, joint.q, joint.v, leader_q, leader_dof, coefficients[1], coefficients[0]});
+  } else {
+    if (!(def.params.stiffness > 0)) reject(owner + ": above degree 1 the stiffness must be positive");
+    const ParamBlock<SpringParams> params = add_params(def.name, def.params);
+    model_.polynomial_couplings.push_back({def.name, joint.q, joint.v, leader_q, leader_dof, coefficients, params});
+  }
+  definitions_.couplings.push_back(def);
+  return count(definitions_.couplings) - 1;
+}
+
+int ModelSpec::add_loop_closure(const LoopClosureDef& def) {
+  const std::string owner = "loop closure '" + def.name + "'";
+  check_body(owner, def.first, true);
+  check_body(owner, def.second, true);
+  if (def.first == def.second) reject(owner + ": its two bodies are the same");
+  check_finite(owner, "first", def.params.first);
+  check_finite(owner, "second", def.params.second);
+  if (!(def.params.stiffness > 0)) reject(owner + ": stiffness must be positive");
+  if (def.weld && !(def.params.turn_stiffness > 0)) reject(owner + ": turn_stiffness of a weld must be positive");
+  LoopClosure closure;
+  closure.name = def.name;
+  closure.first = def.first;
+  closure.second = def.second;
+  closure.weld = def.weld;
+  closure.rotation = rotation_of<double>(unit_quaternion(owner, def.quat));
+  closure.params = add_params(def.name, def.params);
+  model_.loop_closures.push_back(closure);
+  definitions_.loop_closures.push_back(def);
+  return count(model_.loop_closures) - 1;
+}
+
 int ModelSpec::add_actuator(const ActuatorDef& def) {
   const std::string owner = "actuator '" + def.name + "'";
-  if (def.joint < 0 || def.joint >= count(model_.joints)) reject(owner + ": no such joint");
-  const Joint& joint = model_.joints[def.joint];
-  if (joint.has_quaternion()) reject(owner + ": only slide and hinge joints can be actuated");
+  if (def.tendon >= count(model_.tendons)) reject(owner + ": no such tendon");
   const ActuatorParams<double>& p = def.params;
   if (!(p.force_lower < p.force_upper)) reject(owner + ": force_lower must be below force_upper");
   if (!(p.ctrl_lower < p.ctrl_upper)) reject(owner + ": ctrl_lower must be below ctrl_upper");
   Actuator actuator;
   actuator.name = def.name;
   actuator.kind = actuator_kind(owner, def.kind);
-  actuator.dof = joint.v;
-  actuator.q = joint.q;
+  actuator.tendon = def.tendon < 0 ? -1 : def.tendon;
+  const bool on_joint = actuator.tendon < 0;
+  actuator.dof = on_joint ? scalar_joint(owner, def.joint).v : -1;
+  actuator.q = on_joint ? scalar_joint(owner, def.joint).q : -1;
   actuator.params = add_params(def.name, p);
   model_.actuators.push_back(actuator);
   definitions_.actuators.push_back(def);
@@ -283,6 +358,7 @@ Model ModelSpec::build() const {
   model.nh = integrator == "bdf2" ? 2 * model.nv + 1 : 0;
   build_kinematic_tree(model);
   build_contact_pairs(model);
+  build_couplings(model);
   return model;
 }
 

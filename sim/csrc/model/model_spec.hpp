@@ -14,6 +14,9 @@ struct Definitions {
   std::vector<PointsDef> points;
   std::vector<ContactDef> contacts;
   std::vector<PadDef> pads;
+  std::vector<TendonDef> tendons;
+  std::vector<CouplingDef> couplings;
+  std::vector<LoopClosureDef> loop_closures;
   std::vector<ActuatorDef> actuators;
 };
 
@@ -31,6 +34,9 @@ class ModelSpec {
   int add_points(const PointsDef& def);
   int add_contact(const ContactDef& def);
   int add_pad(const PadDef& def);
+  int add_tendon(const TendonDef& def);
+  int add_coupling(const CouplingDef& def);
+  int add_loop_closure(const LoopClosureDef& def);
   int add_actuator(const ActuatorDef& def);
 
   const Definitions& definitions() const { return definitions_; }
@@ -48,11 +54,14 @@ class ModelSpec {
   ParamBlock<PoseParams> add_pose(const std::string& owner, const V3<double>& pos);
   void add_dofs(const Joint& joint);
   void add_pad_contacts(const Pad& pad);
+  const Joint& scalar_joint(const std::string& owner, int joint) const;
   int add_anchors(FrictionLaw law, int count);
 };
 
-// The parts of a model that follow from all its elements: dofs per body, ancestors, and the dofs of each contact pair.
+// The parts of a model that follow from all its elements: dofs per body, ancestors, the dofs of each pair of bodies, and
+// the leaders that couplings end at.
 void build_kinematic_tree(Model& model);
 void build_contact_pairs(Model& model);
+void build_couplings(Model& model);
 
 }  // namespace gelflow

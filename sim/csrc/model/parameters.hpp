@@ -91,6 +91,23 @@ struct ActuatorParams {
   T gear, kp, kd, force_lower, force_upper, ctrl_lower, ctrl_upper, gain, bias;
 };
 
+// A damped spring.
+template <class T>
+struct SpringParams {
+  static constexpr std::array names{"stiffness", "damping"};
+  T stiffness, damping;
+};
+
+// The damped springs of a loop closure, and the two points that it joins.
+template <class T>
+struct LoopClosureParams {
+  static constexpr std::array names{"stiffness", "damping", "turn_stiffness", "turn_damping", "first.x",
+                                    "first.y",   "first.z", "second.x",       "second.y",     "second.z"};
+  T stiffness, damping;            // [N/m], [N s/m]
+  T turn_stiffness, turn_damping;  // of a weld [N m/rad], [N m s/rad]
+  V3<T> first, second;             // in the frames of the bodies [m]
+};
+
 template <class T>
 struct GravityParams {
   static constexpr std::array names{"x", "y", "z"};

@@ -39,6 +39,20 @@ void bind_contact_params(py::class_<Def>& type) {
   bind_param(type, "ks", &P::ks);
 }
 
+template <class Def>
+void bind_joint_params(py::class_<Def>& type) {
+  using P = JointParams<double>;
+  bind_param(type, "damping", &P::damping);
+  bind_param(type, "armature", &P::armature);
+  bind_param(type, "stiffness", &P::stiffness);
+  bind_param(type, "springref", &P::springref);
+  bind_param(type, "lower", &P::lower);
+  bind_param(type, "upper", &P::upper);
+  bind_param(type, "limit_stiffness", &P::limit_stiffness);
+  bind_param(type, "limit_damping", &P::limit_damping);
+  bind_param(type, "frictionloss", &P::frictionloss);
+}
+
 template <class Vectors>
 std::optional<py::array> optional_array(const std::optional<Vectors>& vectors) {
   if (!vectors) return std::nullopt;
@@ -81,16 +95,7 @@ void bind_joint(py::module_& module) {
       .def_readwrite("pos", &JointDef::pos)
       .def_readwrite("axis", &JointDef::axis)
       .def_readwrite("ref", &JointDef::ref);
-  using P = JointParams<double>;
-  bind_param(type, "damping", &P::damping);
-  bind_param(type, "armature", &P::armature);
-  bind_param(type, "stiffness", &P::stiffness);
-  bind_param(type, "springref", &P::springref);
-  bind_param(type, "lower", &P::lower);
-  bind_param(type, "upper", &P::upper);
-  bind_param(type, "limit_stiffness", &P::limit_stiffness);
-  bind_param(type, "limit_damping", &P::limit_damping);
-  bind_param(type, "frictionloss", &P::frictionloss);
+  bind_joint_params(type);
 }
 
 std::shared_ptr<DistanceGrid> distance_grid(const V3<double>& grid_origin, double spacing,
@@ -209,20 +214,81 @@ void bind_pad(py::module_& module) {
   bind_contact_params(type);
 }
 
+void bind_tendon(py::module_& module) {
+  py::class_<TendonDef> type(module, "TendonDef");
+  type.def(py::init([](const std::string& name, const std::vector<int>& joints, const std::vector<double>& coefficients,
+                       double damping, double armature, double stiffness, double springref, double lower, double upper,
+                       double limit_stiffness, double limit_damping, double frictionloss) {
+             const JointParams<double> params{damping, armature,        stiffness,     springref,   lower,
+                                              upper,   limit_stiffness, limit_damping, frictionloss};
+             return TendonDef{name, joints, coefficients, params};
+           }),
+           py::kw_only(), py::arg("name"), py::arg("joints"), py::arg("coefficients"), py::arg("damping") = 0.,
+           py::arg("armature") = 0., py::arg("stiffness") = 0., py::arg("springref") = 0.,
+           py::arg("lower") = -unlimited, py::arg("upper") = unlimited, py::arg("limit_stiffness") = 0.,
+           py::arg("limit_damping") = 0., py::arg("frictionloss") = 0.)
+      .def_readwrite("name", &TendonDef::name)
+      .def_readwrite("joints", &TendonDef::joints)
+      .def_readwrite("coefficients", &TendonDef::coefficients);
+  bind_joint_params(type);
+}
+
+void bind_coupling(py::module_& module) {
+  py::class_<CouplingDef> type(module, "CouplingDef");
+  type.def(py::init([](const std::string& name, int joint, int leader, const std::vector<double>& coefficients,
+                       double stiffness, double damping) {
+             return CouplingDef{name, joint, leader, coefficients, {stiffness, damping}};
+           }),
+           py::kw_only(), py::arg("name"), py::arg("joint"), py::arg("leader") = -1, py::arg("coefficients"),
+           py::arg("stiffness") = 0., py::arg("damping") = 0.)
+      .def_readwrite("name", &CouplingDef::name)
+      .def_readwrite("joint", &CouplingDef::joint)
+      .def_readwrite("leader", &CouplingDef::leader)
+      .def_readwrite("coefficients", &CouplingDef::coefficients);
+  bind_param(type, "stiffness", &SpringParams<double>::stiffness);
+  bind_param(type, "damping", &SpringParams<double>::damping);
+}
+
+void bind_loop_closure(py::module_& module) {
+  using P = LoopClosureParams<double>;
+  py::class_<LoopClosureDef> type(module, "LoopClosureDef");
+  type.def(py::init([](const std::string& name, int first, int second, const V3<double>& first_pos,
+                       const V3<double>& second_pos, bool weld, const V4<double>& quat, double stiffness,
+                       double damping, double turn_stiffness, double turn_damping) {
+             const P params{stiffness, damping, turn_stiffness, turn_damping, first_pos, second_pos};
+             return LoopClosureDef{name, first, second, weld, quat, params};
+           }),
+           py::kw_only(), py::arg("name"), py::arg("first") = world, py::arg("second") = world,
+           py::arg("first_pos") = origin, py::arg("second_pos") = origin, py::arg("weld") = false,
+           py::arg("quat") = identity, py::arg("stiffness"), py::arg("damping") = 0., py::arg("turn_stiffness") = 0.,
+           py::arg("turn_damping") = 0.)
+      .def_readwrite("name", &LoopClosureDef::name)
+      .def_readwrite("first", &LoopClosureDef::first)
+      .def_readwrite("second", &LoopClosureDef::second)
+      .def_readwrite("weld", &LoopClosureDef::weld)
+      .def_readwrite("quat", &LoopClosureDef::quat);
+  bind_param(type, "stiffness", &P::stiffness);
+  bind_param(type, "damping", &P::damping);
+  bind_param(type, "turn_stiffness", &P::turn_stiffness);
+  bind_param(type, "turn_damping", &P::turn_damping);
+}
+
 void bind_actuator(py::module_& module) {
   py::class_<ActuatorDef> type(module, "ActuatorDef");
-  type.def(py::init([](const std::string& name, int joint, const std::string& kind, double gear, double kp, double kd,
-                       double force_lower, double force_upper, double ctrl_lower, double ctrl_upper, double gain,
-                       double bias) {
-             return ActuatorDef{
-                 name, joint, kind, {gear, kp, kd, force_lower, force_upper, ctrl_lower, ctrl_upper, gain, bias}};
+  type.def(py::init([](const std::string& name, int joint, int tendon, const std::string& kind, double gear, double kp,
+                       double kd, double force_lower, double force_upper, double ctrl_lower, double ctrl_upper,
+                       double gain, double bias) {
+             const ActuatorParams<double> params{gear,       kp,         kd,   force_lower, force_upper,
+                                                 ctrl_lower, ctrl_upper, gain, bias};
+             return ActuatorDef{name, joint, tendon, kind, params};
            }),
-           py::kw_only(), py::arg("name"), py::arg("joint"), py::arg("kind"), py::arg("gear") = 1., py::arg("kp") = 0.,
-           py::arg("kd") = 0., py::arg("force_lower") = -unlimited, py::arg("force_upper") = unlimited,
-           py::arg("ctrl_lower") = -unlimited, py::arg("ctrl_upper") = unlimited, py::arg("gain") = 1.,
-           py::arg("bias") = 0.)
+           py::kw_only(), py::arg("name"), py::arg("joint") = -1, py::arg("tendon") = -1, py::arg("kind"),
+           py::arg("gear") = 1., py::arg("kp") = 0., py::arg("kd") = 0., py::arg("force_lower") = -unlimited,
+           py::arg("force_upper") = unlimited, py::arg("ctrl_lower") = -unlimited, py::arg("ctrl_upper") = unlimited,
+           py::arg("gain") = 1., py::arg("bias") = 0.)
       .def_readwrite("name", &ActuatorDef::name)
       .def_readwrite("joint", &ActuatorDef::joint)
+      .def_readwrite("tendon", &ActuatorDef::tendon)
       .def_readwrite("kind", &ActuatorDef::kind);
   using P = ActuatorParams<double>;
   bind_param(type, "gear", &P::gear);
@@ -245,6 +311,9 @@ void bind_definitions(py::module_& module) {
   bind_points(module);
   bind_contact(module);
   bind_pad(module);
+  bind_tendon(module);
+  bind_coupling(module);
+  bind_loop_closure(module);
   bind_actuator(module);
 }
 

@@ -76,6 +76,9 @@ void bind_spec(py::module_& module) {
       .def("add_points", &ModelSpec::add_points, py::arg("definition"))
       .def("add_contact", &ModelSpec::add_contact, py::arg("definition"))
       .def("add_pad", &ModelSpec::add_pad, py::arg("definition"))
+      .def("add_tendon", &ModelSpec::add_tendon, py::arg("definition"))
+      .def("add_coupling", &ModelSpec::add_coupling, py::arg("definition"))
+      .def("add_loop_closure", &ModelSpec::add_loop_closure, py::arg("definition"))
       .def("add_actuator", &ModelSpec::add_actuator, py::arg("definition"));
   bind_option(type, "step", &SolverOptions::step);
   bind_option(type, "tolerance", &SolverOptions::tolerance);
@@ -89,6 +92,9 @@ void bind_spec(py::module_& module) {
   bind_list(type, "points", &Definitions::points);
   bind_list(type, "contacts", &Definitions::contacts);
   bind_list(type, "pads", &Definitions::pads);
+  bind_list(type, "tendons", &Definitions::tendons);
+  bind_list(type, "couplings", &Definitions::couplings);
+  bind_list(type, "loop_closures", &Definitions::loop_closures);
   bind_list(type, "actuators", &Definitions::actuators);
 }
 
@@ -112,6 +118,8 @@ void bind_model(py::module_& module) {
       .def_property_readonly("joint_names", [](const Model& m) { return names(m.joints); })
       .def_property_readonly("contact_names", [](const Model& m) { return names(m.contacts); })
       .def_property_readonly("pad_names", [](const Model& m) { return names(m.pads); })
+      .def_property_readonly("tendon_names", [](const Model& m) { return names(m.tendons); })
+      .def_property_readonly("loop_closure_names", [](const Model& m) { return names(m.loop_closures); })
       .def_property_readonly("actuator_names", [](const Model& m) { return names(m.actuators); })
       .def_property_readonly("joint_q", [](const Model& m) { return column(m.joints, &Joint::q); })
       .def_property_readonly("joint_v", [](const Model& m) { return column(m.joints, &Joint::v); })

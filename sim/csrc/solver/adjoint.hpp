@@ -93,13 +93,18 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
     grad_increment = g.history.head(m.nv);
     grad_v0 = g.history.segment(m.nv, m.nv);
   }
-  const VX<T> b = g.v + r.beta_h * (dposition_dincrement_vjp<T>(m, w.increment, g.q) + grad_increment);
+  VX<T> b = g.v + r.beta_h * (dposition_dincrement_vjp<T>(m, w.increment, g.q) + grad_increment);
+  reduce_couplings<T>(m, b);
+  reduce_couplings<T>(m, w.tangent);
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> multiplier(m.nv);
   solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+  expand_couplings<T>(m, multiplier);
   on_multiplier(multiplier);
-  for (std::size_t a = 0; a < m.actuators.size(); ++a) grad_u[a] -= multiplier[m.actuators[a].dof] * w.dg_du[a];
+  for (std::size_t a = 0; a < m.actuators.size(); ++a) {
+    grad_u[a] -= along_transmission<T>(m, m.actuators[a], multiplier) * w.dg_du[a];
+  }
   const VX<T> grad_q1 = g.q - w.dg_dq.leftCols(m.nv).transpose() * multiplier;
   VX<T> grad_v_star = w.mass.leftCols(m.nv).transpose() * multiplier, grad_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
   grad_increment += dposition_dincrement_vjp<T>(m, w.increment, grad_q1);
@@ -115,6 +120,19 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
     residual_anchors_vjp<T>(m, params, r.beta_h, r.bdf2, r.anchors.data(), r.anchored.data(), w, multiplier,
                             grad_anchor.data());
     g.anchors.swap(grad_anchor);
+  }
+}
+
+// Transforms g from the gradient at a state whose followers were set by their leaders to that at the state before.
+template <class T>
+void follow_leaders_vjp(const Model& m, StateGradient<T>& g) {
+  reduce_couplings<T>(m, g.q);
+  reduce_couplings<T>(m, g.v);
+  if (m.nh == 0) return;
+  for (int part = 0; part < 2; ++part) {
+    VX<T> rates = g.history.segment(part * m.nv, m.nv);
+    reduce_couplings<T>(m, rates);
+    g.history.segment(part * m.nv, m.nv) = rates;
   }
 }
 

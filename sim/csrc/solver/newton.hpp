@@ -5,6 +5,7 @@
 #include <algorithm>
 
 #include "math/linear_solver.hpp"
+#include "solver/couplings.hpp"
 #include "solver/residual.hpp"
 
 namespace gelflow {
@@ -54,14 +55,20 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& star
     fastest = std::max(fastest, std::abs(real_part(start.v_star[k])));
   }
   const double momentum = mass * (speed + reach * spin) * (1 + real_part(start.beta_h) * spin);
-  for (int i = 0; i < m.nv; ++i) {
+  const auto bound_of_row = [&](int i) {
     double velocity_terms = m.angular[i] ? reach * momentum : momentum, position_terms = 0;
     for (int j = 0; j < m.nv; ++j) {
       position_terms += std::abs(real_part(w.dg_dq(i, j))) * (m.angular[j] ? angle : reach);
       velocity_terms +=
           std::abs(real_part(w.dg_dv(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(start.v_star[j])));
     }
-    const double bound = unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
+    return unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
+  };
+  for (int i = 0; i < m.nv; ++i) {
+    double bound = bound_of_row(i);
+    for (const Coupling& c : m.couplings) {
+      if (c.leader_dof == i) bound += std::abs(c.ratio) * bound_of_row(c.dof);
+    }
     if (!(std::abs(real_part(w.residual[i])) <= bound)) return false;
   }
   return true;
@@ -151,6 +158,10 @@ class NewtonSolver {
       evaluate<false, T>(m_, params_, start_, v_.data(), cache, true, w_);
     }
     jacobian_current_ = jacobian;
+    if (m_.couplings.empty()) return;
+    reduce_couplings<T>(m_, w_.residual);
+    reduce_absolute_couplings<T>(m_, w_.impulses);
+    if (jacobian) reduce_couplings<T>(m_, w_.tangent);
   }
   GELFLOW_INLINE void measure(bool jacobian) {
     evaluate_at_v(jacobian, CacheState::current);
@@ -188,6 +199,7 @@ class NewtonSolver {
       factorize<T>(w_.tangent, m_.nv, w_.pivots);
     }
     gelflow::solve<T>(w_.tangent, m_.nv, w_.pivots, w_.residual.data(), w_.direction);
+    expand_couplings<T>(m_, w_.direction);
   }
 
   // Whether the next update is the last one, by the residual that it is expected to leave.

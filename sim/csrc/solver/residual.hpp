@@ -5,9 +5,10 @@
 // with h the step length; `beta_h` is β h.
 #pragma once
 
-#include "contact/contact_forces.hpp"
 #include "dynamics/inverse_dynamics.hpp"
 #include "solver/joint_forces.hpp"
+#include "solver/loop_closures.hpp"
+#include "solver/polynomial_couplings.hpp"
 
 namespace gelflow {
 
@@ -37,14 +38,20 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& start, const 
   if constexpr (derivatives) {
     w.dg_dq.setZero();
     w.dg_dv.setZero();
+    if (!m.tendons.empty()) w.mass.setZero();  // their entries are in no tree
   }
   add_inverse_dynamics<derivatives, T>(m, params, beta_h, v, &start, w);
-  if constexpr (derivatives) w.dg_dv += w.mass;
+  if constexpr (derivatives) {
+    add_tendon_mass<T>(m, params, w);
+    w.dg_dv += w.mass;
+  }
   if (add_impulses) {
     for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
   subtract_joint_forces<derivatives, T>(m, params, beta_h, w.q.data(), v, start.u, start.continuation, add_impulses, w);
+  subtract_polynomial_couplings<derivatives, T>(m, params, beta_h, w.q.data(), v, add_impulses, w);
   subtract_contact_forces<derivatives, T>(m, params, start, cache, add_impulses, w);
+  subtract_loop_closures<derivatives, T>(m, params, beta_h, add_impulses, w);
   if constexpr (derivatives) {
     w.tangent = beta_h * w.dg_dq;
     times_dposition_dincrement<T>(m, w.increment, w.tangent);

@@ -47,6 +47,22 @@ void for_each_set(const std::uint8_t* set, int n, Visit&& visit) {
   }
 }
 
+// Sets positions, velocities and the history of the followers in state s.
+template <class T>
+void follow_leaders(const Model& m, const StateView<T>& s) {
+  for (const Coupling& c : m.couplings) {
+    PositionScalar<T> position(c.offset);
+    if (c.leader_q >= 0) position += PositionScalar<T>(c.ratio) * position_with_rounding(s.q, s.q_rounding, c.leader_q);
+    s.q[c.q] = T(position);
+    if (s.q_rounding != nullptr) s.q_rounding[c.q] = T(position - PositionScalar<T>(s.q[c.q]));
+    const auto follow = [&](T* rates) { rates[c.dof] = c.leader_dof < 0 ? T(0) : T(T(c.ratio) * rates[c.leader_dof]); };
+    follow(s.v);
+    if (m.nh == 0) continue;
+    follow(s.history);
+    follow(s.history + m.nv);
+  }
+}
+
 struct StepReport {
   Status status = Status::ok;
   int iterations = 0;  // Newton iterations, substeps included

@@ -16,6 +16,16 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef, actuator_addition, default_limit, read_actuators
+from gelflow.sim.scene.mjcf.couplings import (
+    CouplingDef,
+    LoopClosureDef,
+    TendonDef,
+    driving_actuators,
+    loop_joints,
+    read_couplings,
+    read_loop_closures,
+    read_tendons,
+)
 from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
 from gelflow.sim.scene.mjcf.unsupported import apply_disable_flags, check_supported, not_modelled
 
@@ -96,6 +106,9 @@ class Mechanics:
     joints: tuple[JointDef, ...]
     geoms: tuple[GeomDef, ...]
     sites: dict[str, tuple[int, Pose]]  # name -> moving body, pose in its frame
+    tendons: tuple[TendonDef, ...]
+    couplings: tuple[CouplingDef, ...]
+    loop_closures: tuple[LoopClosureDef, ...]
     actuators: tuple[ActuatorDef, ...]
     gravity: Array  # [m/s²], shape (3,)
     q0: Array  # initial positions, shape (nq,)
@@ -123,6 +136,7 @@ def read_mechanics(path: Path) -> Mechanics:
     check_supported(model, path.name)
     moving_body, poses = _merge(model)
     actuators = read_actuators(model, path.name)
+    tendons = read_tendons(model, actuators)
     sites = {
         name: (int(moving_body[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
         for i, (name, b) in enumerate(zip(element_names(model, "site", model.nsite), model.site_bodyid, strict=True))
@@ -133,9 +147,12 @@ def read_mechanics(path: Path) -> Mechanics:
         }
     return Mechanics(
         bodies=_bodies(model, moving_body, poses),
-        joints=_joints(model, moving_body, actuators),
+        joints=_joints(model, moving_body, actuators, tendons),
         geoms=_geoms(model, moving_body, poses),
         sites=sites,
+        tendons=tendons,
+        couplings=read_couplings(model),
+        loop_closures=read_loop_closures(model, moving_body, poses),
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
         q0=_initial_positions(model),
@@ -188,14 +205,20 @@ def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tu
     return tuple(bodies)
 
 
-def _joints(model: Any, moving_body: NDArray[np.int64], actuators: tuple[ActuatorDef, ...]) -> tuple[JointDef, ...]:
+def _joints(
+    model: Any, moving_body: NDArray[np.int64], actuators: tuple[ActuatorDef, ...], tendons: tuple[TendonDef, ...]
+) -> tuple[JointDef, ...]:
+    in_loops = loop_joints(model)
+    # A loop passes the torques of all its joints on to any of them.
+    loop_load = sum(_largest_torque(model, j, driving_actuators(actuators, tendons, j)) for j in in_loops)
     joints = []
     for j, name in enumerate(element_names(model, "joint", model.njnt)):
         kind = _JOINTS[int(model.jnt_type[j])]
         q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
         rotates_freely = kind in ("ball", "free")
         limited = bool(model.jnt_limited[j]) and not rotates_freely
-        joint_actuators = [a for a in actuators if a.joint == j]
+        driving = driving_actuators(actuators, tendons, j)
+        load = loop_load if j in in_loops and kind == "hinge" else 0.0
         joints.append(
             JointDef(
                 name=name,
@@ -205,17 +228,27 @@ def _joints(model: Any, moving_body: NDArray[np.int64], actuators: tuple[Actuato
                 axis=model.jnt_axis[j].copy(),
                 q_start=q,
                 v_start=v,
-                damping=float(model.dof_damping[v]) + actuator_addition(model, j, "damping"),
-                armature=float(model.dof_armature[v]) + actuator_addition(model, j, "armature"),
+                damping=float(model.dof_damping[v]) + actuator_addition(model, "joint", j, "damping"),
+                armature=float(model.dof_armature[v]) + actuator_addition(model, "joint", j, "armature"),
                 stiffness=float(model.jnt_stiffness[j]),
                 springref=0.0 if rotates_freely else float(model.qpos_spring[q]),
                 range=(float(model.jnt_range[j, 0]), float(model.jnt_range[j, 1])) if limited else None,
-                default_limit=default_limit(kind, float(model.dof_M0[v]), joint_actuators) if limited else None,
+                default_limit=default_limit(kind, float(model.dof_M0[v]), driving, load) if limited else None,
                 ref=0.0 if rotates_freely else float(model.qpos0[q]),
                 frictionloss=float(model.dof_frictionloss[v]),
             )
         )
     return tuple(joints)
+
+
+def _largest_torque(model: Any, joint: int, actuators: list[ActuatorDef]) -> float:
+    """Largest torque of the spring and the actuators with a force limit of a hinge within its range [N m]."""
+    if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+        return 0.0
+    rest = model.qpos_spring[model.jnt_qposadr[joint]]
+    spring = float(model.jnt_stiffness[joint] * np.abs(model.jnt_range[joint] - rest).max())
+    peaks = [a.peak_force() for a in actuators]
+    return spring + sum(peak for peak in peaks if np.isfinite(peak))
 
 
 def _geoms(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tuple[GeomDef, ...]:

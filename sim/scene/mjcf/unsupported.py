@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from gelflow.errors import UsageError
+from gelflow.sim.scene.mjcf.actuators import is_fixed
 from gelflow.sim.scene.mjcf.model_file import element_names
 
 Unsupported = tuple[str, str]  # element, advice
@@ -23,8 +24,11 @@ _FLAGS = {
 _FLAGS["PASSIVE"] = _FLAGS["SPRING"] + _FLAGS["DAMPER"]
 _FLAGS["CONSTRAINT"] = _FLAGS["LIMIT"] + _FLAGS["FRICTIONLOSS"] + _FLAGS["EQUALITY"]
 
+# Equalities that are modelled.
+_EQUALITIES = tuple(map(int, (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)))
+
 _TRANSMISSIONS = {
-    mujoco.mjtTrn.mjTRN_TENDON: "on a tendon",
+    mujoco.mjtTrn.mjTRN_TENDON: "on a spatial tendon",
     mujoco.mjtTrn.mjTRN_SITE: "on a site",
     mujoco.mjtTrn.mjTRN_SLIDERCRANK: "on a slider-crank",
     mujoco.mjtTrn.mjTRN_BODY: "on a body (adhesion)",
@@ -64,10 +68,10 @@ def not_modelled(model: Any) -> tuple[str, ...]:
         lines.append(f"{pairs} contact pairs and excludes: the TOML file defines the contacts")
     if model.nsensor:
         lines.append(f"{model.nsensor} MuJoCo sensors: the TOML file defines the pads")
-    if model.ntendon:
-        lines.append(f"{model.ntendon} tendons: without force")
-    if model.neq:
-        lines.append(f"{model.neq} equality constraints: not active")
+    if spatial := sum(not is_fixed(model, t) for t in range(model.ntendon)):
+        lines.append(f"{spatial} spatial tendons: without force")
+    if inactive := model.neq - int(np.count_nonzero(model.eq_active0)):
+        lines.append(f"{inactive} equality constraints: not active")
     return tuple(lines)
 
 
@@ -93,9 +97,17 @@ def _elements(model: Any) -> Iterator[Unsupported]:
     for f in range(model.nflex):
         yield f"flex {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, f)!r}", "remove it"
     for t in sorted({*actuated, *stiff}):
-        yield f"tendon {tendons[t]!r}", "remove it or drive the joints directly"
+        if not is_fixed(model, t):
+            yield f"spatial tendon {tendons[t]!r}", "remove it or drive the joints directly"
+    for t in _nonzero(model, "tendon_", "stiffness"):
+        low, high = model.tendon_lengthspring[t]
+        if low != high:
+            yield f"range of springlength of tendon {tendons[t]!r}", "give one length"
+    for t in _nonzero(model, "tendon_", "stiffnesspoly", "dampingpoly"):
+        yield f"polynomial stiffness or damping of tendon {tendons[t]!r}", "give one coefficient"
     for e in _nonzero(model, "eq_", "active0"):
-        yield f"equality {_equality(model, e)}", "remove it, or make it inactive; drive each joint by its own actuator"
+        if model.eq_type[e] not in _EQUALITIES:
+            yield f"equality {_equality(model, e)}", "remove it, or make it inactive"
     for b, body in enumerate(bodies):
         if model.body_plugin[b] >= 0:
             yield f"plugin of body {body!r}", "remove it"
@@ -179,11 +191,17 @@ def _actuator(model: Any, a: int) -> Unsupported | None:
     if dyn != "none":
         return f"with an activation (dyntype {dyn})", "remove timeconst or dyntype"
     trn = model.actuator_trntype[a]
+    if trn == mujoco.mjtTrn.mjTRN_TENDON and is_fixed(model, int(model.actuator_trnid[a, 0])):
+        return _delay(model, a)
     if not _on_joint(model)[a]:
         return _TRANSMISSIONS.get(mujoco.mjtTrn(trn), "without a joint"), "drive the joints directly"
     joint = int(model.actuator_trnid[a, 0])
     if rotating := _ROTATING_JOINTS.get(int(model.jnt_type[joint])):
         return f"on {rotating} joint {model.joint(joint).name!r}", "drive slide or hinge joints"
+    return _delay(model, a)
+
+
+def _delay(model: Any, a: int) -> Unsupported | None:
     if np.any(getattr(model, "actuator_delay", np.zeros(a + 1))[a]):
         return "with a delay", "remove it"
     return None

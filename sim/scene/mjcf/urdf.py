@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,7 +21,7 @@ _MARGIN = 1e-12  # relative, so that MuJoCo's exact comparison holds after its o
 def read_urdf(path: Path) -> ElementTree.Element | None:
     """The root element of a URDF file; None for MJCF and for invalid XML, which MuJoCo reports.
 
-    Raises UsageError, in one line, if the file has macros or mimic joints.
+    Raises UsageError, in one line, if the file has macros or an invalid <mimic>.
     """
     try:
         root = ElementTree.parse(path).getroot()
@@ -31,12 +31,7 @@ def read_urdf(path: Path) -> ElementTree.Element | None:
         return None
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise UsageError(f"{path}: has xacro macros, which are not expanded; run xacro and load its output")
-    for joint in root.iter("joint"):
-        if (mimic := joint.find("mimic")) is not None:
-            raise UsageError(
-                f"{path}: joint {joint.get('name')!r} mimics {mimic.get('joint')!r}, which is not supported: remove "
-                "<mimic> and drive the joint by its own actuator"
-            )
+    _mimic_joints(root, path)  # its errors are clearer than those of MuJoCo's parser
     return root
 
 
@@ -48,7 +43,44 @@ def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     for body in spec.bodies:
         if body.explicitinertial and np.isfinite(body.fullinertia).all():
             body.fullinertia = _repaired(body.fullinertia, f"{path.name}: link {body.name!r}")
-    _add_motors(spec, robot)
+    mimics = _mimic_joints(robot, path)
+    _couple(spec, mimics)
+    _add_motors(spec, robot, without=mimics)
+
+
+def _mimic_joints(robot: ElementTree.Element, path: Path) -> dict[str, tuple[str, float, float]]:
+    """For each joint with <mimic>: the joint that it follows, multiplier and offset. Raises UsageError."""
+    names = {joint.get("name", "") for joint in robot.findall("joint")}
+    mimics = {}
+    for joint in robot.findall("joint"):
+        if (mimic := joint.find("mimic")) is None:
+            continue
+        name, leader = joint.get("name", ""), mimic.get("joint", "")
+        if leader not in names:
+            raise UsageError(f"{path}: joint {name!r} mimics {leader!r}, which the file does not have")
+        try:
+            mimics[name] = leader, float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+        except ValueError:
+            raise UsageError(f"{path}: joint {name!r}: multiplier and offset of <mimic> must be numbers") from None
+    return mimics
+
+
+def _couple(spec: Any, mimics: dict[str, tuple[str, float, float]]) -> None:
+    """Add the joint equality of each <mimic>."""
+    known = {equality.name1 for equality in spec.equalities}  # newer versions of MuJoCo read <mimic> themselves
+    for name, (leader, multiplier, offset) in mimics.items():
+        if name in known:
+            continue
+        data = np.zeros(mujoco.mjNEQDATA)
+        data[:2] = offset, multiplier
+        spec.add_equality(
+            name=f"{name} mimics {leader}",
+            type=mujoco.mjtEq.mjEQ_JOINT,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            name1=name,
+            name2=leader,
+            data=data,
+        )
 
 
 def _mesh_file(address: str, path: Path) -> str:
@@ -112,15 +144,17 @@ def _text(values: NDArray[np.float64]) -> str:
     return ", ".join(f"{value:.4g}" for value in values)
 
 
-def _add_motors(spec: Any, robot: ElementTree.Element) -> None:
+def _add_motors(spec: Any, robot: ElementTree.Element, without: Container[str]) -> None:
     """Add a motor for each joint of a <transmission> or <ros2_control>, or for all joints if the file has neither.
+
+    Joints of `without` follow others and have no motor of their own.
 
     The control is the joint force, as in the effort interface of ROS, within the effort limit of the joint.
     """
     driven = _driven_joints(robot)
     scalar_types = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
     for joint in spec.joints:
-        if joint.type in scalar_types and (not driven or joint.name in driven):
+        if joint.type in scalar_types and joint.name not in without and (not driven or joint.name in driven):
             name = driven.get(joint.name, joint.name)
             spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
 

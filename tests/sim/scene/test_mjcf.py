@@ -332,11 +332,12 @@ def test_disable_flags_are_applied(flag: str, tmp_path: Path) -> None:
 def test_elements_without_effect_are_not_modelled(tmp_path: Path) -> None:
     text = JOINT.format(joint="", actuators="").replace(
         "<actuator>",
-        '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
+        '<tendon><spatial name="t"><site site="a"/><site site="b"/></spatial></tendon>'
         '<equality><joint joint1="j" active="false"/></equality><actuator>',
     )
+    text = text.replace("<worldbody>", '<worldbody><site name="a"/><site name="b" pos="0 0 1"/>')
     scene = load(write(tmp_path, {"scene.xml": text}))
-    assert [line.split(":")[0] for line in scene.not_modelled[:2]] == ["1 tendons", "1 equality constraints"]
+    assert [line.split(":")[0] for line in scene.not_modelled[:2]] == ["1 spatial tendons", "1 equality constraints"]
 
 
 LIMITS = [  # (attributes of the joint, actuator, expected stiffness without the lower bound by the inertia)
