@@ -3,7 +3,7 @@
 import ctypes
 import gc
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,6 +135,7 @@ class Description:
     friction: str
     gravity: tuple[float, ...]  # [m/s²]
     bodies: tuple[BodyPart, ...]  # the world first
+    couplings: tuple[str, ...]  # couplings of joints, fixed tendons and loop closures, a line each
     shapes: tuple[ShapePart, ...]  # meshes and rounded shapes
     contacts: tuple[ContactPart, ...]
     pads: tuple[PadPart, ...]
@@ -161,6 +162,7 @@ def describe(scene: Scene) -> Description:
         friction=scene.friction,
         gravity=_floats(scene.gravity),
         bodies=bodies,
+        couplings=_couplings(scene),
         shapes=_shapes(scene),
         contacts=_contacts(scene, kinds),
         pads=tuple(
@@ -238,6 +240,27 @@ def _actuators(scene: Scene, joint: JointDef) -> tuple[ActuatorPart, ...]:
         for a in scene.actuators
         if any(driven is joint for driven, _ in scene.driven_joints(a))
     )
+
+
+def _couplings(scene: Scene) -> tuple[str, ...]:
+    def sum_of(terms: Iterable[tuple[float, str]]) -> str:
+        words = [f"{c:g} {name}".strip() for c, name in terms if c != 0]
+        return " + ".join(words) if words else "0"
+
+    lines = []
+    for coupling in scene.couplings:
+        leader = scene.joints[coupling.leader].name
+        powers = ["", leader, *(f"{leader}^{n}" for n in range(2, len(coupling.coefficients)))]
+        kind = "exact" if len(coupling.coefficients) <= 2 else "kept by a spring"
+        terms = zip(coupling.coefficients, powers, strict=False)
+        lines.append(f"{scene.joints[coupling.joint].name} = {sum_of(terms)} ({kind})")
+    for tendon in scene.tendons:
+        names = (scene.joints[j].name for j in tendon.joints)
+        lines.append(f"tendon {tendon.name} = {sum_of(zip(tendon.coefficients, names, strict=True))}")
+    for closure in scene.loop_closures:
+        first, second = (_body_name(scene, b) for b in closure.bodies)
+        lines.append(f"{'weld' if closure.weld else 'connect'} {closure.name}: {first} to {second}")
+    return tuple(lines)
 
 
 def _shapes(scene: Scene) -> tuple[ShapePart, ...]:

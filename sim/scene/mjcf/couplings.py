@@ -102,6 +102,7 @@ def read_couplings(model: Any) -> tuple[CouplingDef, ...]:
         else:
             coefficients = polynomial(Polynomial([-model.qpos0[model.jnt_qposadr[leader]], 1.0])).coef
         coefficients[0] += offset
+        coefficients = np.trim_zeros(coefficients, "b")
         kind = "slide" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"
         couplings.append(CouplingDef(name, joint, leader, tuple(coefficients.tolist()), kind))
     return tuple(couplings)

@@ -1,11 +1,14 @@
 """Couplings of model files: joint equalities, <mimic>, fixed tendons, connect and weld, compared with MuJoCo."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+from gelflow.geometry import Pose
+from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
@@ -46,6 +49,7 @@ LOOP = """<mujoco>
 </mujoco>"""
 CONNECT = '<connect body1="rod" body2="rocker" anchor="0.15 0 0.02" solref="0.001 1" solimp="0.9999 0.9999 0.001"/>'
 CONNECT_SITES = '<connect site1="rod tip" site2="rocker tip" solref="0.001 1" solimp="0.9999 0.9999 0.001"/>'
+LINEAR = '<joint joint1="rocker" joint2="crank" polycoef="0.1 -1.5"/>'
 WELD = '<weld body1="rod" body2="rocker" anchor="0 0 0.1" solref="0.001 1" solimp="0.9999 0.9999 0.001"/>'
 
 
@@ -132,6 +136,39 @@ def test_positions_set_for_a_follower_are_those_of_its_leader(tmp_path: Path) ->
     sim.step(np.zeros((1, 1)))
     assert sim.q[0, 2] == pytest.approx(0.1 + 0.5 * sim.q[0, 0], abs=1e-15)
     assert sim.v[0, 2] == 0.5 * sim.v[0, 0]
+
+
+def test_description_lists_couplings(tmp_path: Path) -> None:
+    hand = describe(load(tmp_path, "hand.xml", HAND))
+    assert hand.couplings == ("finger_1 = 1 finger_2 (exact)", "tendon split = 0.5 finger_1 + 0.5 finger_2")
+    loop = describe(load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", CONNECT + LINEAR)))
+    assert loop.couplings == ("rocker = 0.1 + -1.5 crank (exact)", "connect equality0: rod to rocker")
+
+
+def energy(sim: Simulator, scene: Scene) -> float:
+    """Kinetic and potential energy [J]."""
+    kinetic = 0.5 * float(sim.v[0] @ sim.mass_matrix()[0] @ sim.v[0])
+    poses = (Pose(pose[:3], pose[3:]) for pose in sim.poses()[0])
+    heights = [pose.apply(body.com)[2] for pose, body in zip(poses, scene.bodies, strict=True)]
+    return kinetic + 9.81 * sum(body.mass * z for body, z in zip(scene.bodies, heights, strict=True))
+
+
+@pytest.mark.parametrize(
+    "equality",
+    [CONNECT, LINEAR, LINEAR.replace("0.1 -1.5", "0 1 0.3")],
+)
+def test_falling_mechanism_keeps_its_energy(equality: str, tmp_path: Path) -> None:
+    text = LOOP.replace("EQUALITY", equality).replace(' damping="0.01"', "")
+    scene = load(tmp_path, "loop.xml", text)
+    sim = Simulator(replace(scene, step=2e-4))
+    start = energy(sim, scene)
+    lowest = np.inf
+    for _ in range(10):
+        sim.step(np.zeros((1, 1)), 100)
+        kinetic = 0.5 * float(sim.v[0] @ sim.mass_matrix()[0] @ sim.v[0])
+        lowest = min(lowest, energy(sim, scene) - kinetic)
+        assert energy(sim, scene) == pytest.approx(start, abs=2e-3 * max(start - lowest, 1e-3))
+    assert start - lowest > 0.05, "it fell"
 
 
 LINK = """<link name="{}"><inertial><mass value="1"/>

@@ -75,6 +75,10 @@ def tree(d: "Description") -> Tree:
     bodies = root.add("[bold]bodies[/bold]")
     for body in d.bodies:
         _add_body(bodies, body)
+    if d.couplings:
+        couplings = root.add("[bold]couplings[/bold]")
+        for line in d.couplings:
+            couplings.add(escape(line))
     if d.shapes:
         shapes = root.add("[bold]shapes[/bold]")
         for shape in d.shapes:
