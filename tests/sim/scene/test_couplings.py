@@ -150,7 +150,8 @@ def energy(sim: Simulator, scene: Scene) -> float:
     kinetic = 0.5 * float(sim.v[0] @ sim.mass_matrix()[0] @ sim.v[0])
     poses = (Pose(pose[:3], pose[3:]) for pose in sim.poses()[0])
     heights = [pose.apply(body.com)[2] for pose, body in zip(poses, scene.bodies, strict=True)]
-    return kinetic + 9.81 * sum(body.mass * z for body, z in zip(scene.bodies, heights, strict=True))
+    potential = 9.81 * sum(body.mass * float(z) for body, z in zip(scene.bodies, heights, strict=True))
+    return kinetic + potential
 
 
 @pytest.mark.parametrize(
