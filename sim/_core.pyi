@@ -66,6 +66,7 @@ class JointDef:
     limit_stiffness: float
     limit_damping: float
     frictionloss: float
+    prescribed: bool  # no force changes its velocity
     def __init__(
         self,
         *,
@@ -84,6 +85,7 @@ class JointDef:
         limit_stiffness: float = 0.0,
         limit_damping: float = 0.0,
         frictionloss: float = 0.0,
+        prescribed: bool = False,
     ) -> None: ...
 
 class DistanceGrid:

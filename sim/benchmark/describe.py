@@ -152,7 +152,7 @@ def describe(scene: Scene) -> Description:
     mechanics = read_mechanics(path)
     if [b.name for b in mechanics.bodies] != [b.name for b in scene.bodies]:
         raise UsageError(f"{path} has other bodies than the loaded scene; load the scene again")
-    model, _ = compile_model(path)
+    model = compile_model(path).model
     bodies = _bodies(scene, mechanics, model)
     kinds = {geom.name: geom.kind for geom in mechanics.geoms}
     return Description(

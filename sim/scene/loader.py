@@ -14,6 +14,7 @@ from gelflow.sim.scene.pads import read_pads
 from gelflow.sim.scene.presets import Presets, apply_preset, read_presets
 from gelflow.sim.scene.scene import DEFAULT_TOLERANCE, Precision, Scene
 from gelflow.sim.scene.shapes import used_shapes
+from gelflow.sim.scene.sites import add_sites
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 INTEGRATORS = ("bdf1", "bdf2")
@@ -22,7 +23,7 @@ PRECISIONS: tuple[Precision, ...] = ("double", "single")
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
 # Tables of named elements: each key is the name of an element, for example [pads.left].
-_ELEMENT_TABLES = ("joints", "shapes", "points", "contacts", "pads")
+_ELEMENT_TABLES = ("joints", "sites", "shapes", "points", "contacts", "pads")
 _KEYS = ("format", "model", *_SOLVER_KEYS, "friction", *_ELEMENT_TABLES, "presets")
 
 
@@ -74,7 +75,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
         raise UsageError(f"{path}: format is {version}; this gelflow reads format 1")
     top.check_keys(_KEYS)
     friction = top.string("friction", "viscous", choices=FRICTION_LAWS)
-    mechanics = read_mechanics(path.parent / top.string("model"))
+    mechanics = add_sites(top.tables("sites"), read_mechanics(path.parent / top.string("model")))
     points = read_points(top.tables("points"), mechanics)
     contacts = read_contacts(top.tables("contacts"), points, mechanics, friction)
     pads = read_pads(top.tables("pads"), mechanics, friction, path.parent)

@@ -98,6 +98,7 @@ def _joint(joint: JointDef, limit: JointLimit) -> _core.JointDef:
         limit_stiffness=limit.stiffness,
         limit_damping=limit.damping,
         frictionloss=joint.frictionloss,
+        prescribed=joint.prescribed,
     )
 
 

@@ -37,7 +37,8 @@ struct JointDef {
   V3<double> pos = V3<double>::Zero();    // in the body frame [m]
   V3<double> axis = V3<double>::Unit(2);  // of a slide or hinge, in the body frame; need not have length 1
   JointParams<double> params{0, 0, 0, 0, -unlimited, unlimited, 0, 0, 0};
-  double ref = 0;  // position at which the body has the pose of its definition
+  double ref = 0;           // position at which the body has the pose of its definition
+  bool prescribed = false;  // no force changes its velocity
 };
 
 struct ShapeDef {

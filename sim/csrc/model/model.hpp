@@ -199,7 +199,8 @@ struct Model : SolverOptions {
   std::vector<Contact> contacts;
   std::vector<Pad> pads;
   std::vector<Tendon> tendons;
-  std::vector<Coupling> couplings;  // whose leaders follow no other joint
+  std::vector<Coupling> couplings;   // whose leaders follow no other joint
+  std::vector<int> prescribed_dofs;  // whose velocity no force changes
   std::vector<PolynomialCoupling> polynomial_couplings;
   std::vector<LoopClosure> loop_closures;
   std::vector<Actuator> actuators;

@@ -109,14 +109,14 @@ int ModelSpec::add_joint(const JointDef& def) {
   } else {
     model_.q0.push_back(def.ref);
   }
-  add_dofs(joint);
+  add_dofs(joint, def.prescribed);
   model_.joints.push_back(joint);
   body.joint_end = count(model_.joints);
   definitions_.joints.push_back(def);
   return count(model_.joints) - 1;
 }
 
-void ModelSpec::add_dofs(const Joint& joint) {
+void ModelSpec::add_dofs(const Joint& joint, bool prescribed) {
   for (int i = 0; i < joint.dofs; ++i) {
     const bool rotational = joint.has_quaternion() && i >= joint.scalar_dofs();
     model_.dof_body.push_back(joint.body);
@@ -124,6 +124,7 @@ void ModelSpec::add_dofs(const Joint& joint) {
     model_.group_begin.push_back(rotational ? joint.angular_v() : joint.v + i);
     model_.group_end.push_back(rotational ? joint.angular_v() + 3 : joint.v + i + 1);
     model_.angular.push_back(rotational || joint.type == JointType::hinge ? 1 : 0);
+    if (prescribed) model_.prescribed_dofs.push_back(joint.v + i);
   }
   model_.nq += joint.scalar_dofs() + (joint.has_quaternion() ? 4 : 0);
   model_.nv += joint.dofs;

@@ -52,7 +52,7 @@ class ModelSpec {
   template <template <class> class Params>
   ParamBlock<Params> add_params(const std::string& owner, const Params<double>& values);
   ParamBlock<PoseParams> add_pose(const std::string& owner, const V3<double>& pos);
-  void add_dofs(const Joint& joint);
+  void add_dofs(const Joint& joint, bool prescribed);
   void add_pad_contacts(const Pad& pad);
   const Joint& scalar_joint(const std::string& owner, int joint) const;
   int add_anchors(FrictionLaw law, int count);

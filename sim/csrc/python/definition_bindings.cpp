@@ -79,22 +79,23 @@ void bind_joint(py::module_& module) {
   type.def(py::init([](const std::string& name, int body, const std::string& kind, const V3<double>& pos,
                        const V3<double>& axis, double ref, double damping, double armature, double stiffness,
                        double springref, double lower, double upper, double limit_stiffness, double limit_damping,
-                       double frictionloss) {
+                       double frictionloss, bool prescribed) {
              const JointParams<double> params{damping, armature,        stiffness,     springref,   lower,
                                               upper,   limit_stiffness, limit_damping, frictionloss};
-             return JointDef{name, body, kind, pos, axis, params, ref};
+             return JointDef{name, body, kind, pos, axis, params, ref, prescribed};
            }),
            py::kw_only(), py::arg("name"), py::arg("body"), py::arg("type"), py::arg("pos") = origin,
            py::arg("axis") = V3<double>(0, 0, 1), py::arg("ref") = 0., py::arg("damping") = 0.,
            py::arg("armature") = 0., py::arg("stiffness") = 0., py::arg("springref") = 0.,
            py::arg("lower") = -unlimited, py::arg("upper") = unlimited, py::arg("limit_stiffness") = 0.,
-           py::arg("limit_damping") = 0., py::arg("frictionloss") = 0.)
+           py::arg("limit_damping") = 0., py::arg("frictionloss") = 0., py::arg("prescribed") = false)
       .def_readwrite("name", &JointDef::name)
       .def_readwrite("body", &JointDef::body)
       .def_readwrite("type", &JointDef::type)
       .def_readwrite("pos", &JointDef::pos)
       .def_readwrite("axis", &JointDef::axis)
-      .def_readwrite("ref", &JointDef::ref);
+      .def_readwrite("ref", &JointDef::ref)
+      .def_readwrite("prescribed", &JointDef::prescribed);
   bind_joint_params(type);
 }
 

@@ -96,6 +96,9 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   VX<T> b = g.v + r.beta_h * (dposition_dincrement_vjp<T>(m, w.increment, g.q) + grad_increment);
   reduce_couplings<T>(m, b);
   reduce_couplings<T>(m, w.tangent);
+  const PrescribedGradient<T> prescribed(m, b, w.tangent);
+  remove_prescribed<T>(m, b);
+  remove_prescribed<T>(m, w.tangent);
   w.tangent.leftCols(m.nv).transposeInPlace();
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> multiplier(m.nv);
@@ -111,6 +114,7 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   free_bodies_vjp<T>(m, params, start, w, multiplier, grad_v_star, grad_increment, grad_v_before);
   g.q = dposition_dposition_vjp<T>(m, w.increment, grad_q1);
   g.v = grad_v0 + (r.bdf2 ? T(4) / T(3) : T(1)) * grad_v_star;
+  prescribed.add(multiplier, g.v);
   g.history.setZero();
   if (r.bdf2) {
     g.history.head(m.nv) = grad_increment / T(3);

@@ -5,6 +5,8 @@
 //
 // Vectors and matrices keep their size: rows and columns of followers are 0, with 1 on the diagonal. The position of a
 // follower, its velocity and their history are defined by those of its leader (follow_leaders, step.hpp).
+//
+// A prescribed velocity keeps its value: its equation and its unknown leave the system in the same way.
 #pragma once
 
 #include "model/workspace.hpp"
@@ -48,5 +50,44 @@ void reduce_couplings(const Model& m, typename Workspace<T>::Rows& a) {
     a(c.dof, c.dof) = T(1);
   }
 }
+
+// Removes the rows (and below the columns) of prescribed velocities.
+template <class T>
+void remove_prescribed(const Model& m, VX<T>& x) {
+  for (const int k : m.prescribed_dofs) x[k] = T(0);
+}
+
+template <class T>
+void remove_prescribed(const Model& m, typename Workspace<T>::Rows& a) {
+  for (const int k : m.prescribed_dofs) {
+    for (int j = 0; j < m.nv; ++j) a(k, j) = a(j, k) = T(0);
+    a(k, k) = T(1);
+  }
+}
+
+// The gradient with respect to prescribed velocities: with b and A of the reverse pass (adjoint.hpp) before they are
+// removed from it, and its multiplier c, b_k − Σ_j A_jk c_j.
+template <class T>
+class PrescribedGradient {
+ public:
+  PrescribedGradient(const Model& m, const VX<T>& b, const typename Workspace<T>::Rows& a) : m_(m) {
+    for (const int k : m.prescribed_dofs) {
+      b_.push_back(b[k]);
+      columns_.emplace_back(a.col(k));
+    }
+  }
+  void add(const VX<T>& multiplier, VX<T>& grad_v) const {
+    for (std::size_t i = 0; i < b_.size(); ++i) {
+      T& sum = grad_v[m_.prescribed_dofs[i]];
+      sum += b_[i];
+      for (int j = 0; j < m_.nv; ++j) sum -= columns_[i][j] * multiplier[j];
+    }
+  }
+
+ private:
+  const Model& m_;
+  std::vector<T> b_;
+  std::vector<VX<T>> columns_;
+};
 
 }  // namespace gelflow

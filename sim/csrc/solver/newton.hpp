@@ -158,10 +158,13 @@ class NewtonSolver {
       evaluate<false, T>(m_, params_, start_, v_.data(), cache, true, w_);
     }
     jacobian_current_ = jacobian;
-    if (m_.couplings.empty()) return;
+    if (m_.couplings.empty() && m_.prescribed_dofs.empty()) return;
     reduce_couplings<T>(m_, w_.residual);
+    remove_prescribed<T>(m_, w_.residual);
     reduce_absolute_couplings<T>(m_, w_.impulses);
-    if (jacobian) reduce_couplings<T>(m_, w_.tangent);
+    if (!jacobian) return;
+    reduce_couplings<T>(m_, w_.tangent);
+    remove_prescribed<T>(m_, w_.tangent);
   }
   GELFLOW_INLINE void measure(bool jacobian) {
     evaluate_at_v(jacobian, CacheState::current);

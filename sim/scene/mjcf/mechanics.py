@@ -74,6 +74,7 @@ class JointDef:
     default_limit: tuple[float, float] | None = None  # stiffness [N/m] and damping [N s/m] beyond the range
     ref: float = 0.0  # position at which the body has the pose of its definition [m]
     frictionloss: float = 0.0  # dry friction [N]
+    prescribed: bool = False  # of a mocap body: no force changes its velocity
 
     @property
     def nq(self) -> int:
@@ -105,7 +106,8 @@ class Mechanics:
     bodies: tuple[BodyDef, ...]
     joints: tuple[JointDef, ...]
     geoms: tuple[GeomDef, ...]
-    sites: dict[str, tuple[int, Pose]]  # name -> moving body, pose in its frame
+    frames: dict[str, tuple[int, Pose]]  # of all bodies of the file: name -> moving body, pose in its frame
+    sites: dict[str, tuple[int, Pose]]  # the same of the sites
     tendons: tuple[TendonDef, ...]
     couplings: tuple[CouplingDef, ...]
     loop_closures: tuple[LoopClosureDef, ...]
@@ -129,7 +131,8 @@ def read_mechanics(path: Path) -> Mechanics:
 
     Raises UsageError, in one line, if a file is missing or invalid, or has an element that is not supported.
     """
-    model, urdf = compile_model(path)
+    compiled = compile_model(path)
+    model = compiled.model
     if model.njnt == 0:
         raise UsageError(f"{path}: the model has no joint, so nothing can move; add a joint, or a free joint to a body")
     apply_disable_flags(model)
@@ -137,36 +140,26 @@ def read_mechanics(path: Path) -> Mechanics:
     moving_body, poses = _merge(model)
     actuators = read_actuators(model, path.name)
     tendons = read_tendons(model, actuators)
+    frames = {name: (int(moving_body[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))}
     sites = {
         name: (int(moving_body[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
         for i, (name, b) in enumerate(zip(element_names(model, "site", model.nsite), model.site_bodyid, strict=True))
     }
-    if urdf:  # has no sites; the link frames are used instead
-        sites = {
-            name: (int(moving_body[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))
-        }
     return Mechanics(
         bodies=_bodies(model, moving_body, poses),
-        joints=_joints(model, moving_body, actuators, tendons),
+        joints=_joints(model, moving_body, actuators, tendons, compiled.mocap),
         geoms=_geoms(model, moving_body, poses),
-        sites=sites,
+        frames=frames,
+        sites=frames if compiled.urdf else sites,  # a URDF has no sites; its link frames take their place
         tendons=tendons,
         couplings=read_couplings(model),
         loop_closures=read_loop_closures(model, moving_body, poses),
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
-        q0=_initial_positions(model),
+        q0=compiled.q0,
         step=float(model.opt.timestep),
         not_modelled=not_modelled(model),
     )
-
-
-def _initial_positions(model: Any) -> Array:
-    """The keyframe "start", else the keyframe "home", else the pose of the file."""
-    for name in ("start", "home"):
-        if (key := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)) >= 0:
-            return np.array(model.key_qpos[key])
-    return np.array(model.qpos0)
 
 
 def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
@@ -206,7 +199,11 @@ def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tu
 
 
 def _joints(
-    model: Any, moving_body: NDArray[np.int64], actuators: tuple[ActuatorDef, ...], tendons: tuple[TendonDef, ...]
+    model: Any,
+    moving_body: NDArray[np.int64],
+    actuators: tuple[ActuatorDef, ...],
+    tendons: tuple[TendonDef, ...],
+    mocap: tuple[str, ...],
 ) -> tuple[JointDef, ...]:
     in_loops = loop_joints(model)
     # A loop passes the torques of all its joints on to any of them.
@@ -236,6 +233,7 @@ def _joints(
                 default_limit=default_limit(kind, float(model.dof_M0[v]), driving, load) if limited else None,
                 ref=0.0 if rotates_freely else float(model.qpos0[q]),
                 frictionloss=float(model.dof_frictionloss[v]),
+                prescribed=name in mocap,
             )
         )
     return tuple(joints)

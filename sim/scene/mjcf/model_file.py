@@ -1,17 +1,30 @@
 """Parsing and compilation of model files by MuJoCo."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene.mjcf.urdf import complete_urdf, read_urdf
 
 
-def compile_model(path: Path) -> tuple[Any, bool]:
-    """The compiled model (mujoco.MjModel), and whether the file is URDF.
+@dataclass(frozen=True)
+class CompiledModel:
+    """A model file as MuJoCo compiled it. Each mocap body of the file has a free joint with the name of the body."""
+
+    model: Any  # mujoco.MjModel
+    urdf: bool
+    q0: NDArray[np.float64]  # initial positions: the keyframe "start", else "home", else those of the file
+    mocap: tuple[str, ...]  # names of the mocap bodies
+
+
+def compile_model(path: Path) -> CompiledModel:
+    """Parse and compile an MJCF or URDF file.
 
     Raises UsageError, in one line, if a file is missing or invalid.
     """
@@ -25,11 +38,39 @@ def compile_model(path: Path) -> tuple[Any, bool]:
         spec = mujoco.MjSpec.from_file(str(path))
         if robot is not None:
             complete_urdf(spec, robot, path)
-        return spec.compile(), robot is not None
+        return _compiled(spec, urdf=robot is not None)
     except UsageError:
         raise
     except (ValueError, mujoco.FatalError) as error:
         raise UsageError(f"{path}: {_clarified(' '.join(str(error).split()), spec)}") from None
+
+
+def _compiled(spec: Any, *, urdf: bool) -> CompiledModel:
+    model = spec.compile()
+    keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in ("start", "home"))
+    key = next((k for k in keys if k >= 0), None)
+    if model.nmocap == 0:
+        return CompiledModel(model, urdf, np.array(model.qpos0 if key is None else model.key_qpos[key]), ())
+    names = element_names(model, "body", model.nbody)
+    mocap = [body for body in spec.bodies if body.mocap]
+    for keyframe in list(spec.keys):  # which have no positions of the new joints
+        spec.delete(keyframe)
+    for body in mocap:
+        body.mocap = False
+        body.add_freejoint(name=names[body.id])
+        body.mass, body.inertia, body.explicitinertial = 1.0, [1.0, 1.0, 1.0], True  # without effect
+        body.ipos, body.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
+    free = spec.compile()
+    q0 = np.array(free.qpos0)
+    if key is not None:
+        other = np.ones(free.nq, bool)
+        for body in mocap:
+            place = slice(q := free.jnt_qposadr[free.body_jntadr[body.id]], q + 7)
+            which = model.body_mocapid[body.id]
+            q0[place] = [*model.key_mpos[key].reshape(-1, 3)[which], *model.key_mquat[key].reshape(-1, 4)[which]]
+            other[place] = False
+        q0[other] = model.key_qpos[key]
+    return CompiledModel(free, urdf, q0, tuple(names[body.id] for body in mocap))
 
 
 def element_names(model: Any, kind: str, count: int) -> list[str]:

@@ -111,8 +111,6 @@ def _elements(model: Any) -> Iterator[Unsupported]:
     for b, body in enumerate(bodies):
         if model.body_plugin[b] >= 0:
             yield f"plugin of body {body!r}", "remove it"
-        if model.body_mocapid[b] >= 0:
-            yield f"mocap body {body!r}", 'remove mocap="true" (the body is then fixed), or remove the body'
         if model.body_gravcomp[b] != 0:
             yield f"gravcomp of body {body!r}", "remove it, or disable gravity for the whole model"
 

@@ -41,7 +41,7 @@ def moved(scene: Scene, *, precision: str = "double") -> Simulator:
 @pytest.mark.parametrize("name", scene_names())
 def test_poses_equal_those_of_mujoco(name: str) -> None:
     scene = load_scene(name)
-    model, _ = compile_model(scene.path.parent / f"{name}.xml")
+    model = compile_model(scene.path.parent / f"{name}.xml").model
     assert len(scene.sites) == model.nsite
     sim = moved(scene)
     sim.params[:] = sim.model.param_defaults

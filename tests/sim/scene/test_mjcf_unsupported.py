@@ -86,10 +86,6 @@ UNSUPPORTED = [
         f"actuator 'servo' with a plugin is not supported: {SERVO}",
     ),
     (
-        ("</worldbody>", '<body name="target" mocap="true"/></worldbody>'),
-        "mocap body 'target' is not supported: remove mocap=\"true\" (the body is then fixed), or remove the body",
-    ),
-    (
         ('<body name="arm">', '<body name="arm" gravcomp="1">'),
         "gravcomp of body 'arm' is not supported: remove it, or disable gravity for the whole model",
     ),
