@@ -46,6 +46,7 @@ class JointPart:
     armature: float
     stiffness: float
     frictionloss: float
+    prescribed: bool  # of a mocap body: no force changes its velocity
     actuators: tuple[ActuatorPart, ...]
 
 
@@ -220,6 +221,7 @@ def _bodies(scene: Scene, mechanics: Mechanics, model: Any) -> tuple[BodyPart, .
                         armature=joint.armature,
                         stiffness=joint.stiffness,
                         frictionloss=joint.frictionloss,
+                        prescribed=joint.prescribed,
                         actuators=_actuators(scene, joint),
                     )
                     for joint, limit in zip(scene.joints, scene.limits, strict=True)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
@@ -14,13 +15,19 @@ MODEL = """<mujoco>
     <body name="before" pos="0 0 2"><joint name="before" type="slide"/><geom size="0.1"/></body>
     <body name="paddle" mocap="true" pos="0 0 -0.05">
       <geom name="paddle" type="box" size="0.1 0.1 0.05"/>
-      <body name="flap" pos="0.3 0 0"><joint name="flap" axis="0 1 0" damping="0.01"/><geom size="0.02" pos="0.1 0 0"/></body>
+      <body name="flap" pos="0.3 0 0">
+        <joint name="flap" axis="0 1 0" damping="0.01"/><geom size="0.02" pos="0.1 0 0"/>
+      </body>
     </body>
-    <body name="part" pos="0.01 0.02 0.05"><freejoint name="part"/><geom name="part" type="box" size="0.03 0.03 0.05"/></body>
+    <body name="part" pos="0.01 0.02 0.05">
+      <freejoint name="part"/><geom name="part" type="box" size="0.03 0.03 0.05"/>
+    </body>
     <body name="carried" pos="0 0.5 0"><freejoint name="carried"/><geom size="0.05" mass="0.2"/></body>
   </worldbody>
   <equality><weld body1="paddle" body2="carried"/></equality>
-  <keyframe><key name="home" qpos="0.3 0 0.01 0.02 0.05 1 0 0 0 0 0.5 0 1 0 0 0" mpos="0 0 -0.05" mquat="1 0 0 0"/></keyframe>
+  <keyframe>
+    <key name="home" qpos="0.3 0 0.01 0.02 0.05 1 0 0 0 0 0.5 0 1 0 0 0" mpos="0 0 -0.05" mquat="1 0 0 0"/>
+  </keyframe>
 </mujoco>"""
 SCENE = """
 format = 1
@@ -64,6 +71,11 @@ def test_velocity_is_what_was_set(tmp_path: Path) -> None:
     # The part is lifted by contact, and a body with a weld follows at the same velocity.
     assert sim.q[0, sim.joint_q("part") + 2] == pytest.approx(0.08, abs=0.01)
     assert sim.v[0, scene.v("carried")][3:] == pytest.approx(TWIST[3:], abs=0.02)
+
+
+def test_description(tmp_path: Path) -> None:
+    paddle = next(body for body in describe(mocap_scene(tmp_path)).bodies if body.name == "paddle")
+    assert [joint.prescribed for joint in paddle.joints] == [True]
 
 
 def test_body_is_moved_between_steps(tmp_path: Path) -> None:

@@ -110,6 +110,8 @@ def _joint(joint: "JointPart") -> str:
     angle = joint.type == "hinge"
     unit, per = ("rad", "N m/rad") if angle else ("m", "N/m")
     words = [joint.type]
+    if joint.prescribed:
+        words.append("moved from outside")
     if joint.axis is not None:
         words[0] += f" {'about' if angle else 'along'} ({' '.join(f'{a:.3g}' for a in joint.axis)})"
     if joint.range is not None:
