@@ -246,7 +246,7 @@ def test_symmetric_top_converges_to_the_closed_form_at_first_order() -> None:
 
 
 def one_joint(
-    kind: str, *, step: float = 1e-3, com: float = 0.0, actuator: Mapping[str, Any] | None = None, **joint: float
+    kind: str, *, step: float = 1e-3, com: float = 0.0, actuator: Mapping[str, Any] | None = None, **joint: Any
 ) -> Simulator:
     """A body of 2 kg on a vertical slide or a horizontal hinge."""
     spec = _core.ModelSpec()

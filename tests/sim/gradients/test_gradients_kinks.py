@@ -37,7 +37,7 @@ def probe(
     law: str = "viscous",
     numbers: dict[str, float] = LAW,
     slides: str = "y",
-    joint: dict[str, float] | None = None,
+    joint: dict[str, Any] | None = None,
     actuator: dict[str, Any] | None = None,
 ) -> Simulator:
     """A contact point with a marker at a position of a shape, without gravity, on slides."""
