@@ -54,6 +54,9 @@ class Simulator:
     In single precision the core stores the rounding residual of `q`, so that small increments accumulate, and computes
     relative poses of bodies in double. Gradients are computed in double at the states of the trajectory; only the
     contribution of viscous marker forces is in single precision.
+
+    A call during the call of another thread raises UsageError. A signal handler that raises ends a call between two
+    steps: each environment then has the state after its last complete step.
     """
 
     def __init__(

@@ -20,6 +20,7 @@ struct Controls {
   bool shared;
 };
 
+// An interruption ends a call between two steps: the states of all environments are valid, results are incomplete.
 // Functions with an `active` mask, (N) flags or null for all, leave the other environments and their results untouched.
 template <class T>
 class Batch {
@@ -37,7 +38,9 @@ class Batch {
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
   int threads() const { return pool_.size(); }
-  void reset(const std::uint8_t* which);  // (N) flags, or null for all; parameters stay
+  std::atomic<int> user{0};                                // of the bindings: who calls, 0 for nobody
+  Interruption& interruption() { return *interruption_; }  // of the present call
+  void reset(const std::uint8_t* which);                   // (N) flags, or null for all; parameters stay
   void step(const Controls<T>& u, int steps, const std::uint8_t* active);  // the controls are held for all steps
   // Difference between one step and two half steps under u, per dof (N, nv). A step that is halved is compared with
   // substeps half as long as its shortest. status (N) as in `status`. Changes nothing.
@@ -56,6 +59,7 @@ class Batch {
   void rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out);
 
  private:
+  friend class Batch<float>;  // which computes gradients in double precision
   StateView<T> state(int env);
   const T* params_of(int env) const {
     return params.data() + static_cast<std::size_t>(env) * model->param_names.size();
@@ -64,7 +68,8 @@ class Batch {
     return u.u + (u.shared ? 0 : static_cast<std::size_t>(env) * model->actuators.size());
   }
   void kinematics(int env, Workspace<T>& w);
-  // Calls work(environment, thread) for the active environments.
+  // Calls work(environment, thread) for all environments, or for the active ones.
+  void for_all(const std::function<void(int, int)>& work) { pool_.run(n, work, *interruption_); }
   void for_active(const std::uint8_t* active, const std::function<void(int, int)>& work);
   void read(T* out, NonzeroMarkers* nonzero, const std::uint8_t* active);
   void read_one(int env, int thread, T* out, NonzeroMarkers* nonzero);
@@ -79,6 +84,7 @@ class Batch {
   std::vector<T> q_rounding_;                     // (N, nq) in single precision: rounding residual of q (StateView)
   std::unique_ptr<Batch<double>> double_batch_;   // in single precision: computes the gradients
   std::vector<NonzeroMarkers> nonzero_;           // per environment, of `readings`
+  std::shared_ptr<Interruption> interruption_ = std::make_shared<Interruption>();
   ThreadPool pool_;
 };
 

@@ -57,12 +57,12 @@ void Batch<T>::reset(const std::uint8_t* which) {
 
 template <class T>
 void Batch<T>::for_active(const std::uint8_t* active, const std::function<void(int, int)>& work) {
-  if (active == nullptr) return pool_.run(n, work);
+  if (active == nullptr) return for_all(work);
   active_.clear();
   for (int e = 0; e < n; ++e) {
     if (active[e] != 0) active_.push_back(e);
   }
-  pool_.run(static_cast<int>(active_.size()), [&](int i, int thread) { work(active_[i], thread); });
+  pool_.run(static_cast<int>(active_.size()), [&](int i, int thread) { work(active_[i], thread); }, *interruption_);
 }
 
 template <class T>
@@ -96,7 +96,7 @@ void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active)
   check_state(active);
   for_active(active, [&](int e, int thread) {
     follow_leaders<T>(*model, state(e));
-    for (int i = 0; i < steps && status[e] == 0; ++i) {
+    for (int i = 0; i < steps && status[e] == 0 && !interruption_->check(thread); ++i) {
       const StepReport report =
           gelflow::step<T>(*model, params_of(e), controls_of(u, e), model->polish, state(e), memory_[thread], i > 0);
       status[e] = static_cast<std::int32_t>(report.status);
@@ -126,7 +126,7 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
   check_controls(u.u, u.shared ? 1 : n, nullptr);
   check_state(nullptr);
   const Model& m = *model;
-  pool_.run(n, [&](int e, int thread) {
+  for_all([&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
     const T* const control = controls_of(u, e);
     follow_leaders<T>(m, state(e));
@@ -193,7 +193,7 @@ void Batch<T>::read_one(int e, int thread, T* out, NonzeroMarkers* nonzero) {
 
 template <class T>
 void Batch<T>::wrenches(T* out) {
-  pool_.run(n, [&](int e, int thread) {
+  for_all([&](int e, int thread) {
     kinematics(e, memory_[thread].work);
     contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
                         out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
@@ -202,7 +202,7 @@ void Batch<T>::wrenches(T* out) {
 
 template <class T>
 void Batch<T>::contact_forces(T* out) {
-  pool_.run(n, [&](int e, int thread) {
+  for_all([&](int e, int thread) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();

@@ -34,7 +34,7 @@ void Batch<T>::rollout_one(const Trajectory<T>& r, const TouchStop* stop, int en
       r.stopped_at[e] = t;
       moving = false;
     }
-    if (t == r.steps) break;
+    if (t == r.steps || interruption_->check(thread)) break;
     const StateView<T> next = r.state(m, t + 1, e, q_rounding);
     copy_state<T>(m, now, next);
     if (!moving) continue;
@@ -61,9 +61,9 @@ template <class T>
 void Batch<T>::contact_modes(const Trajectory<T>& r, std::uint64_t* out) {
   const Model& m = *model;
   std::fill_n(out, r.row(r.steps, 0), 0);
-  pool_.run(n, [&](int env, int thread) {
+  for_all([&](int env, int thread) {
     const std::size_t e = env;
-    for (int t = 0; t < r.steps_taken(e); ++t) {
+    for (int t = 0; t < r.steps_taken(e) && !interruption_->check(thread); ++t) {
       const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
       const StateView<T> before = r.state(m, t, e), after = r.state(m, t + 1, e);
       ModeHash hash;
@@ -164,13 +164,18 @@ void Batch<T>::rollout_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>&
     std::fill_n(out.anchors, N * m.na * 3, 0.0);
     std::fill_n(out.history, N * m.nh, 0.0);
     if (out.params) std::fill_n(out.params, N * m.param_names.size(), 0.0);
-    pool_.run(n, [&](int e, int thread) {
-      if (r.status[e] == 0) gelflow::rollout_vjp<T>(m, params_of(e), e, r, cotangent, out, memory_[thread]);
+    for_all([&](int e, int thread) {
+      if (r.status[e] != 0) return;
+      const auto ends = [&] { return interruption_->check(thread); };
+      gelflow::rollout_vjp<T>(m, params_of(e), e, r, cotangent, out, memory_[thread], ends);
     });
   } else {
     // Computed in double precision at the states of the single-precision trajectory, because rounding errors grow on the
     // way back. Readings that depend on one state only do not need it: their gradient is computed in single precision.
-    if (!double_batch_) double_batch_ = std::make_unique<Batch<double>>(model, n, threads());
+    if (!double_batch_) {
+      double_batch_ = std::make_unique<Batch<double>>(model, n, threads());
+      double_batch_->interruption_ = interruption_;
+    }
     std::copy(params.begin(), params.end(), double_batch_->params.begin());
     const bool separate_readings = m.na == 0 && out.params == nullptr;
     DoubleTrajectory<T> doubles(m, r, cotangent, separate_readings ? 0 : r.reads);

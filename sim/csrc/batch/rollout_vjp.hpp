@@ -54,10 +54,12 @@ void record_substeps(const Model& m, const T* params, const T* u, const StateVie
 }
 
 // The reverse pass of environment e. Gradients by parameters need T = double. The state does not change after a touch
-// stop, nor where the environment rests: there the gradient passes, and later readings add to it.
-template <class T>
+// stop, nor where the environment rests: there the gradient passes, and later readings add to it. `ends` is asked before
+// each step; where it returns true, the gradient is incomplete.
+template <class T, class Ends>
 void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajectory<T>& r,
-                 const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out, StepMemory<T>& memory) {
+                 const TrajectoryCotangent<T>& cotangent, const TrajectoryGradient<T>& out, StepMemory<T>& memory,
+                 const Ends& ends) {
   double* grad_params = out.params == nullptr ? nullptr : out.params + e * m.param_names.size();
   StateGradient<T> gradient(m);
   std::copy_n(reinterpret_cast<const V3<T>*>(cotangent.anchors_end) + e * m.na, m.na, gradient.anchors.begin());
@@ -71,7 +73,7 @@ void rollout_vjp(const Model& m, const T* params, std::size_t e, const Trajector
     gradient.q += to_tangent<T>(m, now.q, cotangent.q + row * m.nq);
     gradient.v += Eigen::Map<const VX<T>>(cotangent.v + row * m.nv, m.nv);
     readings_vjp<T>(m, params, t, e, r, cotangent, grad_params, gradient, read, memory.work);
-    if (t == 0) break;
+    if (t == 0 || ends()) break;
     if (t > taken) continue;
     const T* u = r.controls(m, t - 1, e);
     T* grad_u = out.u + (u - r.u);

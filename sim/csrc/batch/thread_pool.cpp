@@ -1,12 +1,16 @@
 #include "batch/thread_pool.hpp"
 
 #include <algorithm>
-#include <chrono>
+#include <condition_variable>
+#include <mutex>
 #include <thread>
+#include <vector>
 
 #ifdef __linux__
-#include <pthread.h>
 #include <sched.h>
+#endif
+#ifndef _WIN32
+#include <pthread.h>
 #endif
 
 namespace gelflow {
@@ -40,6 +44,8 @@ bool spin_until(const Condition& condition, Clock::duration spin_time) {
   return false;
 }
 
+std::atomic<int> forks{0};
+
 int current_cpu() {
 #ifdef __linux__
   return sched_getcpu();
@@ -48,11 +54,9 @@ int current_cpu() {
 #endif
 }
 
-}  // namespace
-
 // A worker on the caller's CPU competes with it, and Linux may leave it there for milliseconds while another CPU is idle.
 // The caller therefore excludes its own CPU from the worker's affinity until the worker runs.
-struct ThreadPool::Worker {
+struct Worker {
   std::thread thread;
   static constexpr int sleeping = -2;
   std::atomic<int> cpu{sleeping};  // where it began to spin
@@ -79,29 +83,57 @@ struct ThreadPool::Worker {
 #endif
 };
 
-ThreadPool::ThreadPool(int threads) {
-  for (int i = 1; i < threads; ++i) {
-    Worker& worker = *workers_.emplace_back(std::make_unique<Worker>());
-    worker.thread = std::thread([this, &worker, i] { loop(worker, i); });
+}  // namespace
+
+int fork_count() {
+#ifndef _WIN32
+  static const int registered = pthread_atfork(nullptr, nullptr, [] { ++forks; });
+  static_cast<void>(registered);
+#endif
+  return forks.load(std::memory_order_relaxed);
+}
+
+class ThreadPool::Workers {
+ public:
+  explicit Workers(int count) {
+    for (int i = 1; i <= count; ++i) {
+      Worker& worker = *workers_.emplace_back(std::make_unique<Worker>());
+      worker.thread = std::thread([this, &worker, i] { loop(worker, i); });
+    }
+  }
+  ~Workers() {
+    {
+      const std::lock_guard lock(mutex_);
+      stop_ = true;
+    }
+    start_.notify_all();
+    for (const auto& worker : workers_) worker->thread.join();
+  }
+  void run(int items, const std::function<void(int, int)>& work, Interruption& interruption);
+
+ private:
+  void loop(Worker& worker, int thread);
+  void work_on_items(int thread);
+  std::vector<std::unique_ptr<Worker>> workers_;
+  std::mutex mutex_;
+  std::condition_variable start_, done_;
+  const std::function<void(int, int)>* work_ = nullptr;
+  Interruption* interruption_ = nullptr;
+  std::atomic<int> next_{0};
+  int items_ = 0;
+  std::atomic<int> busy_{0};  // workers that have not finished this run
+  std::atomic<std::uint64_t> run_count_{0};
+  std::atomic<bool> stop_{false};
+  int sleeping_ = 0;  // workers that wait for `start_`
+};
+
+void ThreadPool::Workers::work_on_items(int thread) {
+  for (int item = next_.fetch_add(1); item < items_ && !interruption_->check(thread); item = next_.fetch_add(1)) {
+    (*work_)(item, thread);
   }
 }
 
-ThreadPool::~ThreadPool() {
-  {
-    const std::lock_guard lock(mutex_);
-    stop_ = true;
-  }
-  start_.notify_all();
-  for (const auto& worker : workers_) worker->thread.join();
-}
-
-int ThreadPool::size() const { return static_cast<int>(workers_.size()) + 1; }
-
-void ThreadPool::work_on_items(int thread) {
-  for (int item = next_.fetch_add(1); item < items_; item = next_.fetch_add(1)) (*work_)(item, thread);
-}
-
-void ThreadPool::loop(Worker& worker, int thread) {
+void ThreadPool::Workers::loop(Worker& worker, int thread) {
   std::uint64_t runs_seen = 0;
   Clock::duration spin_time = min_spin_time;
   const auto called = [&] { return stop_ || run_count_ != runs_seen; };
@@ -126,11 +158,7 @@ void ThreadPool::loop(Worker& worker, int thread) {
   }
 }
 
-void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
-  if (workers_.empty() || items <= 1) {
-    for (int i = 0; i < items; ++i) work(i, 0);
-    return;
-  }
+void ThreadPool::Workers::run(int items, const std::function<void(int, int)>& work, Interruption& interruption) {
   const Clock::time_point start = Clock::now();
   const int cpu = current_cpu();
   for (const auto& worker : workers_) worker->move_off(cpu);
@@ -138,6 +166,7 @@ void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
   {
     const std::lock_guard lock(mutex_);
     work_ = &work;
+    interruption_ = &interruption;
     items_ = items;
     next_ = 0;
     busy_ = static_cast<int>(workers_.size());
@@ -149,7 +178,33 @@ void ThreadPool::run(int items, const std::function<void(int, int)>& work) {
   const auto done = [&] { return busy_ == 0; };
   if (spin_until(done, spin_time_after(start))) return;
   std::unique_lock lock(mutex_);
-  done_.wait(lock, done);
+  while (!done_.wait_for(lock, Interruption::period, done)) {
+    lock.unlock();
+    interruption.ask();
+    lock.lock();
+  }
+}
+
+ThreadPool::ThreadPool(int threads) : threads_(std::max(threads, 1)), fork_count_(fork_count()) {
+  if (threads_ > 1) workers_ = std::make_unique<Workers>(threads_ - 1);
+}
+
+// The workers of the parent of a fork, which the child cannot join, are never freed there.
+ThreadPool::~ThreadPool() {
+  if (fork_count() != fork_count_) static_cast<void>(workers_.release());
+}
+
+void ThreadPool::run(int items, const std::function<void(int, int)>& work, Interruption& interruption) {
+  if (threads_ == 1 || items <= 1) {
+    for (int i = 0; i < items && !interruption.check(0); ++i) work(i, 0);
+    return;
+  }
+  if (fork_count() != fork_count_) {
+    static_cast<void>(workers_.release());
+    workers_ = std::make_unique<Workers>(threads_ - 1);
+    fork_count_ = fork_count();
+  }
+  workers_->run(items, work, interruption);
 }
 
 }  // namespace gelflow

@@ -1,40 +1,34 @@
 // A persistent thread pool for the loops over environments.
 #pragma once
 
-#include <atomic>
-#include <condition_variable>
 #include <functional>
 #include <memory>
-#include <mutex>
-#include <vector>
+
+#include "batch/interruption.hpp"
 
 namespace gelflow {
 
+// How often this process is the child of a fork: threads of the parent do not exist in it.
+int fork_count();
+
 // Waking a thread takes longer than some steps, so idle workers and the waiting caller spin briefly before they sleep.
+// After a fork the pool of the child starts workers of its own.
 class ThreadPool {
  public:
   explicit ThreadPool(int threads);
   ~ThreadPool();
   ThreadPool(const ThreadPool&) = delete;
   ThreadPool& operator=(const ThreadPool&) = delete;
-  int size() const;
-  // Calls work(item, thread) for each item below `items`, and returns when all calls have returned.
-  void run(int items, const std::function<void(int, int)>& work);
+  int size() const { return threads_; }
+  // Calls work(item, thread) for each item below `items`, and returns when all calls have returned; after an
+  // interruption for those only that had begun.
+  void run(int items, const std::function<void(int, int)>& work, Interruption& interruption);
 
  private:
-  struct Worker;
-  void loop(Worker& worker, int thread);
-  void work_on_items(int thread);
-  std::vector<std::unique_ptr<Worker>> workers_;
-  std::mutex mutex_;
-  std::condition_variable start_, done_;
-  const std::function<void(int, int)>* work_ = nullptr;
-  std::atomic<int> next_{0};
-  int items_ = 0;
-  std::atomic<int> busy_{0};  // workers that have not finished this run
-  std::atomic<std::uint64_t> run_count_{0};
-  std::atomic<bool> stop_{false};
-  int sleeping_ = 0;  // workers that wait for `start_`
+  class Workers;
+  const int threads_;
+  int fork_count_;
+  std::unique_ptr<Workers> workers_;
 };
 
 }  // namespace gelflow

@@ -26,6 +26,43 @@ struct GradientArrays {
   py::array u, q, v, anchors, history, params;
 };
 
+// One thread at a time calls a batch. A fork ends the calls of the other threads.
+class ExclusiveUse {
+ public:
+  explicit ExclusiveUse(std::atomic<int>& user) : user_(user) {
+    int unused = 0;
+    const int self = fork_count() + 1;
+    if (user_.compare_exchange_strong(unused, self) || (unused != self && user_.exchange(self) != self)) return;
+    throw std::invalid_argument(
+        "the simulator is busy with a call of another thread; give each thread its own simulator");
+  }
+  ~ExclusiveUse() { user_ = 0; }
+  ExclusiveUse(const ExclusiveUse&) = delete;
+  ExclusiveUse& operator=(const ExclusiveUse&) = delete;
+
+ private:
+  std::atomic<int>& user_;
+};
+
+// Calls work() without the interpreter's lock. Python's main thread, which alone handles signals, looks for them
+// meanwhile: an exception of a handler, as at Ctrl-C, ends the call.
+template <class T, class Work>
+void call(Batch<T>& b, const Work& work) {
+  static const auto main_thread =
+      py::module_::import("threading").attr("main_thread")().attr("ident").cast<std::uint64_t>();
+  const ExclusiveUse use(b.user);
+  const bool handles_signals = PyThread_get_thread_ident() == main_thread;
+  b.interruption().begin(!handles_signals ? std::function<bool()>() : [] {
+    const py::gil_scoped_acquire acquire;
+    return PyErr_CheckSignals() != 0;
+  });
+  {
+    const py::gil_scoped_release release;
+    work();
+  }
+  if (b.interruption().requested()) throw py::error_already_set();
+}
+
 template <class T>
 py::ssize_t actuators(const Batch<T>& b) {
   return static_cast<py::ssize_t>(b.model->actuators.size());
@@ -191,10 +228,7 @@ GradientArrays rollout_vjp(Batch<T>& b, TrajectoryArrays& trajectory, const Cota
   const TrajectoryGradient<T> gradient{u.mutable_data(),       q.mutable_data(),
                                        v.mutable_data(),       anchors.mutable_data(),
                                        history.mutable_data(), params ? grad_params.mutable_data() : nullptr};
-  {
-    const py::gil_scoped_release release;
-    b.rollout_vjp(r, c, gradient);
-  }
+  call(b, [&] { b.rollout_vjp(r, c, gradient); });
   return {u, q, v, anchors, history, grad_params};
 }
 
@@ -236,14 +270,18 @@ template <class T>
 void bind_steps(py::class_<Batch<T>>& type) {
   using B = Batch<T>;
   type.def(
-          "reset", [](B& b, const Mask& which) { b.reset(flags(b, which, "which")); }, py::arg("which") = py::none())
+          "reset",
+          [](B& b, const Mask& which) {
+            const std::uint8_t* const mask = flags(b, which, "which");
+            call(b, [&] { b.reset(mask); });
+          },
+          py::arg("which") = py::none())
       .def(
           "step",
           [](B& b, const Array<T>& u, int steps, const Mask& active) {
             const Controls<T> controls = checked_controls<T>(b, u);
             const std::uint8_t* const mask = flags(b, active, "active");
-            const py::gil_scoped_release release;
-            b.step(controls, steps, mask);
+            call(b, [&] { b.step(controls, steps, mask); });
           },
           py::arg("u"), py::arg("steps") = 1, py::arg("active") = py::none())
       .def(
@@ -252,7 +290,9 @@ void bind_steps(py::class_<Batch<T>>& type) {
             const Controls<T> controls = checked_controls<T>(b, u);
             py::array_t<T> out(Dimensions{b.n, b.model->nv});
             py::array_t<std::int32_t> status(static_cast<py::ssize_t>(b.n));
-            b.error_estimate(controls, out.mutable_data(), status.mutable_data());
+            T* const differences = out.mutable_data();
+            std::int32_t* const failures = status.mutable_data();
+            call(b, [&] { b.error_estimate(controls, differences, failures); });
             return py::make_tuple(out, status);
           },
           py::arg("u"))
@@ -262,8 +302,7 @@ void bind_steps(py::class_<Batch<T>>& type) {
             const Trajectory<T> r = checked<T>(b, trajectory);
             const std::optional<TouchStop> touch =
                 stop ? std::optional<TouchStop>(checked(*stop, b.n, r.steps)) : std::nullopt;
-            const py::gil_scoped_release release;
-            b.rollout(r, touch ? &*touch : nullptr);
+            call(b, [&] { b.rollout(r, touch ? &*touch : nullptr); });
           },
           py::arg("trajectory"), py::arg("stop") = py::none())
       .def(
@@ -271,7 +310,8 @@ void bind_steps(py::class_<Batch<T>>& type) {
           [](B& b, TrajectoryArrays& trajectory) {
             const Trajectory<T> r = checked<T>(b, trajectory);
             py::array_t<std::uint64_t> out(Dimensions{r.steps, b.n});
-            b.contact_modes(r, out.mutable_data());
+            std::uint64_t* const signatures = out.mutable_data();
+            call(b, [&] { b.contact_modes(r, signatures); });
             return out;
           },
           py::arg("trajectory"))
@@ -288,7 +328,8 @@ void bind_outputs(py::class_<Batch<T>>& type) {
         [function, shape](B& b, py::array out) {
           Dimensions dimensions = shape(*b.model);
           dimensions.insert(dimensions.begin(), b.n);
-          (b.*function)(writable<T>(out, dimensions, "out"));
+          T* const data = writable<T>(out, dimensions, "out");
+          call(b, [&] { (b.*function)(data); });
         },
         py::arg("out"));
   };
@@ -303,8 +344,7 @@ void bind_outputs(py::class_<Batch<T>>& type) {
           [](B& b, py::array out, const Mask& active) {
             T* data = writable<T>(out, {b.n, b.model->num_markers, 3}, "out");
             const std::uint8_t* const mask = flags(b, active, "active");
-            const py::gil_scoped_release release;
-            b.tactile(data, mask);
+            call(b, [&] { b.tactile(data, mask); });
           },
           py::arg("out"), py::arg("active") = py::none())
       .def(
@@ -313,16 +353,14 @@ void bind_outputs(py::class_<Batch<T>>& type) {
             check_markers(*b.model, reduction);
             T* data = writable<T>(out, {b.n, reduction.rows()}, "out");
             const std::uint8_t* const mask = flags(b, active, "active");
-            const py::gil_scoped_release release;
-            b.reduced_tactile(reduction, data, mask);
+            call(b, [&] { b.reduced_tactile(reduction, data, mask); });
           },
           py::arg("reduction"), py::arg("out"), py::arg("active") = py::none())
       .def(
           "update_readings",
           [](B& b, const Mask& active) {
             const std::uint8_t* const mask = flags(b, active, "active");
-            const py::gil_scoped_release release;
-            b.update_readings(mask);
+            call(b, [&] { b.update_readings(mask); });
           },
           py::arg("active") = py::none());
 }
