@@ -22,6 +22,25 @@ void advance_anchors(const PairFrame<T>& frame, const CandidatePoints<T>& candid
   });
 }
 
+// The same at all points of a cloud, without candidates of the step.
+template <class T>
+void advance_anchors(const PairFrame<T>& frame, const PointCloud& cloud, const ContactSettings<T>& settings,
+                     V3<T>* next, std::uint8_t* next_set) {
+  const auto advance = [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
+    PointForce<Pack<T>> force;
+    point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
+    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.step_length), force, t.x, t.anchor, t.has_anchor);
+    std::fill(next_set + t.first, next_set + std::min(t.first + pack_width<T>, cloud.size()), 0);
+    t.for_each_active([&](int k, int i) {
+      next[i] = lane3<T>(anchor, k);
+      next_set[i] = 1;
+    });
+  };
+  for_contact_points<false, true, T>(
+      frame, cloud, candidate_runs<T>(frame, cloud, settings.rolling_radius), settings, advance,
+      [&](int begin, int end) GELFLOW_LOOP_BODY { std::fill(next_set + begin, next_set + end, 0); });
+}
+
 // Vector-Jacobian product of `advance_anchors`: adds the gradients with respect to the relative pose, the relative twist
 // and the anchors before the step.
 template <class T, class Points>

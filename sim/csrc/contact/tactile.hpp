@@ -92,8 +92,7 @@ void advance_marker_anchors(const Model& m, const T* params, const T& step_lengt
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       const ContactSettings<T> settings = contact_settings<T>(pad, s, params, anchors, anchored, step_length);
-      find_candidate_points<T>(frame, pad.cloud, settings, CacheState::stale, w.marker_candidates);
-      advance_anchors<T>(frame, w.marker_candidates, settings, pad.cloud.size(), next + slot, next_set + slot);
+      advance_anchors<T>(frame, pad.cloud, settings, next + slot, next_set + slot);
     }
   }
 }

@@ -182,7 +182,6 @@ struct Workspace {
 
   ContactJacobian<T> jacobian;                 // of the current pair
   std::vector<CandidatePoints<T>> candidates;  // per contact
-  CandidatePoints<T> marker_candidates;        // of the current pad
 };
 
 }  // namespace gelflow
