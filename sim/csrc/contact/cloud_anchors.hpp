@@ -2,6 +2,8 @@
 // its vector-Jacobian product.
 #pragma once
 
+#include <cstring>
+
 #include "contact/contact_point_loops.hpp"
 
 namespace gelflow {
@@ -30,15 +32,21 @@ void advance_anchors(const PairFrame<T>& frame, const PointCloud& cloud, const C
     PointForce<Pack<T>> force;
     point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
     const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.step_length), force, t.x, t.anchor, t.has_anchor);
-    std::fill(next_set + t.first, next_set + std::min(t.first + pack_width<T>, cloud.size()), 0);
-    t.for_each_active([&](int k, int i) {
-      next[i] = lane3<T>(anchor, k);
-      next_set[i] = 1;
-    });
+    const unsigned active = bits(t.active);
+    for (int k = 0; k < std::min(pack_width<T>, cloud.size() - t.first); ++k) next_set[t.first + k] = active >> k & 1U;
+    if constexpr (has_fours<T>) {
+      if (active == (1U << pack_width<T>)-1) return store_vectors<T>(anchor, next[t.first].data());
+    }
+    t.for_each_active([&](int k, int i) { next[i] = lane3<T>(anchor, k); });
   };
-  for_contact_points<false, true, T>(
-      frame, cloud, candidate_runs<T>(frame, cloud, settings.rolling_radius), settings, advance,
-      [&](int begin, int end) GELFLOW_LOOP_BODY { std::fill(next_set + begin, next_set + end, 0); });
+  for_contact_points<false, true, T>(frame, cloud, candidate_runs<T>(frame, cloud, settings.rolling_radius), settings,
+                                     advance, [&](int begin, int end) GELFLOW_LOOP_BODY {
+                                       if (end - begin > pack_width<T>) {
+                                         std::memset(next_set + begin, 0, end - begin);
+                                       } else {  // usually one pack: a loop costs less than a call
+                                         for (int i = begin; i < end; ++i) next_set[i] = 0;
+                                       }
+                                     });
 }
 
 // Vector-Jacobian product of `advance_anchors`: adds the gradients with respect to the relative pose, the relative twist

@@ -122,6 +122,14 @@ GELFLOW_INLINE void load_anchors(const ContactSettings<T>& settings, int i, int 
   using P = Pack<T>;
   constexpr int width = pack_width<T>;
   T anchors[3][width] = {}, has_anchor[width] = {};
+  if constexpr (has_fours<T>) {
+    if (i + width <= size) {
+      for (int k = 0; k < width; ++k) has_anchor[k] = T(settings.anchored[i + k]);
+      t.has_anchor = load<P>(has_anchor) > P(0.0);
+      t.anchor = load_vectors<T>(settings.anchors[i].data());  // one that is not set may have any value: it is masked
+      return;
+    }
+  }
   for (int k = 0; k < width && i + k < size; ++k) {
     if (!settings.anchored[i + k]) continue;
     for (int a = 0; a < 3; ++a) anchors[a][k] = settings.anchors[i + k][a];

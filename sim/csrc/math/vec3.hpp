@@ -117,4 +117,68 @@ GELFLOW_INLINE V3<T> sum3(const Vec3<P>& a) {
   return {sum(a.x), sum(a.y), sum(a.z)};
 }
 
+// Transposes four consecutive vectors x y z x y z … to one pack per component, and back.
+template <class T>
+GELFLOW_INLINE Vec3<SimdPack<T, 4>> load_threes(const T* from) {
+  using P = SimdPack<T, 4>;
+  const auto a = load<P>(from).v, b = load<P>(from + 4).v, c = load<P>(from + 8).v;
+  const auto xy = __builtin_shufflevector(a, b, 0, 1, 6, 7), zx = __builtin_shufflevector(a, c, 2, 3, 4, 5),
+             yz = __builtin_shufflevector(b, c, 0, 1, 6, 7);
+  return {P(__builtin_shufflevector(xy, zx, 0, 5, 2, 7)), P(__builtin_shufflevector(xy, yz, 1, 4, 3, 6)),
+          P(__builtin_shufflevector(zx, yz, 0, 5, 2, 7))};
+}
+template <class T>
+GELFLOW_INLINE void store_threes(const Vec3<SimdPack<T, 4>>& a, T* to) {
+  using P = SimdPack<T, 4>;
+  const auto &x = a.x.v, &y = a.y.v, &z = a.z.v;
+  const auto xy = __builtin_shufflevector(x, y, 0, 4, 2, 6), zx = __builtin_shufflevector(z, x, 0, 5, 2, 7),
+             yz = __builtin_shufflevector(y, z, 1, 5, 3, 7);
+  store(P(__builtin_shufflevector(xy, zx, 0, 1, 4, 5)), to);
+  store(P(__builtin_shufflevector(yz, xy, 0, 1, 6, 7)), to + 4);
+  store(P(__builtin_shufflevector(zx, yz, 2, 3, 6, 7)), to + 8);
+}
+
+// Four consecutive lanes of a pack.
+template <class T>
+GELFLOW_INLINE SimdPack<T, 4> four(const SimdPack<T, 4>& x, int) {
+  return x;
+}
+template <class T>
+GELFLOW_INLINE SimdPack<T, 4> four(const SimdPack<T, 8>& x, int first) {
+  return first == 0 ? SimdPack<T, 4>(__builtin_shufflevector(x.v, x.v, 0, 1, 2, 3))
+                    : SimdPack<T, 4>(__builtin_shufflevector(x.v, x.v, 4, 5, 6, 7));
+}
+template <class T>
+GELFLOW_INLINE void set_four(SimdPack<T, 4>& x, int, const SimdPack<T, 4>& value) {
+  x = value;
+}
+template <class T>
+GELFLOW_INLINE void set_four(SimdPack<T, 8>& x, int first, const SimdPack<T, 4>& value) {
+  const auto& v = value.v;
+  const auto both = __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3);
+  x = first == 0 ? SimdPack<T, 8>(__builtin_shufflevector(both, x.v, 0, 1, 2, 3, 12, 13, 14, 15))
+                 : SimdPack<T, 8>(__builtin_shufflevector(x.v, both, 0, 1, 2, 3, 12, 13, 14, 15));
+}
+
+// Whether a pack consists of whole fours.
+template <class T>
+inline constexpr bool has_fours = pack_width<T> % 4 == 0;
+
+// As many consecutive vectors as a pack has lanes.
+template <class T>
+GELFLOW_INLINE Vec3<Pack<T>> load_vectors(const T* from) {
+  Vec3<Pack<T>> vectors;
+  for (int k = 0; k < pack_width<T>; k += 4) {
+    const Vec3<SimdPack<T, 4>> part = load_threes<T>(from + 3 * k);
+    for (int a = 0; a < 3; ++a) set_four(vectors[a], k, part[a]);
+  }
+  return vectors;
+}
+template <class T>
+GELFLOW_INLINE void store_vectors(const Vec3<Pack<T>>& a, T* to) {
+  for (int k = 0; k < pack_width<T>; k += 4) {
+    store_threes<T>({four(a.x, k), four(a.y, k), four(a.z, k)}, to + 3 * k);
+  }
+}
+
 }  // namespace gelflow
