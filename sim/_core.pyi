@@ -594,6 +594,10 @@ class _Batch(Generic[_Scalar]):
     @property
     def threads(self) -> int: ...
     @property
+    def checks_params(self) -> bool: ...  # steps and rollouts refuse wrong parameters
+    @checks_params.setter
+    def checks_params(self, value: bool) -> None: ...
+    @property
     def q(self) -> NDArray[_Scalar]: ...  # (N, nq)
     @property
     def v(self) -> NDArray[_Scalar]: ...  # (N, nv)

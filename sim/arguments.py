@@ -1,13 +1,15 @@
 """Checks of the arguments of a simulator: every refusal is a UsageError in one line."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim import _core
+
+if TYPE_CHECKING:  # scenes are loaded without the core
+    from gelflow.sim import _core
 
 _QUATERNION_OFFSET = {7: 3, 4: 0}  # of the quaternion in the positions of a joint, by their number: free, ball
 _MIN_QUATERNION = 1e-6  # length; the core normalizes longer ones
@@ -24,12 +26,73 @@ def checked(function: Callable[..., Any], *arguments: Any) -> Any:
         raise UsageError(f"{getattr(function, '__name__', 'core')}: arguments of these types: {types}") from None
 
 
+def shown(value: Any) -> str:
+    """A value in one short line of an error message."""
+    if shape := getattr(value, "shape", None):
+        return f"{type(value).__name__} of shape {tuple(shape)}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def check_type(name: str, value: Any, kind: Any, expected: str) -> None:
+    """Raise UsageError unless `value` is of a type."""
+    if not isinstance(value, kind):
+        raise UsageError(f"{name} must be {expected}, got {shown(value)}")
+
+
+def check_optional(**named: tuple[Any, type[Any]]) -> None:
+    """Raise UsageError unless each value is None or of its type."""
+    for name, (value, kind) in named.items():
+        check_type(name, value, (kind, type(None)), f"a {kind.__name__}")
+
+
+def integers(name: str, values: ArrayLike) -> NDArray[np.int32]:
+    """A sequence of integers."""
+    array: NDArray[np.int32] = number_array(name, values, np.int32)
+    if array.ndim != 1:
+        raise UsageError(f"{name} must be a sequence of integers, got {shown(values)}")
+    return array
+
+
+def flag(name: str, value: Any) -> bool:
+    """A boolean argument."""
+    check_type(name, value, bool | np.bool_, "True or False")
+    return bool(value)
+
+
+def integer(name: str, value: Any, *, minimum: int | None = None) -> int:
+    """An integer argument."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise UsageError(f"{name} must be an integer, got {shown(value)}")
+    if minimum is not None and value < minimum:
+        raise UsageError(f"{name} must be at least {minimum}, got {value}")
+    return int(value)
+
+
+def near_params(name: Any, params: Iterable[str]) -> list[str]:
+    """For an error message: the parameters of the element that `name` names, or the names of all elements."""
+    owner = str(name).split(".")[0]
+    return [p for p in params if p.split(":")[-1].startswith(owner + ".")] or sorted({p.split(".")[0] for p in params})
+
+
+def index_of(kind: str, name: Any, names: Sequence[str]) -> int:
+    """The index of `name` in `names`. Raises UsageError for an unknown one."""
+    if not isinstance(name, str) or name not in names:
+        raise UsageError(f"no {kind} {shown(name)}; there are {', '.join(names)}")
+    return list(names).index(name)
+
+
 def number_array(name: str, value: ArrayLike, dtype: Any) -> NDArray[Any]:
-    """`value` as an array of numbers; itself if it is one."""
+    """`value` as an array of real numbers; itself if it is one."""
     try:
+        array = np.asarray(value)
+        if np.iscomplexobj(array):
+            raise UsageError(f"{name} must be real, got {array.dtype}")
         return np.asarray(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{name} must be numeric: {error}") from None
+    except UsageError:
+        raise
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise UsageError(f"{name} must be numeric: {' '.join(str(error).split())}") from None
 
 
 def fill(name: str, target: NDArray[Any], value: ArrayLike) -> None:
@@ -43,13 +106,16 @@ def fill(name: str, target: NDArray[Any], value: ArrayLike) -> None:
 
 def flags(name: str, mask: ArrayLike, count: int) -> NDArray[np.bool_]:
     """A mask of environments, (N,)."""
-    array = np.ascontiguousarray(number_array(name, mask, bool))
+    values = np.asarray(number_array(name, mask, float))
+    if not np.isin(values, (0, 1)).all():  # such as indices
+        raise UsageError(f"{name} must be a mask of True and False, got {values[~np.isin(values, (0, 1))][0]:g}")
+    array = np.ascontiguousarray(values, dtype=bool)
     if array.shape != (count,):
         raise UsageError(f"{name} must have shape ({count},), got {array.shape}")
     return array
 
 
-def quaternion_starts(model: _core.Model) -> tuple[tuple[str, int], ...]:
+def quaternion_starts(model: "_core.Model") -> tuple[tuple[str, int], ...]:
     """Name of each free or ball joint, and the index in q of the first component of its quaternion."""
     starts = [*model.joint_q, model.nq]
     sizes = np.diff(starts).tolist()
@@ -57,7 +123,7 @@ def quaternion_starts(model: _core.Model) -> tuple[tuple[str, int], ...]:
     return tuple((name, q + _QUATERNION_OFFSET[size]) for name, q, size in joints if size in _QUATERNION_OFFSET)
 
 
-def check_state(model: _core.Model, q: NDArray[Any], v: NDArray[Any], active: NDArray[np.uint8]) -> None:
+def check_state(model: "_core.Model", q: NDArray[Any], v: NDArray[Any], active: NDArray[np.uint8]) -> None:
     """Raise UsageError if positions (N, nq) or velocities (N, nv) of an active environment are no state."""
     for name, values in (("q", q), ("v", v)):
         bad = ~np.isfinite(values) & (active[:, None] == 1)

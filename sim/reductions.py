@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
+from gelflow.sim.arguments import number_array, shown
 
 if TYPE_CHECKING:  # loading a scene needs MuJoCo, which a simulator of a core model does not
     from gelflow.sim.scene.pads import PadDef
@@ -120,10 +121,12 @@ def shear_features(scene: "Scene", basis: ArrayLike, pads: Sequence[str] | None 
     `polynomial_basis` of gelflow.policies they are polynomial features. Raises UsageError where a pad has another
     number of markers than the basis.
     """
-    columns = np.asarray(basis, dtype=float)
+    columns = number_array("basis", basis, float)
+    if columns.ndim != 2:
+        raise UsageError(f"basis must have shape (markers of a pad, terms), got {columns.shape}")
 
     def rows(pad: "PadDef") -> Array:
-        if columns.ndim != 2 or len(columns) != len(pad.positions):
+        if len(columns) != len(pad.positions):
             raise UsageError(
                 f"basis must have shape ({len(pad.positions)}, terms) for pad {pad.name!r}, got {columns.shape}"
             )
@@ -154,6 +157,10 @@ def center_of_pressure(force: Any, moment: Any) -> Any:
 
 def _per_pad(scene: "Scene", pads: Sequence[str] | None, names: Sequence[str], rows: Any) -> TactileReduction:
     """A reduction with the same named rows for each pad; `rows`(pad) has shape (rows, markers of the pad, 3)."""
+    if not hasattr(scene, "pads"):
+        raise UsageError(f"scene must be a Scene (see load_scene), got {shown(scene)}")
+    if not (pads is None or isinstance(pads, list | tuple)):
+        raise UsageError(f"pads must be a list of names, got {shown(pads)}")
     chosen = [pad.name for pad in scene.pads] if pads is None else list(pads)
     slices = {name: scene.marker_slice(name) for name in chosen}  # raises for an unknown name
     matrix = np.zeros((len(chosen) * len(names), scene.num_markers, 3))

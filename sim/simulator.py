@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.measurement.machine import default_threads
-from gelflow.sim import _core
+from gelflow.sim import _core, arguments
 from gelflow.sim.arguments import check_state, checked, fill, flags, number_array
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
@@ -67,22 +67,19 @@ class Simulator:
         threads: int | None = None,
         precision: Literal["double", "single"] | None = None,
     ) -> None:
-        if not isinstance(num_envs, int | np.integer):
-            raise UsageError(f"num_envs must be an integer, got {num_envs!r}")
-        if num_envs < 1:
-            raise UsageError(f"num_envs must be at least 1, got {num_envs}")
+        num_envs = arguments.integer("num_envs", num_envs, minimum=1)
+        most = default_threads() if threads is None else arguments.integer("threads", threads, minimum=1)
         if precision is None:
             precision = getattr(scene, "precision", "double")
-        if precision not in ("double", "single"):
-            raise UsageError(f"precision must be 'double' or 'single', got {precision!r}")
+        if not isinstance(precision, str) or precision not in ("double", "single"):
+            raise UsageError(f"precision must be 'double' or 'single', got {arguments.shown(precision)}")
         self.scene: Any = scene  # attributes of a `Scene` are used where present
         if not isinstance(scene, _core.Model) and not hasattr(scene, "build"):
-            raise UsageError(f"scene must be a Scene (see load_scene) or a core model, got {scene!r}")
+            raise UsageError(f"scene must be a Scene (see load_scene) or a core model, got {arguments.shown(scene)}")
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
-        workers = max(1, min(num_envs, threads or default_threads()))
         batch = _core.Batch if precision == "double" else _core.BatchFloat
-        self._batch = batch(self.model, num_envs, workers)
+        self._batch = batch(self.model, num_envs, min(num_envs, most))
         self.num_envs = num_envs
         self._threads = threads
         self.q: NDArray[Any] = self._batch.q
@@ -107,14 +104,12 @@ class Simulator:
     def param(self, name: str) -> NDArray[Any]:
         """Values of one parameter, such as "pad_box.kn": a writable view, shape (N,).
 
+        Where elements of different kinds have one name, their kind is given too, as in "pad:finger.kd".
         Raises UsageError for an unknown name.
         """
-        if name not in self.param_index:
-            owner = str(name).split(".")[0]
-            near = [n for n in self.param_index if n.startswith(owner + ".")] or sorted(
-                {n.split(".")[0] for n in self.param_index}
-            )
-            raise UsageError(f"no parameter {name!r}; there are {', '.join(near)}")
+        if not isinstance(name, str) or name not in self.param_index:
+            near = ", ".join(arguments.near_params(name, self.param_index))
+            raise UsageError(f"no parameter {arguments.shown(name)}; there are {near}")
         column: NDArray[Any] = self.params[:, self.param_index[name]]
         return column
 
@@ -123,7 +118,7 @@ class Simulator:
 
         Parameters keep their values.
         """
-        self._batch.reset(self._mask("which", which))
+        checked(self._batch.reset, self._mask("which", which))
 
     def _mask(self, name: str, mask: ArrayLike | None) -> NDArray[np.uint8] | None:
         """Flags of the environments in `mask` for the core; None: all of them."""
@@ -153,7 +148,8 @@ class Simulator:
         except ValueError as error:
             raise UsageError(str(error)) from None
         except TypeError:
-            raise UsageError(f"steps must be an integer, got {steps!r}") from None
+            arguments.integer("steps", steps, minimum=0)
+            raise
 
     def _controls(self, u: ArrayLike) -> NDArray[Any]:
         """Controls in the simulator's precision; the core checks their shape."""
@@ -195,13 +191,14 @@ class Simulator:
         """
         mask = None if active is None else self._mask("active", active)
         if reduction is not None:
+            arguments.check_type("reduction", reduction, TactileReduction, "a TactileReduction")
             target = np.zeros((self.num_envs, len(reduction.names)), self.dtype) if out is None else out
             checked(self._batch.reduced_tactile, reduction.core, target, mask)
             return target
         if out is not None:
             checked(self._batch.tactile, out, mask)
             return out
-        self._batch.update_readings(mask)
+        checked(self._batch.update_readings, mask)
         if self._tactile is None:
             self._tactile = self._batch.readings
         return self._tactile
@@ -217,10 +214,7 @@ class Simulator:
 
     def marker_slice(self, name: str) -> slice:
         """Slice of the marker axis that belongs to one pad."""
-        names = list(self.model.pad_names)
-        if name not in names:
-            raise UsageError(f"no pad {name!r}; there are {', '.join(names)}")
-        first, count = self.model.pad_markers[names.index(name)]
+        first, count = self.model.pad_markers[arguments.index_of("pad", name, self.model.pad_names)]
         return slice(first, first + count)
 
     def joint_q(self, name: str) -> int:
@@ -232,10 +226,7 @@ class Simulator:
         return self._joint(name, self.model.joint_v)
 
     def _joint(self, name: str, indices: Sequence[int]) -> int:
-        names = list(self.model.joint_names)
-        if name not in names:
-            raise UsageError(f"no joint {name!r}; there are {', '.join(names)}")
-        return int(indices[names.index(name)])
+        return int(indices[arguments.index_of("joint", name, self.model.joint_names)])
 
     def poses(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """World poses of the moving bodies, (N, bodies, 7): position [m], quaternion w x y z; a new array, or `out`."""
@@ -264,19 +255,19 @@ class Simulator:
     def contact_forces(self) -> NDArray[Any]:
         """Generalized contact forces Jᵀ f of all contacts at the present state, (N, nv) [N, N m]."""
         out = np.empty((self.num_envs, self.model.nv), self.dtype)
-        self._batch.contact_forces(out)
+        checked(self._batch.contact_forces, out)
         return out
 
     def mass_matrix(self) -> NDArray[Any]:
         """Joint-space mass matrix M(q), (N, nv, nv)."""
         out = np.empty((self.num_envs, self.model.nv, self.model.nv), self.dtype)
-        self._batch.mass_matrix(out)
+        checked(self._batch.mass_matrix, out)
         return out
 
     def bias(self) -> NDArray[Any]:
         """Coriolis, centrifugal and gravity forces C(q, v), (N, nv)."""
         out = np.empty((self.num_envs, self.model.nv), self.dtype)
-        self._batch.bias(out)
+        checked(self._batch.bias, out)
         return out
 
     def rollout(
@@ -311,11 +302,13 @@ class Simulator:
         controls = np.ascontiguousarray(number_array("u", u, self.dtype))
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
             raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
+        arguments.check_optional(stop=(stop, TouchStop), reduction=(reduction, TactileReduction), out=(out, Trajectory))
         if stop is not None and not self.model.num_markers:
             raise UsageError("a touch stop needs a scene with pads")
+        reads = arguments.integers("read_after", read_after)
         steps, n = controls.shape[0], self.num_envs
         reading = (self.model.num_markers, 3) if reduction is None else (len(reduction.names),)
-        tactile_shape = (len(read_after), n, *reading)
+        tactile_shape = (len(reads), n, *reading)
         if out is not None:
             out.check_reusable(controls.shape, tactile_shape)
         mask = self._mask("active", active)
@@ -326,7 +319,7 @@ class Simulator:
             **{name: self._along_time(name, value, steps, out) for name, value in start.items()},
             u=controls,
             tactile=out.tactile if out is not None else empty(tactile_shape, self.dtype),
-            read_after=number_array("read_after", read_after, np.int32),
+            read_after=reads,
             halvings=np.zeros((steps, n), np.int8),
             status=np.zeros(n, np.int32),
             active=np.ones(n, np.uint8) if mask is None else mask.copy(),
@@ -353,7 +346,8 @@ class Simulator:
         Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
         after which they were read.
         """
-        return self._batch.contact_modes(trajectory.core())
+        arguments.check_type("trajectory", trajectory, Trajectory, "a Trajectory")
+        return np.asarray(checked(self._batch.contact_modes, trajectory.core()))
 
     def rollout_gradient(
         self,
@@ -379,6 +373,8 @@ class Simulator:
         Failed environments have gradient zero.
         """
 
+        arguments.check_type("trajectory", trajectory, Trajectory, "a Trajectory")
+
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:
                 return np.zeros(like.shape, self.dtype)
@@ -396,5 +392,5 @@ class Simulator:
             history_end=shaped(history_end, trajectory.history[0]),
             tactile=shaped(tactile, trajectory.tactile),
         )
-        g = self._batch.rollout_vjp(trajectory.core(), cotangent, params)
+        g = checked(self._batch.rollout_vjp, trajectory.core(), cotangent, arguments.flag("params", params))
         return TrajectoryGradient(u=g.u, q=g.q, v=g.v, anchors=g.anchors, history=g.history, params=g.params)

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
+from gelflow.sim.arguments import number_array
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def _sites(scene: Any) -> list[_core.SiteDef]:
 
 def _rows(model: _core.Model, params: NDArray[Any], q: ArrayLike) -> Floats:
     """Positions (…, N, nq) as rows of one array."""
-    positions = np.ascontiguousarray(q, dtype=float)
+    positions = np.ascontiguousarray(number_array("q", q, float))
     if positions.ndim < 2 or positions.shape[-2:] != (len(params), model.nq):
         raise UsageError(f"q must have shape (…, {len(params)}, {model.nq}), got {positions.shape}")
     return positions.reshape(-1, model.nq)

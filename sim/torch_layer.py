@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch.autograd.function import once_differentiable
 
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import check_type, number_array
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.site_poses import site_poses, site_poses_vjp
@@ -59,6 +60,7 @@ class TorchRollout:
 
 def torch_state(sim: Simulator) -> TorchState:
     """The present state of the simulator, copied to tensors."""
+    check_type("sim", sim, Simulator, "a Simulator")
     arrays = (sim.q, sim.v, sim.anchors, sim.anchored, sim.history)
     return TorchState(*(torch.from_numpy(np.array(array)) for array in arrays))
 
@@ -84,6 +86,9 @@ def torch_rollout(
     stopped is differentiated as the steps that it took. Raises UsageError for wrong shapes, a precision other than the
     simulator's, unknown parameters, and values that are not finite.
     """
+    check_type("sim", sim, Simulator, "a Simulator")
+    check_type("state", state, TorchState, "a TorchState (see torch_state)")
+    check_type("params", params, (Mapping, type(None)), "a mapping of parameter names to tensors")
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
     for name, tensor in named.items():
@@ -93,7 +98,13 @@ def torch_rollout(
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
     numbers = None if params is None else _all_params(sim, params)
     inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
-    options = {"read_after": tuple(read_after), "reduction": reduction, "active": active, "stop": stop}
+    reads = number_array("read_after", read_after, np.int32)
+    options = {
+        "read_after": reads,
+        "reduction": reduction,
+        "active": active,
+        "stop": stop,
+    }
     outputs = _Rollout.apply(*inputs, sim, options)  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, history, anchored, ok, stopped_at = outputs
     return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok, stopped_at)
@@ -116,6 +127,8 @@ def torch_step(
     sim: Simulator, state: TorchState, u: torch.Tensor, *, params: Mapping[str, torch.Tensor] | None = None
 ) -> tuple[TorchState, torch.Tensor]:
     """One step with controls u (N, nu): the new state and its marker forces, (N, markers, 3) [N]."""
+    check_type("sim", sim, Simulator, "a Simulator")
+    check_type("u", u, torch.Tensor, "a tensor")
     result = torch_rollout(sim, state, u[None], read_after=(1,) if sim.model.num_markers else (), params=params)
     tactile = result.tactile[0] if sim.model.num_markers else result.q.new_zeros((sim.num_envs, 0, 3))
     return result.end, tactile
@@ -127,6 +140,8 @@ def torch_site_poses(sim: Simulator, q: torch.Tensor) -> torch.Tensor:
     Position [m] and quaternion w x y z, in the order of `Scene.sites`. Differentiable with respect to q; the parameters
     are those of the simulator. Raises UsageError for wrong shapes and for a scene without sites.
     """
+    check_type("sim", sim, Simulator, "a Simulator")
+    check_type("q", q, torch.Tensor, "a tensor")
     return _SitePoses.apply(q, sim)  # type: ignore[no-untyped-call,no-any-return]
 
 

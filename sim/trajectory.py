@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
+from gelflow.sim.arguments import integer, number_array
 from gelflow.sim.reductions import TactileReduction
 
 
@@ -26,12 +27,13 @@ class TouchStop:
 
     def core(self, num_envs: int, steps: int) -> _core.TouchStop:
         """The condition for a rollout. Raises UsageError for a threshold or steps that do not fit it."""
-        threshold = np.asarray(self.threshold, dtype=float)
+        threshold = number_array("threshold", self.threshold, float)
         if threshold.shape not in ((), (num_envs,)):
             raise UsageError(f"threshold must have shape ({num_envs},) or (), got {threshold.shape}")
         if not (threshold >= 0).all():
             raise UsageError("threshold must be at least 0 N everywhere, and not nan")
-        after_step = self.reference_step + 1 if self.after_step is None else self.after_step
+        integer("reference_step", self.reference_step)
+        after_step = self.reference_step + 1 if self.after_step is None else integer("after_step", self.after_step)
         if not 0 <= self.reference_step < after_step <= steps:
             raise UsageError(
                 f"a touch stop needs 0 ≤ reference_step < after_step ≤ {steps} steps of the rollout, "

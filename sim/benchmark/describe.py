@@ -149,6 +149,8 @@ def describe(scene: Scene) -> Description:
 
     Raises UsageError when the scene's files changed after it was loaded.
     """
+    if not isinstance(scene, Scene):
+        raise UsageError(f"scene must be a Scene (see load_scene), got {type(scene).__name__}")
     path = scene.path.parent / str(scene_tables(scene.path).get("model"))
     mechanics = read_mechanics(path)
     if [b.name for b in mechanics.bodies] != [b.name for b in scene.bodies]:

@@ -58,7 +58,10 @@ def load_scene(
     presets = read_presets(TomlTable(data, str(path)), top_level_keys=_SOLVER_KEYS, element_tables=_ELEMENT_TABLES)
     if preset is not None:
         apply_preset(data, presets, preset, str(path))
-    for key, value in (overrides or {}).items():
+    overrides = {} if overrides is None else overrides
+    if not isinstance(overrides, Mapping):
+        raise UsageError(f"overrides must be a mapping of dotted keys to values, got {type(overrides).__name__}")
+    for key, value in overrides.items():
         set_by_path(data, key, value)
     if friction is not None:
         data["friction"] = friction
@@ -112,6 +115,8 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
 
 
 def _find(scene: str | Path) -> Path:
+    if not isinstance(scene, str | Path):
+        raise UsageError(f"scene must be a name or a path, got {type(scene).__name__}")
     path = Path(scene)
     if path.suffix in (".toml", *MODEL_SUFFIXES) or path.is_file():
         return path

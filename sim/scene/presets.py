@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import shown
 from gelflow.toml_tables import TomlTable, set_by_path, suggestion, tables_at_path
 
 PRESET_NAMES = ("fast", "balanced", "accurate")  # presets of every scene of gelflow
@@ -45,8 +46,8 @@ def read_presets(top: TomlTable, *, top_level_keys: Collection[str], element_tab
 
 def apply_preset(data: dict[str, Any], presets: Presets, name: str, location: str) -> None:
     """Write the values of a preset into the tables of a scene. Raises UsageError on an unknown preset."""
-    if name not in presets:
-        raise UsageError(f"{location}: no preset {name!r}; {suggestion(name, list(presets))}")
+    if not isinstance(name, str) or name not in presets:
+        raise UsageError(f"{location}: no preset {shown(name)}; {suggestion(name, list(presets))}")
     for dotted_key, value in presets[name].items():
         set_by_path(data, dotted_key, value)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.sim.arguments import shown
 from gelflow.sim.scene.contacts import ContactDef, PointsDef
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef
@@ -163,6 +164,6 @@ class Scene:
 
 
 def _index(kind: str, name: str, names: list[str]) -> int:
-    if name not in names:
-        raise UsageError(f"no {kind} {name!r}; {suggestion(name, names)}")
+    if not isinstance(name, str) or name not in names:
+        raise UsageError(f"no {kind} {shown(name)}; {suggestion(name, names)}")
     return names.index(name)

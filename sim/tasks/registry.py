@@ -5,6 +5,7 @@ from types import ModuleType
 from typing import Any
 
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import shown
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.task import INSERTION, InsertionTask, TaskDescription
@@ -58,6 +59,6 @@ def _named_randomization(name: str, table: str, task: TaskDescription | None) ->
 
 
 def _module(name: str) -> ModuleType:
-    if name not in _TASKS:
-        raise UsageError(f"no task {name!r}; {suggestion(name, task_names())}")
+    if not isinstance(name, str) or name not in _TASKS:
+        raise UsageError(f"no task {shown(name)}; {suggestion(name, task_names())}")
     return importlib.import_module(_TASKS[name][0])

@@ -9,6 +9,7 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
+from gelflow.sim.arguments import integer
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import TaskDescription
 
@@ -60,8 +61,7 @@ class TaskBatch(ABC):
         action_space: Box,
         privileged: int,
     ) -> None:
-        if num_envs < 1:
-            raise UsageError(f"num_envs must be at least 1, got {num_envs}")
+        num_envs = integer("num_envs", num_envs, minimum=1)
         self.description = description
         self.num_envs = num_envs
         self.frames_per_second = 1.0  # of a video with one picture a step

@@ -38,6 +38,7 @@ class Batch {
   std::vector<std::int64_t> iterations, halved;  // (N): Newton iterations and halved steps since the reset
 
   int threads() const { return pool_.size(); }
+  bool checks_params = true;                               // refuses wrong parameters (parameter_checks.hpp)
   std::atomic<int> user{0};                                // of the bindings: who calls, 0 for nobody
   Interruption& interruption() { return *interruption_; }  // of the present call
   void reset(const std::uint8_t* which);                   // (N) flags, or null for all; parameters stay
@@ -77,10 +78,12 @@ class Batch {
   void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* grad_q,
                         double* grad_v);
   void check_state(const std::uint8_t* active) const;
+  void check_params(const std::uint8_t* active);
   void check_controls(const T* u, int rows, const std::uint8_t* active) const;
   std::vector<StepMemory<T>> memory_;             // one per thread
   std::vector<ReadingMemory<T>> reading_memory_;  // one per thread
   std::vector<int> active_;                       // active environments of the present call
+  std::vector<T> right_params_;                   // (N, params): the last ones that were checked
   std::vector<T> q_rounding_;                     // (N, nq) in single precision: rounding residual of q (StateView)
   std::unique_ptr<Batch<double>> double_batch_;   // in single precision: computes the gradients
   std::vector<NonzeroMarkers> nonzero_;           // per environment, of `readings`

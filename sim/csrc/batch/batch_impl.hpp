@@ -1,6 +1,8 @@
 // Members of Batch. batch_double.cpp and batch_float.cpp compile them once per precision.
 #pragma once
 
+#include <cstring>
+#include <sstream>
 #include <stdexcept>
 
 #include "batch/batch.hpp"
@@ -28,6 +30,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
     std::copy(model->param_defaults.begin(), model->param_defaults.end(),
               params.begin() + static_cast<std::ptrdiff_t>(e * model->param_names.size()));
   }
+  right_params_ = params;
   reset(nullptr);
 }
 
@@ -88,12 +91,40 @@ void Batch<T>::check_state(const std::uint8_t* active) const {
   };
   check(q, "q", model->nq);
   check(v, "v", model->nv);
+  for (const Joint& joint : model->joints) {
+    if (!joint.has_quaternion()) continue;
+    const int first = joint.quaternion_q();
+    for (int e = 0; e < n; ++e) {
+      const V4<T> quaternion = vec4(q.data() + static_cast<std::size_t>(e) * model->nq + first);
+      constexpr double shortest = 1e-6;
+      if (quaternion.squaredNorm() >= T(shortest * shortest) || (active != nullptr && active[e] == 0)) continue;
+      std::ostringstream text;
+      text << "environment " << e << ": the quaternion of joint '" << joint.name << "', q[" << first << ":" << first + 4
+           << "], has length " << quaternion.stableNorm() << "; it must have length 1";
+      throw std::invalid_argument(text.str());
+    }
+  }
+}
+
+// Compares parameters with those that were checked before, which costs less than a check.
+template <class T>
+void Batch<T>::check_params(const std::uint8_t* active) {
+  const std::size_t width = model->param_names.size();
+  for (int e = 0; checks_params && e < n; ++e) {
+    T* const right = right_params_.data() + e * width;
+    if (std::memcmp(right, params_of(e), width * sizeof(T)) == 0 || (active != nullptr && active[e] == 0)) continue;
+    const std::string wrong = wrong_parameter(*model, params_of(e));
+    if (!wrong.empty()) throw std::invalid_argument("environment " + std::to_string(e) + ": " + wrong);
+    std::copy_n(params_of(e), width, right);
+  }
 }
 
 template <class T>
 void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active) {
+  if (steps < 0) throw std::invalid_argument("steps must not be negative, got " + std::to_string(steps));
   check_controls(u.u, u.shared ? 1 : n, u.shared ? nullptr : active);
   check_state(active);
+  check_params(active);
   for_active(active, [&](int e, int thread) {
     follow_leaders<T>(*model, state(e));
     for (int i = 0; i < steps && status[e] == 0 && !interruption_->check(thread); ++i) {
@@ -125,6 +156,7 @@ template <class T>
 void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
   check_controls(u.u, u.shared ? 1 : n, nullptr);
   check_state(nullptr);
+  check_params(nullptr);
   const Model& m = *model;
   for_all([&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];

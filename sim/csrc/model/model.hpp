@@ -10,6 +10,7 @@
 
 #include "geometry/distance_grid.hpp"
 #include "geometry/point_cloud.hpp"
+#include "model/parameter_checks.hpp"
 #include "model/parameters.hpp"
 
 namespace gelflow {
@@ -207,6 +208,7 @@ struct Model : SolverOptions {
 
   std::vector<std::string> param_names;
   std::vector<double> param_defaults;
+  std::vector<ParamSign> param_signs;
   ParamBlock<GravityParams> gravity;
 
   int nq = 0, nv = 0, na = 0, num_markers = 0;  // positions, velocities, anchors, markers

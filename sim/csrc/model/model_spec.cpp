@@ -1,6 +1,8 @@
 #include "model/model_spec.hpp"
 
 #include <algorithm>
+#include <map>
+#include <type_traits>
 
 #include "model/definition_checks.hpp"
 
@@ -15,23 +17,34 @@ int count(const std::vector<Item>& items) {
 
 }  // namespace
 
-void ModelSpec::check_new_name(const std::string& owner, const std::string& param) const {
-  if (std::find(model_.param_names.begin(), model_.param_names.end(), param) != model_.param_names.end()) {
-    reject("the name '" + owner + "' is used twice (parameter " + param + ")");
-  }
-}
-
+// Elements of different kinds may have the same name; elements of one kind may not.
 template <template <class> class Params>
-ParamBlock<Params> ModelSpec::add_params(const std::string& owner, const Params<double>& values) {
+ParamBlock<Params> ModelSpec::add_params(const char* kind, const std::string& owner, const Params<double>& values) {
+  constexpr bool of_actuator = std::is_same_v<Params<double>, ActuatorParams<double>>;
   const ParamBlock<Params> block{count(model_.param_names)};
   const auto* numbers = reinterpret_cast<const double*>(&values);
   for (std::size_t i = 0; i < Params<double>::names.size(); ++i) {
-    const std::string name = owner + "." + Params<double>::names[i];
-    check_new_name(owner, name);
+    const char* const param = Params<double>::names[i];
+    const std::string name = owner + "." + param;
+    if (!used_names_.insert(kind + (":" + name)).second) {
+      reject("the name '" + owner + "' is used twice (parameter " + name + ")");
+    }
     model_.param_names.push_back(name);
     model_.param_defaults.push_back(numbers[i]);
+    model_.param_signs.push_back(of_actuator ? ParamSign::any : param_sign(param, numbers[i]));
+    param_kinds_.push_back(kind);
   }
   return block;
+}
+
+// Parameters of elements of different kinds that have one name get the kind before it, as in "pad:finger.kd".
+void ModelSpec::name_kinds(Model& model) const {
+  std::map<std::string, int> uses;
+  for (const std::string& name : model.param_names) ++uses[name];
+  for (std::size_t i = 0; i < model.param_names.size(); ++i) {
+    if (uses[model.param_names[i]] > 1)
+      model.param_names[i] = std::string(param_kinds_[i]) + ":" + model.param_names[i];
+  }
 }
 
 void ModelSpec::check_body(const std::string& owner, int body, bool world_allowed) const {
@@ -40,9 +53,9 @@ void ModelSpec::check_body(const std::string& owner, int body, bool world_allowe
   }
 }
 
-ParamBlock<PoseParams> ModelSpec::add_pose(const std::string& owner, const V3<double>& pos) {
+ParamBlock<PoseParams> ModelSpec::add_pose(const char* kind, const std::string& owner, const V3<double>& pos) {
   check_finite(owner, "pos", pos);
-  return add_params(owner, PoseParams<double>{pos, V3<double>::Zero()});
+  return add_params(kind, owner, PoseParams<double>{pos, V3<double>::Zero()});
 }
 
 int ModelSpec::add_anchors(FrictionLaw law, int anchors) {
@@ -66,8 +79,8 @@ int ModelSpec::add_body(const BodyDef& def) {
   body.rotation = rotation_of<double>(body.quat);
   body.joint_begin = body.joint_end = 0;
   const V6<double>& i = def.inertia;
-  body.params =
-      add_params(def.name, BodyParams<double>{def.mass, def.com, i[0], i[1], i[2], i[3], i[4], i[5], def.pose.pos});
+  body.params = add_params("body", def.name,
+                           BodyParams<double>{def.mass, def.com, i[0], i[1], i[2], i[3], i[4], i[5], def.pose.pos});
   model_.bodies.push_back(body);
   definitions_.bodies.push_back(def);
   return count(model_.bodies) - 1;
@@ -100,7 +113,7 @@ int ModelSpec::add_joint(const JointDef& def) {
   }
   joint.dofs = joint.scalar_dofs() + (joint.has_quaternion() ? 3 : 0);
   joint.ref = joint.has_quaternion() ? 0 : def.ref;
-  joint.params = add_params(def.name, def.params);
+  joint.params = add_params("joint", def.name, def.params);
   if (free) {
     const V3<double>& p = body.params.in(model_.param_defaults.data()).pos;
     model_.q0.insert(model_.q0.end(), {p[0], p[1], p[2], body.quat[0], body.quat[1], body.quat[2], body.quat[3]});
@@ -140,9 +153,9 @@ int ModelSpec::add_shape(const ShapeDef& def) {
   shape.rotation = rotation_of<double>(unit_quaternion(owner, def.pose.quat));
   shape.kind = shape_kind(owner, def);
   shape.grid = def.grid;
-  shape.size = add_params(def.name, SizeParams<double>{def.size});
-  if (def.rounding > 0) add_params(def.name, RoundingParams<double>{def.rounding});
-  shape.pose = add_pose(def.name + ".shape", def.pose.pos);
+  shape.size = add_params("shape", def.name, SizeParams<double>{def.size});
+  if (def.rounding > 0) add_params("shape", def.name, RoundingParams<double>{def.rounding});
+  shape.pose = add_pose("shape", def.name + ".shape", def.pose.pos);
   model_.shapes.push_back(shape);
   definitions_.shapes.push_back(def);
   return count(model_.shapes) - 1;
@@ -164,8 +177,8 @@ int ModelSpec::add_points(const PointsDef& def) {
   set.name = def.name;
   set.radius = def.radius;
   set.mount = {def.body, def.pose.pos, rotation_of<double>(unit_quaternion(owner, def.pose.quat)), {}, {}};
-  set.mount.pose = add_pose(def.name + ".points", def.pose.pos);
-  set.mount.scale = add_params(def.name + ".points", ScaleParams<double>{V3<double>::Ones()});
+  set.mount.pose = add_pose("points", def.name + ".points", def.pose.pos);
+  set.mount.scale = add_params("points", def.name + ".points", ScaleParams<double>{V3<double>::Ones()});
   set.cloud = PointCloud(def.points, weights);
   for (std::size_t i = 0; def.areas && i < def.areas->size(); ++i) {
     set.cloud.areas.push_back((*def.areas)[set.cloud.original[i]]);
@@ -194,7 +207,7 @@ int ModelSpec::add_contact(const ContactDef& def) {
   if (set.radius > 0 && contact.law == FrictionLaw::elastic) {
     reject(owner + ": a sphere's moving point can not keep an anchor; let its friction be viscous");
   }
-  contact.params = add_params(def.name, def.params);
+  contact.params = add_params("contact", def.name, def.params);
   contact.anchor = add_anchors(contact.law, set.cloud.size());
   model_.contacts.push_back(contact);
   definitions_.contacts.push_back(def);
@@ -224,8 +237,8 @@ int ModelSpec::add_pad(const PadDef& def) {
   pad.shapes = def.shapes;
   pad.law = friction_law(owner, def.law);
   check_contact_params(owner, def.params, pad.law);
-  pad.params = add_params(def.name, def.params);
-  pad.mount.pose = add_pose(def.name + ".markers", def.pose.pos);
+  pad.params = add_params("pad", def.name, def.params);
+  pad.mount.pose = add_pose("pad", def.name + ".markers", def.pose.pos);
   pad.anchor = add_anchors(pad.law, pad.cloud.size() * count(def.shapes));
   pad.first_marker = model_.num_markers;
   model_.num_markers += pad.cloud.size();
@@ -272,7 +285,7 @@ int ModelSpec::add_tendon(const TendonDef& def) {
     if (!std::isfinite(def.coefficients[i])) reject(owner + ": coefficients must be finite");
     tendon.terms.push_back({joint.q, joint.v, def.coefficients[i]});
   }
-  tendon.params = add_params(def.name, def.params);
+  tendon.params = add_params("tendon", def.name, def.params);
   model_.tendons.push_back(tendon);
   definitions_.tendons.push_back(def);
   return count(model_.tendons) - 1;
@@ -300,7 +313,7 @@ int ModelSpec::add_coupling(const CouplingDef& def) {
     model_.couplings.push_back({def.name, joint.q, joint.v, leader_q, leader_dof, coefficients[1], coefficients[0]});
   } else {
     if (!(def.params.stiffness > 0)) reject(owner + ": above degree 1 the stiffness must be positive");
-    const ParamBlock<SpringParams> params = add_params(def.name, def.params);
+    const ParamBlock<SpringParams> params = add_params("coupling", def.name, def.params);
     model_.polynomial_couplings.push_back({def.name, joint.q, joint.v, leader_q, leader_dof, coefficients, params});
   }
   definitions_.couplings.push_back(def);
@@ -322,7 +335,7 @@ int ModelSpec::add_loop_closure(const LoopClosureDef& def) {
   closure.second = def.second;
   closure.weld = def.weld;
   closure.rotation = rotation_of<double>(unit_quaternion(owner, def.quat));
-  closure.params = add_params(def.name, def.params);
+  closure.params = add_params("loop closure", def.name, def.params);
   model_.loop_closures.push_back(closure);
   definitions_.loop_closures.push_back(def);
   return count(model_.loop_closures) - 1;
@@ -341,7 +354,7 @@ int ModelSpec::add_actuator(const ActuatorDef& def) {
   const bool on_joint = actuator.tendon < 0;
   actuator.dof = on_joint ? scalar_joint(owner, def.joint).v : -1;
   actuator.q = on_joint ? scalar_joint(owner, def.joint).q : -1;
-  actuator.params = add_params(def.name, p);
+  actuator.params = add_params("actuator", def.name, p);
   model_.actuators.push_back(actuator);
   definitions_.actuators.push_back(def);
   return count(model_.actuators) - 1;
@@ -353,9 +366,10 @@ Model ModelSpec::build() const {
   if (!(options.tolerance > 0)) reject("tolerance must be positive");
   if (integrator != "bdf1" && integrator != "bdf2") reject("integrator '" + integrator + "' is not bdf1 or bdf2");
   ModelSpec complete = *this;  // a spec may be built again after changes
-  complete.model_.gravity = complete.add_params("gravity", GravityParams<double>{gravity});
+  complete.model_.gravity = complete.add_params("scene", "gravity", GravityParams<double>{gravity});
   Model model = std::move(complete.model_);
   static_cast<SolverOptions&>(model) = options;
+  complete.name_kinds(model);
   model.nh = integrator == "bdf2" ? 2 * model.nv + 1 : 0;
   build_kinematic_tree(model);
   build_contact_pairs(model);

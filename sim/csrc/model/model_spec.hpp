@@ -1,6 +1,8 @@
 // ModelSpec collects the definitions of a scene, checks each, and builds the Model.
 #pragma once
 
+#include <unordered_set>
+
 #include "model/definitions.hpp"
 #include "model/model.hpp"
 
@@ -44,14 +46,16 @@ class ModelSpec {
 
  private:
   Definitions definitions_;
-  std::vector<int> point_sets_;  // of each PointsDef in the model, where pads add sets of their own
-  Model model_;                  // without what depends on all definitions (build)
+  std::vector<const char*> param_kinds_;        // of the element that has the parameter
+  std::unordered_set<std::string> used_names_;  // kinds and parameters
+  std::vector<int> point_sets_;                 // of each PointsDef in the model, where pads add sets of their own
+  Model model_;                                 // without what depends on all definitions (build)
 
   void check_body(const std::string& owner, int body, bool world_allowed) const;
-  void check_new_name(const std::string& owner, const std::string& param) const;
   template <template <class> class Params>
-  ParamBlock<Params> add_params(const std::string& owner, const Params<double>& values);
-  ParamBlock<PoseParams> add_pose(const std::string& owner, const V3<double>& pos);
+  ParamBlock<Params> add_params(const char* kind, const std::string& owner, const Params<double>& values);
+  void name_kinds(Model& model) const;
+  ParamBlock<PoseParams> add_pose(const char* kind, const std::string& owner, const V3<double>& pos);
   void add_dofs(const Joint& joint, bool prescribed);
   void add_pad_contacts(const Pad& pad);
   const Joint& scalar_joint(const std::string& owner, int joint) const;

@@ -372,6 +372,7 @@ void bind_batch(py::module_& module, const char* name) {
   type.def(py::init<std::shared_ptr<const Model>, int, int>(), py::arg("model"), py::arg("environments"),
            py::arg("threads"))
       .def_readonly("environments", &B::n)
+      .def_readwrite("checks_params", &B::checks_params)
       .def_property_readonly("threads", &B::threads);
   bind_state(type);
   bind_steps(type);

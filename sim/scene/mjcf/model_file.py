@@ -1,6 +1,8 @@
 """Parsing and compilation of model files by MuJoCo."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,14 +37,26 @@ def compile_model(path: Path) -> CompiledModel:
     if hasattr(mujoco, "mj_clearCache"):  # its cache does not notice a mesh that changes within a second
         mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        if robot is not None:
-            complete_urdf(spec, robot, path)
-        return _compiled(spec, urdf=robot is not None)
+        with _no_log_file():
+            spec = mujoco.MjSpec.from_file(str(path))
+            if robot is not None:
+                complete_urdf(spec, robot, path)
+            return _compiled(spec, urdf=robot is not None)
     except UsageError:
         raise
     except (ValueError, mujoco.FatalError) as error:
         raise UsageError(f"{path}: {_clarified(' '.join(str(error).split()), spec)}") from None
+
+
+@contextmanager
+def _no_log_file() -> Iterator[None]:
+    """MuJoCo writes its warnings into MUJOCO_LOG.TXT of the working directory, in addition to Python's warnings."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(handler or (lambda _: None))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 def _compiled(spec: Any, *, urdf: bool) -> CompiledModel:

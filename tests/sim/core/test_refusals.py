@@ -10,9 +10,13 @@ import torch
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
+from gelflow.sim import _core
+from gelflow.sim.reductions import pad_forces
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.torch_layer import TorchState, torch_rollout, torch_state
+from gelflow.sim.trajectory import TouchStop
 
 U = np.zeros((2, 2, 6))  # of "pushing"
 FLOAT: Any = 0.5
@@ -20,6 +24,7 @@ FLOAT: Any = 0.5
 CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: s.reset([[1], [1, 2]]), "which must be numeric"),
     (lambda s: s.reset(np.ones(3)), r"which must have shape \(2,\), got \(3,\)"),
+    (lambda s: s.reset([0, 2]), "which must be a mask of True and False, got 2"),
     (lambda s: s.clear_history(np.ones(3)), r"which must have shape \(2,\), got \(3,\)"),
     (lambda s: s.tactile(np.zeros(3)), "out must have shape"),
     (lambda s: s.tactile(np.zeros((2, 130, 3), np.float32)), "out must be a C-contiguous array"),
@@ -27,7 +32,25 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: s.poses(np.zeros(2)), "out must have shape"),
     (lambda s: s.wrenches(3), "wrenches: arguments of these types: int"),
     (lambda s: s.step(np.zeros(6), 1.5), "steps must be an integer, got 1.5"),
+    (lambda s: s.step(np.zeros(6), -1), "steps must not be negative, got -1"),
     (lambda s: s.step(np.zeros(5)), "u must have shape"),
+    (lambda s: s.site_poses("a"), "q must be numeric"),
+    (lambda s: s.marker_slice(np.zeros(2)), r"no pad ndarray of shape \(2,\)"),
+    (lambda s: s.joint_q(3), "no joint 3"),
+    (lambda s: s.contact_modes(None), "trajectory must be a Trajectory, got None"),
+    (lambda s: s.rollout_gradient(None), "trajectory must be a Trajectory, got None"),
+    (lambda s: s.tactile(reduction=3), "reduction must be a TactileReduction, got 3"),
+    (lambda s: s.rollout(U, stop=1.0), "stop must be a TouchStop, got 1.0"),
+    (lambda s: s.rollout(U, stop=TouchStop("a")), "threshold must be numeric"),
+    (lambda s: s.rollout(U, read_after=3), "read_after must be a sequence of integers, got 3"),
+    (lambda s: s.rollout(U, anchored=-1), "anchored must be numeric"),
+    (lambda s: s.rollout(U + 1j), "u must be real, got complex128"),
+    (lambda s: s.scene.q(3), "no joint 3"),
+    (lambda s: load_scene(3), "scene must be a name or a path, got int"),  # type: ignore[arg-type]
+    (lambda s: load_scene("pushing", preset=[1]), r".*no preset \[1\]"),  # type: ignore[arg-type]
+    (lambda s: make_task("pushing", "a"), "num_envs must be an integer, got 'a'"),  # type: ignore[arg-type]
+    (lambda s: pad_forces(3), "scene must be a Scene"),  # type: ignore[arg-type]
+    (lambda s: torch_state(3), "sim must be a Simulator, got 3"),  # type: ignore[arg-type]
     (lambda s: s.step([1, [2]]), "u must be numeric"),
     (lambda s: s.rollout("a"), "u must be numeric"),
     (lambda s: s.rollout(U, q=np.zeros(3)), r"q must have shape \(2, 7\), got \(3,\)"),
@@ -74,6 +97,14 @@ def test_quaternion_of_length_zero(joint: str, start: int, tmp_path: Path) -> No
     with pytest.raises(UsageError, match=message):
         sim.rollout(np.zeros((1, 2, 1)), q=q)
     sim.rollout(np.zeros((1, 2, 1)), q=q, active=[True, False])
+    present = sim.q.copy()
+    sim.q[:] = q
+    with pytest.raises(UsageError, match=message):
+        sim.step(np.zeros(1))
+    sim.step(np.zeros(1), active=[True, False])
+    with pytest.raises(UsageError, match=message):
+        sim.error_estimate(np.zeros(1))
+    sim.q[:] = present
     state = torch_state(sim)
     state = TorchState(torch.from_numpy(q), state.v, state.anchors, state.anchored, state.history)
     with pytest.raises(UsageError, match=message):
@@ -83,7 +114,6 @@ def test_quaternion_of_length_zero(joint: str, start: int, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("pad", "extra", "message"),
     [
-        ("p", "ks = 1", "the name 'p' is used twice"),
         ("pad", 'law = "elastic"\nks = 0', "the elastic friction law needs ks > 0"),
     ],
 )
@@ -99,3 +129,56 @@ def test_refusals_of_the_core_at_load(
     assert main(["describe", str(tmp_path / "s.toml"), "--no-timing"]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+WRONG_PARAMETERS = [
+    ("box.mass", -1.0, "parameter 'box.mass' must be positive, got -1"),
+    ("box.mass", 0.0, "parameter 'box.mass' must be positive, got 0"),
+    ("box.inertia.xx", -1e-9, "parameter 'box.inertia.xx' must not be negative, got -1e-09"),
+    ("box.inertia.xy", 1.0, "the inertia of body 'box' must have no negative principal moment"),
+    ("pad_box.kn", -5.0, "parameter 'pad_box.kn' must not be negative, got -5"),
+    ("pad_box.mu", -0.1, "parameter 'pad_box.mu' must not be negative, got -0.1"),
+    ("box_yaw.damping", -0.1, "parameter 'box_yaw.damping' must not be negative, got -0.1"),
+    ("box.points.scale.y", 0.0, "parameter 'box.points.scale.y' must be positive, got 0"),
+    ("box.size.x", -0.1, "parameter 'box.size.x' must be positive, got -0.1"),
+]
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize(("name", "value", "message"), WRONG_PARAMETERS)
+def test_wrong_parameter(name: str, value: float, message: str, precision: Any) -> None:
+    sim = Simulator(load_scene("pushing"), num_envs=2, precision=precision)
+    right = sim.param(name)[1].copy()
+    sim.step(np.zeros(6))
+    sim.param(name)[1] = value
+    match = f"^environment 1: {message}"
+    with pytest.raises(UsageError, match=match):
+        sim.step(np.zeros(6))
+    with pytest.raises(UsageError, match=match):
+        sim.rollout(U)
+    sim.step(np.zeros(6), active=[True, False])
+    sim.param(name)[1] = right
+    sim.step(np.zeros(6))
+    values = torch.tensor([float(right), value], dtype=torch_state(sim).q.dtype)
+    with pytest.raises(UsageError, match=match):
+        torch_rollout(sim, torch_state(sim), torch.zeros((2, 2, 6), dtype=values.dtype), params={name: values})
+
+
+def test_a_pad_may_have_the_name_of_an_actuator(tmp_path: Path) -> None:
+    (tmp_path / "free.xml").write_text(FREE)
+    law = "kn = 1\nkt = 1\nmu = 1\nkd = 1\nks = 1"
+    table = f'[pads.p]\nsite = "s"\nrows = 2\ncols = 2\npitch = 1e-3\nagainst = "floor"\n{law}\n'
+    (tmp_path / "s.toml").write_text(f'format = 1\nmodel = "free.xml"\nstep = 0.002\n{table}\n')
+    sim = Simulator(load_scene(tmp_path / "s.toml"))
+    assert sim.param("pad:p.kd")[0] == 1 and sim.param("actuator:p.kd")[0] == 0
+    assert sim.param("p.kn")[0] == 1 and sim.param("p.gear")[0] == 1
+    with pytest.raises(UsageError, match=r"no parameter 'p.kd'; there are .*actuator:p.kd") as caught:
+        sim.param("p.kd")
+    assert "pad:p.kd" in str(caught.value)
+
+
+def test_two_elements_of_one_kind_and_name_are_refused() -> None:
+    spec = _core.ModelSpec()
+    spec.add_shape(_core.ShapeDef(name="floor", kind="plane"))
+    with pytest.raises(ValueError, match="the name 'floor' is used twice"):
+        spec.add_shape(_core.ShapeDef(name="floor", kind="plane"))

@@ -367,3 +367,17 @@ def test_urdf_is_loaded(tmp_path: Path) -> None:
     scene = load_scene(tmp_path / "arm.toml")
     assert [(j.name, j.type) for j in scene.joints] == [("turn", "hinge")]
     assert scene.bodies[0].mass == 2
+
+
+def test_loading_leaves_no_log_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MuJoCo writes its warnings into a file of the working directory."""
+    body = '<body name="hand"><joint/><geom size="0.1"/></body>'
+    (tmp_path / "child.xml").write_text(f'<mujoco><option impratio="10"/><worldbody>{body}</worldbody></mujoco>')
+    (tmp_path / "parent.xml").write_text(
+        '<mujoco><asset><model name="c" file="child.xml"/></asset><worldbody><body><joint/><geom size="0.1"/>'
+        '<attach model="c" body="hand" prefix="x_"/></body></worldbody></mujoco>'
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.warns(UserWarning, match="Attach conflict"):
+        load_scene(tmp_path / "parent.xml")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["child.xml", "parent.xml"]

@@ -1,0 +1,89 @@
+#include "model/parameter_checks.hpp"
+
+#include <algorithm>
+#include <sstream>
+
+#include "model/model.hpp"
+
+namespace gelflow {
+
+namespace {
+
+constexpr std::string_view signed_names[] = {"mass",
+                                             "inertia.xx",
+                                             "inertia.yy",
+                                             "inertia.zz",
+                                             "damping",
+                                             "armature",
+                                             "stiffness",
+                                             "frictionloss",
+                                             "limit_stiffness",
+                                             "limit_damping",
+                                             "turn_stiffness",
+                                             "turn_damping",
+                                             "kn",
+                                             "kt",
+                                             "mu",
+                                             "kd",
+                                             "ks"};
+constexpr std::string_view positive_names[] = {"mass",   "scale.x", "scale.y", "scale.z",
+                                               "size.x", "size.y",  "size.z",  "rounding"};
+
+template <std::size_t n>
+bool contains(const std::string_view (&names)[n], std::string_view name) {
+  return std::find(std::begin(names), std::end(names), name) != std::end(names);
+}
+
+// Whether a symmetric matrix has no negative eigenvalue: its principal minors are not negative, up to rounding errors.
+bool is_inertia(const M3<double>& m) {
+  constexpr double rounding = 1e-6;  // of parameters in single precision
+  const double size = m.cwiseAbs().maxCoeff();
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3;
+    if (m(i, i) * m(j, j) - m(i, j) * m(i, j) < -rounding * size * size) return false;
+  }
+  return !(m.determinant() < -rounding * size * size * size);
+}
+
+template <class T>
+std::string message(const std::string& name, const char* required, T got) {
+  std::ostringstream text;
+  text << "parameter '" << name << "' must " << required << ", got " << got;
+  return text.str();
+}
+
+}  // namespace
+
+ParamSign param_sign(std::string_view name, double value) {
+  if (value > 0 && contains(positive_names, name)) return ParamSign::positive;
+  return value >= 0 && contains(signed_names, name) ? ParamSign::not_negative : ParamSign::any;
+}
+
+template <class T>
+std::string wrong_parameter(const Model& model, const T* params) {
+  for (std::size_t i = 0; i < model.param_signs.size(); ++i) {
+    const ParamSign sign = model.param_signs[i];
+    if (sign == ParamSign::positive && params[i] <= T(0))
+      return message(model.param_names[i], "be positive", params[i]);
+    if (sign == ParamSign::not_negative && params[i] < T(0)) {
+      return message(model.param_names[i], "not be negative", params[i]);
+    }
+  }
+  for (const Body& body : model.bodies) {
+    const M3<double> before = body.params.in(model.param_defaults.data()).inertia();
+    const M3<double> now = body.params.in(params).inertia().template cast<double>();
+    if (is_inertia(before) && !is_inertia(now)) {
+      std::ostringstream text;
+      text << "the inertia of body '" << body.name << "' must have no negative principal moment, got xx yy zz xy xz yz "
+           << now(0, 0) << ' ' << now(1, 1) << ' ' << now(2, 2) << ' ' << now(0, 1) << ' ' << now(0, 2) << ' '
+           << now(1, 2);
+      return text.str();
+    }
+  }
+  return {};
+}
+
+template std::string wrong_parameter<double>(const Model&, const double*);
+template std::string wrong_parameter<float>(const Model&, const float*);
+
+}  // namespace gelflow
