@@ -12,7 +12,7 @@ from gelflow.geometry import Pose
 from gelflow.observation import Grid
 from gelflow.sim.scene.contacts import CONTACT_PARAMS, FRICTION_LAWS, is_per_area, read_contact_params
 from gelflow.sim.scene.gel import Gel, read_gel
-from gelflow.sim.scene.geometry.sampling import capsule, disc_lattice, shortest_rotations
+from gelflow.sim.scene.geometry.sampling import capsule, check_count, disc_lattice, shortest_rotations
 from gelflow.sim.scene.marker_files import read_marker_list
 from gelflow.sim.scene.mjcf.mechanics import GeomDef, Mechanics
 from gelflow.sim.scene.shapes import shape_geom
@@ -139,6 +139,7 @@ def _planar_markers(positions: Array, area: float, grid: Grid | None) -> _Marker
 def _grid(table: TomlTable) -> Grid:
     """The grid of a rectangle [mm], from rows, columns and either the pitch or the size of the area [m]."""
     rows, cols = table.integer("rows"), table.integer("cols")
+    check_count(table.location, rows * cols)
     if ("pitch" in table.data) == ("size" in table.data):
         raise UsageError(f"{table.location}: give either pitch (distance of markers) or size (area of the markers)")
     if "pitch" in table.data:

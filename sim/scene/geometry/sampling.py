@@ -10,6 +10,7 @@ Round surfaces have a Fibonacci lattice: points at equal steps of height, each r
 below. Equal steps of height are equal areas on spheres and on cylinders (Archimedes).
 """
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,6 +23,7 @@ from gelflow.sim.scene.geometry.mesh import TriangleMesh
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 ENDS = ("-z", "+z")
+MANY_POINTS, MOST_POINTS = 1_000_000, 20_000_000  # a point takes up to 0.5 kB
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 _PLASTIC = np.array(
     [0.7548776662466927, 0.5698402909980532]
@@ -31,6 +33,14 @@ _MIN_SAMPLES = 20_000
 _LLOYD_ITERATIONS = 8
 
 Array = NDArray[np.float64]
+
+
+def check_count(owner: str, count: int) -> None:
+    """Warn about a number of points that takes long; raise UsageError for one that does not fit into memory."""
+    if count > MOST_POINTS:
+        raise UsageError(f"{owner}: {count} points do not fit into memory; at most {MOST_POINTS}")
+    if count > MANY_POINTS:
+        warnings.warn(f"{owner}: {count} points; each step evaluates all that are near a shape", stacklevel=2)
 
 
 def box_surface(
@@ -56,6 +66,7 @@ def box_surface(
         raise UsageError(f"unknown face {unknown[0]!r} of a box; faces are {' '.join(FACES)}")
     if len(set(faces)) != len(faces) or not faces:
         raise UsageError(f"a box needs at least one face, each named once, got {list(faces)}")
+    check_count("box", counts[0] * counts[1] * counts[2])
     axes = [np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)]
     # Cell lengths of the trapezoidal rule: half a spacing at both ends.
     lengths = [_trapezoid(2 * h, n) for h, n in zip(half, counts, strict=True)]

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gelflow.errors import UsageError
+from gelflow.sim.scene import load_scene
 from gelflow.sim.scene.geometry.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
 
 
@@ -146,3 +147,12 @@ def test_area_components_give_the_derivative_of_the_area(axes: tuple[float, floa
 def test_invalid_sampling_is_an_error(call: object, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         call()  # type: ignore[operator]
+
+
+def test_many_points_are_announced() -> None:
+    with pytest.raises(UsageError, match="box: 1000000000000 points do not fit into memory"):
+        box_surface([1, 1, 1], [10_000, 10_000, 10_000])
+    with pytest.warns(UserWarning, match="box: 1000002 points; each step"):
+        box_surface([1, 1, 1], [2, 3, 166_667])
+    with pytest.raises(UsageError, match="do not fit into memory"):
+        load_scene("pushing", overrides={"pads.pad.rows": 100_000, "pads.pad.cols": 100_000})
