@@ -73,11 +73,14 @@ def output(script: str, folder: Path, *arguments: str) -> str:
     return done.stdout.strip()
 
 
-@pytest.mark.parametrize("start", ["fork", "spawn"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 def test_data_loader(start: str, tmp_path: Path) -> None:
     assert output(DATA_LOADER, tmp_path, start) == "same"
 
 
-@pytest.mark.parametrize(("start", "name"), [("fork", "gelflow/Pushing-v0"), ("spawn", "gelflow/Insertion-v0")])
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [("fork", "gelflow/Pushing-v0"), pytest.param("spawn", "gelflow/Insertion-v0", marks=pytest.mark.slow)],
+)
 def test_async_vector_environment(start: str, name: str, tmp_path: Path) -> None:
     assert output(ENVIRONMENTS, tmp_path, start, name) == "same"
