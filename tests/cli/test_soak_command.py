@@ -1,6 +1,7 @@
 """`gelflow soak` and the options of `gelflow mock` that it uses: results, resumption, errors."""
 
 import json
+import re
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ import pytest
 
 import gelflow.cli.soak_case as soak_case
 from gelflow.cli.main import main
-from gelflow.cli.soak_case import SoakCase, _outcome, _Watch
-from gelflow.errors import PeerError
+from gelflow.cli.mock_process import mock_robot
+from gelflow.cli.soak_case import REFUSED_WORLD, SoakCase, _outcome, _Watch
+from gelflow.errors import PeerError, PeerRefused
 from gelflow.hardware_mocks.faults.random_plan import random_plan
 from gelflow.hardware_mocks.simulated_cell.random_world import random_world
 
@@ -65,6 +67,28 @@ def test_a_mock_robot_that_never_starts_ends_the_soak_test(
     monkeypatch.setattr(SoakCase, "run", run)
     assert main(["soak", "--plans", "9", "--out", str(tmp_path)]) == 2
     assert "3 plans in sequence did not run" in capsys.readouterr().err
+
+
+def test_a_refused_world_is_a_row_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(case: SoakCase, keep: Path | None = None) -> dict[str, Any]:
+        raise PeerRefused("the mock robot did not start: gelflow mock: the markers are uneven")
+
+    monkeypatch.setattr(SoakCase, "run", run)
+    assert main(["soak", "--plans", "4", "--out", str(tmp_path), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["plans"] == 4 and result["outcomes"] == {REFUSED_WORLD: 4} and not result["kinds"]
+    assert main(["soak", "--plans", "4", "--out", str(tmp_path)]) == 0, "the rows are known; nothing is run again"
+    capsys.readouterr()
+    assert main(["soak", "--only", "1", "--out", str(tmp_path), "--json"]) == 0
+    assert "markers are uneven" in json.loads(capsys.readouterr().out)["rows"][0]["message"]
+
+
+def test_a_mock_robot_that_refuses_its_options_says_why(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.toml"
+    with pytest.raises(PeerRefused, match=re.escape(str(missing))), mock_robot(factor=1.0, seed=0, world=missing):
+        pass
 
 
 @pytest.mark.parametrize("arguments", [["--plans", "0"], ["--jobs", "0"], ["--seed", "-1"]])

@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from gelflow.errors import PeerError
+from gelflow.cli.exit_codes import ERROR
+from gelflow.errors import PeerError, PeerRefused
 
 _START_LIMIT = 60.0  # of the mock robot [s, wall]
 _STOP_LIMIT = 10.0  # [s, wall]
@@ -24,7 +25,8 @@ def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: o
     """Run a mock robot in a separate process; yields its lab file and the URL of its true state.
 
     `more` are further options of `gelflow mock`, by name; None omits one.
-    Raises PeerError with the process's last line of standard error when it does not start.
+    Raises PeerError with the process's last line of standard error when it does not start, PeerRefused when that line
+    is a refusal of its options.
     """
     truth_port = free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as errors:
@@ -80,7 +82,8 @@ def _await_file(path: Path, process: subprocess.Popen[bytes], errors: IO[bytes])
         if process.poll() is not None or time.monotonic() > end:
             errors.seek(0)
             lines = errors.read().decode(errors="replace").strip().splitlines()
-            raise PeerError(f"the mock robot did not start: {lines[-1] if lines else 'no reason given'}")
+            kind = PeerRefused if process.returncode == ERROR else PeerError
+            raise kind(f"the mock robot did not start: {lines[-1] if lines else 'no reason given'}")
         time.sleep(0.05)
 
 

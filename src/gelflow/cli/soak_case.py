@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.cli.mock_process import mock_robot, true_state
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, PeerRefused
 from gelflow.hardware_mocks.faults.plan import FaultPlan
 from gelflow.hardware_mocks.faults.plan_file import plan_to_tables
 from gelflow.hardware_mocks.faults.random_plan import random_plan
@@ -24,10 +24,12 @@ from gelflow.real.soak.rules import RunFacts, violations
 from gelflow.real.soak.session_facts import largest_time_out, read_session
 from gelflow.toml_tables import toml_text
 
+REFUSED_WORLD = "no insertion: the mock robot refused the world"
 _POLL = 0.25  # of the true state [s, wall]
 _STILL = 1e-6  # change of a position that is no motion [m]
 _WALL_LIMIT = 240.0  # of a run, in which robot time may have stopped [s, wall]
-_OUTCOME_LENGTH = 60  # characters; the message of the row is longer
+_OUTCOME_LENGTH = 60  # characters
+_MESSAGE_LENGTH = 300  # characters
 _END_LIMIT = 10.0  # from SIGTERM to the end of the runner [s, wall]
 
 
@@ -50,7 +52,7 @@ class SoakCase:
     def run(self, keep: Path | None = None) -> dict[str, Any]:
         """Run the case and check the rules; returns the row for the ledger. `keep` is the folder for its files.
 
-        Raises PeerError when the mock robot does not start.
+        Raises PeerError when the mock robot does not start, PeerRefused when it refuses the world.
         """
         begun = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="gelflow-soak-") as name:
@@ -94,7 +96,7 @@ class SoakCase:
             "changed": changed_groups(self.world),
             "outcome": run.outcome,
             "exit_code": run.exit_code,
-            "message": (errors.strip().splitlines() or [""])[-1][:300],
+            "message": (errors.strip().splitlines() or [""])[-1][:_MESSAGE_LENGTH],
             "truth": {key: value for key, value in part.items() if key != "misalignment"},
             "faults": watch.truth.get("faults", []),
             "idle": round(run.idle, 2),
@@ -166,9 +168,29 @@ def _outcome(output: str, errors: str) -> str:
         return "refused at preflight" if "preflight failed" in errors else "stopped by an error"
 
 
+def _refused_row(case: SoakCase, message: str) -> dict[str, Any]:
+    return {
+        "plan": str(case.plan),
+        "kinds": [],  # no fault took place
+        "world": plain_world(case.world),
+        "changed": changed_groups(case.world),
+        "outcome": REFUSED_WORLD,
+        "message": message[:_MESSAGE_LENGTH],
+        "truth": {},
+        "violations": [],
+        "wall": 0.0,
+    }
+
+
 def try_case(case: SoakCase, keep: Path | None) -> dict[str, Any] | str:
-    """The row of a case, or the reason why its mock robot failed."""
+    """The row of a case, or the reason why its mock robot failed.
+
+    A refused world has a row without an insertion: its calibration fails each time, for example with markers that are
+    too uneven.
+    """
     try:
         return case.run(keep)
+    except PeerRefused as error:
+        return _refused_row(case, str(error))
     except PeerError as error:
         return str(error)

@@ -151,6 +151,8 @@ def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: ar
 
 
 def _line(seed: int, row: dict[str, Any]) -> str:
+    if not row["truth"]:
+        return f"{seed:6d}  {row['outcome']}: {row['message']}"
     broken = f"  VIOLATED: {', '.join(row['violations'])}" if row["violations"] else ""
     truth = "in the hole" if row["truth"].get("inserted") else "not in the hole"
     pushed = 1e3 * row["truth"].get("largest_push", 0.0)
