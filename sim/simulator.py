@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.measurement.machine import default_threads
 from gelflow.sim import _core, arguments
-from gelflow.sim.arguments import check_state, checked, fill, flags, number_array
+from gelflow.sim.arguments import checked, fill, flags, number_array
 from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator_copy import contents, rebuilt
@@ -326,7 +326,6 @@ class Simulator:
             stopped_at=np.full(n, -1, np.int32),
             reduction=reduction,
         )
-        check_state(self.model, result.q[0], result.v[0], result.active)
         checked(self._batch.rollout, result.core(), None if stop is None else stop.core(n, steps))
         return result
 

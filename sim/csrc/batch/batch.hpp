@@ -77,7 +77,7 @@ class Batch {
   void rollout_one(const Trajectory<T>& r, const TouchStop* stop, int env, int thread);
   void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* grad_q,
                         double* grad_v);
-  void check_state(const std::uint8_t* active) const;
+  void check_state(const T* positions, const T* velocities, const std::uint8_t* active) const;  // (N, nq), (N, nv)
   void check_params(const std::uint8_t* active);
   void check_controls(const T* u, int rows, const std::uint8_t* active) const;
   std::vector<StepMemory<T>> memory_;             // one per thread

@@ -81,21 +81,21 @@ void Batch<T>::check_controls(const T* u, int rows, const std::uint8_t* active) 
 }
 
 template <class T>
-void Batch<T>::check_state(const std::uint8_t* active) const {
-  const auto check = [&](const std::vector<T>& values, const char* what, int width) {
-    for (std::size_t i = 0; i < values.size(); ++i) {
+void Batch<T>::check_state(const T* positions, const T* velocities, const std::uint8_t* active) const {
+  const auto check = [&](const T* values, const char* what, std::size_t width) {
+    for (std::size_t i = 0; i < n * width; ++i) {
       if (is_finite(values[i]) || (active != nullptr && active[i / width] == 0)) continue;
       throw std::invalid_argument(std::string(what) + "[" + std::to_string(i / width) + ", " +
                                   std::to_string(i % width) + "] is not finite");
     }
   };
-  check(q, "q", model->nq);
-  check(v, "v", model->nv);
+  check(positions, "q", model->nq);
+  check(velocities, "v", model->nv);
   for (const Joint& joint : model->joints) {
     if (!joint.has_quaternion()) continue;
     const int first = joint.quaternion_q();
     for (int e = 0; e < n; ++e) {
-      const V4<T> quaternion = vec4(q.data() + static_cast<std::size_t>(e) * model->nq + first);
+      const V4<T> quaternion = vec4(positions + static_cast<std::size_t>(e) * model->nq + first);
       constexpr double shortest = 1e-6;
       if (quaternion.squaredNorm() >= T(shortest * shortest) || (active != nullptr && active[e] == 0)) continue;
       std::ostringstream text;
@@ -123,7 +123,7 @@ template <class T>
 void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active) {
   if (steps < 0) throw std::invalid_argument("steps must not be negative, got " + std::to_string(steps));
   check_controls(u.u, u.shared ? 1 : n, u.shared ? nullptr : active);
-  check_state(active);
+  check_state(q.data(), v.data(), active);
   check_params(active);
   for_active(active, [&](int e, int thread) {
     follow_leaders<T>(*model, state(e));
@@ -155,7 +155,7 @@ void position_difference(const Model& m, const T* q0, const T* q1, T* out) {
 template <class T>
 void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
   check_controls(u.u, u.shared ? 1 : n, nullptr);
-  check_state(nullptr);
+  check_state(q.data(), v.data(), nullptr);
   check_params(nullptr);
   const Model& m = *model;
   for_all([&](int e, int thread) {

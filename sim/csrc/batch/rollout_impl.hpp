@@ -48,6 +48,7 @@ void Batch<T>::rollout_one(const Trajectory<T>& r, const TouchStop* stop, int en
 template <class T>
 void Batch<T>::rollout(const Trajectory<T>& r, const TouchStop* stop) {
   check_controls(r.u, r.steps * n, r.active);
+  check_state(r.q, r.v, r.active);
   check_params(r.active);
   for (int e = 0; e < n; ++e) {
     r.status[e] = 0;

@@ -20,8 +20,8 @@ class ThreadPool {
   ThreadPool(const ThreadPool&) = delete;
   ThreadPool& operator=(const ThreadPool&) = delete;
   int size() const { return threads_; }
-  // Calls work(item, thread) for each item below `items`, and returns when all calls have returned; after an
-  // interruption for those only that had begun.
+  // Calls work(item, thread) for each item below `items`, and returns when all calls have returned. After an interruption
+  // no further call begins.
   void run(int items, const std::function<void(int, int)>& work, Interruption& interruption);
 
  private:

@@ -8,15 +8,21 @@
 
 namespace gelflow {
 
+// Anchors of the points of a pack after a step.
+template <class T>
+GELFLOW_INLINE Vec3<Pack<T>> next_anchors(const ContactPack<T>& t, const T& step_length) {
+  PointForce<Pack<T>> force;
+  point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
+  return next_anchor(t.law, Pack<T>(step_length), force, t.x, t.anchor, t.has_anchor);
+}
+
 // Anchors after an accepted step at the candidate points; `next` and `next_set` may be the arrays that are read.
 template <class T>
 void advance_anchors(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
                      const ContactSettings<T>& settings, int cloud_size, V3<T>* next, std::uint8_t* next_set) {
   std::fill(next_set, next_set + cloud_size, 0);
   for_contact_points<false, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
-    PointForce<Pack<T>> force;
-    point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
-    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.step_length), force, t.x, t.anchor, t.has_anchor);
+    const Vec3<Pack<T>> anchor = next_anchors<T>(t, settings.step_length);
     t.for_each_active([&](int k, int i) {
       next[i] = lane3<T>(anchor, k);
       next_set[i] = 1;
@@ -29,9 +35,7 @@ template <class T>
 void advance_anchors(const PairFrame<T>& frame, const PointCloud& cloud, const ContactSettings<T>& settings,
                      V3<T>* next, std::uint8_t* next_set) {
   const auto advance = [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
-    PointForce<Pack<T>> force;
-    point_force<false>(t.law, t.at, t.v, t.e, t.has_anchor, force);
-    const Vec3<Pack<T>> anchor = next_anchor(t.law, Pack<T>(settings.step_length), force, t.x, t.anchor, t.has_anchor);
+    const Vec3<Pack<T>> anchor = next_anchors<T>(t, settings.step_length);
     const unsigned active = bits(t.active);
     for (int k = 0; k < std::min(pack_width<T>, cloud.size() - t.first); ++k) next_set[t.first + k] = active >> k & 1U;
     if constexpr (has_fours<T>) {

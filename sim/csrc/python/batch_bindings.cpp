@@ -44,12 +44,12 @@ class ExclusiveUse {
   std::atomic<int>& user_;
 };
 
+std::uint64_t main_thread = 0;  // Python's; set when the module is loaded
+
 // Calls work() without the interpreter's lock. Python's main thread, which alone handles signals, looks for them
 // meanwhile: an exception of a handler, as at Ctrl-C, ends the call.
 template <class T, class Work>
 void call(Batch<T>& b, const Work& work) {
-  static const auto main_thread =
-      py::module_::import("threading").attr("main_thread")().attr("ident").cast<std::uint64_t>();
   const ExclusiveUse use(b.user);
   const bool handles_signals = PyThread_get_thread_ident() == main_thread;
   b.interruption().begin(!handles_signals ? std::function<bool()>() : [] {
@@ -382,6 +382,7 @@ void bind_batch(py::module_& module, const char* name) {
 }  // namespace
 
 void bind_batches(py::module_& module) {
+  main_thread = py::module_::import("threading").attr("main_thread")().attr("ident").cast<std::uint64_t>();
   bind_reading_options(module);
   bind_trajectory(module);
   bind_batch<double>(module, "Batch");

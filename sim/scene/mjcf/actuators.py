@@ -16,12 +16,6 @@ from gelflow.sim.scene.mjcf.model_file import element_names
 
 INF = float("inf")
 
-
-def is_fixed(model: Any, tendon: int) -> bool:
-    """Whether a tendon of a compiled model is fixed: a linear combination of joint positions."""
-    return bool(model.wrap_type[model.tendon_adr[tendon]] == mujoco.mjtWrap.mjWRAP_JOINT)
-
-
 LIMIT_TIME = 0.01  # [s] largest time constant sqrt(inertia / stiffness) of a default limit
 LIMIT_DEFLECTION = {"hinge": 0.01, "slide": 1e-3}  # [rad], [m] beyond the range under the full motor force
 LIMIT_SERVO_RATIO = 100.0  # stiffness of a default limit over that of a servo without a force limit
@@ -51,6 +45,11 @@ class ActuatorDef:
             gain = {"velocity": self.kd, "general": self.gain}.get(self.kind, 1.0)
             largest = abs(gain) * largest_control + abs(self.bias) if gain else abs(self.bias)
         return abs(self.gear) * largest if self.gear else 0.0
+
+
+def is_fixed(model: Any, tendon: int) -> bool:
+    """Whether a tendon of a compiled model is fixed: a linear combination of joint positions."""
+    return bool(model.wrap_type[model.tendon_adr[tendon]] == mujoco.mjtWrap.mjWRAP_JOINT)
 
 
 def read_actuators(model: Any, where: str) -> tuple[ActuatorDef, ...]:

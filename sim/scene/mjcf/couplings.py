@@ -9,7 +9,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from gelflow.geometry import Pose
+from gelflow.geometry import Pose, conjugate, multiply
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef, actuator_addition, default_limit, is_fixed
 from gelflow.sim.scene.mjcf.model_file import element_names
 
@@ -95,13 +95,12 @@ def read_couplings(model: Any) -> tuple[CouplingDef, ...]:
     couplings = []
     for e, name in _active(model, (mujoco.mjtEq.mjEQ_JOINT,)):
         joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-        offset = float(model.qpos0[model.jnt_qposadr[joint]])
-        polynomial = Polynomial(model.eq_data[e, :5])
         if leader < 0:
             coefficients = np.array([model.eq_data[e, 0]])
         else:
-            coefficients = polynomial(Polynomial([-model.qpos0[model.jnt_qposadr[leader]], 1.0])).coef
-        coefficients[0] += offset
+            deviation = Polynomial([-model.qpos0[model.jnt_qposadr[leader]], 1.0])
+            coefficients = Polynomial(model.eq_data[e, :5])(deviation).coef
+        coefficients[0] += model.qpos0[model.jnt_qposadr[joint]]
         coefficients = np.trim_zeros(coefficients, "b")
         kind = "slide" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"
         couplings.append(CouplingDef(name, joint, leader, tuple(coefficients.tolist()), kind))
@@ -126,7 +125,7 @@ def read_loop_closures(model: Any, moving_body: NDArray[np.int64], poses: Sequen
         bodies = int(moving_body[members[0]]), int(moving_body[members[1]])
         if bodies[0] == bodies[1]:
             continue  # fixed to each other already
-        turn = (Pose(np.zeros(3), second.quaternion) @ Pose(np.zeros(3), first.quaternion).inverse()).quaternion
+        turn = np.array(multiply(second.quaternion, conjugate(first.quaternion)))
         closures.append(LoopClosureDef(name, bodies, (first.position, second.position), weld, turn if weld else None))
     return tuple(closures)
 
