@@ -17,6 +17,19 @@ from gelflow.session.recorder import SessionRecorder
 CLOCK = ScaledClock()
 
 
+class StandingClock:
+    """Robot time that stands still, as while the simulation of a mock robot is late."""
+
+    def now(self) -> float:
+        return 5.0
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    def wall(self, seconds: float) -> float:
+        return seconds
+
+
 @pytest.mark.parametrize("slow", ["fsync", "write"])
 def test_a_slow_disk_is_noticed_within_the_allowed_delay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow: str
@@ -48,6 +61,16 @@ def test_a_slow_disk_is_noticed_within_the_allowed_delay(
         released.set()
     with SessionReader(tmp_path / "a.mcap") as reader:
         assert reader.counts()["/event"] > 10
+
+
+def test_records_are_stored_while_robot_time_stands_still(tmp_path: Path) -> None:
+    with SessionRecorder(tmp_path / "a.mcap", StandingClock(), max_delay=20.0) as recorder:
+        recorder.event("tick")
+        end = time.monotonic() + 20
+        while recorder.delay > 0 and time.monotonic() < end:
+            time.sleep(0.01)
+        assert recorder.delay == 0
+        recorder.check()
 
 
 def test_delay_is_zero_when_all_records_are_stored(tmp_path: Path) -> None:

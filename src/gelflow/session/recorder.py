@@ -303,11 +303,12 @@ class SessionRecorder:
 
     def _write_queue(self, writer: Writer, channels: Mapping[str, int], syncer: "_Syncer") -> bool:
         """Write the queue until the recorder is closed (True) or fails (False)."""
-        due = self._clock.now() + FLUSH_PERIOD
+        period = self._clock.wall(FLUSH_PERIOD)  # robot time may stand still
+        due = time.monotonic() + period
         while self._failure is None:
             item: _Item | threading.Event | None = None
             with contextlib.suppress(queue.Empty):
-                queued = self._queue.get(timeout=max(0.0, self._clock.wall(due - self._clock.now())))
+                queued = self._queue.get(timeout=max(0.0, due - time.monotonic()))
                 if queued is None:
                     return True
                 stamp, item = queued
@@ -315,13 +316,13 @@ class SessionRecorder:
             if isinstance(item, tuple):
                 topic, logged, published, sequence, data = item
                 writer.add_message(channels[topic], logged, data, published, sequence)
-            if isinstance(item, threading.Event) or self._clock.now() >= due:
+            if isinstance(item, threading.Event) or time.monotonic() >= due:
                 if self._writing is not None:
                     writer.flush()  # type: ignore[no-untyped-call]
                     self._syncing.append(self._writing)
                     self._writing = None
                     syncer.request(item if isinstance(item, threading.Event) else None)
-                due = self._clock.now() + FLUSH_PERIOD
+                due = time.monotonic() + period
         return False
 
 
