@@ -79,6 +79,23 @@ std::vector<V3<T>> end_anchors_vjp(const Model& m, const T* params, const Subste
   return grad_anchor;
 }
 
+// The multiplier where rounding errors made the Jacobian singular: far from the world's origin the inertia of a rotation
+// is a difference of much larger numbers, inertias about the origin, and may become 0. The diagonal changes by the
+// rounding error of these numbers.
+template <class T>
+void solve_nearly_singular(const Model& m, const T* params, const StepStart<T>& start, const VX<T>& v, const VX<T>& b,
+                           Workspace<T>& w, VX<T>& multiplier) {
+  evaluate<true, T>(m, params, start, v.data(), CacheState::stale, false, w);
+  reduce_couplings<T>(m, w.tangent);
+  remove_prescribed<T>(m, w.tangent);
+  w.tangent.leftCols(m.nv).transposeInPlace();
+  for (const int k : m.articulated_dofs) {
+    if (m.angular[k]) w.tangent(k, k) += Eigen::NumTraits<T>::epsilon() * w.composite[m.dof_body[k]].inertia.trace();
+  }
+  factorize<T>(w.tangent, m.nv, w.pivots);
+  solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+}
+
 // Transforms g from the gradient at the substep's end to the gradient at its start, and adds to grad_u.
 // `on_multiplier`(c) is called before the gradient of the anchors changes.
 template <class T, class OnMultiplier>
@@ -103,6 +120,9 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   factorize<T>(w.tangent, m.nv, w.pivots);
   VX<T> multiplier(m.nv);
   solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+  if (!multiplier.allFinite()) [[unlikely]] {
+    solve_nearly_singular<T>(m, params, start, r.v1, b, w, multiplier);
+  }
   expand_couplings<T>(m, multiplier);
   on_multiplier(multiplier);
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
