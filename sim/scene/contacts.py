@@ -1,6 +1,7 @@
 """Contact points sampled on geometries, and contacts between point sets and shapes."""
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,6 +9,13 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose
+from gelflow.sim.scene.default_points import (
+    WIDEST_GAP,
+    choose_spacings,
+    default_surface,
+    largest_gap,
+    smallest_width,
+)
 from gelflow.sim.scene.geometry.sampling import (
     ENDS,
     FACES,
@@ -28,6 +36,7 @@ DAMPING_LAWS = ("hunt-crossley", "linear")  # the first is the default
 _RENAMED_DAMPING = {"depth": "hunt-crossley", "plain": "linear"}
 CONTACT_PARAMS = ("kn", "kt", "mu", "kd", "ks")  # parameters of the contact law (docs/reference/physics.md)
 _STIFFNESS_UNITS = ("per point", "per area")
+_DENSITY_KEYS = ("resolution", "count", "angles", "radii", "heights", "faces")
 
 
 @dataclass(frozen=True)
@@ -58,10 +67,53 @@ class ContactDef:
     params: Mapping[str, float]  # kn, kt, mu, kd, ks
 
 
-def read_points(tables: Mapping[str, TomlTable], mechanics: Mechanics) -> dict[str, PointsDef]:
-    """The point sets of the tables `points.NAME`. Raises UsageError on an unknown or unsupported geometry."""
+def read_points(
+    tables: Mapping[str, TomlTable], contacts: Mapping[str, TomlTable], mechanics: Mechanics
+) -> dict[str, PointsDef]:
+    """The point sets of the tables `points.NAME`; `contacts` are the tables `contacts.NAME`.
+
+    Raises UsageError on an unknown or unsupported geometry.
+    """
     geoms = {geom.name: geom for geom in mechanics.geoms}
-    return {name: _sample(name, table, geoms) for name, table in tables.items()}
+    spacings = _default_spacings(tables, contacts, geoms)
+    return {name: _sample(name, table, geoms, spacings.get(name)) for name, table in tables.items()}
+
+
+def warn_of_gaps(
+    contacts: Sequence[ContactDef],
+    points: Mapping[str, PointsDef],
+    tables: Mapping[str, TomlTable],
+    mechanics: Mechanics,
+) -> None:
+    """Warn of each contact whose shape fits between the points, unless points on it cover the opposite direction."""
+    geoms = {geom.name: geom for geom in mechanics.geoms}
+    gaps: dict[str, float] = {}
+
+    def covered(name: str, shape: str) -> bool:
+        sampled, width = points[name], smallest_width(geoms[shape])
+        if sampled.radius > 0 or np.isinf(width):
+            return True
+        if name not in gaps:
+            geom = geoms[sampled.geom]
+            faces = tables[name].strings("faces", FACES if geom.kind == "box" else ENDS)
+            gaps[name] = largest_gap(geom, geom.pose.inverse().apply(sampled.points), faces)
+        return gaps[name] <= WIDEST_GAP * width
+
+    pairs = [(contact, points[contact.points].geom) for contact in contacts]
+    for contact, geom in pairs:
+        if covered(contact.points, contact.shape):
+            continue
+        if any(other.shape == geom and of == contact.shape and covered(other.points, geom) for other, of in pairs):
+            continue
+        given = tables[contact.points].data.keys() & {*_DENSITY_KEYS}
+        denser = "increase count" if "count" in given else f"omit {', '.join(sorted(given))}"
+        advice = f"{denser}, or add" if given else "add"
+        warnings.warn(
+            f"{tables[contact.points].location}: {contact.shape!r}, {smallest_width(geoms[contact.shape]):.3g} m wide, "
+            f"can pass between the points of {geom!r}, whose gaps are up to {gaps[contact.points]:.3g} m; {advice} a "
+            f"contact of points on {contact.shape!r} against {geom!r}",
+            stacklevel=2,
+        )
 
 
 def read_contacts(
@@ -119,7 +171,28 @@ def _check_contact(sampled: PointsDef, shape: GeomDef, law: str, table: TomlTabl
         )
 
 
-def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef]) -> PointsDef:
+def _default_spacings(
+    tables: Mapping[str, TomlTable], contacts: Mapping[str, TomlTable], geoms: Mapping[str, GeomDef]
+) -> dict[str, float]:
+    """The spacing of each point set that is in a contact and whose table gives no density [m].
+
+    Names that do not exist are left to the readers of points and contacts.
+    """
+    partners: dict[str, list[GeomDef]] = {}
+    for table in contacts.values():
+        against, name = table.data.get("against"), table.data.get("points")
+        names = [against] if isinstance(against, str) else against if isinstance(against, list) else []
+        partners.setdefault(str(name), []).extend(geoms[shape] for shape in names if shape in geoms)
+    sampled = {name: geoms.get(str(table.data.get("geom"))) for name, table in tables.items()}
+    default = {
+        name: geom
+        for name, geom in sampled.items()
+        if geom and partners.get(name) and not tables[name].data.keys() & {*_DENSITY_KEYS}
+    }
+    return choose_spacings(default, partners)
+
+
+def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef], spacing: float | None) -> PointsDef:
     geom = table.lookup(geoms, table.string("geom"), "geometry")
     if geom.kind == "sphere" and "count" not in table.data:
         if len(table.data) > 1:
@@ -128,8 +201,10 @@ def _sample(name: str, table: TomlTable, geoms: Mapping[str, GeomDef]) -> Points
             )
         radius, center = float(geom.size[0]), geom.pose.position[None]
         return PointsDef(name, geom.name, geom.body, center, np.ones((1, 3)), np.ones(1), radius, geom.pose, False)
+    if spacing is not None:
+        table.check_keys(("geom", "stiffness"))
     try:
-        local, areas = _surface(table, geom)
+        local, areas = _surface(table, geom) if spacing is None else default_surface(geom, spacing)
     except UsageError as error:
         located = str(error).startswith(table.location)
         raise UsageError(str(error) if located else f"{table.location}: {error}") from None

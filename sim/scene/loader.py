@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points
+from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points, warn_of_gaps
 from gelflow.sim.scene.joint_limits import read_limits
 from gelflow.sim.scene.mjcf.mechanics import SiteDef, read_mechanics
 from gelflow.sim.scene.pads import read_pads
@@ -79,8 +79,9 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
     top.check_keys(_KEYS)
     friction = top.string("friction", "viscous", choices=FRICTION_LAWS)
     mechanics = add_sites(top.tables("sites"), read_mechanics(path.parent / top.string("model")))
-    points = read_points(top.tables("points"), mechanics)
+    points = read_points(top.tables("points"), top.tables("contacts"), mechanics)
     contacts = read_contacts(top.tables("contacts"), points, mechanics, friction)
+    warn_of_gaps(contacts, points, top.tables("points"), mechanics)
     pads = read_pads(top.tables("pads"), mechanics, friction, path.parent)
     shape_names = {contact.shape for contact in contacts} | {name for pad in pads for name in pad.against}
     point_names = {contact.points for contact in contacts}

@@ -68,8 +68,23 @@ def box_surface(
         raise UsageError(f"a box needs at least one face, each named once, got {list(faces)}")
     check_count("box", counts[0] * counts[1] * counts[2])
     axes = [np.linspace(-h, h, n) for h, n in zip(half, counts, strict=True)]
-    # Cell lengths of the trapezoidal rule: half a spacing at both ends.
     lengths = [_trapezoid(2 * h, n) for h, n in zip(half, counts, strict=True)]
+    return _surface_of_grid(axes, lengths, faces)
+
+
+def box_grid(axes: Sequence[Array], *, faces: Sequence[str] = FACES) -> tuple[Array, Array]:
+    """Points on the surface of a box, of a grid with any increasing coordinates [m] along x, y, z.
+
+    The first and last coordinates are those of the faces. Returns points and areas as `box_surface`.
+    """
+    return _surface_of_grid(
+        axes, [(np.diff(axis, prepend=axis[0]) + np.diff(axis, append=axis[-1])) / 2 for axis in axes], faces
+    )
+
+
+def _surface_of_grid(axes: Sequence[Array], lengths: Sequence[Array], faces: Sequence[str]) -> tuple[Array, Array]:
+    """The points of a grid that are on faces of its box; `lengths` are the cell lengths of the trapezoidal rule."""
+    counts = [len(axis) for axis in axes]
     areas = np.zeros((*counts, 3))
     chosen = np.zeros(counts, dtype=bool)
     for face in faces:
@@ -221,6 +236,11 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
     points: Array = samples[chosen]
     areas: Array = (fractions * (total / number)).astype(float)
     return points, areas
+
+
+def mesh_samples(mesh: TriangleMesh, number: int) -> Array:
+    """`number` points of a low-discrepancy sequence on a mesh [m], shape (number, 3); deterministic."""
+    return _equal_area_samples(mesh, number)[0]
 
 
 def _equal_area_samples(mesh: TriangleMesh, number: int) -> tuple[Array, Array, float]:
