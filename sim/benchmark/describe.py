@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import UsageError
+from gelflow.sim.benchmark.accuracy_hints import accuracy_hints
 from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.loader import scene_tables
@@ -133,6 +134,7 @@ class Description:
     scene: str
     path: str
     step: float  # [s]
+    integrator: str  # "bdf1" or "bdf2"
     friction: str
     gravity: tuple[float, ...]  # [m/s²]
     bodies: tuple[BodyPart, ...]  # the world first
@@ -140,6 +142,7 @@ class Description:
     shapes: tuple[ShapePart, ...]  # meshes and rounded shapes
     contacts: tuple[ContactPart, ...]
     pads: tuple[PadPart, ...]
+    hints: tuple[str, ...]  # parts that the step and integrator resolve poorly
     not_modelled: tuple[str, ...]
     size: Size
 
@@ -162,6 +165,7 @@ def describe(scene: Scene) -> Description:
         scene=scene.name,
         path=str(scene.path),
         step=scene.step,
+        integrator=scene.integrator,
         friction=scene.friction,
         gravity=_floats(scene.gravity),
         bodies=bodies,
@@ -186,6 +190,7 @@ def describe(scene: Scene) -> Description:
             )
             for pad in scene.pads
         ),
+        hints=accuracy_hints(scene),
         not_modelled=(*scene.not_modelled, *_not_modelled(scene, mechanics, model, bodies)),
         size=_size(scene),
     )

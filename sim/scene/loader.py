@@ -12,7 +12,7 @@ from gelflow.sim.scene.joint_limits import read_limits
 from gelflow.sim.scene.mjcf.mechanics import SiteDef, read_mechanics
 from gelflow.sim.scene.pads import read_pads
 from gelflow.sim.scene.presets import Presets, apply_preset, read_presets
-from gelflow.sim.scene.scene import DEFAULT_TOLERANCE, Precision, Scene
+from gelflow.sim.scene.scene import DEFAULT_INTEGRATOR, DEFAULT_TOLERANCE, Precision, Scene
 from gelflow.sim.scene.shapes import used_shapes
 from gelflow.sim.scene.sites import add_sites
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
@@ -92,7 +92,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
         name=path.stem,
         path=path,
         step=top.number("step", mechanics.step if path.suffix in MODEL_SUFFIXES else None, minimum=1e-6),
-        integrator=top.string("integrator", "bdf1", choices=INTEGRATORS),
+        integrator=top.string("integrator", DEFAULT_INTEGRATOR, choices=INTEGRATORS),
         tolerance=top.number("tolerance", DEFAULT_TOLERANCE, minimum=1e-15),
         precision=cast("Precision", top.string("precision", "double", choices=PRECISIONS)),
         friction=friction,

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Precision = Literal["double", "single"]
 
 DEFAULT_TOLERANCE = 1e-7  # of Newton's method
+DEFAULT_INTEGRATOR = "bdf2"  # the reasons are in docs/reference/accuracy.md
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Scene:
     joints: tuple[JointDef, ...]
     limits: tuple[JointLimit, ...]  # one per joint
     q0: Array  # initial positions, shape (nq,)
-    integrator: str = "bdf1"  # or "bdf2"
+    integrator: str = DEFAULT_INTEGRATOR  # or "bdf1"
     tolerance: float = DEFAULT_TOLERANCE  # of Newton's method, see docs/reference/physics.md
     precision: Precision = "double"  # default precision of a `Simulator` of this scene
     friction: str = "viscous"  # friction law of contacts and pads that set none: "viscous" or "elastic"

@@ -46,7 +46,7 @@ PARALLEL = Gripper(
     f'<tendon><fixed name="split">{HALVES}</fixed></tendon>{EQUAL.replace("MORE", "")}'
     '<actuator><motor name="grip" tendon="split"/></actuator>',
     (0, 0, 0),
-    (10, 0.3),
+    (10, 0.75),
 )
 # Each finger is the coupler of a parallelogram, so that its pad stays vertical.
 FOUR_BAR = Gripper(
@@ -78,7 +78,7 @@ TENDON = Gripper(
     + '</tendon><equality><joint joint1="right" joint2="left"/></equality>'
     + '<actuator><motor name="grip" tendon="left_tendon"/><motor name="grip_right" tendon="right_tendon"/></actuator>',
     (0, 0, -0.05),
-    (0.5, 0.05),
+    (0.5, 0.045),
     'shape = "hemisphere"\nradius = 0.01\ncount = 60',
 )
 GRIPPERS = {"tendon and equality": PARALLEL, "four-bar": FOUR_BAR, "tendons of two joints": TENDON}
@@ -126,9 +126,9 @@ def gripper_scene(folder: Path, gripper: Gripper, solid: str, mu: float) -> Path
     return folder / "lift.toml"
 
 
-def held(folder: Path, gripper: Gripper, solid: str, mu: float = 0.8) -> Simulator:
+def held(folder: Path, gripper: Gripper, solid: str, mu: float = 0.8, integrator: str = "bdf2") -> Simulator:
     """The object rests on the table between the closed fingers."""
-    scene = load_scene(gripper_scene(folder, gripper, solid, mu))
+    scene = load_scene(gripper_scene(folder, gripper, solid, mu), overrides={"integrator": integrator})
     sim = Simulator(scene)
     for _ in range(200):
         sim.step(controls(sim, gripper.grip[0]))
@@ -162,12 +162,20 @@ def test_gripper_lifts_an_object(name: str, solid: str, tmp_path: Path) -> None:
     assert thing == pytest.approx(hand, abs=5e-4)
 
 
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
 @pytest.mark.parametrize("solid", OBJECTS)
 @pytest.mark.parametrize("name", GRIPPERS)
-def test_slip_by_grip_force(name: str, solid: str, tmp_path: Path) -> None:
-    """The hand rises and the grip is too weak: the derivative of the slip by the grip is exact."""
+def test_slip_by_grip_force(name: str, solid: str, integrator: str, tmp_path: Path) -> None:
+    """The hand rises and the grip is too weak: the derivative of the slip by the grip is exact.
+
+    The grip weakens slowly, so that the fingers keep contact. Fingers that are released at once fly off and return;
+    the slip is then not differentiable at grip forces that differ by 1e-6 of their value, where points of the pads
+    touch one step earlier or later, and differences across such kinks are no derivatives.
+    """
     gripper = GRIPPERS[name]
-    sim = held(tmp_path, gripper, solid)
+    sim = held(tmp_path, gripper, solid, integrator=integrator)
+    for grip in np.linspace(*gripper.grip, 100):
+        sim.step(controls(sim, grip))
     lift, thing = sim.joint_q("lift"), sim.joint_q("object") + 2
     u = np.concatenate([controls(sim, gripper.grip[1], 0.02 * s) for s in np.linspace(0, 1, 60)])
     by_grip = np.zeros_like(u)

@@ -170,8 +170,8 @@ def load(folder: Path, model: str = "scene.xml", more: str = "") -> Scene:
 def check_against_mujoco(scene: Scene, model: Any, steps: int = 20, seed: int = 0) -> None:
     """Compare with MuJoCo: mass matrix and bias at random states, and the equation of each of `steps` steps.
 
-    A step satisfies M(q₁) (v₁ − v₀) / h = f(q₁, v₁, u) − C(q₁, v₁) with M, C and f of MuJoCo. No joint reaches its
-    range.
+    A step satisfies M(q₁) (v₁ − v*) / (β h) = f(q₁, v₁, u) − C(q₁, v₁) with M, C and f of MuJoCo, and β and v* of the
+    scene's integrator (docs/reference/physics.md, "Equations"). No joint reaches its range.
     """
     rng = np.random.default_rng(seed)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -194,6 +194,7 @@ def check_against_mujoco(scene: Scene, model: Any, steps: int = 20, seed: int = 
         np.testing.assert_allclose(sim.bias()[0], data.qfrc_bias, rtol=1e-9, atol=1e-9)
 
     motors = [a for a in scene.actuators if model.nu == 0]  # of a URDF file: u is the joint force
+    earlier: Array | None = None  # BDF2 starts with a step of BDF1
     for step in range(steps):
         before, u = sim.v[0].copy(), rng.normal(size=scene.nu) * (10 if step % 4 == 0 else 0.5)
         sim.step(u)
@@ -204,7 +205,11 @@ def check_against_mujoco(scene: Scene, model: Any, steps: int = 20, seed: int = 
         force -= model.dof_frictionloss * np.clip(v / 1e-3, -1, 1)
         for motor, control in zip(motors, u, strict=bool(motors)):
             force[scene.joints[motor.joint].v_start] += np.clip(control, *motor.force_range)
-        inertia = full @ (v - before) / scene.step
+        if scene.integrator == "bdf1" or earlier is None:
+            inertia = full @ (v - before) / scene.step
+        else:
+            inertia = full @ (3 * v - 4 * before + earlier) / (2 * scene.step)
+        earlier = before
         np.testing.assert_allclose(inertia, force, rtol=1e-6, atol=1e-6 * np.abs(force).max())
     assert sim.halved[0] == 0
 

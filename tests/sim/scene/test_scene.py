@@ -56,9 +56,10 @@ def test_a_scene_built_in_python_is_simulated() -> None:
     assert (ball.nq, ball.nv, ball.nu, ball.num_markers) == (7, 6, 0, 1)
     sim = Simulator(ball)
     sim.q[:] = ball.q0
-    sim.step(np.zeros((1, 0)), 1000)
-    sim.check()
     depth = MASS * 9.81 / KN
+    decay = PARAMS["kd"] * depth / (2 * MASS)  # of the oscillation about the rest position [1/s]
+    sim.step(np.zeros((1, 0)), round(15 / decay / ball_on_ground().step))
+    sim.check()
     assert sim.q[0, 2] == pytest.approx(RADIUS - depth, rel=1e-6)
     np.testing.assert_allclose(sim.tactile()[0], [[0, 0, KN * depth]], rtol=1e-4, atol=1e-9)
 

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         times = None if args.no_timing else dataclasses.asdict(_measured(scene, args.repeats))
         output.result(dataclasses.asdict(description) | {"times": times})
         return SUCCESS
-    output.console.print(tree(description), _not_modelled(description), _size(description.size))
+    output.console.print(tree(description), *_hints(description), _not_modelled(description), _size(description.size))
     if not args.no_timing:
         output.console.print(_times(_measured(scene, args.repeats)))
     return SUCCESS
@@ -70,7 +70,8 @@ def tree(d: "Description") -> Tree:
     """Tree of the parts of a scene."""
     gravity = " ".join(f"{g:g}" for g in d.gravity)
     root = Tree(
-        f"[bold]{escape(d.scene)}[/bold]: steps of {d.step * 1e3:g} ms, {d.friction} law, gravity {gravity} m/s²"
+        f"[bold]{escape(d.scene)}[/bold]: steps of {d.step * 1e3:g} ms, {d.friction} law, gravity {gravity} m/s², "
+        f"{d.integrator.upper()}"
     )
     bodies = root.add("[bold]bodies[/bold]")
     for body in d.bodies:
@@ -190,6 +191,15 @@ def _law(law: str, unit: str, numbers: "dict[str, float]", more: str, *, damped_
     words.append(f"µ {numbers['mu']:g}")
     of = "" if unit == "one exact point" else f" {unit}"
     return f"{law}{of}{more}: {', '.join(words)}"
+
+
+def _hints(d: "Description") -> "list[Tree]":
+    if not d.hints:
+        return []
+    root = Tree("[bold]accuracy[/bold]: docs/reference/accuracy.md")
+    for line in d.hints:
+        root.add(escape(line))
+    return [root]
 
 
 def _not_modelled(d: "Description") -> Tree:
