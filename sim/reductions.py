@@ -142,6 +142,11 @@ def center_of_pressure(force: Any, moment: Any) -> Any:
     `force` and `moment` (…, 3) are the rows of `pad_forces` and `pad_moments` of a pad: arrays, or tensors with
     gradients. From M = r × F with r in the plane of the markers: x = M_y / −F_z, y = −M_x / −F_z.
     """
+    for name, value in (("force", force), ("moment", moment)):
+        if not (isinstance(value, np.ndarray) or hasattr(value, "requires_grad")) or value.shape[-1:] != (3,):
+            raise UsageError(f"{name} must be an array or a tensor of shape (…, 3), got {shown(value)}")
+    if type(force) is not type(moment) or force.shape != moment.shape:
+        raise UsageError(f"force and moment must have the same type and shape, got {shown(force)} and {shown(moment)}")
     xp: Any = np
     if not isinstance(force, np.ndarray):
         import torch  # deferred: only tensors need torch

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.geometry import rotation_matrices
 from gelflow.observation import MIN_DIVISORS, normalize
+from gelflow.sim.arguments import check_type
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
@@ -106,6 +107,7 @@ class AttemptResult:
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
     """The insertion scene with the task's part and the marker grid of its observations, which presets do not change."""
+    check_type("task", task, InsertionTask, "an InsertionTask")
     grid = task.grid
     scene = load_scene(
         "insertion",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import check_type
 from gelflow.toml_tables import suggestion
 
 Array = NDArray[np.float64]
@@ -108,6 +109,9 @@ class Randomization:
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_type("quantities", self.quantities, Mapping, "a mapping of names to quantities")
+        for name, row in self.quantities.items():
+            check_type(f"quantity {name!r}", row, Quantity, "a Quantity")
         object.__setattr__(self, "quantities", MappingProxyType(dict(self.quantities)))
 
     def __iter__(self) -> Iterator[str]:

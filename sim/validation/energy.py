@@ -6,13 +6,14 @@ has the same points, shapes and anchors as markers of stiffness 1, whose forces 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.geometry import rotate
 from gelflow.sim import _core
+from gelflow.sim.arguments import check_type
 from gelflow.sim.scene import CONTACT_PARAMS, Scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.gradient_check import quaternion_joints
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 _UNBOUNDED = 1e18  # friction coefficient without slip
 
 
+@runtime_checkable
 class HasModelSpec(Protocol):
     """An object with the definitions of a model, such as `gelflow.sim.Scene`."""
 
@@ -55,11 +57,13 @@ class EnergyGauge:
     """
 
     def __init__(self, scene: HasModelSpec, *, num_envs: int = 1) -> None:
+        check_type("scene", scene, HasModelSpec, "a Scene (see load_scene)")
         spec, self._weights = _probe_spec(scene.model_spec())
         self._probe = Simulator(_core.Model(spec), num_envs=num_envs)
 
     def read(self, sim: Simulator) -> Energy:
         """Energy of the present state of a simulator."""
+        check_type("sim", sim, Simulator, "a Simulator")
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
         contact, friction = self._stored(sim, *self.points(sim))
         springs, limits = _joints(sim)

@@ -11,12 +11,15 @@ import torch
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.reductions import pad_forces
+from gelflow.sim.reductions import center_of_pressure, pad_forces
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
+from gelflow.sim.tasks.insertion import insertion_scene
+from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.torch_layer import TorchState, torch_rollout, torch_state
 from gelflow.sim.trajectory import TouchStop
+from gelflow.sim.validation.energy import EnergyGauge
 
 U = np.zeros((2, 2, 6))  # of "pushing"
 FLOAT: Any = 0.5
@@ -50,6 +53,17 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: load_scene("pushing", preset=[1]), r".*no preset \[1\]"),  # type: ignore[arg-type]
     (lambda s: make_task("pushing", "a"), "num_envs must be an integer, got 'a'"),  # type: ignore[arg-type]
     (lambda s: pad_forces(3), "scene must be a Scene"),  # type: ignore[arg-type]
+    (lambda s: center_of_pressure(3, 3), "force must be an array or a tensor of shape"),
+    (lambda s: center_of_pressure(np.ones((2, 2)), np.ones((2, 3))), r"force must be .* got ndarray of shape \(2, 2\)"),
+    (
+        lambda s: center_of_pressure(np.ones((2, 3)), np.ones((4, 3))),
+        "force and moment must have the same type and shape",
+    ),
+    (lambda s: EnergyGauge(3), "scene must be a Scene"),  # type: ignore[arg-type]
+    (lambda s: EnergyGauge(s.scene).read(3), "sim must be a Simulator, got 3"),  # type: ignore[arg-type]
+    (lambda s: insertion_scene(3), "task must be an InsertionTask, got 3"),  # type: ignore[arg-type]
+    (lambda s: Randomization(3), "quantities must be a mapping of names to quantities, got 3"),  # type: ignore[arg-type]
+    (lambda s: Randomization({"mass": 3}), "quantity 'mass' must be a Quantity, got 3"),  # type: ignore[dict-item]
     (lambda s: torch_state(3), "sim must be a Simulator, got 3"),  # type: ignore[arg-type]
     (lambda s: s.step([1, [2]]), "u must be numeric"),
     (lambda s: s.rollout("a"), "u must be numeric"),
