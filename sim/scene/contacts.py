@@ -21,6 +21,7 @@ from gelflow.sim.scene.geometry.sampling import (
     FACES,
     box_surface,
     capsule,
+    check_count,
     cylinder,
     ellipsoid,
     mesh_surface,
@@ -226,6 +227,8 @@ def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
         faces, heights = table.strings("faces", ENDS), table.integer("heights", 5)
         if "heights" in table.data and "wall" not in faces:
             raise UsageError('heights apply to the wall; add faces = ["-z", "+z", "wall"]')
+        rows = radii * sum(face != "wall" for face in faces) + heights * ("wall" in faces)
+        check_count(table.location, angles * rows)
         return cylinder(*size[:2], angles=angles, radii=radii, heights=heights, faces=faces)
     if geom.mesh is not None:
         table.check_keys(("geom", "count", "stiffness"))
@@ -235,6 +238,7 @@ def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
         raise UsageError(f"{geom.kind} {geom.name!r} cannot be sampled; supported: {supported}")
     table.check_keys(("geom", "count", "faces", "stiffness"))
     count, faces = table.integer("count"), table.strings("faces", ENDS)
+    check_count(table.location, count)
     if geom.kind == "ellipsoid":
         return ellipsoid(size, count=count, faces=faces)
     return capsule(size[0], size[1] if geom.kind == "capsule" else 0.0, count=count, faces=faces)

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.geometry.sampling import shortest_rotations
+from gelflow.sim.scene.geometry.sampling import check_count, check_memory, shortest_rotations
 from gelflow.toml_tables import TomlTable
 
 Array = NDArray[np.float64]
 
+_BYTES = 24  # of a position
 _ARRAYS = ("positions", "normals", "x_axes")
 
 
@@ -26,6 +27,7 @@ def read_marker_list(table: TomlTable, folder: Path) -> tuple[Array, Array]:
     arrays, location = _arrays(table, folder)
     positions = _vectors(arrays, "positions", location)
     count = len(positions)
+    check_count(location, count)
     normals = _unit_vectors(arrays, "normals", location, count)
     axes = np.tile(np.eye(3), (count, 1, 1)) if normals is None else shortest_rotations(normals)
     x_axes = _unit_vectors(arrays, "x_axes", location, count)
@@ -59,9 +61,14 @@ def _read_file(path: Path, location: str) -> Mapping[str, Any]:
     try:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as content:
+                check_memory(location, max(info.file_size for info in content.zip.infolist()) // _BYTES)
                 arrays = {name: content[name] for name in content.files}
         else:
+            with path.open("rb") as lines:
+                check_memory(location, sum(1 for _ in lines))
             columns = np.loadtxt(path, delimiter=",", ndmin=2)
+    except UsageError:
+        raise
     except FileNotFoundError:
         raise UsageError(f"{location}: no such file in the folder of the scene") from None
     except (OSError, ValueError) as error:

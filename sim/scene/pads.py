@@ -123,6 +123,7 @@ def _markers(table: TomlTable, shape: str, folder: Path) -> _Markers:
     if shape == "points":
         return _Markers(*read_marker_list(table, folder), area=None, grid=None)
     radius, count = table.number("radius", minimum=1e-9), table.integer("count")
+    check_count(table.location, count)
     if shape == "disc":
         positions = disc_lattice(radius, count) + table.numbers("center", 2, (0.0, 0.0))
         return _planar_markers(positions, np.pi * radius**2 / count, None)

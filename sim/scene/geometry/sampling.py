@@ -35,10 +35,15 @@ _LLOYD_ITERATIONS = 8
 Array = NDArray[np.float64]
 
 
-def check_count(owner: str, count: int) -> None:
-    """Warn about a number of points that takes long; raise UsageError for one that does not fit into memory."""
+def check_memory(owner: str, count: int) -> None:
+    """Raise UsageError for a number of points that does not fit into memory."""
     if count > MOST_POINTS:
         raise UsageError(f"{owner}: {count} points do not fit into memory; at most {MOST_POINTS}")
+
+
+def check_count(owner: str, count: int) -> None:
+    """Warn about a number of points that takes long; raise UsageError for one that does not fit into memory."""
+    check_memory(owner, count)
     if count > MANY_POINTS:
         warnings.warn(f"{owner}: {count} points; each step evaluates all that are near a shape", stacklevel=2)
 

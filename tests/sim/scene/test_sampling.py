@@ -1,5 +1,8 @@
 """Sampled points are on the surface, and their weights sum to its area."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +10,7 @@ from hypothesis import strategies as st
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene import load_scene
+from gelflow.sim.scene.geometry import sampling
 from gelflow.sim.scene.geometry.sampling import FACES, box_surface, capsule, cylinder, disc, ellipsoid
 
 
@@ -156,3 +160,47 @@ def test_many_points_are_announced() -> None:
         box_surface([1, 1, 1], [2, 3, 166_667])
     with pytest.raises(UsageError, match="do not fit into memory"):
         load_scene("pushing", overrides={"pads.pad.rows": 100_000, "pads.pad.cols": 100_000})
+
+
+SOLIDS = {
+    "can": 'type="cylinder" size="1 1"',
+    "pill": 'type="capsule" size="1 1"',
+    "egg": 'type="ellipsoid" size="1 1 2"',
+}
+
+
+@pytest.mark.parametrize(
+    ("table", "owner"),
+    [
+        ('[points.p]\ngeom = "can"\nangles = 100\nradii = 10', "points.p"),
+        ('[points.p]\ngeom = "can"\nangles = 100\nheights = 10\nfaces = ["wall"]', "points.p"),
+        ('[points.p]\ngeom = "pill"\ncount = 1000', "points.p"),
+        ('[points.p]\ngeom = "egg"\ncount = 1000', "points.p"),
+        ('PAD\nshape = "disc"\nradius = 0.01\ncount = 1000', "pads.pad"),
+        ('PAD\nshape = "hemisphere"\nradius = 0.01\ncount = 1000', "pads.pad"),
+        ('PAD\nshape = "points"\nfile = "markers.csv"', "pads.pad: markers.csv"),
+        ('PAD\nshape = "points"\nfile = "markers.npz"', "pads.pad: markers.npz"),
+    ],
+)
+def test_many_points_of_each_kind_are_announced(
+    table: str, owner: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    geoms = "".join(f'<geom name="{name}" {solid} mass="1"/>' for name, solid in SOLIDS.items())
+    (tmp_path / "s.xml").write_text(
+        '<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1"/>'
+        f'<body name="b"><freejoint/><site name="tip"/>{geoms}</body></worldbody></mujoco>'
+    )
+    positions = np.random.default_rng(0).normal(size=(1000, 3))
+    np.savetxt(tmp_path / "markers.csv", positions, delimiter=",")
+    np.savez_compressed(tmp_path / "markers.npz", positions=positions)
+    law = "\nagainst = 'floor'\nkn = 1\nkt = 1\nmu = 1\nkd = 1\n"
+    contact = f"\n[contacts.c]\npoints = 'p'{law}" if "points.p" in table else law
+    text = 'format = 1\nmodel = "s.xml"\nstep = 1e-3\n' + table.replace("PAD", '[pads.pad]\nsite = "tip"') + contact
+    (tmp_path / "s.toml").write_text(text)
+    load_scene(tmp_path / "s.toml")
+    monkeypatch.setattr(sampling, "MANY_POINTS", 900)
+    with pytest.warns(UserWarning, match=re.escape(owner) + r": (1000|2000) points; each step"):
+        load_scene(tmp_path / "s.toml")
+    monkeypatch.setattr(sampling, "MOST_POINTS", 900)
+    with pytest.raises(UsageError, match=re.escape(owner) + r": \d+ points do not fit into memory; at most 900"):
+        load_scene(tmp_path / "s.toml")
