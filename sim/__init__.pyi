@@ -1,4 +1,7 @@
 from .benchmark.describe import describe as describe
+from .drawing.camera import Camera as Camera
+from .drawing.renderer import render as render
+from .drawing.scene_drawing import Mark as Mark
 from .reductions import TactileReduction as TactileReduction
 from .reductions import center_of_pressure as center_of_pressure
 from .reductions import mean_shear as mean_shear
@@ -40,6 +43,7 @@ from .validation.energy import EnergyGauge as EnergyGauge
 
 __all__ = [
     "STATUS_MESSAGES",
+    "Camera",
     "Energy",
     "EnergyGauge",
     "Fixed",
@@ -48,6 +52,7 @@ __all__ = [
     "InsertionEnv",
     "InsertionVectorEnv",
     "LogUniform",
+    "Mark",
     "Normal",
     "Randomization",
     "Scene",
@@ -71,6 +76,7 @@ __all__ = [
     "pad_forces",
     "pad_moments",
     "pad_pressures",
+    "render",
     "scene_names",
     "shear_features",
     "task_names",

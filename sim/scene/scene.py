@@ -15,7 +15,7 @@ from gelflow.sim.scene.contacts import ContactDef, PointsDef
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.actuators import ActuatorDef
 from gelflow.sim.scene.mjcf.couplings import CouplingDef, LoopClosureDef, TendonDef
-from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef, SiteDef
+from gelflow.sim.scene.mjcf.mechanics import BodyDef, GeomDef, JointDef, SiteDef
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.toml_tables import suggestion
@@ -60,6 +60,7 @@ class Scene:
     contacts: tuple[ContactDef, ...] = ()
     pads: tuple[PadDef, ...] = ()
     sites: tuple[SiteDef, ...] = ()  # in the order of the model file; in a URDF the link frames
+    geoms: tuple[GeomDef, ...] = ()  # of the model file, for pictures; the simulation uses shapes and points
     not_modelled: tuple[str, ...] = ()  # elements of the files without effect in the simulation, with the reason
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # name -> dotted key -> value
 

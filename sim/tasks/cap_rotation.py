@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.sim.drawing.scene_drawing import Mark
 from gelflow.sim.reductions import TactileReduction, pad_forces, pad_pressures
 from gelflow.sim.scene import Scene
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Quantity, Randomization, Uniform
-from gelflow.sim.tasks.rendering import Mark, render_scene
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
 from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
@@ -306,13 +306,15 @@ class CapRotation(ControlTask):
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`; a dashed line on the cap shows its rotation."""
+        from gelflow.sim.drawing.renderer import render  # deferred: a policy in training draws nothing
+
         x, y, radius = (float(self.sim.param(f"cap.{name}")[index]) for name in ("pos.x", "pos.y", "size.x"))
         angle = float(self.info["angle"][index])
         ends = [(x, y), (x + radius * np.cos(angle), y + radius * np.sin(angle))]
         mark = Mark(np.array([(*end, self._top) for end in ends]), "cap")
         goal = np.degrees(self.description.goal_angle)
         title = f"Cap rotation: turned {np.degrees(angle):.0f}° of {goal:.0f}°"
-        return render_scene(self.sim, index, title=title, marks=[mark])
+        return render(self.sim, index, title=title, marks=[mark])
 
 
 def _fingertip_rows(scene: Scene) -> TactileReduction:

@@ -100,12 +100,12 @@ class Insertion(AttemptTask):
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """The part of environment `index` at the end of its last attempt, and the pads."""
-        from gelflow.sim.tasks.rendering import render_scene  # deferred: a policy in training draws nothing
+        from gelflow.sim.drawing.renderer import render  # deferred: a policy in training draws nothing
 
         sim = self.attempts.show_end(index)
         x, y, yaw = self.attempts.pose[index]
         title = f"attempt {self.info['attempts'][index]} at {x * 1e3:.1f} mm, {y * 1e3:.1f} mm, {np.degrees(yaw):.1f}°"
-        return render_scene(sim, 0, title=title + (": inserted" if self.info["success"][index] else ""))
+        return render(sim, 0, title=title + (": inserted" if self.info["success"][index] else ""))
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         check_options(self.description.name, options, _RESET_OPTIONS)

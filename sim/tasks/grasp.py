@@ -157,7 +157,7 @@ class Grasp(AttemptTask):
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """The lifted bar of environment `index` and its pads."""
-        from gelflow.sim.tasks.rendering import render_scene  # deferred: a policy in training draws nothing
+        from gelflow.sim.drawing.renderer import render  # deferred: a policy in training draws nothing
 
         self.sim.reset()
         self.sim.params[0] = self._params[index]
@@ -165,7 +165,7 @@ class Grasp(AttemptTask):
             getattr(self.sim, name)[0] = values[index]
         info = {name: self.info[name][index] for name in ("attempts", "position", "tilt")}
         title = f"attempt {info['attempts']} at {info['position'] * 1e3:.0f} mm: tilt {info['tilt'] * 1e3:.0f} mrad"
-        return render_scene(self.sim, 0, title=title, side="y")
+        return render(self.sim, 0, title=title)
 
     def _set_geometry(self) -> None:
         """Length of the bar, and the tables below its ends."""

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.sim.drawing.scene_drawing import Mark
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization
-from gelflow.sim.tasks.rendering import Mark, render_scene
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
 from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
@@ -329,6 +329,8 @@ class Pushing(ControlTask):
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`; a dashed outline shows the goal of the box."""
+        from gelflow.sim.drawing.renderer import render  # deferred: a policy in training draws nothing
+
         x, y, yaw = self.goal[index]
         corners = self.half_size[index] * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -336,4 +338,4 @@ class Pushing(ControlTask):
         goal = Mark(np.column_stack([outline, np.zeros(len(outline))]), "goal")
         apart = 1e3 * self.info["position_error"][index], np.degrees(self.info["yaw_error"][index])
         title = "Pushing: box {:.0f} mm and {:.0f}° from its goal".format(*apart)
-        return render_scene(self.sim, index, title=title, marks=[goal])
+        return render(self.sim, index, title=title, marks=[goal])

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.observation import Grid
+from gelflow.sim.drawing.scene_drawing import Mark
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Randomization
-from gelflow.sim.tasks.rendering import Mark, render_scene
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
 from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
 
@@ -173,9 +173,11 @@ class Rolling(ControlTask):
 
     def render(self, index: int = 0) -> NDArray[np.uint8]:
         """A picture of environment `index`; a dashed circle with the radius of the ball shows its goal."""
+        from gelflow.sim.drawing.renderer import render  # deferred: a policy in training draws nothing
+
         angle = np.linspace(0, 2 * np.pi, 65)
         radius = float(self.sim.param("ball.size.x")[index])
         circle = self.goal[index] + radius * np.column_stack([np.cos(angle), np.sin(angle)])
         goal = Mark(np.column_stack([circle, np.full(len(angle), radius)]), "goal")
         title = f"Rolling: ball {1e3 * self.info['error'][index]:.1f} mm from its goal"
-        return render_scene(self.sim, index, title=title, marks=[goal])
+        return render(self.sim, index, title=title, marks=[goal])

@@ -30,6 +30,7 @@ COMMON_OPTIONS = {
     "recover": {"--json", "--out"},
     "mock": {"--json", "--out", "--seed", "--preset"},
     "render": {"--json", "--out", "--seed"},
+    "render-scene": {"--json", "--out", "--preset"},
     "bench": {"--json", "--out", "--quick", "--repeats"},
     "tradeoff": {"--json", "--out", "--quick", "--repeats"},
     "describe": {"--json", "--preset", "--repeats"},

@@ -80,7 +80,8 @@ def _with_grid(scene: Scene, geometry: PartGeometry) -> Scene:
     first = next(shape for shape in scene.shapes if shape.name in WALLS)
     hole = replace(first, name=HOLE, kind="mesh", pose=Pose(), size=np.array([1.0, 0.0, 0.0]), grid=grid)
     shapes = tuple(shape for shape in scene.shapes if shape.name not in WALLS)
-    return replace(scene, shapes=(*shapes, hole), contacts=_one_contact(scene.contacts))
+    geoms = tuple(geom for geom in scene.geoms if geom.name not in WALLS)
+    return replace(scene, geoms=geoms, shapes=(*shapes, hole), contacts=_one_contact(scene.contacts))
 
 
 def _one_contact(contacts: tuple[ContactDef, ...]) -> tuple[ContactDef, ...]:

@@ -33,6 +33,7 @@ COMMANDS = {
     "recover": "copy the complete records of an unfinished or damaged session",
     "mock": "start the mock robot: gripper, arm and two cameras with their network protocols",
     "render": "render gel images with known marker positions",
+    "render-scene": "draw a scene or a rollout of it: a picture or a film with bodies, contact forces and pads",
     "bench": "measure the speed of the simulator and the tracker",
     "tradeoff": "measure speed and error of a scene for many settings and for the presets",
     "describe": "describe a scene: model, omissions, size, and time of a step",

@@ -1,6 +1,7 @@
 """Command-line options that several commands share. An option has the same meaning in every command."""
 
 import argparse
+import re
 from pathlib import Path
 
 from gelflow.errors import UsageError
@@ -100,6 +101,14 @@ def checkpoint_for(task: InsertionTask, given: Path | None) -> Path:
             "then give --checkpoint"
         )
     return path
+
+
+def picture_size(text: str) -> tuple[int, int]:
+    """Width and height [px] of a `--size` such as 640x480. Raises UsageError for another text."""
+    size = re.fullmatch(r"(\d+)x(\d+)", text)
+    if size is None:
+        raise UsageError(f"--size must be width x height in pixels, as 640x480; got {text!r}")
+    return int(size[1]), int(size[2])
 
 
 def check_at_least(args: argparse.Namespace, **limits: int) -> None:

@@ -2,12 +2,11 @@
 
 import argparse
 import dataclasses
-import re
 from pathlib import Path
 from typing import Any
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_seed, check_at_least
+from gelflow.cli.options import add_json, add_out, add_seed, check_at_least, picture_size
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.appearance import PRESETS, SIZES, DegradedGelAppearance, make_appearance
@@ -57,12 +56,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Render the sequence, then print the paths of images and true positions."""
-    size = re.fullmatch(r"(\d+)x(\d+)", args.size)
-    if size is None:
-        raise UsageError(f"--size must be width x height in pixels, as 640x480; got {args.size!r}")
+    width, height = picture_size(args.size)
     check_at_least(args, seed=0)
     changed = dict(_factor(text) for text in args.set)
-    width, height = (int(part) for part in size.groups())
     appearance = make_appearance(
         args.flaws, markers=args.markers, width=width, height=height, seed=args.seed, **changed
     )

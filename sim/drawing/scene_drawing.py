@@ -1,0 +1,162 @@
+"""The content of a picture of one environment: geometries, contact forces and pad readings, in world coordinates."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.geometry import Pose
+from gelflow.sim import arguments
+from gelflow.sim.scene import Scene
+from gelflow.sim.scene.geometry.distance_grid import DistanceGrid
+from gelflow.sim.scene.geometry.mesh import TriangleMesh
+from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
+from gelflow.sim.scene.pads import PadDef
+from gelflow.sim.scene.shapes import ShapeDef
+from gelflow.sim.simulator import Simulator
+
+Array = NDArray[np.float64]
+
+DRAWN_KINDS = ("plane", "sphere", "box", "cylinder", "capsule", "ellipsoid", "mesh")
+_NO_FORCE = 1e-6  # [N]; smaller contact forces are not drawn
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A line that is drawn into the scene, such as the outline of a goal."""
+
+    points: Array  # in the world [m], (n, 3)
+    label: str
+
+
+@dataclass(frozen=True)
+class ContactForce:
+    """The total force of a contact on the body of its points."""
+
+    name: str
+    point: Array  # where it acts, in the world [m], shape (3,)
+    force: Array  # in the world [N], shape (3,)
+
+
+@dataclass(frozen=True)
+class PadReading:
+    """Markers of a pad with their forces."""
+
+    name: str
+    positions: Array  # in the world [m], shape (n, 3)
+    layout: Array  # x (to the fingertip) and y of the markers in the frame of the pad's site [m], shape (n, 2)
+    shear: Array  # along x and y of the site [N], shape (n, 2)
+    normal: Array  # ≥ 0 in compression [N], shape (n,)
+
+
+@dataclass(frozen=True)
+class SceneDrawing:
+    """One environment as it is drawn."""
+
+    geoms: tuple[GeomDef, ...]  # in the frames of their bodies
+    poses: tuple[Pose, ...]  # of the moving bodies in the world
+    contacts: tuple[ContactForce, ...]
+    pads: tuple[PadReading, ...]
+
+    def geom_pose(self, geom: GeomDef) -> Pose:
+        """The pose of a geometry in the world."""
+        return geom.pose if geom.body == WORLD else self.poses[geom.body] @ geom.pose
+
+
+def scene_drawing(sim: Simulator, env: int = 0) -> SceneDrawing:
+    """The drawing of environment `env` at its present state.
+
+    Raises UsageError if there is no such environment, and for a simulator that was made from a core model: that has no
+    geometries to draw.
+    """
+    if not isinstance(sim.scene, Scene):
+        raise UsageError("a simulator of a core model cannot be drawn; make it from a Scene, see load_scene")
+    env = arguments.integer("env", env, minimum=0)
+    if env >= sim.num_envs:
+        raise UsageError(f"env must be below {sim.num_envs}, the number of environments, got {env}")
+    poses = tuple(Pose(row[:3].astype(float), row[3:].astype(float)) for row in sim.poses()[env])
+    geoms = drawn_geoms(sim, env)
+    return SceneDrawing(geoms, poses, _contact_forces(sim, env, poses), _pad_readings(sim, env, poses))
+
+
+def drawn_geoms(sim: Simulator, env: int) -> tuple[GeomDef, ...]:
+    """The geometries of the model file and the shapes of the scene, with the sizes and places of an environment."""
+    scene: Scene = sim.scene
+    shapes = {shape.name: shape for shape in scene.shapes}
+    files = {geom.name: geom for geom in scene.geoms}
+    drawn = [geom for geom in scene.geoms if geom.name not in shapes and geom.kind in DRAWN_KINDS]
+    return (*drawn, *(_shape_geom(sim, env, shape, files.get(shape.name)) for shape in scene.shapes))
+
+
+def _shape_geom(sim: Simulator, env: int, shape: ShapeDef, file: GeomDef | None) -> GeomDef:
+    position = [_parameter(sim, env, f"{shape.name}.shape.pos.{axis}") for axis in "xyz"]
+    size = np.array([_parameter(sim, env, f"{shape.name}.size.{axis}") for axis in "xyz"])
+    pose = replace(shape.pose, position=np.array(position))
+    if shape.grid is None:
+        return GeomDef(shape.name, shape.body, shape.kind, pose, size)
+    mesh = file.mesh if file is not None and file.mesh is not None else grid_mesh(shape.grid)
+    scaled = replace(mesh, vertices=mesh.vertices * size[0])  # the first size of a mesh is its scale
+    return GeomDef(shape.name, shape.body, shape.kind, pose, size, scaled)
+
+
+def _parameter(sim: Simulator, env: int, name: str) -> float:
+    kind = f"shape:{name}"  # where elements of different kinds have one name
+    return float(sim.param(kind if kind in sim.param_index else name)[env])
+
+
+def grid_mesh(grid: DistanceGrid) -> TriangleMesh:
+    """The surface of a distance grid: where the distance is 0, by marching cubes."""
+    from skimage import measure  # deferred: slow to import
+
+    cubes: Any = measure.marching_cubes
+    # A node's value of a cubic B-spline is the mean of its coefficient and the neighbours, weighted 1 4 1 per axis.
+    values = grid.coefficients.astype(float)
+    for axis in range(3):
+        v = np.moveaxis(values, axis, 0)
+        values = np.moveaxis((v[:-2] + 4 * v[1:-1] + v[2:]) / 6, 0, axis)
+    outside = float(np.abs(values).max())
+    closed = np.pad(values, 1, constant_values=outside)  # a surface that is cut by the edge of the grid is closed
+    vertices, faces, *_ = cubes(closed, 0.0)
+    return TriangleMesh(grid.origin + (vertices - 1) * grid.spacing, np.asarray(faces, dtype=np.int64))
+
+
+def _contact_forces(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[ContactForce, ...]:
+    scene: Scene = sim.scene
+    if not scene.contacts:
+        return ()
+    shapes = {shape.name: shape for shape in scene.shapes}
+    clouds = {cloud.name: cloud for cloud in scene.points}
+    found = []
+    for contact, wrench in zip(scene.contacts, sim.wrenches()[env].astype(float), strict=True):
+        force = wrench[3:]
+        if not np.linalg.norm(force) > _NO_FORCE:
+            continue
+        cloud, shape = clouds[contact.points], shapes[contact.shape]
+        points = cloud.points if cloud.body == WORLD else poses[cloud.body].apply(cloud.points)
+        frame = shape.pose if shape.body == WORLD else poses[shape.body] @ shape.pose
+        distance, normal = sim.model.distance(shape.name, frame.inverse().apply(points))[:2]
+        points = points - cloud.radius * normal @ frame.matrix().T  # of a sphere, the point next to the shape
+        distance = distance - cloud.radius
+        depth = np.maximum(-distance, 0)
+        point = depth @ points / depth.sum() if depth.sum() > 0 else points[np.argmin(distance)]
+        found.append(ContactForce(contact.name, np.asarray(point), force))
+    return tuple(found)
+
+
+def _pad_readings(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[PadReading, ...]:
+    scene: Scene = sim.scene
+    if not scene.pads:
+        return ()
+    forces = sim.tactile()[env].astype(float)
+    return tuple(_pad_reading(pad, forces[scene.marker_slice(pad.name)], poses) for pad in scene.pads)
+
+
+def _pad_reading(pad: PadDef, forces: Array, poses: Sequence[Pose]) -> PadReading:
+    rotation = pad.pose.matrix()
+    positions = pad.positions if pad.body == WORLD else poses[pad.body].apply(pad.positions)
+    layout = ((pad.positions - pad.pose.position) @ rotation)[:, :2]
+    shear = (np.einsum("mij,mj->mi", pad.axes[:, :, :2], forces[:, :2]) @ rotation)[:, :2]
+    return PadReading(pad.name, positions, layout, shear, forces[:, 2])

@@ -1,0 +1,62 @@
+"""`gelflow render-scene`: films and pictures of shipped scenes and of bare model files."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.sim.scene import load_scene
+
+MODEL = """
+<mujoco><worldbody><geom name="ground" type="plane" size="1 1 .1"/>
+  <body name="arm" pos="0 0 .3"><joint name="hinge" axis="0 1 0"/><geom name="rod" type="capsule" size=".02 .1"/></body>
+</worldbody></mujoco>
+"""
+
+
+def test_film_has_the_pictures_of_the_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    controls = np.zeros((20, load_scene("pushing").nu))
+    np.savetxt(tmp_path / "u.csv", controls, delimiter=",")
+    film = tmp_path / "film.mp4"
+    arguments = ["--out", str(film), "--controls", str(tmp_path / "u.csv"), "--size", "160x120"]
+    assert main(["render-scene", "pushing", *arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    video = cv2.VideoCapture(str(film))
+    count = 0
+    while video.read()[0]:
+        count += 1
+    assert count == result["pictures"] == int(20 * load_scene("pushing").step * 25 + 1e-9) + 1
+
+
+def test_picture_of_a_bare_model(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(MODEL)
+    picture = tmp_path / "arm.png"
+    assert main(["render-scene", str(tmp_path / "arm.xml"), "--out", str(picture), "--camera", "front"]) == 0
+    image = cv2.imread(str(picture))
+    assert image is not None and image.shape == (480, 640, 3) and image.std() > 5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--out", "film.gif"], "--out must end in"),
+        (["--out", "no/such/folder/film.mp4"], "there is no folder"),
+        (["--size", "big"], "--size must be width x height"),
+        (["--fps", "0"], "--fps must be above 0"),
+        (["--seconds", "-1"], "--seconds must be at least 0"),
+        (["--controls", "missing.npy"], "cannot read missing.npy"),
+        (["--camera", "behind"], "no view 'behind'"),
+    ],
+)
+def test_wrong_options_are_refused(options: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render-scene", "pushing", *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_controls_of_a_wrong_width_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "u.npy", np.zeros((3, 99)))
+    assert main(["render-scene", "pushing", "--controls", str(tmp_path / "u.npy")]) == 2
+    assert "must be (steps," in capsys.readouterr().err
