@@ -133,14 +133,15 @@ class RayCaster:
         lit = np.ones(height * width, dtype=np.float32)
         lit[seen] = (hit < 0) | (hit > length - 2e-3 * view.camera.distance)
         soft = cv2.GaussianBlur(np.ascontiguousarray(lit.reshape(height, width)[::2, ::2]), (5, 5), 0)
-        return np.asarray(cv2.resize(soft, (width, height), interpolation=cv2.INTER_LINEAR)).reshape(-1)
+        fine = cv2.resize(soft, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(fine, dtype=np.float32).reshape(-1)
 
     def _planes(self, eye: Array, distance: Array, tile: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Visibility of each pixel if it is on a plane, 0 at the horizon, and brightness by the lines `tile` apart."""
         assert self._view is not None
         horizon = _HORIZON * self._view.camera.distance
         away = np.minimum(distance, horizon).astype(np.float32)
-        near: NDArray[np.float32] = np.square(1 - np.square(away / np.float32(horizon)))
+        near = np.asarray(np.square(1 - np.square(away / np.float32(horizon))), dtype=np.float32)
         width = away * np.float32(_LINE_GROWTH / tile) + np.float32(_LINE_WIDTH)
         line = np.zeros(len(away), dtype=bool)
         for axis in range(2):
