@@ -1,5 +1,7 @@
 """Explicit lists of markers, from the TOML table of a pad or from a CSV or NPZ file."""
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -60,8 +62,11 @@ def _read_file(path: Path, location: str) -> Mapping[str, Any]:
         raise UsageError(f"{location}: a file of markers must be .csv or .npz")
     try:
         if path.suffix == ".npz":
+            with path.open("rb") as file:
+                if not zipfile.is_zipfile(file):
+                    raise UsageError(f"{location} cannot be read: it is not an NPZ file")
             with np.load(path, allow_pickle=False) as content:
-                check_memory(location, max(info.file_size for info in content.zip.infolist()) // _BYTES)
+                check_memory(location, max((info.file_size for info in content.zip.infolist()), default=0) // _BYTES)
                 arrays = {name: content[name] for name in content.files}
         else:
             with path.open("rb") as lines:
@@ -71,7 +76,7 @@ def _read_file(path: Path, location: str) -> Mapping[str, Any]:
         raise
     except FileNotFoundError:
         raise UsageError(f"{location}: no such file in the folder of the scene") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UsageError(f"{location} cannot be read: {str(error).splitlines()[0]}") from None
     if path.suffix == ".npz":
         if unknown := [name for name in arrays if name not in _ARRAYS]:

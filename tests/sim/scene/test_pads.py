@@ -202,6 +202,9 @@ def test_contact_points_on_round_geometries(kind: str, text: str, message: str, 
         ('shape = "points"\nfile = "two.csv"', "expected 3, 6 or 9 columns (position, normal, x axis), got 2"),
         ('shape = "points"\nfile = "words.csv"', "words.csv cannot be read"),
         ('shape = "points"\nfile = "words.npz"', "words.npz cannot be read"),
+        ('shape = "points"\nfile = "array.npz"', "array.npz cannot be read"),
+        ('shape = "points"\nfile = "cut.npz"', "cut.npz cannot be read"),
+        ('shape = "points"\nfile = "bad.npz"', "bad.npz cannot be read"),
         ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; valid names: positions, normals, x_axes"),
         ('shape = "points"\npositions = [[0, 0]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = [[0, 0, nan]]', "positions must be a list of [x, y, z], all finite"),
@@ -220,6 +223,12 @@ def test_invalid_pad_gives_a_one_line_error(text: str, message: str, tmp_path: P
     (tmp_path / "words.csv").write_text("x, y, z\n")
     (tmp_path / "words.npz").write_text("x, y, z\n")
     np.savez(tmp_path / "other.npz", points=POINTS)
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:100])
+    damaged = bytearray((tmp_path / "other.npz").read_bytes())
+    damaged[150] ^= 255  # in the data of the first array
+    (tmp_path / "bad.npz").write_bytes(damaged)
+    with (tmp_path / "array.npz").open("wb") as array:
+        np.save(array, POINTS)
     with pytest.raises(UsageError) as caught:
         loaded(tmp_path, text)
     assert message in str(caught.value)
