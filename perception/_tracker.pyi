@@ -40,8 +40,9 @@ class Tracker:
         profile_reach: float,
         rest: NDArray[np.float64],
         visible: NDArray[np.bool_],
-        ellipse: NDArray[np.float64],
+        shape: NDArray[np.float64],
         contrast: NDArray[np.float64],
+        tolerated: NDArray[np.float64],
     ) -> None: ...
     def start(self, image: NDArray[np.uint8]) -> StartResult: ...
     def rest(self) -> NDArray[np.float64]: ...

@@ -1,8 +1,8 @@
-"""The dot model, estimated from the first image: dot profile, ellipse and contrast per marker, and pixel noise.
+"""The dot model, estimated from the first image: dot profile, shape and contrast per marker, and pixel noise.
 
-All dots are prints of one shape seen through one lens. Each has the same profile over q = dᵀ Q d, d the offset from its
-centre. The ellipse Q combines the local grid steps, which contain tilt, keystone and lens distortion, with one
-common matrix for the print. Centres and profile are estimated alternately.
+All dots have one profile over the distance from the centre relative to the outline. The outline of a dot begins as an
+ellipse: the local grid steps, which contain tilt, keystone and lens distortion, times one common matrix for the print.
+Its own size, ellipse and raggedness follow by least squares. Centres, outlines and profile are estimated alternately.
 """
 
 from dataclasses import dataclass, replace
@@ -21,6 +21,15 @@ Floats = NDArray[np.float64]
 _ROUNDS = 2  # of the alternating estimation
 _PROFILE_REACH = 2.2  # the profile ends at this many radii
 _MIN_MATCHING = 0.6  # fraction of the dots that must match the common profile
+_SHAPE_STEPS = 2  # of the fit of the shapes
+_WAVE_LIMIT = 0.25  # smallest |z|² of a wave, as in csrc/dot_fit.hpp
+_MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
+# A sound dot differs from the median dot by less than this [radii], or a multiple of the median difference. Others are
+# damaged, or joined to another one.
+_SOUND = 0.04
+_TOLERATED = (0.16, 0.7)  # smallest and largest tolerated residual / contrast
+_USUAL = 0.03  # standard deviation of what the model does not explain of any dot: JPEG, steps of grey
+_UNEXPLAINED = 6.0  # tolerated residual / standard deviation of what the model does not explain at rest
 _RINGS = 44  # bins of the radius in which the profile is averaged
 
 
@@ -30,8 +39,11 @@ class DotModel:
 
     rest: Floats  # positions at rest (right, down) [px], shape (markers, 2)
     visible: NDArray[np.bool_]  # whether the first image shows the dot, shape (markers,)
-    ellipse: Floats  # Q as xx, xy, yy [1/px²], shape (markers, 3); dᵀ Q d = 1 on the edge of a dot
+    # Frame of each dot as xx, xy, yx, yy [1/px]: maps an offset from the centre to coordinates in which the dot is a
+    # disc of radius 1; then the coefficients of the waves of its outline (`_waves`). Shape (markers, 8).
+    shape: Floats
     contrast: Floats  # of each dot, negative for dark dots, shape (markers,)
+    tolerated: Floats  # residual of each dot that still has half the weight / contrast, shape (markers,)
     profile: NDArray[
         np.float32
     ]  # at equidistant q up to _PROFILE_REACH², 1 inside, 0 outside, shape (PROFILE_STEPS + 1,)
@@ -55,20 +67,26 @@ def fit_dot_model(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, 
 def _fit(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, DotModel]:
     plane = image_plane(image, grid.appearance.plane).astype(np.float64)
     windows = _DotWindows(plane, grid)
-    ellipse = windows.ellipses(grid)
+    shape = windows.common
     sign = 1.0 if grid.appearance.bright else -1.0
     profile = _edge(np.sqrt(np.linspace(0, _PROFILE_REACH**2, PROFILE_STEPS + 1)))
     visible = grid.visible.reshape(-1)
     contrast = np.full(len(visible), sign * float(np.median(windows.contrast)))
-    quality = visible.astype(np.float64)
-    model = DotModel(grid.positions.reshape(-1, 2), visible, ellipse, contrast, profile, 0.02, quality)
+    quality, tolerated = visible.astype(np.float64), np.full(len(visible), _TOLERATED[0])
+    model = DotModel(grid.positions.reshape(-1, 2), visible, shape, contrast, tolerated, profile, 0.02, quality)
     for _ in range(_ROUNDS):
-        tracker = _make_tracker(image, grid, model)
-        fit = tracker.start(image)
-        visible = _matching(image, grid, fit.quality)
-        contrast = np.where(visible, fit.contrast, np.median(fit.contrast[visible]))
-        profile, noise = windows.profile(fit.position, ellipse, visible)
-        model = replace(model, contrast=contrast, rest=fit.position, profile=profile, noise=noise)
+        fit = _make_tracker(image, grid, model).start(image)
+        shape = windows.refined(fit.position, model.shape, model.profile)
+        other = _make_tracker(image, grid, replace(model, shape=shape, rest=fit.position)).start(image)
+        better = other.quality > fit.quality  # a damaged dot may match with its former shape only
+        shape = np.where(better[:, None], shape, model.shape)
+        rest = np.where(better[:, None], other.position, fit.position)
+        visible = _matching(image, grid, np.maximum(fit.quality, other.quality))
+        contrast = np.where(better, other.contrast, fit.contrast)
+        contrast = np.where(visible, contrast, np.median(contrast[visible]))
+        profile, noise = windows.profile(rest, shape, visible)
+        model = replace(model, contrast=contrast, rest=rest, shape=shape, profile=profile, noise=noise)
+    model = replace(model, tolerated=windows.tolerated(model))
     tracker = _make_tracker(image, grid, model)
     fit = tracker.start(image)
     visible = _matching(image, grid, fit.quality)
@@ -102,8 +120,9 @@ def _make_tracker(image: NDArray[np.uint8], grid: MarkerGrid, model: DotModel) -
         profile_reach=_PROFILE_REACH**2,
         rest=model.rest,
         visible=model.visible,
-        ellipse=model.ellipse,
+        shape=model.shape,
         contrast=model.contrast,
+        tolerated=model.tolerated,
     )
 
 
@@ -128,9 +147,11 @@ class _DotWindows:
         self.contrast = np.abs((ratio * inside).sum(1) / np.maximum(inside.sum(1), 1))
         sign = 1.0 if grid.appearance.bright else -1.0
         self.ink = sign * ratio / np.maximum(self.contrast, 1e-3)[:, None]
+        self.common = self._common_shapes(grid)
+        self.inner = np.linalg.norm(self.step, axis=1) < 1.6 * grid.radius + 1
 
-    def ellipses(self, grid: MarkerGrid) -> Floats:
-        """Q of each marker, shape (markers, 3), from the second moments of the dots and the local grid steps."""
+    def _common_shapes(self, grid: MarkerGrid) -> Floats:
+        """Shapes as in `DotModel` of equal elliptic dots, from the second moments of the dots and the grid steps."""
         inner = np.linalg.norm(self.offset, axis=-1) < 2.0 * grid.radius
         weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * inner
         total = np.maximum(weight.sum(1), 1e-9)[:, None]
@@ -142,20 +163,67 @@ class _DotWindows:
         # In units of the grid steps, all dots have the same moments; a disc of radius 1 has second moments 1/4.
         common = np.median(inverse[self.markers] @ moments @ inverse[self.markers].transpose(0, 2, 1), axis=0)
         q = inverse.transpose(0, 2, 1) @ np.linalg.inv(4 * common) @ inverse
-        return np.stack([q[:, 0, 0], q[:, 0, 1], q[:, 1, 1]], axis=1)
+        frames = np.linalg.cholesky(q).transpose(0, 2, 1).reshape(-1, 4)
+        return np.concatenate([frames, np.zeros_like(frames)], axis=1)
 
-    def profile(self, rest: Floats, ellipse: Floats, visible: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
-        """The mean profile, as in `DotModel`, and the pixel noise outside the dots."""
-        use = visible[self.markers]
-        markers = self.markers[use]
-        off = self.step - (rest - self.centre_pixel)[markers][:, None]
-        xx, xy, yy = ellipse[markers].T[:, :, None]
-        radius = np.sqrt(off[..., 0] ** 2 * xx + 2 * off[..., 0] * off[..., 1] * xy + off[..., 1] ** 2 * yy)
+    def refined(self, rest: Floats, shape: Floats, profile: NDArray[np.float32]) -> Floats:
+        """The shapes with size, stretch and waves of each dot by least squares; the median size is kept."""
+        markers = self.markers
+        refined = shape[markers]
+        off = self._offsets(rest, markers)
+        ink, _ = self._ink(_in_dots(off, shape[markers])[2], np.ones(len(markers), dtype=bool))
+        ink, off = ink[:, self.inner], off[:, self.inner]
+        for _ in range(_SHAPE_STEPS):
+            x, y, radius = _in_dots(off, refined)
+            here, slope = _sample(profile, radius)
+            change = _least_squares(_outline_changes(x, y) * slope, ink - here)
+            change[:, 0] -= np.median(change[:, 0])
+            change = np.clip(change, -_MAX_CHANGE, _MAX_CHANGE)
+            off -= np.linalg.solve(refined[:, :4].reshape(-1, 2, 2), change[:, 1:3, None])[:, None, :, 0]
+            refined = _reshaped(refined, change)
+        size, raggedness = _deviations(refined, self.common[markers])
+        sound = (raggedness < max(_SOUND, 3.5 * float(np.median(raggedness)))) & (
+            size < max(_SOUND, 5 * float(np.median(size)))
+        )
+        result = shape.copy()
+        result[markers[sound]] = refined[sound]
+        return result
+
+    def tolerated(self, model: DotModel) -> Floats:
+        """Tolerated residuals as in `DotModel`: more for a dot that the model does not explain at rest.
+
+        Damaged dots, whose shape is the common one, get the smallest value: their other parts must be without weight.
+        """
+        shape = model.shape[self.markers]
+        radius = _in_dots(self._offsets(model.rest, self.markers), shape)[2]
+        ink, _ = self._ink(radius, np.ones(len(self.markers), dtype=bool))
+        residual = ink - _sample(model.profile, radius)[0]
+        inside = radius < 1.5
+        variance = (residual**2 * inside).sum(1) / inside.sum(1) - (model.noise / model.contrast[self.markers]) ** 2
+        variance -= _USUAL**2
+        sound = (shape != self.common[self.markers]).any(axis=1)
+        result = np.full(len(model.rest), _TOLERATED[0])
+        unexplained = np.sqrt(np.maximum(variance, 0.0)) * sound
+        result[self.markers] = np.clip(_TOLERATED[0] + _UNEXPLAINED * unexplained, *_TOLERATED)
+        return result
+
+    def _offsets(self, rest: Floats, markers: NDArray[np.intp]) -> Floats:
+        """Offsets of the pixels from the centres `rest` of all markers [px], shape (dots, pixels, 2)."""
+        return np.asarray(self.step - (rest - self.centre_pixel)[markers][:, None])
+
+    def _ink(self, radius: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+        """Ink at the distances `radius` from the centres, and value over background less 1, shape (dots, pixels)."""
         background = _fit_planes(self.pixels[use], self.step, (radius > 1.7).astype(np.float64))
         ratio = self.pixels[use] / np.maximum(background, 1.0) - 1
         inside = radius < 0.6
         contrast = (ratio * inside).sum(1) / np.maximum(inside.sum(1), 1)
-        ink = ratio / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3)[:, None]
+        return ratio / np.where(np.abs(contrast) > 1e-3, contrast, 1e-3)[:, None], ratio
+
+    def profile(self, rest: Floats, shape: Floats, visible: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+        """The mean profile, as in `DotModel`, and the pixel noise outside the dots."""
+        use = visible[self.markers]
+        radius = _in_dots(self._offsets(rest, self.markers[use]), shape[self.markers[use]])[2]
+        ink, ratio = self._ink(radius, use)
         ring = np.minimum(radius / _PROFILE_REACH * _RINGS, _RINGS).astype(np.intp)
         sound = np.abs(ink - _edge(radius)) < 0.75  # excludes damaged parts of dots
         count = np.bincount(ring[sound], minlength=_RINGS + 1)[:_RINGS]
@@ -170,6 +238,61 @@ class _DotWindows:
         outside = ratio[(radius > 1.7) & (radius < 2.0)]
         noise = 1.4826 * float(np.median(np.abs(outside))) if outside.size else 0.02
         return table.astype(np.float32), noise
+
+
+def _in_dots(off: Floats, shape: Floats) -> tuple[Floats, Floats, Floats]:
+    """Coordinates of offsets (dots, pixels, 2) in the frames of the dots, and distance relative to the outline."""
+    xx, xy, yx, yy, *waves = shape.T[:, :, None]
+    x, y = xx * off[..., 0] + xy * off[..., 1], yx * off[..., 0] + yy * off[..., 1]
+    bulge = sum(share * wave for share, wave in zip(waves, _waves(x, y), strict=True))
+    return x, y, np.asarray(np.hypot(x, y) * (1 - bulge))
+
+
+def _waves(x: Floats, y: Floats) -> tuple[Floats, ...]:
+    """Waves of an outline: Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴ with z = x + i y."""
+    real, imaginary = x * x - y * y, 2 * x * y
+    inverse = 1 / np.square(np.maximum(x * x + y * y, _WAVE_LIMIT))
+    third = (x * real - y * imaginary) * inverse, (x * imaginary + y * real) * inverse
+    return *third, (real * real - imaginary * imaginary) * inverse, 2 * real * imaginary * inverse
+
+
+def _outline_changes(x: Floats, y: Floats) -> Floats:
+    """Changes of an outline by size, offset (right, down), stretch (two axes) and waves, shape (dots, 9, pixels)."""
+    square = np.maximum(x * x + y * y, _WAVE_LIMIT)
+    inverse = 1 / np.sqrt(square)
+    stretch = (x * x - y * y) / square, 2 * x * y / square
+    return np.stack([np.ones_like(x), x * inverse, y * inverse, *stretch, *_waves(x, y)], axis=1)
+
+
+def _least_squares(terms: Floats, values: Floats) -> Floats:
+    """Coefficients of `terms` (dots, n, pixels) that sum to `values` (dots, pixels), shape (dots, n)."""
+    matrix = terms @ terms.transpose(0, 2, 1) + 1e-5 * np.eye(terms.shape[1], dtype=terms.dtype)
+    return np.asarray(np.linalg.solve(matrix, terms @ values[..., None])[..., 0])
+
+
+def _reshaped(shape: Floats, change: Floats) -> Floats:
+    """Shapes after a change of the outline: size, offset (ignored), stretch, waves."""
+    size, long, turned = change[:, [0, 3, 4]].T
+    stretch = np.stack([1 + size + long, turned, turned, 1 + size - long], axis=1).reshape(-1, 2, 2)
+    frame = np.linalg.solve(stretch, shape[:, :4].reshape(-1, 2, 2)).reshape(-1, 4)
+    return np.concatenate([frame, shape[:, 4:] + change[:, 5:]], axis=1)
+
+
+def _deviations(shape: Floats, common: Floats) -> tuple[Floats, Floats]:
+    """Size of each dot from the median size, and its outline from the median one; standard deviations in radii."""
+    (a, b), (c, d) = np.moveaxis(common[:, :4].reshape(-1, 2, 2) @ np.linalg.inv(shape[:, :4].reshape(-1, 2, 2)), 0, -1)
+    outline = np.stack([(a - d) / 2, (b + c) / 2, *shape[:, 4:].T], axis=1)
+    outline -= np.median(outline, axis=0)
+    size = (a + d) / 2
+    return np.abs(size - np.median(size)), np.asarray(np.sqrt((outline**2).sum(axis=1) / 2))
+
+
+def _sample(profile: NDArray[np.float32], radius: Floats) -> tuple[Floats, Floats]:
+    """The profile at distances from the centre [radii], and its change by the logarithm of the size, (dots, 1, ...)."""
+    at = np.minimum(np.square(radius / _PROFILE_REACH) * PROFILE_STEPS, PROFILE_STEPS - 1e-3)
+    index = at.astype(np.intp)
+    steps = np.diff(profile)[index]
+    return profile[index] + (at - index) * steps, (-2 * at * steps)[:, None]
 
 
 def _fit_planes(pixels: Floats, step: Floats, weight: Floats) -> Floats:

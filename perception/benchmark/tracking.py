@@ -25,7 +25,7 @@ DRIFT, QUICK_DRIFT = 240, 15  # images until the gel is back at rest
 DRIFT_PERIOD = 60
 
 # Bounds of the errors of gelflow: (median, 95th percentile) [px], and the fraction of markers within 0.1 spacings.
-ERROR_BOUNDS = {"clean": (0.02, 0.04), "typical": (0.03, 0.06), "hard": (0.08, 0.5)}
+ERROR_BOUNDS = {"clean": (0.02, 0.04), "typical": (0.03, 0.06), "hard": (0.08, 0.5), "print": (0.03, 0.08)}
 NEAR_BOUNDS = dict.fromkeys(("5 % missing", "15 % damaged", "four bridges", "two highlights"), 0.99)
 # Bounds for the classes "clean" and "typical": [px], [px], spacings.
 JITTER_BOUND, DRIFT_BOUND, JUMP_BOUND = 0.02, 0.05, 0.7

@@ -51,33 +51,41 @@ struct SharedTracker {
 };
 
 void check_marker(const TrackerSetup& setup, std::size_t m) {
-  const Ellipse& q = setup.ellipse[m];
+  const DotShape& f = setup.shape[m];
   const Point rest = setup.rest[m];
   const double contrast = std::abs(setup.contrast[m]);
-  const bool definite = q.xx > 0 && q.xx < 16 && q.yy > 0 && q.yy < 16 && double(q.xx) * q.yy > double(q.xy) * q.xy;
+  const bool regular =
+      std::hypot(f.xx, f.xy, f.yx) < 4 && std::abs(f.yy) < 4 && double(f.xx) * f.yy > double(f.xy) * f.yx;
+  double raggedness = 0;
+  for (const float wave : f.waves) raggedness += std::abs(double(wave));
   const bool bounded = std::abs(rest.x) < 1e6 && std::abs(rest.y) < 1e6 && contrast > 1e-3 && contrast < 1e3;
-  if (!definite || !bounded) throw std::invalid_argument("position, ellipse or contrast of a marker is out of range");
+  const double tolerated = setup.tolerated[m];
+  if (!regular || !bounded || !(raggedness < 0.9) || !(tolerated > 0.01 && tolerated < 10))
+    throw std::invalid_argument("position, shape, contrast or tolerated residual of a marker is out of range");
 }
 
 TrackerSetup make_setup(int width, int height, int channel, bool bright, int rows, int cols, double spacing,
                         double radius, double noise, const Array<float>& profile, float profile_reach,
-                        const Array<double>& rest, const Array<bool>& visible, const Array<double>& ellipse,
-                        const Array<double>& contrast) {
+                        const Array<double>& rest, const Array<bool>& visible, const Array<double>& shape,
+                        const Array<double>& contrast, const Array<double>& tolerated) {
   const bool in_range = width > 0 && height > 0 && rows > 0 && cols > 0 && channel >= 0 && channel <= 5 &&
                         radius > 0.5 && radius < 16 && spacing > 2 * radius && spacing < 1e4 && noise >= 0 &&
                         profile_reach > 0;
   if (!in_range) throw std::invalid_argument("a setting of the tracker is out of range");
   const py::ssize_t n = py::ssize_t(rows) * cols;
-  check_shape(rest, n, 2, "rest"), check_shape(ellipse, n, 3, "ellipse"), check_shape(visible, n, 0, "visible");
-  check_shape(contrast, n, 0, "contrast"), check_shape(profile, DotProfile::steps + 1, 0, "profile");
-  TrackerSetup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}};
+  check_shape(rest, n, 2, "rest"), check_shape(shape, n, 8, "shape"), check_shape(visible, n, 0, "visible");
+  check_shape(contrast, n, 0, "contrast"), check_shape(tolerated, n, 0, "tolerated"),
+      check_shape(profile, DotProfile::steps + 1, 0, "profile");
+  TrackerSetup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {},
+                     {},    {}};
   for (py::ssize_t i = 0; i <= DotProfile::steps; ++i) setup.profile.value[std::size_t(i)] = profile.at(i);
   setup.profile.reach = profile_reach;
   for (py::ssize_t m = 0; m < n; ++m) {
     setup.rest.push_back({rest.at(m, 0), rest.at(m, 1)});
     setup.visible.push_back(char(visible.at(m)));
-    setup.ellipse.push_back({float(ellipse.at(m, 0)), float(ellipse.at(m, 1)), float(ellipse.at(m, 2))});
-    setup.contrast.push_back(contrast.at(m));
+    const auto value = [&](py::ssize_t i) { return float(shape.at(m, i)); };
+    setup.shape.push_back({value(0), value(1), value(2), value(3), {value(4), value(5), value(6), value(7)}});
+    setup.contrast.push_back(contrast.at(m)), setup.tolerated.push_back(tolerated.at(m));
     check_marker(setup, std::size_t(m));
   }
   return setup;
@@ -156,15 +164,16 @@ PYBIND11_MODULE(_tracker, module) {
   py::class_<SharedTracker>(module, "Tracker")
       .def(py::init([](int width, int height, int channel, bool bright, int rows, int cols, double spacing,
                        double radius, double noise, const Array<float>& profile, float profile_reach,
-                       const Array<double>& rest, const Array<bool>& visible, const Array<double>& ellipse,
-                       const Array<double>& contrast) {
+                       const Array<double>& rest, const Array<bool>& visible, const Array<double>& shape,
+                       const Array<double>& contrast, const Array<double>& tolerated) {
              return std::make_unique<SharedTracker>(make_setup(width, height, channel, bright, rows, cols, spacing,
                                                                radius, noise, profile, profile_reach, rest, visible,
-                                                               ellipse, contrast));
+                                                               shape, contrast, tolerated));
            }),
            py::kw_only(), py::arg("width"), py::arg("height"), py::arg("channel"), py::arg("bright"), py::arg("rows"),
            py::arg("cols"), py::arg("spacing"), py::arg("radius"), py::arg("noise"), py::arg("profile"),
-           py::arg("profile_reach"), py::arg("rest"), py::arg("visible"), py::arg("ellipse"), py::arg("contrast"))
+           py::arg("profile_reach"), py::arg("rest"), py::arg("visible"), py::arg("shape"), py::arg("contrast"),
+           py::arg("tolerated"))
       .def("start", &start, py::arg("image").noconvert())
       .def("rest", &rest)
       .def("track", &track, py::arg("image").noconvert());

@@ -2,10 +2,11 @@
 //
 // The image around a dot is modelled as a linear background times one plus the contrast of the dot times its profile:
 //
-//   m(x) = b (1 + β·(x − w)) (1 + a s(q)),   q = (x − p)ᵀ Q (x − p),
+//   m(x) = b (1 + β·(x − w)) (1 + a s(q)),   q = |d|² (1 − e(d))²,   d = F (x − p),
 //
-// with the window centre w, the profile s from the first image (1 inside, 0 outside; a table over q), and the ellipse Q
-// of the marker. The unknowns are the centre p, the contrast a, the background b and its slope β. The slope is required:
+// with the window centre w, the profile s of all dots (1 inside, 0 outside; a table over q), and the shape of the
+// marker's dot: the frame F, in which the dot is a disc of radius 1, and the waves e of its ragged outline, with three
+// and four periods around the dot. The unknowns are the centre p, the contrast a, the background b and its slope β. The slope is required:
 // an unmodelled slope of 1 % per pixel shifts the centre by a quarter of a pixel.
 //
 // The residual r = I − m enters through ψ(r) = r / (1 + (r/k)²), which limits the influence of scratches, highlights,
@@ -37,8 +38,9 @@ struct DotProfile {
   float reach;                         // s = 0 for larger q
 };
 
-struct Ellipse {
-  float xx, xy, yy;  // Q [1/px²]
+struct DotShape {
+  float xx, xy, yx, yy;          // F, row-major [1/px]
+  std::array<float, 4> waves{};  // coefficients of Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴, z = d₁ + i d₂
 };
 
 struct DotFit {
@@ -75,10 +77,21 @@ struct ProfileSample {
   FloatPack s, gx, gy;  // profile and its derivative by p in window coordinates
 };
 
-GELFLOW_INLINE ProfileSample sample_profile(const DotProfile& profile, const Ellipse& ellipse, FloatPack dx, float dy) {
-  const float scale = float(DotProfile::steps) / profile.reach;
-  const FloatPack qx = ellipse.xx * dx + ellipse.xy * dy, qy = ellipse.xy * dx + ellipse.yy * dy;
-  FloatPack t = scale * (qx * dx + qy * dy);
+// e at d = (x, y); its denominator is limited, for d = 0.
+GELFLOW_INLINE FloatPack bulge(const std::array<float, 4>& waves, FloatPack x, FloatPack y, FloatPack square) {
+  const FloatPack bounded = square > 0.25f ? square : FloatPack{} + 0.25f;
+  const FloatPack re2 = x * x - y * y, im2 = 2 * x * y;
+  const FloatPack third = waves[0] * (x * re2 - y * im2) + waves[1] * (x * im2 + y * re2);
+  const FloatPack fourth = waves[2] * (re2 * re2 - im2 * im2) + waves[3] * (2 * re2 * im2);
+  return (third + fourth) / (bounded * bounded);
+}
+
+// The derivative neglects the change of e.
+GELFLOW_INLINE ProfileSample sample_profile(const DotProfile& profile, const DotShape& shape, FloatPack dx, float dy) {
+  const FloatPack x = shape.xx * dx + shape.xy * dy, y = shape.yx * dx + shape.yy * dy, square = x * x + y * y;
+  const FloatPack shrink = 1 - bulge(shape.waves, x, y, square);
+  const FloatPack scale = (float(DotProfile::steps) / profile.reach) * (shrink * shrink);
+  FloatPack t = scale * square;
   t = t < float(DotProfile::steps) ? t : FloatPack{} + float(DotProfile::steps);
   const IntPack index = __builtin_convertvector(t, IntPack);
   const FloatPack part = t - __builtin_convertvector(index, FloatPack);
@@ -88,7 +101,7 @@ GELFLOW_INLINE ProfileSample sample_profile(const DotProfile& profile, const Ell
     high[l] = profile.value[std::size_t(index[l]) + 1];
   }
   const FloatPack slope = (high - low) * (-2 * scale);
-  return {low + part * (high - low), slope * qx, slope * qy};
+  return {low + part * (high - low), slope * (shape.xx * x + shape.yx * y), slope * (shape.xy * x + shape.yy * y)};
 }
 
 GELFLOW_INLINE double sum_lanes(FloatPack v) {
@@ -98,7 +111,7 @@ GELFLOW_INLINE double sum_lanes(FloatPack v) {
 }
 
 GELFLOW_CLONES inline void accumulate(const Window& window, int width, int height, const DotProfile& profile,
-                                      const Ellipse& ellipse, FitState& state) {
+                                      const DotShape& shape, FitState& state) {
   const float middle = 0.5f * float(window.size - 1), k2 = 1 / (state.k * state.k);
   FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{};
   const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
@@ -110,7 +123,7 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
       FloatPack pixel;
       std::memcpy(&pixel, line + start, sizeof pixel);
       const FloatPack column = x + (middle + float(window.left));
-      const ProfileSample dot = sample_profile(profile, ellipse, x - state.x, y - state.y);
+      const ProfileSample dot = sample_profile(profile, shape, x - state.x, y - state.y);
       const FloatPack ink = 1 + state.a * dot.s;
       const FloatPack r = pixel - state.b * (1 + state.slope_x * x + state.slope_y * y) * ink;
       FloatPack w = 1 / (1 + r * r * k2);
@@ -160,7 +173,7 @@ inline bool invert(std::array<double, 36>& matrix, InverseHessian& inverse) {
   return true;
 }
 
-GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const Ellipse& ellipse, double contrast, int size,
+GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotShape& shape, double contrast, int size,
                                            InverseHessian& inverse) {
   std::array<FloatPack, 36> sums{};
   const float middle = 0.5f * float(size - 1);
@@ -169,7 +182,7 @@ GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const Elli
     for (int start = 0; start < size; start += pack_size) {
       const FloatPack x = ramp + (float(start) - middle);
       const float y = float(row) - middle, a = float(contrast);
-      const ProfileSample dot = sample_profile(profile, ellipse, x, y);
+      const ProfileSample dot = sample_profile(profile, shape, x, y);
       const FloatPack ink = 1 + a * dot.s;
       const std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
       for (std::size_t i = 0; i < 6; ++i)
@@ -188,10 +201,12 @@ struct FitSettings {
   double noise;   // standard deviation of a pixel at rest / background
 };
 
-// Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed. The quality is 0
+// Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
+// scale of the robust weight k relative to background times contrast. The quality is 0
 // when the fit leaves the central part of the window or the contrast changes sign.
-inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Ellipse& ellipse,
-                      const InverseHessian& inverse, double rest_contrast, Point position, int max_iterations) {
+inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape,
+                      const InverseHessian& inverse, double rest_contrast, double tolerated, Point position,
+                      int max_iterations) {
   const int size = settings.window;
   const double middle = 0.5 * (size - 1), limit = 0.8 * settings.radius + 1;
   Window window;
@@ -210,9 +225,9 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Ell
   state.x = float(begin.x), state.y = float(begin.y), state.a = float(rest_contrast), state.b = float(background);
   bool coarse = true;
   for (int number = 0; number < max_iterations; ++number) {
-    state.k = state.b * float(std::max(0.16 * std::abs(double(state.a)), 3 * settings.noise));
+    state.k = state.b * float(std::max(tolerated * std::abs(double(state.a)), 3 * settings.noise));
     state.row_step = coarse ? 2 : 1;
-    accumulate(window, plane.width, plane.height, settings.profile, ellipse, state);
+    accumulate(window, plane.width, plane.height, settings.profile, shape, state);
     // H includes all pixels, the sums only those with weight.
     const double scale = std::min(4.0, double(size * size) / std::max(state.weight, 1.0));
     std::array<double, 6> step{};

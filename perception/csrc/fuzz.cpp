@@ -33,9 +33,11 @@ TrackerSetup random_setup() {
     const double x = (m % setup.grid.cols + 0.5) * setup.spacing, y = (m / setup.grid.cols + 0.5) * setup.spacing;
     setup.rest.push_back(far ? Point{real(-1e5, 1e5), real(-1e5, 1e5)} : Point{x + real(-2, 2), y + real(-2, 2)});
     setup.visible.push_back(char(whole(0, 9) > 0));
-    const double q = 1 / (setup.radius * setup.radius);
-    setup.ellipse.push_back({float(q * real(0.3, 3)), float(q * real(-0.25, 0.25)), float(q * real(0.3, 3))});
-    setup.contrast.push_back((setup.bright ? 1 : -1) * real(0.01, 2));
+    const auto entry = [&](double low, double high) { return float(real(low, high) / setup.radius); };
+    const auto wave = [] { return float(real(-0.2, 0.2)); };
+    setup.shape.push_back(
+        {entry(0.5, 2), entry(-0.4, 0.4), entry(-0.4, 0.4), entry(0.5, 2), {wave(), wave(), wave(), wave()}});
+    setup.contrast.push_back((setup.bright ? 1 : -1) * real(0.01, 2)), setup.tolerated.push_back(real(0.05, 1));
   }
   return setup;
 }

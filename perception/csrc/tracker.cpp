@@ -13,7 +13,7 @@ constexpr double min_response_ratio = 0.3;  // minimum response of a dot / media
 constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
 constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
 constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
-constexpr float ellipse_change = 0.1f;      // relative change of an ellipse that detected dots resolve
+constexpr float frame_change = 0.05f;       // relative change of a frame that detected dots resolve
 constexpr int relaxation_steps = 8;
 constexpr int max_rest_images = 8;      // images averaged in the rest positions
 constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
@@ -35,14 +35,14 @@ Tracker::Tracker(TrackerSetup setup)
       assignment_(setup_.grid, setup_.spacing) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m)
-    if (!inverse_hessian(setup_.profile, setup_.ellipse[m], setup_.contrast[m], settings_.window, inverse_hessian_[m]))
+    if (!inverse_hessian(setup_.profile, setup_.shape[m], setup_.contrast[m], settings_.window, inverse_hessian_[m]))
       throw std::invalid_argument("the dot profile does not determine the centre of a dot");
-  for (const Ellipse& q : setup_.ellipse) {  // half width and half height, reduced by 10 % for a blurred edge
-    const double area = double(q.xx) * q.yy - double(q.xy) * q.xy;
-    half_size_.push_back({0.9 * std::sqrt(q.yy / area), 0.9 * std::sqrt(q.xx / area)});
+  for (const DotShape& f : setup_.shape) {  // half width and half height, reduced by 10 % for a blurred edge
+    const double area = std::abs(double(f.xx) * f.yy - double(f.xy) * f.yx);
+    half_size_.push_back({0.9 * std::hypot(f.xy, f.yy) / area, 0.9 * std::hypot(f.xx, f.yx) / area});
   }
   positions_ = previous_ = setup_.rest;
-  ellipse_ = setup_.ellipse;
+  shape_ = setup_.shape;
   velocity_.resize(n), displacement_.resize(n), relaxed_.resize(n), detection_offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
   measured_.resize(n), filled_.resize(n), expected_.resize(n);
@@ -51,7 +51,7 @@ Tracker::Tracker(TrackerSetup setup)
 
 void Tracker::start(const std::uint8_t* bgr) {
   extract_plane(bgr, plane_, setup_.channel);
-  ellipse_ = setup_.ellipse;
+  shape_ = setup_.shape;
   anything_valid_ = false;
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
@@ -129,8 +129,8 @@ void Tracker::measure(const std::vector<int>& dot_of) {
     if (measured_[m]) positions_[m] = dots_[std::size_t(dot_of[m])].position + detection_offset_[m];
   }
   for (std::size_t m = 0; m < n; ++m) {
-    const Ellipse now = deformed_ellipse(m);
-    if (differ(now, ellipse_[m])) ellipse_[m] = now;
+    const DotShape now = deformed_shape(m);
+    if (differ(now, shape_[m])) shape_[m] = now;
   }
   for (std::size_t m = 0; m < n; ++m) {
     quality_[m] = 0;
@@ -151,7 +151,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   }
   reject_outliers();
   fill_missing();
-  for (std::size_t m = 0; m < n; ++m) ellipse_[m] = deformed_ellipse(m);
+  for (std::size_t m = 0; m < n; ++m) shape_[m] = deformed_shape(m);
 }
 
 // Accepts a fit as the position of a marker if its quality reaches `threshold`.
@@ -161,45 +161,45 @@ void Tracker::accept(std::size_t marker, const DotFit& found, double threshold) 
   positions_[marker] = found.position, quality_[marker] = quality, measured_[marker] = 1;
 }
 
-// The ellipse of a dot on the deformed gel: GᵀQG with G = L₀ L⁻¹, where the columns of L are the vectors between the
+// The shape of a dot on the deformed gel: its frame is F G with G = L₀ L⁻¹, where the columns of L are the vectors between the
 // opposite neighbours of the marker, and L₀ are those at rest.
-Ellipse Tracker::deformed_ellipse(std::size_t marker) const {
+DotShape Tracker::deformed_shape(std::size_t marker) const {
   Point now[2], rest[2];
   for (int axis = 0; axis < 2; ++axis) {
     std::size_t ends[2];
     for (int side = 0; side < 2; ++side) {
       const int other = setup_.grid.neighbour(int(marker), (axis ? Grid::downward : Grid::rightward) + side);
       ends[side] = other < 0 ? marker : std::size_t(other);
-      if (!measured_[ends[side]]) return ellipse_[marker];
+      if (!measured_[ends[side]]) return shape_[marker];
     }
     now[axis] = positions_[ends[0]] - positions_[ends[1]];
     rest[axis] = setup_.rest[ends[0]] - setup_.rest[ends[1]];
   }
   const double area = now[0].x * now[1].y - now[0].y * now[1].x;
-  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return ellipse_[marker];
+  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return shape_[marker];
   const double xx = (rest[0].x * now[1].y - rest[1].x * now[0].y) / area;
   const double xy = (rest[1].x * now[0].x - rest[0].x * now[1].x) / area;
   const double yx = (rest[0].y * now[1].y - rest[1].y * now[0].y) / area;
   const double yy = (rest[1].y * now[0].x - rest[0].y * now[1].x) / area;
-  const Ellipse& q = setup_.ellipse[marker];
-  return {float(q.xx * xx * xx + 2 * q.xy * xx * yx + q.yy * yx * yx),
-          float(q.xx * xx * xy + q.xy * (xx * yy + xy * yx) + q.yy * yx * yy),
-          float(q.xx * xy * xy + 2 * q.xy * xy * yy + q.yy * yy * yy)};
+  const DotShape& f = setup_.shape[marker];
+  return {float(f.xx * xx + f.xy * yx), float(f.xx * xy + f.xy * yy), float(f.yx * xx + f.yy * yx),
+          float(f.yx * xy + f.yy * yy), f.waves};
 }
 
-// Whether two ellipses differ by more than the uncertainty of detected dots. Otherwise the ellipse of the last image,
-// from fitted positions, is more accurate.
-bool Tracker::differ(const Ellipse& one, const Ellipse& two) {
-  const float limit = ellipse_change * (two.xx + two.yy);
-  return std::abs(one.xx - two.xx) > limit || std::abs(one.xy - two.xy) > limit || std::abs(one.yy - two.yy) > limit;
+// Whether two frames differ by more than the uncertainty of detected dots. Otherwise the frame of the last image, from
+// fitted positions, is more accurate.
+bool Tracker::differ(const DotShape& one, const DotShape& two) {
+  const float limit = frame_change * std::sqrt(two.xx * two.xx + two.xy * two.xy + two.yx * two.yx + two.yy * two.yy);
+  return std::abs(one.xx - two.xx) > limit || std::abs(one.xy - two.xy) > limit || std::abs(one.yx - two.yx) > limit ||
+         std::abs(one.yy - two.yy) > limit;
 }
 
 DotFit Tracker::fit(std::size_t marker, Point position, int iterations) const {
   if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
         position.y < setup_.height + setup_.radius))
     return {position, 0, 0};
-  return fit_dot(plane_, settings_, ellipse_[marker], inverse_hessian_[marker], setup_.contrast[marker], position,
-                 iterations);
+  return fit_dot(plane_, settings_, shape_[marker], inverse_hessian_[marker], setup_.contrast[marker],
+                 setup_.tolerated[marker], position, iterations);
 }
 
 // Quality of a fit, 0 if the image border cuts the dot or its contrast differs too much from that at rest.

@@ -15,10 +15,11 @@ struct TrackerSetup {
   double spacing, radius;  // [px]
   double noise;            // standard deviation of a pixel / background
   DotProfile profile;
-  std::vector<Point> rest;       // position at rest [px]
-  std::vector<char> visible;     // whether the first image shows its dot
-  std::vector<Ellipse> ellipse;  // of its dot
-  std::vector<double> contrast;  // of its dot, negative for dark dots
+  std::vector<Point> rest;        // position at rest [px]
+  std::vector<char> visible;      // whether the first image shows its dot
+  std::vector<DotShape> shape;    // of its dot
+  std::vector<double> contrast;   // of its dot, negative for dark dots
+  std::vector<double> tolerated;  // residual of its dot with half the weight / contrast
 };
 
 class Tracker {
@@ -42,8 +43,8 @@ class Tracker {
  private:
   void measure(const std::vector<int>& dot_of);
   void accept(std::size_t marker, const DotFit& found, double threshold);
-  Ellipse deformed_ellipse(std::size_t marker) const;
-  static bool differ(const Ellipse& one, const Ellipse& two);
+  DotShape deformed_shape(std::size_t marker) const;
+  static bool differ(const DotShape& one, const DotShape& two);
   DotFit fit(std::size_t marker, Point position, int iterations) const;
   double accepted_quality(std::size_t marker, const DotFit& fit) const;
   bool is_inside(std::size_t marker, Point position) const;
@@ -57,7 +58,7 @@ class Tracker {
   TrackerSetup setup_;
   FitSettings settings_;
   std::vector<InverseHessian> inverse_hessian_;
-  std::vector<Ellipse> ellipse_;  // of the dots on the deformed gel
+  std::vector<DotShape> shape_;  // of the dots on the deformed gel
   Plane plane_;
   DotDetector detector_;
   DotAssignment assignment_;

@@ -45,6 +45,8 @@ _DEGRADATION_LIMITS: dict[str, tuple[float, float]] = {
     "keystone": (0.0, 0.5),
     "barrel": (0.0, 0.2),
     "oval": (1.0, 3.0),
+    "radius_spread": (0.0, 0.2),
+    "ragged": (0.0, 0.2),
     "blur": (0.5, 20.0),  # an edge sharper than a pixel has no exact centre
 }
 
@@ -102,9 +104,9 @@ class GelAppearance:
 class DegradedGelAppearance(GelAppearance):
     """Parameters of a gel with imperfect print, illumination, lens and contact; the defaults add no imperfection.
 
-    `missing`, `damaged` and `bridges` belong to the print and move with the gel; illumination, `dust` and `occluders`
-    are fixed to the camera; `shading`, `ridges` and `highlights` move with the contact. `noise` is the noise of the
-    grey image.
+    `missing`, `damaged`, `bridges`, `radius_spread` and `ragged` belong to the print and move with the gel;
+    illumination, `dust` and `occluders` are fixed to the camera; `shading`, `ridges` and `highlights` move with the
+    contact. `noise` is the noise of the grey image.
     """
 
     gradient: float = 0.0  # relative brightness difference from the mean at opposite borders, 0 to 0.9
@@ -120,6 +122,8 @@ class DegradedGelAppearance(GelAppearance):
     keystone: float = 0.0  # 1 − (scale at the bottom) / (scale at the top of the image), 0 to 0.5
     barrel: float = 0.0  # relative inward shift of the image corners by barrel distortion, 0 to 0.2
     oval: float = 1.0  # width / height of a dot, 1 to 3
+    radius_spread: float = 0.0  # standard deviation of the dots' radii / `radius`, 0 to 0.2
+    ragged: float = 0.0  # standard deviation of a dot's outline from its ellipse / radius, 0 to 0.2
     cut_row: bool = False  # adds a row of dots above the first, cut by the image border; its dots are no markers
 
     def __post_init__(self) -> None:
@@ -158,6 +162,11 @@ PRESETS: dict[str, dict[str, Any]] = {
         **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.6, "missing": 0.03},
         **{"damaged": 0.06, "bridges": 2, "occluders": 1, "motion_blur": 0.5},
     },
+    # The most uneven of ten published prints: a hand-made one.
+    "print": {
+        **{"blur": 1.0, "noise": 1.5, "shot": 0.02, "quality": 90, "gradient": 0.3, "colour": 0.55},
+        **{"shading": 0.35, "barrel": 0.02, "dust": 2, "radius_spread": 0.095, "ragged": 0.06},
+    },
 }
 
 # Changes of one parameter of the class "typical".
@@ -175,6 +184,8 @@ FACTORS: dict[str, dict[str, Any]] = {
     "bright dots": {"bright": True},
     "two highlights": {"highlights": 2},
     "cut row": {"cut_row": True},
+    "uneven dots": {"radius_spread": 0.06, "ragged": 0.04},
+    "radii 12 %": {"radius_spread": 0.12, "ragged": 0.04},
 }
 
 # Number of markers → (rows, columns)

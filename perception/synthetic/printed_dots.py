@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ _DAMAGE_RANGES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "worn": ((0.0, 0.0), (0.06, 0.2)),
 }
 _WORN_HOLES = 6  # holes of a worn dot
+_WAVES = np.arange(2, 7)  # periods of the deviation of an outline around a dot; one period would be an offset
+_LARGEST = 2.5  # deviation of a radius or of an outline in standard deviations
 _INK_DENSITY = 0.96  # mean ink density; `contrast` of the appearance is for density 1
 
 
@@ -57,6 +60,37 @@ def _random_damage(rng: np.random.Generator) -> Damage:
     return Damage(kind, rng.uniform(0, 2 * np.pi), offset, size)
 
 
+class Outlines:
+    """Ragged outlines of the dots of one print.
+
+    In the undeformed frame of a dot, in units of its radius, the outline is 1 plus a random sum of waves at each angle;
+    the origin is the centroid of the inked area.
+    """
+
+    def __init__(self, deviation: float, dots: int, rng: np.random.Generator) -> None:
+        falling = 1 / _WAVES
+        scale = deviation / np.sqrt((falling**2).sum())
+        self._waves = rng.normal(size=(dots, 2, len(_WAVES))).clip(-_LARGEST, _LARGEST) * falling * scale
+        angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+        edge = self._edge(self._waves[:, :, :, None], angle)
+        area = (edge**2).sum(axis=-1) / 2
+        self._centroid = np.stack([(edge**3 * one(angle)).sum(axis=-1) / 3 / area for one in (np.cos, np.sin)])
+
+    def distance(self, x: Patches, y: Patches) -> Patches:
+        """Distance from the outline at (x, y) [radii], shape (dots, side, side), negative inside."""
+        right, down = (self._centroid.astype(np.float32)[:, :, None, None] + np.stack([x, y])).astype(np.float32)
+        waves = self._waves.astype(np.float32)[:, :, :, None, None]
+        return np.asarray(np.hypot(right, down) - self._edge(waves, np.arctan2(down, right)))
+
+    @staticmethod
+    def _edge(waves: NDArray[Any], angle: NDArray[Any]) -> NDArray[Any]:
+        """Radius of the outline at `angle`; `waves` has shape (dots, 2, waves, ...)."""
+        edge = 1.0
+        for k, period in enumerate(_WAVES.tolist()):
+            edge = edge + waves[:, 0, k] * np.cos(period * angle) + waves[:, 1, k] * np.sin(period * angle)
+        return np.asarray(edge)
+
+
 @dataclass(frozen=True)
 class DotPatches:
     """Square pixel patches around the dots of one image."""
@@ -65,11 +99,13 @@ class DotPatches:
     centers: Array  # [px], shape (dots, 2)
     shapes: Array  # maps a disc with the appearance's radius to the dot's ellipse, shape (dots, 2, 2)
     motion_blur: Array  # motion of each dot during the exposure [px], shape (dots, 2)
+    outlines: Outlines | None = None  # None: ellipses
 
     @cached_property
     def _half(self) -> Array:
         """Half width and half height of each dot with motion blur [px], shape (dots, 2)."""
-        return np.asarray(self.appearance.radius * np.linalg.norm(self.shapes, axis=-1) + np.abs(self.motion_blur) / 2)
+        largest = self.appearance.radius * (1 + _LARGEST * self.appearance.ragged)
+        return np.asarray(largest * np.linalg.norm(self.shapes, axis=-1) + np.abs(self.motion_blur) / 2)
 
     @cached_property
     def reach(self) -> int:
@@ -112,7 +148,8 @@ class DotPatches:
             motion = self.motion_blur.astype(np.float32)[:, :, None, None]
             # A Gaussian edge with the variance of a box filter of the motion's length.
             variance = variance + ((right * motion[:, 0] + down * motion[:, 1]) / steep) ** 2 / 12
-        return np.asarray(ndtr((1 - distance) / (steep * np.sqrt(variance))))
+        inwards = 1 - distance if self.outlines is None else -self.outlines.distance(x, y)
+        return np.asarray(ndtr(inwards / (steep * np.sqrt(variance))))
 
     def transmission(self, ink: NDArray[np.floating]) -> Layer:
         """Transmission (0 to 1) of `ink`, shape (dots, side, side), at each pixel of the image."""
@@ -151,11 +188,14 @@ class DotPrint:
         whole = rng.permutation(np.flatnonzero(self.printed))
         self._damages = {int(marker): _random_damage(rng) for marker in whole[: round(appearance.damaged * markers)]}
         self._bridges = self._random_bridges(rng)
+        radii = 1 + appearance.radius_spread * rng.normal(size=markers).clip(-_LARGEST, _LARGEST)
+        self._radii = radii[:, None, None]  # relative to `appearance.radius`
+        self._outlines = Outlines(appearance.ragged, markers, rng) if appearance.ragged else None
 
     def draw(self, centers: Array, shapes: Array, motion_blur: Array) -> tuple[Layer, DotPatches]:
         """Transmission (0 to 1) of the print, shape (height, width), and the patches of the markers."""
         appearance, cols = self.appearance, self.appearance.grid.cols
-        dots = DotPatches(appearance, centers, shapes, motion_blur)
+        dots = DotPatches(appearance, centers, self._radii * shapes, motion_blur, self._outlines)
         ink = dots.ink * np.where(self.printed, self._density, 0.0)[:, None, None]
         x, y = dots.inner
         for marker, damage in self._damages.items():

@@ -209,6 +209,25 @@ def test_errors_are_close_to_the_error_bound(preset: str, median: float, high: f
     assert np.mean([tracked.valid[frame.visible].mean() for frame, tracked, _ in results]) > 0.98
 
 
+@pytest.mark.parametrize(("width", "height", "markers"), [(320, 240, 63), (640, 480, 130), (640, 480, 63)])
+@pytest.mark.parametrize(
+    ("preset", "spread", "median", "high"),
+    [("clean", 0.06, 0.02, 0.04), ("typical", 0.06, 0.03, 0.06), ("typical", 0.12, 0.03, 0.08)],
+)
+def test_dots_of_different_sizes_and_ragged_outlines_are_tracked_as_exactly(
+    width: int, height: int, markers: int, preset: str, spread: float, median: float, high: float
+) -> None:
+    size = {"width": width, "height": height, "markers": markers}
+    appearance = make_appearance(preset, seed=2, radius_spread=spread, ragged=0.04, **size)
+    results = track_sequence(GelSequence(appearance, "twist", frames=8, period=10))
+    for errors in (
+        np.concatenate([off[tracked.valid] for _, tracked, off in results]),
+        np.concatenate([np.linalg.norm(t.position - f.position, axis=1)[t.valid] for f, t, _ in results]),
+    ):
+        assert np.median(errors) < median and np.quantile(errors, 0.95) < high
+    assert np.mean([tracked.valid[frame.visible].mean() for frame, tracked, _ in results]) > 0.998
+
+
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("changed", [{}, {"missing": 0.05, "bridges": 2}, {"cut_row": True, "markers": 63}])
 def test_a_jump_by_most_of_a_spacing_causes_no_identity_switch(field: Field, changed: dict[str, float]) -> None:

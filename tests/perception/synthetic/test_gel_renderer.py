@@ -120,7 +120,7 @@ def test_every_image_class_factor_and_size_can_be_rendered(name: str, markers: i
 
 def test_invalid_appearances_and_sequences_are_rejected() -> None:
     for wrong, message in (
-        ({"preset": "dirty"}, "image class must be one of clean, typical, hard, got 'dirty'"),
+        ({"preset": "dirty"}, "image class must be one of clean, typical, hard, print, got 'dirty'"),
         ({"markers": 100}, "markers must be one of 35, 63, 130, 154, 252, got 100"),
         ({"blurr": 1.0}, "a gel appearance has no field 'blurr'; fields are barrel"),
         ({"damaged": 1.5}, "damaged of a gel appearance must be within 0.0 to 1.0, got 1.5"),
