@@ -208,6 +208,7 @@ def test_status_and_dry_run_send_no_motion_byte(robot: MockRobot, operator: Oper
     assert robot.arm.report.answers == 0
 
 
+@pytest.mark.slow
 def test_held_part_is_only_raised_while_a_camera_fails(robot: MockRobot, tmp_path: Path, operator: Operator) -> None:
     stopped_in_mid_descent(robot, tmp_path)
     robot.cameras[0].stall()

@@ -94,6 +94,7 @@ def test_image_that_is_live_but_never_changes_is_no_touch(robot: MockRobot, tmp_
     assert part(robot)["height"] > 30e-3  # it was not lowered
 
 
+@pytest.mark.slow
 def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, tmp_path: Path) -> None:
     finish = BackgroundRun(lambda: insert(robot, tmp_path))
     wait_for(lambda: lowered_to(robot, 24.4e-3), 280, during=finish)
