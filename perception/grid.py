@@ -20,12 +20,14 @@ from gelflow.perception.detect import (
 from gelflow.perception.errors import TrackerInitError, draw_detections
 from gelflow.perception.grid_part import GridExtent, GridRequest, Polarity, completeness, grid_extent, select_part, trim
 from gelflow.perception.lattice import Lattice, grow_lattice, interpolate_nodes
+from gelflow.perception.pattern import pattern_reason
 
 _RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of the searched dots [px], in an image of about _SEARCH_SIZE px
 _SEARCH_SIZE = 360
 _MAX_DOTS = 2500  # weaker dots are texture
 _MAX_BETWEEN = 0.4  # limit of (dots between the rows and columns) / (dots of the grid)
 _MAX_IRREGULARITY = 0.12  # limit of `Lattice.irregularity`
+_MAX_AREA = 3.0  # of a dot that is not two joined ones / median
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,7 @@ def _rejection_reason(lattice: Lattice | None, dots: DetectedDots, polarity: Pol
             f"{between} dots lie between the rows and columns of the {lattice.dot_count} that form a grid: "
             "not markers, or a grid rotated by more than 30° in the image"
         )
-    return ""
+    return pattern_reason(lattice, dots)
 
 
 def _count_between(lattice: Lattice, dots: DetectedDots) -> int:
@@ -245,6 +247,6 @@ def _marker_grid(appearance: DotAppearance, lattice: Lattice, dots: DetectedDots
     index = lattice.dots
     median = float(np.median(dots.areas[index[index >= 0]]))
     area = dots.areas[index]
-    visible = (index >= 0) & dots.inside[index] & (area > 0.4 * median) & (area < 2.0 * median)
+    visible = (index >= 0) & dots.inside[index] & (area > 0.4 * median) & (area < _MAX_AREA * median)
     positions = interpolate_nodes(dots.centers[index], index >= 0)
     return MarkerGrid(appearance, float(np.sqrt(median / np.pi)), lattice.spacing, positions, visible)

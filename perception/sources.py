@@ -25,6 +25,7 @@ Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
+_MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
 # Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
@@ -39,6 +40,19 @@ class SourceImage:
     data: bytes | None = None  # JPEG or PNG data of `image`, if any
 
 
+@dataclass
+class UnreadableImages:
+    """The images of a source that were skipped because they cannot be decoded."""
+
+    count: int = 0
+    first: str = ""  # name of the first one and why it cannot be read
+
+    def add(self, name: str, reason: object) -> None:
+        """Count the image `name`."""
+        self.count += 1
+        self.first = self.first or f"{name}: {reason}"
+
+
 @dataclass(frozen=True)
 class ImageSource:
     """A finite or endless sequence of images; see `image_source`."""
@@ -50,6 +64,7 @@ class ImageSource:
     rate: float = 25.0  # frame rate of a folder, and of a video without a rate [Hz]
     timeout: float = 5.0  # of a stream, for opening and for each image [s]
     clock: Clock = field(default_factory=ScaledClock)  # time stamps of live images
+    unreadable: UnreadableImages = field(default_factory=UnreadableImages, compare=False)  # of the iteration so far
 
     @property
     def live(self) -> bool:
@@ -57,10 +72,22 @@ class ImageSource:
         return self.kind in ("stream", "camera")
 
     def __iter__(self) -> Iterator[SourceImage]:
-        """Iterates over the images. Raises PeerError when an image cannot be read."""
+        """Iterates over the images; those that cannot be decoded are skipped and counted in `unreadable`.
+
+        Raises PeerError when no image can be read, a video ends early, or the image size of a stream changes.
+        """
         if self.kind == "session":
-            return self._from_session()
-        return self._from_files() if self.files else self._from_capture()
+            images = self._from_session()
+        elif self.files:
+            images = self._from_files()
+        else:
+            images = self._from_capture()
+        empty = True
+        for image in images:
+            empty = False
+            yield image
+        if empty:
+            raise PeerError(self._why_empty())
 
     def count(self) -> int | None:
         """Number of images, None if unknown."""
@@ -76,52 +103,78 @@ class ImageSource:
         capture.release()
         return number if number > 0 else None
 
+    def _why_empty(self) -> str:
+        """The reason for a source without a readable image."""
+        if self.unreadable.count == 1 and self.kind == "image":
+            return self.unreadable.first
+        if self.unreadable.count:
+            return f"none of the {self.unreadable.count} images of {self.text} can be read; {self.unreadable.first}"
+        if self.kind == "session":
+            return f"session {self.text} has no image of the {self.sensor} sensor"
+        return f"{self.kind} {self.text} was opened but gave no image"
+
     def _from_files(self) -> Iterator[SourceImage]:
         for number, file in enumerate(self.files):
             try:
                 data = file.read_bytes()
-                kept = data if data.startswith(ENCODED) else None
-                yield SourceImage(file.name, decode_image(data), number / self.rate, kept)
+                image = decode_image(data)
             except PeerError as error:
-                raise PeerError(f"{file}: {error}") from None
+                self.unreadable.add(str(file), error)
             except OSError as error:
-                raise PeerError(f"{file} cannot be read: {error.strerror}") from None
+                self.unreadable.add(str(file), f"cannot be read: {error.strerror}")
+            else:
+                yield SourceImage(file.name, image, number / self.rate, data if data.startswith(ENCODED) else None)
 
     def _from_session(self) -> Iterator[SourceImage]:
-        empty = True
         with SessionReader(self.text) as session:
             for record in session.records([f"/{self.sensor}/image"]):
-                empty = False
                 name = f"{record.value.sequence:06d}"
                 try:
-                    yield SourceImage(name, decode_image(record.value.data), record.stamp, record.value.data)
+                    image = decode_image(record.value.data)
                 except PeerError as error:
-                    raise PeerError(f"{self.text}, image {name} of the {self.sensor} sensor: {error}") from None
-        if empty:
-            raise PeerError(f"session {self.text} has no image of the {self.sensor} sensor")
+                    self.unreadable.add(f"image {name} of the {self.sensor} sensor", error)
+                else:
+                    yield SourceImage(name, image, record.stamp, record.value.data)
 
     def _from_capture(self) -> Iterator[SourceImage]:
         capture = self._open()
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else self.rate
-        number = 0
+        # FFmpeg scales the images of a stream whose size changes; undecoded JPEG images keep their size.
+        encoded = self.kind == "stream" and _codec(capture) == b"MJPG" and capture.set(cv2.CAP_PROP_FORMAT, -1)
+        expected, number, seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0
+        size: tuple[int, ...] | None = None
         try:
             while True:
                 good, image = capture.read()
                 if not good:
                     break
-                if image.ndim == 2:
-                    image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+                name, data = f"{number:06d}", image.tobytes() if encoded else None
                 stamp = self.clock.now() if self.live else number / rate
-                yield SourceImage(f"{number:06d}", np.asarray(image, dtype=np.uint8), stamp)
+                seconds = max(seconds, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
                 number += 1
+                try:
+                    image = decode_image(data) if data is not None else _in_colour(image)
+                except PeerError as error:
+                    self.unreadable.add(f"image {name}", error)
+                    continue
+                size = size or image.shape[:2]
+                if image.shape[:2] != size:
+                    raise PeerError(
+                        f"{self.kind} {self.text}: image {name} has {image.shape[1]} × {image.shape[0]} px, those "
+                        f"before have {size[1]} × {size[0]}: the camera's settings changed"
+                    )
+                yield SourceImage(name, image, stamp, data)
         finally:
             capture.release()
-        if number == 0:
-            raise PeerError(f"{self.kind} {self.text} was opened but gave no image")
-        if self.live:
+        if number and self.live:
             raise PeerTimeout(
                 f"{self.kind} {self.text} ended after {number} images: closed, or no image within {self.timeout:g} s"
+            )
+        missing = expected - max(number, seconds * rate + 1)  # by time too: a container may only estimate the number
+        if number and missing > max(_MISSING, _MISSING_SHARE * expected):
+            raise PeerError(
+                f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged"
             )
 
     def _open(self) -> cv2.VideoCapture:
@@ -197,6 +250,15 @@ def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Imag
     if not path.exists():
         raise UsageError(f"expected a folder, a file, a URL or a camera number; {text} does not exist")
     return ImageSource(text, "image", (path,)) if _is_image(path) else ImageSource(text, "video", rate=rate)
+
+
+def _codec(capture: cv2.VideoCapture) -> bytes:
+    """Four-character code of the codec."""
+    return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
+
+
+def _in_colour(image: Image) -> Image:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image, dtype=np.uint8)
 
 
 def natural_sort_key(path: Path) -> tuple[tuple[int, int, str], ...]:

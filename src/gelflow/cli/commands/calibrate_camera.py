@@ -11,14 +11,14 @@ from rich.table import Table
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out
 from gelflow.cli.output import Output
-from gelflow.errors import UsageError
+from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid import find_extent
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
 from gelflow.perception.output.calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error
-from gelflow.perception.sources import image_source
+from gelflow.perception.sources import ImageSource, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
 
 _MAX_OPTIONS = 4  # possible visible parts that an error lists
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{file} exists; name a new file with --out")
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
-    image = next(iter(image_source(args.source, sensor=args.sensor))).image
+    image = _first_image(image_source(args.source, sensor=args.sensor))
     with picture_of_init_error(args.out):
         tracker, first, part = _start(image, args)
     rest, measured = tracker.rest, first.valid
@@ -86,6 +86,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         output.console.print(_table(fit, measured, rejected, written=f"{args.out}, and the picture {picture}"))
     return SUCCESS
+
+
+def _first_image(source: ImageSource) -> NDArray[np.uint8]:
+    """The first image. Raises PeerError when it cannot be read: a later one may not show the gel at rest."""
+    image = next(iter(source)).image
+    if source.unreadable.count:
+        raise PeerError(source.unreadable.first)
+    return image
 
 
 def _start(

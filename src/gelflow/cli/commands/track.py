@@ -21,7 +21,7 @@ from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, 
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
-from gelflow.perception.sources import ImageSource, SourceImage, image_source
+from gelflow.perception.sources import ImageSource, SourceImage, UnreadableImages, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
         if summary.images:
-            _show(output, summary, time.perf_counter() - begin, args.out)
+            _show(output, summary, source.unreadable, time.perf_counter() - begin, args.out)
     return SUCCESS
 
 
@@ -177,15 +177,20 @@ def _tracked_image(
     return TrackedImage(number, frame, tracked, calibration.to_mm(tracked.position), displacement)
 
 
-def _show(output: Output, summary: TrackingSummary, wall: float, files: list[Path]) -> None:
+def _show(
+    output: Output, summary: TrackingSummary, unreadable: UnreadableImages, wall: float, files: list[Path]
+) -> None:
     """Print the summary; `wall` is the duration of the run [s]."""
     values = summary.to_json()
     if output.json:
-        output.result(values | {"seconds": wall, "files": files})
+        skipped = {"unreadable_images": unreadable.count, "first_unreadable": unreadable.first or None}
+        output.result(values | skipped | {"seconds": wall, "files": files})
         return
     markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
     table = Table(show_header=False)
     table.add_row("images", str(values["images"]))
+    if unreadable.count:
+        table.add_row("skipped", f"{unreadable.count} unreadable; {unreadable.first}")
     table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")
     if summary.visible:
         table.add_row("visible", _visible_text(summary.visible, markers))
