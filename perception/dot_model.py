@@ -24,9 +24,10 @@ _MIN_MATCHING = 0.6  # fraction of the dots that must match the common profile
 _SHAPE_STEPS = 2  # of the fit of the shapes
 _WAVE_LIMIT = 0.25  # smallest |z|² of a wave, as in csrc/dot_fit.hpp
 _MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
-# A sound dot differs from the median dot by less than this [radii], or a multiple of the median difference. Others are
-# damaged, or joined to another one.
+# The outline of a sound dot differs from that of the median dot by less than this [radii], or a multiple of the median
+# difference. Others are damaged, or joined to another one.
 _SOUND = 0.04
+_LARGEST_SIZE = 0.6  # difference from the size of the median dot [radii]
 _TOLERATED = (0.16, 0.7)  # smallest and largest tolerated residual / contrast
 _USUAL = 0.03  # standard deviation of what the model does not explain of any dot: JPEG, steps of grey
 _UNEXPLAINED = 6.0  # tolerated residual / standard deviation of what the model does not explain at rest
@@ -182,9 +183,7 @@ class _DotWindows:
             off -= np.linalg.solve(refined[:, :4].reshape(-1, 2, 2), change[:, 1:3, None])[:, None, :, 0]
             refined = _reshaped(refined, change)
         size, raggedness = _deviations(refined, self.common[markers])
-        sound = (raggedness < max(_SOUND, 3.5 * float(np.median(raggedness)))) & (
-            size < max(_SOUND, 5 * float(np.median(size)))
-        )
+        sound = (raggedness < max(_SOUND, 3.5 * float(np.median(raggedness)))) & (size < _LARGEST_SIZE)
         result = shape.copy()
         result[markers[sound]] = refined[sound]
         return result

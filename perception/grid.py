@@ -27,7 +27,7 @@ _SEARCH_SIZE = 360
 _MAX_DOTS = 2500  # weaker dots are texture
 _MAX_BETWEEN = 0.4  # limit of (dots between the rows and columns) / (dots of the grid)
 _MAX_IRREGULARITY = 0.12  # limit of `Lattice.irregularity`
-_MAX_AREA = 3.0  # of a dot that is not two joined ones / median
+_MAX_AREA = 2.2  # of a dot / median; larger ones are joined dots
 
 
 @dataclass(frozen=True)

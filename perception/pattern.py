@@ -18,7 +18,7 @@ def pattern_reason(lattice: Lattice, dots: DetectedDots) -> str:
     """The reason why the pattern of the dots, of which `lattice` is a part, is not a grid; empty if it may be one."""
     if abs(_angle(lattice, dots.centers) - np.pi / 2) > _MAX_SHEAR:
         return (
-            "the dots form a hexagonal pattern, each with six neighbours; only rectangular grids of markers, "
+            "the dots form a hexagonal or concentric pattern; only rectangular grids of markers, "
             "with rows and columns, can be tracked"
         )
     outside = _equal_outside(lattice, dots)
@@ -35,7 +35,9 @@ def _angle(lattice: Lattice, centers: NDArray[np.float64]) -> float:
     corner, right, down = lattice.dots[:-1, :-1], lattice.dots[:-1, 1:], lattice.dots[1:, :-1]
     known = (corner >= 0) & (right >= 0) & (down >= 0)
     along, across = (centers[other[known]] - centers[corner[known]] for other in (right, down))
-    return float(np.median(np.arctan2(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0], (along * across).sum(1))))
+    return float(
+        np.median(np.arctan2(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0], (along * across).sum(1)))
+    )
 
 
 def _equal_outside(lattice: Lattice, dots: DetectedDots) -> int:

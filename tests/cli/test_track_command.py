@@ -1,6 +1,7 @@
 """`gelflow track` and `gelflow calibrate-camera`: written files, killed runs, errors."""
 
 import csv
+import json
 import subprocess
 import sys
 import time
@@ -135,6 +136,30 @@ def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsy
         seen = cv2.imread(str(picture))
         assert str(picture) in line and seen is not None and seen.shape == (240, 320, 3)
         assert not file.exists()
+
+
+def test_a_picture_of_a_failed_start_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
+    kept = tmp_path / "t-refused.png"
+    kept.write_bytes(b"mine")
+    for name in ("t-refused-2.png", "t-refused-3.png"):
+        assert main(["track", str(tmp_path / "blank.png"), "--out", str(tmp_path / "t.csv")]) == 2
+        assert str(tmp_path / name) in capsys.readouterr().err and (tmp_path / name).stat().st_size > 100
+    assert kept.read_bytes() == b"mine"
+
+
+def test_unreadable_images_are_skipped_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = draw(tmp_path / "images", 6)
+    for number in (0, 3):
+        (folder / f"{number}.jpg").write_bytes((folder / f"{number}.jpg").read_bytes()[:500])
+    assert main(["track", str(folder), "--out", str(tmp_path / "t.csv")]) == 0
+    assert "2 unreadable" in capsys.readouterr().out
+    assert len(rows_of(tmp_path / "t.csv")) == 4 * 48
+    assert main(["track", str(folder), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["images"] == 4 and result["unreadable_images"] == 2 and "0.jpg" in result["first_unreadable"]
+    assert main(["calibrate-camera", str(folder), "--spacing-mm", "2.2", "--out", str(tmp_path / "g.json")]) == 2
+    assert "0.jpg: expected a JPEG or PNG image" in capsys.readouterr().err and not (tmp_path / "g.json").exists()
 
 
 @pytest.mark.parametrize(
