@@ -22,12 +22,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.perception.scale_error import scale_error
 from gelflow.session.records import from_plain, to_plain
 
 FORMAT = 1
 
 _MIN_MARKERS = 16  # fewer markers do not determine a lens
-_MAX_RESIDUAL = 0.03  # root mean square residual of a gel at rest / marker spacing
+_MAX_RESIDUAL = 0.1  # root mean square residual of a gel at rest / marker spacing
+_MAX_SCALE_ERROR = 0.025  # relative, of lengths on the gel
 _OUTLIER = 5.0  # residual of an outlier / median residual
 _EVIDENCE = 10.0  # decrease of the Bayesian information criterion that justifies a larger model ("very strong")
 _MAX_OFF_CENTER = 0.5  # largest distance of the lens centre from the image centre [half diagonals]
@@ -58,6 +60,10 @@ class Calibration:
     residual_px: float  # root mean square distance of the markers from the fitted grid
     largest_px: float  # largest distance of a marker from the fitted grid
     skipped: tuple[int, int, int, int] = (0, 0, 0, 0)  # printed lines not in the image: above, below, left, right
+    # Relative standard deviation of a length on the gel, due to an uneven print. None: of a file without it.
+    scale_error: float | None = None
+    # Share of the residuals' variance that changes slowly over the image, 0 to 1: a stretched print or a touched gel.
+    smooth_share: float | None = None
 
     def __post_init__(self) -> None:
         whole = (self.width, self.height, self.rows, self.cols)
@@ -65,7 +71,8 @@ class Calibration:
             good = all(type(number) is int and number >= 1 for number in whole)
             good &= len(self.skipped) == 4 and all(type(number) is int and number >= 0 for number in self.skipped)
             good &= np.shape(self.matrix) == (3, 3) and len(self.radial) <= 3 and len(self.center) == 2
-            numbers = np.array([*np.ravel(self.matrix), *self.radial, *self.center, self.spacing_mm, self.residual_px])
+            derived = (self.residual_px, self.scale_error or 0.0, self.smooth_share or 0.0)
+            numbers = np.array([*np.ravel(self.matrix), *self.radial, *self.center, self.spacing_mm, *derived])
             good &= numbers.dtype.kind in "if" and bool(np.isfinite(numbers).all())
             good = good and self.spacing_mm > 0 and np.linalg.det(self.matrix) != 0
         except (TypeError, ValueError):
@@ -176,16 +183,28 @@ def fit_calibration(
         gain = _criterion(best, _distances(best, rest)[inliers]) - _criterion(fit, _distances(fit, rest)[inliers])
         if gain > _EVIDENCE and _is_one_to_one(fit):
             best = fit
-    distance = _distances(best, rest)[inliers]
+    return _checked(best, rest, visible, inliers)
+
+
+def _checked(fit: Calibration, rest: Floats, visible: NDArray[np.bool_], inliers: NDArray[np.bool_]) -> Calibration:
+    """`fit` with its residuals. Raises PeerError when they are too large."""
+    distance, pixels = _distances(fit, rest)[inliers], fit.spacing_mm * min(fit.pixels_per_mm())
+    nodes = fit.marker_positions_mm()[inliers]
+    uneven = (fit.to_mm(rest[inliers]) - nodes) / fit.spacing_mm
+    error, smooth = scale_error(nodes / fit.spacing_mm, uneven, degree=3 if fit.radial else 2)
     residual = float(np.sqrt(np.mean(distance**2)))
-    limit = _MAX_RESIDUAL * spacing_mm * min(best.pixels_per_mm())
-    if not residual <= limit or inliers.sum() < _MIN_INLIERS * visible.sum():
+    if residual > _MAX_RESIDUAL * pixels or inliers.sum() < _MIN_INLIERS * visible.sum():
         raise PeerError(
             f"the markers do not form a regular grid behind a lens: root mean square residual {residual:.2f} px of "
-            f"{inliers.sum()} of {visible.sum()} markers, limit {limit:.2f} px; check that the gel is undamaged and "
-            "without contact, and its markers evenly spaced"
+            f"{inliers.sum()} of {visible.sum()} markers, limit {_MAX_RESIDUAL * pixels:.2f} px; check that the gel is "
+            "undamaged and without contact, and its markers evenly spaced"
         )
-    return replace(best, residual_px=residual, largest_px=float(distance.max()))
+    if error > _MAX_SCALE_ERROR:
+        raise PeerError(
+            f"the grid of markers is distorted: the scale is uncertain by {100 * error:.1f} %, limit "
+            f"{100 * _MAX_SCALE_ERROR:g} %; check that the gel is undamaged and without contact"
+        )
+    return replace(fit, residual_px=residual, largest_px=float(distance.max()), scale_error=error, smooth_share=smooth)
 
 
 def _fit(

@@ -24,8 +24,8 @@ def pattern_reason(lattice: Lattice, dots: DetectedDots) -> str:
     outside = _equal_outside(lattice, dots)
     if outside > _MAX_OUTSIDE * lattice.dot_count:
         return (
-            f"{outside} dots lie beside the {lattice.dot_count} that form rows and columns: the pattern is concentric or "
-            "irregular; only rectangular grids of markers can be tracked"
+            f"{outside} dots lie beside the {lattice.dot_count} that form rows and columns: the pattern is concentric "
+            "or irregular; only rectangular grids of markers can be tracked"
         )
     return ""
 

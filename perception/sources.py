@@ -257,7 +257,7 @@ def _codec(capture: cv2.VideoCapture) -> bytes:
     return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
 
 
-def _in_colour(image: Image) -> Image:
+def _in_colour(image: cv2.typing.MatLike) -> Image:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image, dtype=np.uint8)
 
 

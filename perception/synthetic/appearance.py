@@ -155,12 +155,13 @@ PRESETS: dict[str, dict[str, Any]] = {
     "clean": {"blur": 0.8, "noise": 1.0, "colour": 0.0, "quality": 100},
     "typical": {
         **{"blur": 1.0, "noise": 1.5, "shot": 0.02, "quality": 90, "gradient": 0.3, "colour": 0.55},
-        **{"shading": 0.35, "barrel": 0.02, "dust": 2},
+        **{"shading": 0.35, "barrel": 0.02, "dust": 2, "radius_spread": 0.03, "ragged": 0.03},
     },
     "hard": {
         **{"blur": 1.4, "noise": 2.5, "shot": 0.02, "quality": 75, "gradient": 0.45, "colour": 0.8},
         **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.6, "missing": 0.03},
         **{"damaged": 0.06, "bridges": 2, "occluders": 1, "motion_blur": 0.5},
+        **{"radius_spread": 0.05, "ragged": 0.04},
     },
     # The most uneven of ten published prints: a hand-made one.
     "print": {

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,10 +127,53 @@ def test_a_deformed_gel_and_too_few_markers_are_rejected() -> None:
     bump = np.exp(-((MARKERS - (3.0, -2.0)) ** 2).sum(axis=1) / 18)[:, None]
     with pytest.raises(PeerError, match="check that the gel is undamaged"):
         fitted(rest + bump * (6.0, 4.0))
+    with pytest.raises(PeerError, match="do not form a regular grid"):
+        fitted(rest + np.random.default_rng(0).normal(0, 2.0, rest.shape))
     with pytest.raises(PeerError, match="10 markers are visible, at least 16"):
         fitted(rest, np.arange(len(MARKERS)) < 10)
     with pytest.raises(UsageError, match="spacing"):
         fit_calibration(rest, ALL, rows=ROWS, cols=COLS, spacing_mm=0.0, size=SIZE)
+
+
+def rms_length_error(calibration: Calibration, view: dict[str, Any]) -> float:
+    """Root mean square relative error of short lengths at the markers, against the camera that `view` describes."""
+    columns = []
+    for step in np.eye(2) * 0.05:
+        ends = (calibration.to_mm(camera(MARKERS + sign * step, **view)) for sign in (1, -1))
+        columns.append((next(ends) - next(ends)) / 0.1)
+    deviation = np.stack(columns, axis=-1) - np.eye(2)
+    return float(np.sqrt((deviation**2).sum(axis=(1, 2)).mean() / 2))
+
+
+@pytest.mark.parametrize("barrel", [0.0, 0.08])
+@pytest.mark.parametrize("spread", [0.01, 0.03, 0.06])
+def test_an_uneven_print_is_accepted_with_its_uncertainty(spread: float, barrel: float) -> None:
+    view: dict[str, Any] = {"barrel": barrel, "keystone": 0.1, "center": (159.5, 119.5)}
+    stated, true = [], []
+    for seed in range(8):
+        printed = MARKERS + np.random.default_rng(seed).normal(0, spread * SPACING, MARKERS.shape)
+        calibration = fitted(camera(printed, **view))
+        assert calibration.scale_error is not None and calibration.smooth_share is not None
+        stated.append(calibration.scale_error)
+        true.append(rms_length_error(calibration, view))
+    assert 0.5 < np.mean(stated) / np.mean(true) < 2 and np.mean(stated) < 0.2 * spread
+
+
+@pytest.mark.parametrize("strength", [0.25, 0.5, 0.8])
+def test_a_touched_gel_is_stated_as_a_smooth_deviation(strength: float) -> None:
+    view: dict[str, Any] = {"barrel": 0.05, "keystone": 0.05, "center": (159.5, 119.5)}
+    bump = np.exp(-((MARKERS - (3.0, -2.0)) ** 2).sum(axis=1) / 18)[:, None]
+    calibration = fitted(camera(MARKERS, **view) + strength * bump * (6.0, 4.0))
+    assert calibration.scale_error is not None and calibration.smooth_share is not None
+    assert 0.7 < calibration.scale_error / rms_length_error(calibration, view) < 1.4 and calibration.smooth_share > 0.5
+
+
+def test_a_file_without_an_uncertainty_loads(tmp_path: Path) -> None:
+    path = tmp_path / "gel.json"
+    save_calibration(fitted(camera(MARKERS, barrel=0.0, keystone=0.0, center=(159.5, 119.5))), path)
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps({name: data[name] for name in data if name not in ("scale_error", "smooth_share")}))
+    assert load_calibration(path).scale_error is None
 
 
 def test_a_saved_calibration_loads_equal_and_is_never_overwritten(tmp_path: Path) -> None:

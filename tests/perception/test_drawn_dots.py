@@ -54,7 +54,7 @@ def test_a_hexagonal_pattern_is_refused_as_such(turn: float, limit: float | None
 
 def test_a_concentric_pattern_is_refused_as_such() -> None:
     points = concentric()
-    with pytest.raises(TrackerInitError, match="concentric.*only rectangular grids"):
+    with pytest.raises(TrackerInitError, match=r"concentric.*only rectangular grids"):
         MarkerTracker().start(draw(points, np.full(len(points), 4.0)))
 
 

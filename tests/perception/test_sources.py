@@ -43,7 +43,7 @@ def test_unreadable_images_of_a_folder_are_skipped_and_counted(tmp_path: Path) -
 def test_a_folder_without_a_readable_image_is_an_error(tmp_path: Path) -> None:
     for number in range(3):
         (tmp_path / f"{number}.png").write_text("not an image")
-    with pytest.raises(PeerError, match="none of the 3 images of .* can be read; .*0.png: expected a JPEG or PNG"):
+    with pytest.raises(PeerError, match=r"none of the 3 images of .* can be read; .*0\.png: expected a JPEG or PNG"):
         names(image_source(str(tmp_path)))
 
 

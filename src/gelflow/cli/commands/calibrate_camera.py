@@ -21,6 +21,7 @@ from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.sources import ImageSource, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
 
+_UNEVEN, _SMOOTH = 0.02, 0.5  # residual [spacings] and its smooth share that may be a touched gel
 _MAX_OPTIONS = 4  # possible visible parts that an error lists
 
 Floats = NDArray[np.float64]
@@ -81,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
                 "pixels_per_mm": scale,
                 "residual_px": fit.residual_px,
                 "largest_residual_px": fit.largest_px,
+                "scale_error": fit.scale_error,
+                "smooth_share": fit.smooth_share,
             }
         )
     else:
@@ -169,6 +172,12 @@ def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, writ
     table.add_row("lens", lens)
     residuals = (fit.residual_px, 1e3 * fit.residual_px / along, fit.largest_px)
     table.add_row("residual", "{:.3f} px = {:.1f} µm root mean square, {:.2f} px at most".format(*residuals))
+    table.add_row(
+        "uncertainty", f"{100 * (fit.scale_error or 0.0):.1f} % of a length, from the unevenness of the print"
+    )
+    spacings = fit.residual_px / (fit.spacing_mm * min(along, down))
+    if spacings > _UNEVEN and (fit.smooth_share or 0.0) > _SMOOTH:
+        table.add_row("", "the deviations change slowly over the image: check that nothing touches the gel")
     table.add_row("written", written)
     return table
 
