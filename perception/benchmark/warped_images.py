@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.perception.benchmark.baselines import GelflowTracker, LucasKanade, MarkerEstimate
+from gelflow.perception.benchmark.baselines import BenchmarkTracker, GelflowTracker, LucasKanade, MarkerEstimate
 from gelflow.perception.tracker import MarkerTracker
 
 Image = NDArray[np.uint8]
@@ -45,7 +45,7 @@ def measure_warped(name: str, image: Image, *, seed: int = 0) -> WarpedErrors:
     for shading in (0.0, _SHADING):
         found: dict[str, list[float]] = {"gelflow": [], "lucas_kanade": []}
         for field in ("press", "shear", "twist"):
-            trackers = {"gelflow": GelflowTracker(), "lucas_kanade": LucasKanade()}
+            trackers: dict[str, BenchmarkTracker] = {"gelflow": GelflowTracker(), "lucas_kanade": LucasKanade()}
             for number, (warped, truth) in enumerate(_warped(image, rest, spacing, field, shading, seed)):
                 for key, tracker in trackers.items():
                     if number == 0:
@@ -75,7 +75,7 @@ def _warped(
         start = grid.copy()  # of each pixel before the motion
         for _ in range(_INVERSE_STEPS):
             start = grid - peak * _field(field, (start - centre) / reach)
-        x, y = np.float32(start[..., 0]), np.float32(start[..., 1])
+        x, y = np.moveaxis(start.astype(np.float32), -1, 0)
         moved = cv2.remap(image, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE).astype(float)
         if number and shading:
             off = (grid - centre) / reach
