@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.perception._tracker import PROFILE_STEPS, Tracker
-from gelflow.perception.detect import PLANES, image_plane
 from gelflow.perception.errors import TrackerInitError, draw_detections
-from gelflow.perception.grid import MarkerGrid
+from gelflow.perception.grid_detection.detect import PLANES, image_plane
+from gelflow.perception.grid_detection.grid import MarkerGrid
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.frames import CameraMount
-from gelflow.perception.grid import find_extent
-from gelflow.perception.grid_part import GridExtent, Polarity, Skipped
+from gelflow.perception.grid_detection.grid import find_extent
+from gelflow.perception.grid_detection.grid_part import GridExtent, Polarity, Skipped
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 
 # Largest difference of the spacing from the pitch, relative to the pitch. A uniform scale at the centre of the image

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
-from gelflow.perception.detect import downsample
 from gelflow.perception.dot_model import fit_dot_model
-from gelflow.perception.grid import find_grid
-from gelflow.perception.grid_part import GridRequest, Polarity
+from gelflow.perception.grid_detection.detect import downsample
+from gelflow.perception.grid_detection.grid import find_grid
+from gelflow.perception.grid_detection.grid_part import GridRequest, Polarity
 
 _MAX_RADIUS = 10.0  # of a dot [px]; larger images are downsampled, since more pixels add no accuracy
 

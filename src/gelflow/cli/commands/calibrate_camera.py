@@ -14,7 +14,7 @@ from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
 from gelflow.perception.errors import TrackerInitError
-from gelflow.perception.grid import find_extent
+from gelflow.perception.grid_detection.grid import find_extent
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
 from gelflow.perception.output.calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error

@@ -16,7 +16,7 @@ from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
-from gelflow.perception.grid_part import Polarity
+from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gelflow.perception.detect import DetectedDots
-from gelflow.perception.lattice import Lattice
+from gelflow.perception.grid_detection.detect import DetectedDots
+from gelflow.perception.grid_detection.lattice import Lattice
 
 _MAX_SHEAR = np.deg2rad(20)  # of rows and columns seen at a slant; those in a hexagonal pattern meet at 60°
 _MAX_OUTSIDE = 0.3  # limit of (equal dots beside the grid) / (dots of the grid)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.perception.detect import DetectedDots
-from gelflow.perception.lattice import Lattice, interpolate_nodes
+from gelflow.perception.grid_detection.detect import DetectedDots
+from gelflow.perception.grid_detection.lattice import Lattice, interpolate_nodes
 
 Polarity = Literal["auto", "dark", "bright"]
 Side = Literal["ends", "continues", "unknown"]  # unknown: the next line would be outside the image

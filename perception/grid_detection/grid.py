@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.perception.detect import (
+from gelflow.perception.errors import TrackerInitError, draw_detections
+from gelflow.perception.grid_detection.detect import (
     BRIGHT,
     DARK,
     DetectedDots,
@@ -17,10 +18,17 @@ from gelflow.perception.detect import (
     local_contrast,
     smooth_response,
 )
-from gelflow.perception.errors import TrackerInitError, draw_detections
-from gelflow.perception.grid_part import GridExtent, GridRequest, Polarity, completeness, grid_extent, select_part, trim
-from gelflow.perception.lattice import Lattice, grow_lattice, interpolate_nodes
-from gelflow.perception.pattern import pattern_reason
+from gelflow.perception.grid_detection.grid_part import (
+    GridExtent,
+    GridRequest,
+    Polarity,
+    completeness,
+    grid_extent,
+    select_part,
+    trim,
+)
+from gelflow.perception.grid_detection.lattice import Lattice, grow_lattice, interpolate_nodes
+from gelflow.perception.grid_detection.pattern import pattern_reason
 
 _RADII = (2.2, 3.2, 4.6, 6.6, 9.5, 14.0)  # of the searched dots [px], in an image of about _SEARCH_SIZE px
 _SEARCH_SIZE = 360

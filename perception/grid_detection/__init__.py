@@ -1,0 +1,1 @@
+"""Finds the dots and the grid of markers in a first image."""
