@@ -1,6 +1,7 @@
 #include "model/parameter_checks.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <sstream>
 
 #include "model/model.hpp"
@@ -34,15 +35,29 @@ bool contains(const std::string_view (&names)[n], std::string_view name) {
   return std::find(std::begin(names), std::end(names), name) != std::end(names);
 }
 
+// Whether an infinite value means that there is no limit.
+bool is_limit(std::string_view name) { return name.ends_with("lower") || name.ends_with("upper"); }
+
+constexpr double rounding = 1e-6;  // of parameters in single precision, relative to the largest element
+
 // Whether a symmetric matrix has no negative eigenvalue: its principal minors are not negative, up to rounding errors.
-bool is_inertia(const M3<double>& m) {
-  constexpr double rounding = 1e-6;  // of parameters in single precision
-  const double size = m.cwiseAbs().maxCoeff();
+bool is_positive(const M3<double>& m, double size) {
   for (int i = 0; i < 3; ++i) {
     const int j = (i + 1) % 3;
+    if (m(i, i) < -rounding * size) return false;
     if (m(i, i) * m(j, j) - m(i, j) * m(i, j) < -rounding * size * size) return false;
   }
   return !(m.determinant() < -rounding * size * size * size);
+}
+
+// Why a symmetric matrix is no inertia of a rigid body; empty if it may be one. Of a body, each principal moment is at
+// most the sum of the others: half the trace minus the inertia is the matrix of second moments of mass.
+std::string wrong_inertia(const M3<double>& m) {
+  const double size = m.cwiseAbs().maxCoeff();
+  if (!is_positive(m, size)) return "have no negative principal moment";
+  if (!is_positive(m.trace() / 2 * M3<double>::Identity() - m, size))
+    return "have no principal moment above the sum of the others";
+  return {};
 }
 
 template <class T>
@@ -63,6 +78,9 @@ template <class T>
 std::string wrong_parameter(const Model& model, const T* params) {
   for (std::size_t i = 0; i < model.param_signs.size(); ++i) {
     const ParamSign sign = model.param_signs[i];
+    if (std::isnan(params[i])) return message(model.param_names[i], "be a number", params[i]);
+    if (std::isinf(params[i]) && std::isfinite(model.param_defaults[i]) && !is_limit(model.param_names[i]))
+      return message(model.param_names[i], "be finite", params[i]);
     if (sign == ParamSign::positive && params[i] <= T(0))
       return message(model.param_names[i], "be positive", params[i]);
     if (sign == ParamSign::not_negative && params[i] < T(0)) {
@@ -72,11 +90,11 @@ std::string wrong_parameter(const Model& model, const T* params) {
   for (const Body& body : model.bodies) {
     const M3<double> before = body.params.in(model.param_defaults.data()).inertia();
     const M3<double> now = body.params.in(params).inertia().template cast<double>();
-    if (is_inertia(before) && !is_inertia(now)) {
+    const std::string wrong = wrong_inertia(now);
+    if (!wrong.empty() && wrong_inertia(before).empty()) {
       std::ostringstream text;
-      text << "the inertia of body '" << body.name << "' must have no negative principal moment, got xx yy zz xy xz yz "
-           << now(0, 0) << ' ' << now(1, 1) << ' ' << now(2, 2) << ' ' << now(0, 1) << ' ' << now(0, 2) << ' '
-           << now(1, 2);
+      text << "the inertia of body '" << body.name << "' must " << wrong << ", got xx yy zz xy xz yz " << now(0, 0)
+           << ' ' << now(1, 1) << ' ' << now(2, 2) << ' ' << now(0, 1) << ' ' << now(0, 2) << ' ' << now(1, 2);
       return text.str();
     }
   }

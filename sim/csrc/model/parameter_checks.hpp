@@ -15,7 +15,7 @@ enum class ParamSign : std::uint8_t { any, not_negative, positive };
 ParamSign param_sign(std::string_view name, double value);
 
 // The first wrong parameter of an environment and what it must be, such as "parameter 'box.mass' must be positive, got
-// -1"; else empty. Parameters that are not a number are left to the solver, which fails.
+// -1"; else empty.
 template <class T>
 std::string wrong_parameter(const Model& model, const T* params);
 

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.sim.scene.geometry.collada import read_collada
+from gelflow.sim.scene.geometry.mesh import TriangleMesh
 
 _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # rows and columns of xx, yy, zz, xy, xz, yz
 _ROUNDING = 1e-9  # relative violation of the triangle inequality that printed decimals of a thin body can cause
@@ -40,6 +42,8 @@ def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     spec.compiler.fusestatic = False  # keep the link frames: a pad may refer to them as sites
     for mesh in spec.meshes:
         mesh.file = _mesh_file(mesh.file, path)
+        if Path(mesh.file).suffix.lower() == ".dae" and (path.parent / mesh.file).is_file():
+            _insert_triangles(mesh, read_collada(path.parent / mesh.file))
     for body in spec.bodies:
         if body.explicitinertial and np.isfinite(body.fullinertia).all():
             body.fullinertia = _repaired(body.fullinertia, f"{path.name}: link {body.name!r}")
@@ -81,6 +85,12 @@ def _couple(spec: Any, mimics: dict[str, tuple[str, float, float]]) -> None:
             name2=leader,
             data=data,
         )
+
+
+def _insert_triangles(mesh: Any, triangles: TriangleMesh) -> None:
+    """Replace the file of a mesh (mujoco.MjsMesh) by triangles."""
+    mesh.name, mesh.file = mesh.name or Path(mesh.file).stem, ""
+    mesh.uservert, mesh.userface = triangles.vertices.reshape(-1), triangles.faces.reshape(-1)
 
 
 def _mesh_file(address: str, path: Path) -> str:

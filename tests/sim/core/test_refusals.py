@@ -150,6 +150,11 @@ WRONG_PARAMETERS = [
     ("box.mass", 0.0, "parameter 'box.mass' must be positive, got 0"),
     ("box.inertia.xx", -1e-9, "parameter 'box.inertia.xx' must not be negative, got -1e-09"),
     ("box.inertia.xy", 1.0, "the inertia of body 'box' must have no negative principal moment"),
+    ("box.inertia.zz", 1.0, "the inertia of body 'box' must have no principal moment above the sum of the others"),
+    ("box.mass", np.nan, "parameter 'box.mass' must be a number, got nan"),
+    ("box.mass", np.inf, "parameter 'box.mass' must be finite, got inf"),
+    ("box.com.x", np.nan, "parameter 'box.com.x' must be a number, got nan"),
+    ("pad_box.mu", np.nan, "parameter 'pad_box.mu' must be a number, got nan"),
     ("pad_box.kn", -5.0, "parameter 'pad_box.kn' must not be negative, got -5"),
     ("pad_box.mu", -0.1, "parameter 'pad_box.mu' must not be negative, got -0.1"),
     ("box_yaw.damping", -0.1, "parameter 'box_yaw.damping' must not be negative, got -0.1"),
@@ -174,7 +179,7 @@ def test_wrong_parameter(name: str, value: float, message: str, precision: Any) 
     sim.param(name)[1] = right
     sim.step(np.zeros(6))
     values = torch.tensor([float(right), value], dtype=torch_state(sim).q.dtype)
-    with pytest.raises(UsageError, match=match):
+    with pytest.raises(UsageError, match=match if np.isfinite(value) else f"^{name} is not finite"):
         torch_rollout(sim, torch_state(sim), torch.zeros((2, 2, 6), dtype=values.dtype), params={name: values})
 
 
