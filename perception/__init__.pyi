@@ -8,6 +8,8 @@ from .frames import decode_image as decode_image
 from .frames import tactile_frame as tactile_frame
 from .mount_check import check_scale as check_scale
 from .overlay import draw_overlay as draw_overlay
+from .sensors.profile import SensorProfile as SensorProfile
+from .sensors.profile import load_sensor_profile as load_sensor_profile
 from .sources import ImageSource as ImageSource
 from .sources import SourceImage as SourceImage
 from .sources import image_source as image_source
@@ -20,6 +22,7 @@ __all__ = [
     "CameraMount",
     "ImageSource",
     "MarkerTracker",
+    "SensorProfile",
     "SourceImage",
     "TrackerConfig",
     "TrackerInitError",
@@ -30,6 +33,7 @@ __all__ = [
     "fit_calibration",
     "image_source",
     "load_calibration",
+    "load_sensor_profile",
     "save_calibration",
     "tactile_frame",
 ]

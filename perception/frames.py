@@ -19,6 +19,19 @@ from gelflow.perception.tracker import TrackerConfig, TrackingResult
 
 Image = NDArray[np.uint8]
 
+
+class UnreadableImage(PeerError):
+    """The data of an image cannot be decoded."""
+
+
+Reduction = Literal[1, 2, 4, 8]  # of the size of an image by its decoder
+_DECODING: dict[int, int] = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
+
 ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG files
 
 
@@ -189,18 +202,19 @@ def skipped_lines(seen: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     return counts[0], counts[1], counts[2], counts[3]
 
 
-def decode_image(data: bytes) -> Image:
-    """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3).
+def decode_image(data: bytes, *, reduce: Reduction = 1) -> Image:
+    """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3), at 1 / `reduce` of its size.
 
-    The runner and replay both use this function, so that they process identical images. Raises PeerError when the
-    bytes are not an image.
+    The JPEG decoder computes the smaller image only, which takes less than half the time at a quarter of the size.
+    The runner and replay both use this function, so that they process identical images. Raises UnreadableImage when
+    the bytes are not an image.
     """
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR) if data else None
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODING[reduce]) if data else None
     if image is None:
         problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
         if data.startswith(ENCODED):
             problem = "cannot be decoded: truncated or damaged"
-        raise PeerError(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
+        raise UnreadableImage(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
     return np.asarray(image, dtype=np.uint8)
 
 

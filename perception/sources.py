@@ -3,31 +3,25 @@
 A source is opened when its iteration starts, and iterated once. The cameras of a robot have drivers in gelflow.real.
 """
 
-import os
 import re
-import socket
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import urlsplit
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.clock import Clock, ScaledClock
-from gelflow.errors import PeerError, PeerTimeout, UsageError
-from gelflow.perception.frames import ENCODED, decode_image
+from gelflow.errors import PeerError, UsageError
+from gelflow.perception.capture import Capture
+from gelflow.perception.frames import ENCODED, UnreadableImage
+from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS
 
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
-_PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
-_MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
-# Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 @dataclass(frozen=True)
@@ -41,15 +35,16 @@ class SourceImage:
 
 
 @dataclass
-class UnreadableImages:
-    """The images of a source that were skipped because they cannot be decoded."""
+class SkippedImages:
+    """The images of a source that were left out."""
 
-    count: int = 0
-    first: str = ""  # name of the first one and why it cannot be read
+    unreadable: int = 0  # cannot be decoded
+    first: str = ""  # name of the first unreadable one and why it cannot be read
+    dropped: int = 0  # live images that arrived while the program was behind
 
     def add(self, name: str, reason: object) -> None:
-        """Count the image `name`."""
-        self.count += 1
+        """Count the unreadable image `name`."""
+        self.unreadable += 1
         self.first = self.first or f"{name}: {reason}"
 
 
@@ -64,7 +59,8 @@ class ImageSource:
     rate: float = 25.0  # frame rate of a folder, and of a video without a rate [Hz]
     timeout: float = 5.0  # of a stream, for opening and for each image [s]
     clock: Clock = field(default_factory=ScaledClock)  # time stamps of live images
-    unreadable: UnreadableImages = field(default_factory=UnreadableImages, compare=False)  # of the iteration so far
+    profile: SensorProfile = field(default_factory=lambda: load_sensor_profile("generic"))
+    skipped: SkippedImages = field(default_factory=SkippedImages, compare=False)  # in the iteration so far
 
     @property
     def live(self) -> bool:
@@ -72,7 +68,7 @@ class ImageSource:
         return self.kind in ("stream", "camera")
 
     def __iter__(self) -> Iterator[SourceImage]:
-        """Iterates over the images; those that cannot be decoded are skipped and counted in `unreadable`.
+        """Iterates over the images; those that cannot be decoded are skipped and counted in `skipped`.
 
         Raises PeerError when no image can be read, a video ends early, or the image size of a stream changes.
         """
@@ -98,17 +94,18 @@ class ImageSource:
         if self.kind == "session":
             with SessionReader(self.text) as session:
                 return session.counts().get(f"/{self.sensor}/image", 0)
-        capture = self._open()
-        number = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        capture.release()
-        return number if number > 0 else None
+        return self._capture().count()
+
+    def _original(self, data: bytes | None) -> bytes | None:
+        """The encoded image, if it shows what `SourceImage.image` shows."""
+        return data if self.profile.image.is_plain else None
 
     def _why_empty(self) -> str:
         """The reason for a source without a readable image."""
-        if self.unreadable.count == 1 and self.kind == "image":
-            return self.unreadable.first
-        if self.unreadable.count:
-            return f"none of the {self.unreadable.count} images of {self.text} can be read; {self.unreadable.first}"
+        if self.skipped.unreadable == 1 and self.kind == "image":
+            return self.skipped.first
+        if self.skipped.unreadable:
+            return f"none of the {self.skipped.unreadable} images of {self.text} can be read; {self.skipped.first}"
         if self.kind == "session":
             return f"session {self.text} has no image of the {self.sensor} sensor"
         return f"{self.kind} {self.text} was opened but gave no image"
@@ -117,116 +114,61 @@ class ImageSource:
         for number, file in enumerate(self.files):
             try:
                 data = file.read_bytes()
-                image = decode_image(data)
+                image = self.profile.decode(data)
+            except UnreadableImage as error:
+                self.skipped.add(str(file), error)
             except PeerError as error:
-                self.unreadable.add(str(file), error)
+                raise PeerError(f"{file}: {error}") from None
             except OSError as error:
-                self.unreadable.add(str(file), f"cannot be read: {error.strerror}")
+                self.skipped.add(str(file), f"cannot be read: {error.strerror}")
             else:
-                yield SourceImage(file.name, image, number / self.rate, data if data.startswith(ENCODED) else None)
+                kept = data if data.startswith(ENCODED) else None
+                yield SourceImage(file.name, image, number / self.rate, self._original(kept))
 
     def _from_session(self) -> Iterator[SourceImage]:
         with SessionReader(self.text) as session:
             for record in session.records([f"/{self.sensor}/image"]):
                 name = f"{record.value.sequence:06d}"
                 try:
-                    image = decode_image(record.value.data)
-                except PeerError as error:
-                    self.unreadable.add(f"image {name} of the {self.sensor} sensor", error)
+                    image = self.profile.decode(record.value.data)
+                except UnreadableImage as error:
+                    self.skipped.add(f"image {name} of the {self.sensor} sensor", error)
                 else:
-                    yield SourceImage(name, image, record.stamp, record.value.data)
+                    yield SourceImage(name, image, record.stamp, self._original(record.value.data))
 
     def _from_capture(self) -> Iterator[SourceImage]:
-        capture = self._open()
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        rate = rate if 0.1 <= rate <= 1000 else self.rate
-        # FFmpeg scales the images of a stream whose size changes; undecoded JPEG images keep their size.
-        encoded = self.kind == "stream" and _codec(capture) == b"MJPG" and capture.set(cv2.CAP_PROP_FORMAT, -1)
-        expected, number, seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0
-        size: tuple[int, ...] | None = None
-        try:
-            while True:
-                good, image = capture.read()
-                if not good:
-                    break
-                name, data = f"{number:06d}", image.tobytes() if encoded else None
-                stamp = self.clock.now() if self.live else number / rate
-                seconds = max(seconds, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
-                number += 1
-                try:
-                    image = decode_image(data) if data is not None else _in_colour(image)
-                except PeerError as error:
-                    self.unreadable.add(f"image {name}", error)
-                    continue
-                size = size or image.shape[:2]
-                if image.shape[:2] != size:
-                    raise PeerError(
-                        f"{self.kind} {self.text}: image {name} has {image.shape[1]} × {image.shape[0]} px, those "
-                        f"before have {size[1]} × {size[0]}: the camera's settings changed"
-                    )
-                yield SourceImage(name, image, stamp, data)
-        finally:
-            capture.release()
-        if number and self.live:
-            raise PeerTimeout(
-                f"{self.kind} {self.text} ended after {number} images: closed, or no image within {self.timeout:g} s"
-            )
-        missing = expected - max(number, seconds * rate + 1)  # by time too: a container may only estimate the number
-        if number and missing > max(_MISSING, _MISSING_SHARE * expected):
-            raise PeerError(
-                f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged"
-            )
+        capture, size = self._capture(), None
+        for number, captured in enumerate(capture):
+            self.skipped.dropped = capture.dropped
+            name, content = f"{number:06d}", captured.content
+            data = content if isinstance(content, bytes) else None
+            try:
+                image = (
+                    self.profile.prepare(content) if not isinstance(content, bytes) else self.profile.decode(content)
+                )
+            except UnreadableImage as error:
+                self.skipped.add(f"image {name}", error)
+                continue
+            size = size or image.shape[:2]
+            if image.shape[:2] != size:
+                raise PeerError(
+                    f"{self.kind} {self.text}: image {name} has {image.shape[1]} × {image.shape[0]} px, those before "
+                    f"have {size[1]} × {size[0]}: the camera's settings changed"
+                )
+            yield SourceImage(name, image, captured.stamp, self._original(data))
 
-    def _open(self) -> cv2.VideoCapture:
-        # OpenCV logs to the terminal; the error below replaces its message.
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(0)
-        try:
-            if self.kind == "camera":
-                capture = cv2.VideoCapture(int(self.text))
-                advice = "check the connection and the access rights of this user"
-            elif self.kind == "stream":
-                self._check_reachable()
-                limit = int(self.timeout * 1000)
-                options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
-                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG, options)
-                advice = f"no video stream within {self.timeout:g} s; check address and port"
-            else:
-                self._check_not_text()
-                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
-                advice = "not an image or a video that OpenCV can read"
-        finally:
-            cv2.utils.logging.setLogLevel(level)
-        if not capture.isOpened():
-            capture.release()
-            raise PeerError(f"{self.kind} {self.text} cannot be opened: {advice}")
-        return capture
-
-    def _check_reachable(self) -> None:
-        """Raises PeerError when the address of the stream is unreachable, faster than the video library does."""
-        try:
-            url = urlsplit(self.text)
-            if url.scheme in _PORTS:
-                address = url.hostname or "", url.port or _PORTS[url.scheme]
-                socket.create_connection(address, timeout=self.timeout).close()
-        except (OSError, ValueError) as error:
-            raise PeerError(f"stream {self.text} cannot be opened: {error}; check address and port") from None
-
-    def _check_not_text(self) -> None:
-        """Raises PeerError for a text file, which FFmpeg would render as a video of characters."""
-        try:
-            with Path(self.text).open("rb") as file:
-                start = file.read(4096)
-        except OSError as error:
-            raise PeerError(f"{self.text} cannot be read: {error.strerror}") from None
-        if start and b"\0" not in start and _is_text(start):
-            raise PeerError(f"{self.text} is a text file, not an image or a video")
+    def _capture(self) -> Capture:
+        size = (self.profile.image.width, self.profile.image.height)
+        return Capture(self.text, self.kind, self.rate, self.timeout, self.clock, size)
 
 
-def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> ImageSource:
+def image_source(
+    text: str, *, sensor: str = "left", rate: float = 25.0, profile: SensorProfile | None = None
+) -> ImageSource:
     """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
-    `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder. Raises UsageError when the
+    `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder; `profile` is that of the
+    sensor, whose part of each image is used. Raises UsageError when the
     file or folder does not exist, or the folder contains no images.
     """
     if not text:
@@ -235,45 +177,29 @@ def image_source(text: str, *, sensor: str = "left", rate: float = 25.0) -> Imag
         raise UsageError(f"sensor must be {' or '.join(SENSORS)}, got {sensor!r}")
     if not 0.01 <= rate <= 10000:
         raise UsageError(f"rate must be within 0.01 to 10000 Hz, got {rate}")
+    profile = profile or load_sensor_profile("generic")
     if text.isascii() and text.isdigit():
-        return ImageSource(text, "camera", rate=rate)
+        return ImageSource(text, "camera", rate=rate, profile=profile)
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
-        return ImageSource(text, "stream", rate=rate)
+        return ImageSource(text, "stream", rate=rate, profile=profile)
     path = Path(text)
     if path.suffix.lower() == ".mcap":
-        return ImageSource(text, "session", sensor=sensor)
+        return ImageSource(text, "session", sensor=sensor, profile=profile)
     if path.is_dir():
         files = tuple(sorted((f for f in path.iterdir() if _is_image(f)), key=natural_sort_key))
         if not files:
             raise UsageError(f"folder {text} contains no images (known suffixes: {', '.join(sorted(IMAGE_SUFFIXES))})")
-        return ImageSource(text, "folder", files, rate=rate)
+        return ImageSource(text, "folder", files, rate=rate, profile=profile)
     if not path.exists():
         raise UsageError(f"expected a folder, a file, a URL or a camera number; {text} does not exist")
-    return ImageSource(text, "image", (path,)) if _is_image(path) else ImageSource(text, "video", rate=rate)
-
-
-def _codec(capture: cv2.VideoCapture) -> bytes:
-    """Four-character code of the codec."""
-    return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
-
-
-def _in_colour(image: cv2.typing.MatLike) -> Image:
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image, dtype=np.uint8)
+    files = (path,) if _is_image(path) else ()
+    return ImageSource(text, "image" if files else "video", files, rate=rate, profile=profile)
 
 
 def natural_sort_key(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders 9.jpg before 10.jpg."""
     parts = re.split(r"([0-9]+)", path.name)
     return tuple((1, int(part), part) if part.isdecimal() else (0, 0, part) for part in parts)
-
-
-def _is_text(start: bytes) -> bool:
-    """Whether `start`, the first bytes of a file, is UTF-8 text; the last character may be incomplete."""
-    try:
-        start.decode("utf-8")
-    except UnicodeDecodeError as error:
-        return error.start > len(start) - 4 and error.reason == "unexpected end of data"
-    return True
 
 
 def _is_image(path: Path) -> bool:

@@ -24,6 +24,7 @@ class TrackingSummary:
     largest_mm: float | None = None
     largest_at: str = ""  # image and marker of the largest displacement
     first: TrackingResult | None = None
+    pixels_per_mm: float | None = None  # uniform scale, where it is known and there is no calibration
     visible: list[VisiblePart] = field(default_factory=list)  # possible visible parts of a partly visible grid
     _valid: list[float] = field(default_factory=list)  # share of each image
     _inferred: list[float] = field(default_factory=list)
@@ -77,6 +78,7 @@ class TrackingSummary:
             "printed_grid": (self.visible[0].rows, self.visible[0].cols) if self.visible else None,
             "visible_rows": self._lines(0),
             "visible_cols": self._lines(1),
+            "pixels_per_mm": self.pixels_per_mm,
             "tracked_share": float(np.mean(self._valid)),
             "tracked_share_min": min(self._valid),
             "inferred_share": float(np.mean(self._inferred)),

@@ -207,7 +207,7 @@ class TomlTable:
         if typing.get_origin(kind) is tuple:
             members = typing.get_args(kind)
             return self.integers(key, len(members)) if set(members) == {int} else self.numbers(key, len(members))
-        if kind is int:
+        if kind is int or typing.get_origin(kind) is typing.Literal:  # of integers, which __post_init__ checks
             return self.integer(key, minimum=None)
         if kind is float:
             return self.number(key)

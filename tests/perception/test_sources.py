@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, PeerTimeout
-from gelflow.perception.sources import ImageSource, image_source
+from gelflow.perception.sensors.profile import load_sensor_profile
+from gelflow.perception.sources import ImageSource, SourceImage, image_source
 
 
 def picture(number: int, size: tuple[int, int] = (96, 64)) -> np.ndarray:
@@ -36,8 +37,8 @@ def test_unreadable_images_of_a_folder_are_skipped_and_counted(tmp_path: Path) -
     images = list(source)
     assert [image.name for image in images] == ["0.jpg", "2.jpg", "3.jpg", "5.jpg"]
     assert [image.stamp for image in images] == [0 / 25, 2 / 25, 3 / 25, 5 / 25]
-    assert source.unreadable.count == 2
-    assert source.unreadable.first.startswith(f"{tmp_path / '1.jpg'}: ") and "truncated" in source.unreadable.first
+    assert source.skipped.unreadable == 2
+    assert source.skipped.first.startswith(f"{tmp_path / '1.jpg'}: ") and "truncated" in source.skipped.first
 
 
 def test_a_folder_without_a_readable_image_is_an_error(tmp_path: Path) -> None:
@@ -64,57 +65,99 @@ def test_a_truncated_video_is_an_error_after_its_images(suffix: str, codec: str,
     assert 20 <= len(seen) < 30
 
 
-@contextmanager
-def stream(images: list[bytes]) -> Iterator[str]:
-    """An MJPEG stream over HTTP, which ends after `images`."""
+class Stream:
+    """An MJPEG stream over HTTP, which sends `images` at the pace of the reader and then ends."""
 
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            pass
+    def __init__(self, images: list[bytes], *, paced: bool = True) -> None:
+        self.images, self.paced = images, paced
+        self.free = threading.Semaphore(6)  # images that may be sent
+        self.sent = threading.Event()  # all of them
 
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-            self.end_headers()
-            for data in images:
-                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-                self.wfile.write(head.encode() + data + b"\r\n")
+    def read(self, source: ImageSource) -> Iterator[SourceImage]:
+        for image in source:
+            yield image
+            self.free.release()
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}/stream"
-    finally:
-        server.shutdown()
-        server.server_close()
+    @contextmanager
+    def serve(self) -> Iterator[str]:
+        stream = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def log_message(self, *_: object) -> None:
+                pass
+
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                for data in stream.images:
+                    if stream.paced:
+                        stream.free.acquire(timeout=5)
+                    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                    self.wfile.write(head.encode() + data + b"\r\n")
+                stream.sent.set()
+
+        server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/stream"
+        finally:
+            server.shutdown()
+            server.server_close()
+
+
+def read_stream(stream: Stream, *, profile: str = "generic") -> tuple[ImageSource, list[SourceImage], PeerError]:
+    """The source, the images before the error that ends it, and the error."""
+    seen = []
+    with stream.serve() as url:
+        source = image_source(url, profile=load_sensor_profile(profile))
+        with pytest.raises(PeerError) as ended:
+            for image in stream.read(source):
+                seen.append(image)
+    return source, seen, ended.value
 
 
 def test_images_of_a_stream_keep_the_bytes_of_the_camera() -> None:
     sent = [jpeg(number) for number in range(40)]
-    seen = []
-    with stream(sent) as url, pytest.raises(PeerTimeout, match="ended after 40 images"):
-        for image in image_source(url):
-            seen.append(image)
-    assert [image.data for image in seen] == sent
+    source, seen, error = read_stream(Stream(sent))
+    assert "ended after 40 images" in str(error) and isinstance(error, PeerTimeout)
+    assert [image.data for image in seen] == sent and source.skipped.dropped == 0
     assert all(image.image.shape == (64, 96, 3) for image in seen)
 
 
 def test_a_stream_whose_image_size_changes_is_an_error() -> None:
     sent = [jpeg(number) for number in range(40)] + [jpeg(number, (128, 96)) for number in range(20)]
-    seen = []
-    with stream(sent) as url, pytest.raises(PeerError, match="image 000040 has 128 × 96 px, those before have 96 × 64"):
-        for image in image_source(url):
-            seen.append(image.name)
-    assert len(seen) == 40
+    _, seen, error = read_stream(Stream(sent))
+    assert "image 000040 has 128 × 96 px, those before have 96 × 64" in str(error) and len(seen) == 40
+
+
+def test_a_slow_reader_drops_the_oldest_images_and_counts_them() -> None:
+    stream = Stream([jpeg(number) for number in range(60)], paced=False)
+    names: list[int] = []
+    with stream.serve() as url:
+        source = image_source(url)
+        with pytest.raises(PeerTimeout):
+            for image in source:
+                names.append(stream.images.index(image.data or b""))
+                stream.sent.wait(10)
+    assert source.skipped.dropped > 30 and len(names) + source.skipped.dropped == 60
+    assert names == sorted(names) and names[-1] == 59
+
+
+def test_images_of_a_profile_are_reduced_and_cropped(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(
+        'format = 1\ntitle = "s"\n[image]\nwidth = 384\nheight = 256\nreduce = 4\ncrop = [0.125, 0, 0.25, 0.5]\n'
+    )
+    stream = Stream([jpeg(number, (384, 256)) for number in range(10)])
+    _, seen, _ = read_stream(stream, profile=str(tmp_path / "s.toml"))
+    assert len(seen) == 10 and all(image.data is None for image in seen)
+    whole = cv2.imdecode(np.frombuffer(stream.images[3], dtype=np.uint8), cv2.IMREAD_REDUCED_COLOR_4)
+    assert whole is not None
+    np.testing.assert_array_equal(seen[3].image, whole[0:32, 12:72])
 
 
 def test_a_damaged_image_of_a_stream_is_skipped_and_counted() -> None:
     sent = [jpeg(number) for number in range(40)]
     sent[25] = sent[25][:300] + bytes(200) + b"\xff\xd9"
-    with stream(sent) as url:
-        source = image_source(url)
-        seen = []
-        with pytest.raises(PeerTimeout):
-            for image in source:
-                seen.append(image.name)
-    assert len(seen) + source.unreadable.count == 40
+    source, seen, _ = read_stream(Stream(sent))
+    assert len(seen) + source.skipped.unreadable == 40

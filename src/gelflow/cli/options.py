@@ -103,6 +103,16 @@ def checkpoint_for(task: InsertionTask, given: Path | None) -> Path:
     return path
 
 
+def add_profile(parser: argparse.ArgumentParser) -> None:
+    """`--profile`: the sensor."""
+    parser.add_argument(
+        "--profile",
+        default="generic",
+        metavar="NAME",
+        help="sensor: gelsight-mini, gelslim-3, or a .toml file with image size, crop and print (default %(default)s)",
+    )
+
+
 def picture_size(text: str) -> tuple[int, int]:
     """Width and height [px] of a `--size` such as 640x480. Raises UsageError for another text."""
     size = re.fullmatch(r"(\d+)x(\d+)", text)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out
+from gelflow.cli.options import add_json, add_out, add_profile
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
@@ -18,6 +18,7 @@ from gelflow.perception.grid_detection.grid import find_extent
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
 from gelflow.perception.output.calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error
+from gelflow.perception.sensors.profile import load_sensor_profile
 from gelflow.perception.sources import ImageSource, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
 
@@ -31,8 +32,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("source", help="image of the gel at rest, or a folder, video, session or camera (first image)")
     parser.add_argument(
-        "--spacing-mm", type=float, required=True, metavar="MM", help="distance of neighbouring markers"
+        "--spacing-mm", type=float, metavar="MM", help="distance of neighbouring markers (default: of the profile)"
     )
+    add_profile(parser)
     parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
     parser.add_argument("--cols", type=int, metavar="N", help="printed markers in a row (default: detected)")
     for name, start in (("rows", "top"), ("cols", "left")):
@@ -57,12 +59,18 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(f"{file} exists; name a new file with --out")
     if not args.out.parent.is_dir():
         raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
-    image = _first_image(image_source(args.source, sensor=args.sensor))
+    profile = load_sensor_profile(args.profile)
+    spacing = args.spacing_mm or profile.markers.pitch_mm
+    if not spacing:
+        raise UsageError("--spacing-mm is missing: the distance of neighbouring markers; measure it on the gel")
+    if args.rows is None and args.cols is None and profile.markers.rows:
+        args.rows, args.cols = profile.markers.rows, profile.markers.cols
+    image = _first_image(image_source(args.source, sensor=args.sensor, profile=profile))
     with picture_of_init_error(args.out):
         tracker, first, part = _start(image, args)
     rest, measured = tracker.rest, first.valid
     size = (image.shape[1], image.shape[0])
-    fit = fit_calibration(rest, measured, rows=first.rows, cols=first.cols, spacing_mm=args.spacing_mm, size=size)
+    fit = fit_calibration(rest, measured, rows=first.rows, cols=first.cols, spacing_mm=spacing, size=size)
     fit = replace(fit, skipped=part.skipped) if part else fit
     save_calibration(fit, args.out)
     draw_calibration(image, rest, measured, fit, picture)
@@ -94,8 +102,8 @@ def run(args: argparse.Namespace) -> int:
 def _first_image(source: ImageSource) -> NDArray[np.uint8]:
     """The first image. Raises PeerError when it cannot be read: a later one may not show the gel at rest."""
     image = next(iter(source)).image
-    if source.unreadable.count:
-        raise PeerError(source.unreadable.first)
+    if source.skipped.unreadable:
+        raise PeerError(source.skipped.first)
     return image
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, check_at_least
+from gelflow.cli.options import add_json, add_profile, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.perception.calibration import Calibration, load_calibration
@@ -21,7 +21,8 @@ from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, 
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
-from gelflow.perception.sources import ImageSource, SourceImage, UnreadableImages, image_source
+from gelflow.perception.sensors.profile import load_sensor_profile
+from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
@@ -41,8 +42,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     polarity = parser.add_mutually_exclusive_group()
     polarity.add_argument("--dark", action="store_true", help="dots are darker than the gel (default: detected)")
     polarity.add_argument("--bright", action="store_true", help="dots are brighter than the gel (default: detected)")
-    parser.add_argument(
+    add_profile(parser)
+    scale = parser.add_mutually_exclusive_group()
+    scale.add_argument(
         "--calibration", type=Path, metavar="FILE", help="result of gelflow calibrate-camera: adds millimetres"
+    )
+    scale.add_argument(
+        "--pixels-per-mm", type=float, metavar="X", help="scale, without a calibration (default: pitch of the profile)"
     )
     parser.add_argument(
         "--out",
@@ -68,7 +74,10 @@ def run(args: argparse.Namespace) -> int:
     """Track all images, write the requested files and print a summary."""
     _check(args)
     output = Output(args.json)
-    source = image_source(args.source, sensor=args.sensor, rate=args.rate)
+    profile = load_sensor_profile(args.profile)
+    if args.rows is None and args.cols is None and profile.markers.rows:
+        args.rows, args.cols = profile.markers.rows, profile.markers.cols
+    source = image_source(args.source, sensor=args.sensor, rate=args.rate, profile=profile)
     calibration = load_calibration(args.calibration) if args.calibration else None
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
@@ -79,12 +88,14 @@ def run(args: argparse.Namespace) -> int:
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
         if summary.images:
-            _show(output, summary, source.unreadable, time.perf_counter() - begin, args.out)
+            _show(output, summary, source.skipped, time.perf_counter() - begin, args.out)
     return SUCCESS
 
 
 def _check(args: argparse.Namespace) -> None:
     check_at_least(args, images=1)
+    if args.pixels_per_mm is not None and not 0 < args.pixels_per_mm < float("inf"):
+        raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
     for file in args.out:
@@ -119,9 +130,10 @@ def _track(
                     tracked = tracker.track(frame.image)
             seconds = time.perf_counter() - begin
             if number == 0:
+                summary.pixels_per_mm = _scale(tracked, source, args)
                 # Files are created after the first image: a failed start leaves no empty files.
-                writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration)]
-            step = _tracked_image(number, frame, tracked, calibration)
+                writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
+            step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             for writer in writers:
                 writer.add(step)
             summary.add(step, seconds)
@@ -154,14 +166,29 @@ def _start(
     return tracker, first, parts
 
 
-def _writers(args: argparse.Namespace, calibration: Calibration | None) -> list[TrackWriter]:
-    description = {"source": args.source, "calibration": calibration, "versions": software_versions()}
+def _scale(first: TrackingResult, source: ImageSource, args: argparse.Namespace) -> float | None:
+    """The uniform scale [px/mm] where there is no calibration; None if it is not known."""
+    if args.calibration is not None or args.pixels_per_mm is not None:
+        scale: float | None = args.pixels_per_mm
+        return scale
+    pitch = source.profile.markers.pitch_mm
+    return first.spacing / pitch if pitch else None
+
+
+def _writers(args: argparse.Namespace, calibration: Calibration | None, summary: TrackingSummary) -> list[TrackWriter]:
+    description = {
+        "source": args.source,
+        "profile": args.profile,
+        "calibration": calibration,
+        "pixels_per_mm": summary.pixels_per_mm,
+        "versions": software_versions(),
+    }
     return [
         open_writer(
             file,
             sensor=args.sensor,
             magnify=args.magnify,
-            millimetres=calibration is not None,
+            millimetres=calibration is not None or summary.pixels_per_mm is not None,
             description=description,
         )
         for file in args.out
@@ -169,31 +196,43 @@ def _writers(args: argparse.Namespace, calibration: Calibration | None) -> list[
 
 
 def _tracked_image(
-    number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None
+    number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None, scale: float | None
 ) -> TrackedImage:
-    if calibration is None:
-        return TrackedImage(number, frame, tracked)
-    displacement = calibration.displacement_mm(tracked.position, tracked.displacement)
-    return TrackedImage(number, frame, tracked, calibration.to_mm(tracked.position), displacement)
+    """The result in millimetres too: by the calibration, or by `scale` [px/mm] from the centre of the image."""
+    if calibration is not None:
+        displacement = calibration.displacement_mm(tracked.position, tracked.displacement)
+        return TrackedImage(number, frame, tracked, calibration.to_mm(tracked.position), displacement)
+    if scale is not None:
+        centre = (np.array(frame.image.shape[1::-1]) - 1) / 2
+        return TrackedImage(number, frame, tracked, (tracked.position - centre) / scale, tracked.displacement / scale)
+    return TrackedImage(number, frame, tracked)
 
 
-def _show(
-    output: Output, summary: TrackingSummary, unreadable: UnreadableImages, wall: float, files: list[Path]
-) -> None:
+def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall: float, files: list[Path]) -> None:
     """Print the summary; `wall` is the duration of the run [s]."""
     values = summary.to_json()
     if output.json:
-        skipped = {"unreadable_images": unreadable.count, "first_unreadable": unreadable.first or None}
-        output.result(values | skipped | {"seconds": wall, "files": files})
+        left_out = {
+            "unreadable_images": skipped.unreadable,
+            "first_unreadable": skipped.first or None,
+            "dropped_images": skipped.dropped,
+        }
+        output.result(values | left_out | {"seconds": wall, "files": files})
         return
     markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
     table = Table(show_header=False)
     table.add_row("images", str(values["images"]))
-    if unreadable.count:
-        table.add_row("skipped", f"{unreadable.count} unreadable; {unreadable.first}")
+    if skipped.unreadable:
+        table.add_row("skipped", f"{skipped.unreadable} unreadable; {skipped.first}")
+    if skipped.dropped:
+        table.add_row("dropped", f"{skipped.dropped} live images, while tracking and writing were behind")
     table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")
     if summary.visible:
         table.add_row("visible", _visible_text(summary.visible, markers))
+    if summary.pixels_per_mm is not None:
+        table.add_row(
+            "scale", f"{summary.pixels_per_mm:.2f} px/mm everywhere: no lens and no tilt; see calibrate-camera"
+        )
     worst = f"in the worst image {100 * values['tracked_share_min']:.1f} %"
     table.add_row("tracked", f"{100 * values['tracked_share']:.1f} % ({worst})")
     table.add_row("inferred", f"{100 * values['inferred_share']:.1f} %, from neighbours")
