@@ -44,7 +44,7 @@ class Capture:
     timeout: float  # of a stream [s]
     clock: Clock  # time stamps of live images
     size: tuple[int, int] = (0, 0)  # width, height that a camera is set to [px]; 0: its default
-    dropped: int = field(default=0, init=False)  # live images that were left out because the program was behind
+    dropped: int = field(default=0, init=False)  # live images that arrived while the program was behind
 
     def __iter__(self) -> Iterator[CapturedImage]:
         """Iterates over the images. Live ones are read by a thread; the oldest are dropped when too many wait.

@@ -36,7 +36,7 @@ class SourceImage:
 
 @dataclass
 class SkippedImages:
-    """The images of a source that were left out."""
+    """The images of a source that are not tracked."""
 
     unreadable: int = 0  # cannot be decoded
     first: str = ""  # name of the first unreadable one and why it cannot be read

@@ -30,14 +30,14 @@ class PrintedMarkers:
 
     def __post_init__(self) -> None:
         if self.rows < 0 or self.cols < 0 or (self.rows == 0) != (self.cols == 0):
-            raise UsageError(f"rows and cols must both be positive, or both be left out, got {self.rows}, {self.cols}")
+            raise UsageError(f"rows and cols must both be positive, or both be absent, got {self.rows}, {self.cols}")
         if not 0 <= self.pitch_mm <= 1000:
             raise UsageError(f"pitch_mm must be within 0 to 1000, got {self.pitch_mm:g}")
 
 
 @dataclass(frozen=True)
 class SensorImage:
-    """What the camera sends and which part of it is used."""
+    """The image of the camera and the part of it that is used."""
 
     width: int = 0  # of the image as sent [px]; 0: any
     height: int = 0
@@ -47,7 +47,7 @@ class SensorImage:
     def __post_init__(self) -> None:
         if self.width < 0 or self.height < 0 or (self.width == 0) != (self.height == 0):
             raise UsageError(
-                f"width and height must both be positive, or both be left out, got {self.width}, {self.height}"
+                f"width and height must both be positive, or both be absent, got {self.width}, {self.height}"
             )
         if self.reduce not in get_args(Reduction):
             raise UsageError(f"reduce must be 1, 2, 4 or 8, got {self.reduce}")

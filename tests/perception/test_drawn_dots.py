@@ -81,3 +81,17 @@ def test_a_few_dots_of_another_size_are_measured(factor: float) -> None:
         tracked = tracker.track(draw(grid() + moved, radii, seed=step))
         error = np.linalg.norm(tracked.displacement - moved, axis=1)
         assert tracked.valid.all() and error.max() < 0.1 and np.median(error) < 0.03
+
+
+@pytest.mark.parametrize("bright", [False, True])
+def test_a_dot_that_leaves_the_image_is_right_or_not_valid(bright: bool) -> None:
+    points = np.stack(np.meshgrid(np.arange(13) * 24 + 15.3, np.arange(9) * 24 + 22.2), axis=-1).reshape(-1, 2)
+    radii, leaving = np.full(len(points), 5.0), np.arange(len(points)) % 13 == 0
+    tracker = MarkerTracker()
+    tracker.start(draw(points, radii, bright=bright))
+    for step in range(1, 13):
+        moved = np.array([-1.75 * step, 0.3])
+        tracked = tracker.track(draw(points + moved, radii, bright=bright, seed=step))
+        error = np.linalg.norm(tracked.displacement - moved, axis=1)
+        assert tracked.valid[~leaving].all() and error[tracked.valid].max() < 0.1
+    assert not tracked.valid[leaving].any()

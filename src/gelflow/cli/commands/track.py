@@ -212,12 +212,12 @@ def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall
     """Print the summary; `wall` is the duration of the run [s]."""
     values = summary.to_json()
     if output.json:
-        left_out = {
+        not_tracked = {
             "unreadable_images": skipped.unreadable,
             "first_unreadable": skipped.first or None,
             "dropped_images": skipped.dropped,
         }
-        output.result(values | left_out | {"seconds": wall, "files": files})
+        output.result(values | not_tracked | {"seconds": wall, "files": files})
         return
     markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
     table = Table(show_header=False)
