@@ -103,6 +103,7 @@ class AttemptResult:
     # descent, and no step failed.
     inserted: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # shape (n,): a simulation step failed
+    depth: Array  # [m], shape (n,): of the gripper's target below its start when the descent ended, by contact or not
 
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
@@ -135,10 +136,10 @@ class InsertionAttempts:
     threads: of the simulator; None uses all available cores. Results do not depend on it.
     steps: simulation steps of a descent; None gives 225 ms
 
-    `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to it between attempts.
-    An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the memory of its trajectory; `sim`
-    simulates that many, and holds the end of the last attempt. Raises UsageError when the scene does not match the
-    task.
+    `sensors` are the pads. `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to
+    it between attempts. An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the memory of
+    its trajectory; `sim` simulates that many, and holds the end of the last attempt. Raises UsageError when the scene
+    does not match the task.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class InsertionAttempts:
         self._clear_height = max(_CLEAR_HEIGHT, task.part.depth + task.part.size[2])
         self.pose: Array = np.zeros((num_envs, 3))
         self.drawn: dict[str, Array] = {}  # quantities of the latest `draw`, one value for each of its environments
-        self._sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
+        self.sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
         self._stop_shear: Array = np.full(num_envs, np.inf)
         self._params = np.repeat(self.sim.params[:1], num_envs, axis=0)
@@ -214,7 +215,7 @@ class InsertionAttempts:
             self.pose[rows] = misalignment
         for part in _parts(len(rows)):
             self._close(rows[part], sampled["grasp_force"][part], sampled["grasp_height"][part])
-        self._sensors.draw(chosen, sampled, rng)
+        self.sensors.draw(chosen, sampled, rng)
 
     def _close(self, rows: Rows, force: Array, height: Array) -> None:
         """Close the grippers `rows` on their parts, far above the holes, and store the state at rest."""
@@ -251,6 +252,7 @@ class InsertionAttempts:
         steps = sorted({self._reference_at, *self._frames})
         shear = np.zeros((len(steps), len(rows), self.scene.num_markers, 2))
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
+        depth = np.full(len(rows), self.task.descent)
         for part in _parts(len(rows)):
             trajectory = self._simulate(rows[part], jitter[part], steps)
             n = len(rows[part])
@@ -259,11 +261,13 @@ class InsertionAttempts:
                 shear[k, part] = trajectory.tactile[k, :n, :, :2] if step else self._grasp_shear[rows[part]]
             height[part], inserted[part] = self._outcome(trajectory.q[-1, :n])
             failed[part] = trajectory.status[:n] != 0
-            inserted[part] &= ~failed[part] & (trajectory.stopped_at[:n] < 0)
+            stopped = trajectory.stopped_at[:n]
+            inserted[part] &= ~failed[part] & (stopped < 0)
+            depth[part] = np.where(stopped < 0, self.task.descent, self.task.descent * stopped / self._steps)
         readings = self._readings(dict(zip(steps, shear, strict=True)), chosen, rng)
         stack = np.stack([readings[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
-        return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed)
+        return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed, depth)
 
     def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
         """The descent of the grippers `rows`, read after `steps`."""
@@ -319,10 +323,10 @@ class InsertionAttempts:
     def _readings(self, frames: Mapping[int, Array], which: Mask, rng: np.random.Generator) -> dict[int, Array]:
         """Readings of the pads after the given numbers of steps, (n, pads, rows, cols, 2) each."""
         grid = self.task.grid
-        self._sensors.clear(which)
+        self.sensors.clear(which)
         readings, last = {}, 0
         for step, shear in frames.items():
-            reading = self._sensors.read(shear, which, rng, interval=(step - last) * self.scene.step)
+            reading = self.sensors.read(shear, which, rng, interval=(step - last) * self.scene.step)
             readings[step] = reading.reshape(len(shear), len(PADS), grid.rows, grid.cols, 2)
             last = step
         return readings

@@ -45,6 +45,8 @@ class SensorModel:
     ----------
     positions: marker positions of each pad, (markers, 2) or (markers, 3), in one unit of length
     num_envs: number of environments N
+
+    `gain` and `turn` (N, pads) are the present factors and camera rotations [rad] of the pads.
     """
 
     def __init__(self, positions: Sequence[Array], num_envs: int) -> None:
@@ -53,8 +55,8 @@ class SensorModel:
         self._pad_of = np.repeat(np.arange(pads), self._sizes)
         self._positions = positions
         self._level = {name: np.zeros(num_envs) for name in SENSOR_QUANTITIES}
-        self._gain = np.ones((num_envs, pads))
-        self._turn = np.zeros((num_envs, pads))
+        self.gain = np.ones((num_envs, pads))
+        self.turn = np.zeros((num_envs, pads))
         self._found = np.ones((num_envs, total), dtype=bool)
         self._noise_factor = np.ones((num_envs, total))
         self._input: Array | None = None  # forces of the last reading, (N, markers, k)
@@ -64,7 +66,7 @@ class SensorModel:
     @cached_property
     def _neighbours(self) -> tuple[NDArray[np.int64], Array]:
         """Nearest markers of each marker and their inverse distances; computed when an effect needs them."""
-        return _nearest(self._positions)
+        return nearest_markers(self._positions)
 
     @property
     def ideal(self) -> bool:
@@ -75,7 +77,7 @@ class SensorModel:
         """New pads in the environments `which`; `sampled` has the levels of all effects, (n,) each."""
         for name, level in self._level.items():
             level[which] = sampled[name]
-        count, pads, total = int(which.sum()), self._gain.shape[1], len(self._pad_of)
+        count, pads, total = int(which.sum()), self.gain.shape[1], len(self._pad_of)
 
         def spread(name: str, size: int) -> Array:
             level = sampled[name]
@@ -85,8 +87,8 @@ class SensorModel:
             level = sampled[name]
             return rng.random((count, total)) < level[:, None] if level.any() else np.zeros((count, total), dtype=bool)
 
-        self._gain[which] = np.exp(spread("pad_gain", pads))
-        self._turn[which] = spread("pad_turn", pads)
+        self.gain[which] = np.exp(spread("pad_gain", pads))
+        self.turn[which] = spread("pad_turn", pads)
         self._found[which] = ~chosen("dead_markers")
         self._noise_factor[which] = np.where(chosen("noisy_markers"), _NOISY, 1.0)
         self.clear(which)
@@ -99,7 +101,7 @@ class SensorModel:
         """Copy the pads of `other_rows` of another model to `rows`, with gels at rest."""
         for name, level in self._level.items():
             level[rows] = other._level[name][other_rows]
-        for name in ("_gain", "_turn", "_found", "_noise_factor"):
+        for name in ("gain", "turn", "_found", "_noise_factor"):
             getattr(self, name)[rows] = getattr(other, name)[other_rows]
         self._at_rest[rows] = True
 
@@ -120,7 +122,7 @@ class SensorModel:
         if (crosstalk := self._level["crosstalk"][rows]).any():
             near = reading[:, self._neighbours[0][:, :_NEIGHBOURS]].mean(2)
             reading += crosstalk[:, None, None] * (near - reading)
-        if not (self._gain[rows] == 1).all() or self._turn[rows].any():
+        if not (self.gain[rows] == 1).all() or self.turn[rows].any():
             reading = self._transformed(reading, rows)
         if (drift := self._level["pad_drift"][rows]).any():
             shift = rng.standard_normal((len(rows), len(self._sizes), 2))
@@ -154,8 +156,8 @@ class SensorModel:
 
     def _transformed(self, reading: Array, rows: NDArray[np.int64]) -> Array:
         """The reading with each pad's gain and the rotation of its camera."""
-        scaled = reading * self._gain[rows][:, self._pad_of, None]
-        turn = self._turn[rows][:, self._pad_of]
+        scaled = reading * self.gain[rows][:, self._pad_of, None]
+        turn = self.turn[rows][:, self._pad_of]
         cos, sin = np.cos(turn), np.sin(turn)
         x, y = scaled[..., 0].copy(), scaled[..., 1].copy()
         scaled[..., 0], scaled[..., 1] = cos * x - sin * y, sin * x + cos * y
@@ -177,7 +179,7 @@ class SensorModel:
         return reading
 
 
-def _nearest(positions: Sequence[Array]) -> tuple[NDArray[np.int64], Array]:
+def nearest_markers(positions: Sequence[Array]) -> tuple[NDArray[np.int64], Array]:
     """Nearest markers of each marker on its own pad, by distance: indices and inverse distances, (markers, candidates).
 
     A pad with fewer markers repeats its last one, with inverse distance 0.

@@ -1,0 +1,1 @@
+"""Calibration: fits the simulator to recorded insertions."""

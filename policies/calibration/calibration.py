@@ -1,0 +1,169 @@
+"""A calibration: parameters with intervals, errors on insertions that were not fitted, and what to record next."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
+from gelflow.policies.calibration.parameters import Parameter
+from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.calibration.suggestions import Suggestion, suggest
+from gelflow.sim.tasks.insertion import NOMINAL
+
+Array = NDArray[np.float64]
+
+KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
+ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
+_CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter with its 95 % interval."""
+
+    parameter: Parameter
+    value: float
+    low: float
+    high: float
+    relative_width: float  # of the interval, relative to that of the prior
+
+    @property
+    def verdict(self) -> str:
+        """Whether the recordings determine the parameter: known, partly or unknown."""
+        return "known" if self.relative_width < KNOWN else "partly" if self.relative_width < PARTLY else "unknown"
+
+
+@dataclass(frozen=True)
+class FlowMaps:
+    """Recorded flow maps of n attempts, and simulated ones before and after the calibration, (n, markers, 2)."""
+
+    recorded: Array
+    before: Array
+    after: Array
+    insertion: NDArray[np.int64]  # (n,)
+
+    def error(self, simulated: Array) -> float:
+        """Root mean square difference of a component of a marker vector."""
+        return float(np.sqrt(((simulated - self.recorded) ** 2).mean()))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Result of `calibrate`. Flow maps and noise are in `unit`."""
+
+    estimates: tuple[Estimate, ...]
+    correlated: tuple[tuple[str, str, float], ...]  # pairs of parameters that only their combination determines
+    fitted: FlowMaps
+    held_out: FlowMaps | None  # None: there was one insertion only
+    noise: float  # standard deviation of the difference of two readings of a marker
+    unit: str
+    suggestions: tuple[Suggestion, ...]
+    fit: FitResult
+
+    @property
+    def explained(self) -> bool | None:
+        """Whether the errors of held-out flow maps are at most `ALLOWED_ERROR` times the noise; None: none held out."""
+        maps = self.held_out
+        return None if maps is None else maps.error(maps.after) <= ALLOWED_ERROR * self.noise
+
+    def not_modelled(self) -> str:
+        """One line about the difference between held-out and simulated flow maps beyond the noise."""
+        maps = self.held_out
+        if maps is None or self.explained:
+            return ""
+        rest = maps.after - maps.recorded
+        sides = rest.reshape(len(rest), 2, -1, 2)
+        power = (sides**2).mean((0, 2))
+        shift = float((sides.mean(2) ** 2).mean() / (sides**2).mean())
+        side, axis = np.unravel_index(int(power.argmax()), power.shape)
+        times = maps.error(maps.after) / max(self.noise, 1e-30)
+        return (
+            f"not modelled: held-out flow maps differ by {times:.1f} times the noise; {100 * shift:.0f} % of this is a "
+            f"common shift of all markers of a pad; the largest part is on the {('left', 'right')[side]} pad along "
+            f"{'xy'[axis]}"
+        )
+
+
+def calibrate(
+    recordings: Recordings,
+    *,
+    seed: int = 0,
+    settings: FitSettings | None = None,
+    processes: int = 1,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Calibration:
+    """Fit the simulator to recordings; the last insertion is held out if there are several.
+
+    Raises UsageError without attempts, SimulationError when no start can be simulated.
+    """
+    insertions = np.unique(recordings.insertion)
+    training = recordings.of(insertions[:-1]) if len(insertions) > 1 else recordings
+    result = fit(training, seed=seed, settings=settings, processes=processes, progress=progress)
+    problem = Problem(training)
+    rng = np.random.default_rng((seed, 0xCA1))
+    point = result.best.point[: result.count]
+    held_out = None
+    if len(insertions) > 1:
+        held_out = _flow_maps(Problem(recordings.of(insertions[-1:])), point, rng)
+    return Calibration(
+        _estimates(problem.fitted, result),
+        _pairs(problem.fitted, result),
+        _flow_maps(problem, point, rng, poses=result),
+        held_out,
+        recordings.noise(),
+        recordings.unit,
+        tuple(suggest(problem, result)),
+        result,
+    )
+
+
+def _estimates(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[Estimate, ...]:
+    low, high = result.interval
+    return tuple(
+        Estimate(
+            p,
+            float(p.value(result.best.point[i])),
+            float(p.value(low[i])),
+            float(p.value(high[i])),
+            float((high[i] - low[i]) / (2 * 1.96)),
+        )
+        for i, p in enumerate(fitted)
+    )
+
+
+def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str, str, float], ...]:
+    spread = np.sqrt(np.diag(result.covariance))
+    correlation = result.covariance / np.outer(spread, spread)
+    found = [
+        (fitted[i].name, fitted[j].name, float(correlation[i, j]))
+        for i in range(len(fitted))
+        for j in range(i + 1, len(fitted))
+        if abs(correlation[i, j]) > _CORRELATED
+    ]
+    return tuple(sorted(found, key=lambda pair: -abs(pair[2])))
+
+
+def _flow_maps(problem: Problem, point: Array, rng: np.random.Generator, *, poses: FitResult | None = None) -> FlowMaps:
+    """Flow maps with the scene's values and with calibrated ones; poses and start heights are searched for both.
+
+    With `poses` those of a fit are taken for the calibrated values.
+    """
+    before = find_poses(problem, _scene_point(problem), rng)
+    after = find_poses(problem, point, rng) if poses is None else (poses.best.point, poses.best.misalignment)
+    recorded = problem.recorded_flow()
+    return FlowMaps(recorded, problem.flow(*before), problem.flow(*after), problem.recordings.insertion)
+
+
+def _scene_point(problem: Problem) -> Array:
+    """Whitened parameters with the values of the scene, and the force and height of the lab file."""
+    point = np.zeros(len(problem.fitted))
+    nominal = NOMINAL.sample(np.random.default_rng(0), 1, friction="elastic")
+    for i, parameter in enumerate(problem.fitted):
+        if parameter.name in nominal and not parameter.name.startswith("grasp"):
+            value = 0.0 if parameter.name == "crosstalk" else nominal[parameter.name]
+            point[i] = float(np.squeeze(parameter.whitened(np.asarray(value))))
+    return point

@@ -1,0 +1,70 @@
+"""How often the intervals of calibrations contain the truth, in random worlds that differ more than in training."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import GelflowError
+from gelflow.policies.calibration.calibration import calibrate
+from gelflow.policies.calibration.fit import FitSettings
+from gelflow.policies.calibration.worlds import record_world
+
+
+def measure_coverage(
+    seeds: Sequence[int],
+    *,
+    settings: FitSettings | None = None,
+    processes: int = 1,
+    progress: Callable[[dict[str, Any]], None] = lambda world: None,
+) -> dict[str, Any]:
+    """Calibrate from five insertions in the world of each seed; returns each world's results and the counts.
+
+    A world counts as covered when every parameter that is reported as known lies in its interval. Worlds that cannot
+    be recorded, because the gripper loses the part or no attempt has contact, are listed as refused.
+    """
+    worlds = []
+    for seed in seeds:
+        worlds.append(_world(seed, settings, processes))
+        progress(worlds[-1])
+    done = [world for world in worlds if "refused" not in world]
+    known = [entry for world in done for entry in world["known"].values()]
+    return {
+        "worlds": len(done),
+        "refused": len(worlds) - len(done),
+        "covered_worlds": sum(world["covered"] for world in done),
+        "known": len(known),
+        "known_in_interval": sum(known),
+        "results": worlds,
+    }
+
+
+def _world(seed: int, settings: FitSettings | None, processes: int) -> dict[str, Any]:
+    try:
+        world = record_world(seed)
+        begun = time.process_time()
+        result = calibrate(world.recordings, seed=seed, settings=settings, processes=processes)
+    except GelflowError as error:
+        return {"seed": seed, "refused": str(error)}
+    known = {
+        e.parameter.name: bool(e.low <= world.truth[e.parameter.name] <= e.high)
+        for e in result.estimates
+        if e.verdict == "known"
+    }
+    all_in = {e.parameter.name: bool(e.low <= world.truth[e.parameter.name] <= e.high) for e in result.estimates}
+    held_out = result.held_out
+    return {
+        "seed": seed,
+        "attempts": len(world.recordings),
+        "known": known,
+        "covered": all(known.values()),
+        "outside": [name for name, inside in all_in.items() if not inside],
+        "verdicts": {e.parameter.name: e.verdict for e in result.estimates},
+        "residual": result.fit.best.chi,
+        "noise": result.noise,
+        "held_out_before": None if held_out is None else held_out.error(held_out.before),
+        "held_out_after": None if held_out is None else held_out.error(held_out.after),
+        "rms": float(np.sqrt((world.recordings.flow**2).mean())),
+        "cpu_seconds": round(time.process_time() - begun, 1),
+    }

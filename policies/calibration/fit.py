@@ -1,0 +1,216 @@
+"""The fit: Levenberg-Marquardt steps in the parameters, alternated with a search of the poses, from several starts.
+
+The starts are independent. The forces have kinks and steps where contact points cross edges of the hole, so that starts
+can end in different minima; their spread is part of the intervals.
+"""
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import SimulationError
+from gelflow.policies.calibration.poses import best_poses, draw_poses
+from gelflow.policies.calibration.problem import MODEL_ERROR, Problem, huber_weights
+from gelflow.policies.calibration.recordings import Recordings
+
+Array = NDArray[np.float64]
+
+# Allowed error of the model while the search narrows, relative to the flow maps.
+_MODEL_ERRORS = (0.3, 0.15, 0.08, 0.04, MODEL_ERROR, MODEL_ERROR)
+_SEARCH = np.array([2e-3, 2e-3, np.radians(4)])  # spread of new poses around the present ones, at first [m, m, rad]
+_AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Effort of a fit."""
+
+    starts: int = 4  # independent fits
+    points: int = 2  # random points of which the best begins a fit
+    poses: int = 64  # random poses of each insertion, per search
+    steps: int = 3  # of Levenberg-Marquardt between two searches
+
+
+@dataclass(frozen=True)
+class StartResult:
+    """The end of one start."""
+
+    point: Array  # whitened unknowns, see `Problem`
+    misalignment: Array  # (insertions, 3)
+    covariance: Array  # of the unknowns, with these poses
+    cost: float
+    chi: float  # root mean square of the whitened residuals
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """All starts that fit about equally well, the best first."""
+
+    starts: tuple[StartResult, ...]
+    count: int  # number of parameters; the other unknowns are start heights
+
+    @property
+    def best(self) -> StartResult:
+        """The start with the lowest cost."""
+        return self.starts[0]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the whitened parameters within a start, the mean of the starts."""
+        return np.asarray(np.mean([start.covariance[: self.count, : self.count] for start in self.starts], axis=0))
+
+    @property
+    def interval(self) -> tuple[Array, Array]:
+        """95 % intervals of the whitened parameters: from the lowest to the highest limit of all starts."""
+        spread = [1.96 * np.sqrt(np.diag(start.covariance)[: self.count]) for start in self.starts]
+        points = [start.point[: self.count] for start in self.starts]
+        low = np.min([p - s for p, s in zip(points, spread, strict=True)], axis=0)
+        high = np.max([p + s for p, s in zip(points, spread, strict=True)], axis=0)
+        return low, high
+
+
+def fit(
+    recordings: Recordings,
+    *,
+    seed: int = 0,
+    settings: FitSettings | None = None,
+    processes: int = 1,
+    progress: Callable[[int], None] = lambda done: None,
+) -> FitResult:
+    """Fit parameters, start heights and poses. Results do not depend on the number of `processes`.
+
+    Raises UsageError without attempts, SimulationError when no start can be simulated.
+    """
+    settings = settings or FitSettings()
+    count = len(Problem(recordings, threads=1).fitted)
+    jobs = [(recordings, seed, k, settings) for k in range(settings.starts)]
+    results: list[StartResult | None] = []
+    if processes <= 1:
+        for job in jobs:
+            results.append(_fit_start(*job))
+            progress(len(results))
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+            futures = [pool.submit(_fit_start, *job) for job in jobs]
+            for done, _ in enumerate(as_completed(futures)):
+                progress(done + 1)
+            results = [future.result() for future in futures]
+    ended = sorted((result for result in results if result is not None), key=lambda result: result.cost)
+    if not ended:
+        raise SimulationError("the recorded descents cannot be simulated with any start of the fit")
+    limit = _AS_GOOD * ended[0].chi
+    return FitResult(tuple(result for result in ended if result.chi <= limit), count)
+
+
+def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSettings) -> StartResult | None:
+    """One start; None when it cannot be simulated."""
+    rng = np.random.default_rng((seed, index))
+    problem = Problem(recordings, threads=1)
+    try:
+        point, poses = _first(problem, rng, settings, with_center=index == 0)
+        return _descend(problem, point, poses, rng, settings)
+    except SimulationError:
+        return None
+
+
+def _insertions(problem: Problem) -> int:
+    return int(problem.recordings.insertion.max()) + 1
+
+
+def _first(
+    problem: Problem, rng: np.random.Generator, settings: FitSettings, *, with_center: bool
+) -> tuple[Array, Array]:
+    """The best of random points of the prior, each with the best of random poses."""
+    found = []
+    problem.set_model_error(_MODEL_ERRORS[0])
+    for k in range(settings.points):
+        point = np.zeros(problem.size)
+        if k or not with_center:
+            point[: len(problem.fitted)] = 0.8 * np.clip(rng.normal(size=len(problem.fitted)), -1.7, 1.7)
+        candidates = [draw_poses(problem, i, settings.poses, rng) for i in range(_insertions(problem))]
+        found.append(_searched(problem, point, candidates))
+    _, point, poses = min(found, key=lambda item: item[0])
+    return point, poses
+
+
+def _searched(problem: Problem, point: Array, candidates: list[Array]) -> tuple[float, Array, Array]:
+    """The cost, the point with the best start heights, and the best poses."""
+    poses, costs, heights = best_poses(problem, point, candidates)
+    point = point.copy()
+    for i in range(len(candidates)):
+        rows = np.flatnonzero(problem.recordings.insertion == i)
+        point[len(problem.fitted) + rows] = heights[i][0]
+    prior = 0.5 * float(point[: len(problem.fitted)] @ point[: len(problem.fitted)])
+    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in poses])
+
+
+def _descend(
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
+) -> StartResult:
+    """Steps and searches with a decreasing error of the model."""
+    for round_, error in enumerate(_MODEL_ERRORS):
+        problem.set_model_error(error)
+        point, cost, _ = levenberg_marquardt(problem, point, poses, settings.steps)
+        if round_ == len(_MODEL_ERRORS) - 1:
+            break
+        half = settings.poses // 2
+        around = rng.normal(size=(len(poses), half, 3)) * _SEARCH * rng.choice([1.0, 0.3], (len(poses), half, 1))
+        candidates = [
+            np.vstack([poses[i], poses[i] + around[i] / (1 + 0.5 * round_), draw_poses(problem, i, half, rng)])
+            for i in range(len(poses))
+        ]
+        better, moved, searched = _searched(problem, point, candidates)
+        if better < cost:
+            point, poses = moved, searched
+    line = problem.linearize(point, poses)
+    residuals = line.residuals.reshape(-1)
+    jacobian = line.jacobian.reshape(len(residuals), -1)
+    chi = float(np.sqrt((huber_weights(residuals) * residuals**2).mean()))
+    information, _ = problem.normal_equations(residuals / max(1.0, chi), jacobian / max(1.0, chi), point)
+    return StartResult(
+        point, poses, np.asarray(np.linalg.inv(information), dtype=float), problem.cost(line.residuals, point), chi
+    )
+
+
+def levenberg_marquardt(
+    problem: Problem, point: Array, poses: Array, steps: int, damping: float = 1e-2
+) -> tuple[Array, float, float]:
+    """Up to `steps` Levenberg-Marquardt steps with fixed poses; returns the point, its cost and the damping.
+
+    The Jacobian is exact at the start, then follows the residuals (Broyden's update) until a step fails.
+    """
+    residuals, ok = problem.residuals(point, poses)
+    if not ok:
+        raise SimulationError("a recorded descent cannot be simulated at the start of the fit")
+    cost = problem.cost(residuals, point)
+    line = problem.linearize(point, poses)
+    r = line.residuals.reshape(-1)
+    jacobian = line.jacobian.reshape(len(r), -1)
+    fresh = True
+    for _ in range(steps):
+        normal, gradient = problem.normal_equations(r, jacobian, point)
+        before = cost
+        for _ in range(6):
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            step *= min(1.0, 1.5 / np.abs(step).max())
+            trial = np.clip(point + step, -4.0, 4.0)
+            r_trial, ok = problem.residuals(trial, poses)
+            trial_cost = problem.cost(r_trial, trial)
+            if ok and trial_cost < cost:
+                moved, changed = trial - point, r_trial.reshape(-1) - r
+                jacobian = jacobian + np.outer(changed - jacobian @ moved, moved) / (moved @ moved)
+                point, cost, damping, r = trial, trial_cost, max(damping / 5, 1e-8), r_trial.reshape(-1)
+                fresh = False
+                break
+            damping = min(damping * 8, 1e8)
+        if before - cost < 1e-3 * max(1.0, abs(cost)):
+            if fresh:
+                break
+            line = problem.linearize(point, poses)
+            jacobian, damping, fresh = line.jacobian.reshape(len(r), -1), 1e-2, True
+    return point, cost, damping

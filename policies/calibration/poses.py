@@ -1,0 +1,130 @@
+"""Search of the misalignment of each insertion: random poses, compared with the recorded flow maps."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, in_hole
+
+Array = NDArray[np.float64]
+
+_FREE = (1.3e-3, 1.3e-3, np.radians(2.5))  # standard deviation of the pose of an inserted part in its hole [m, m, rad]
+_HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
+_SHORTLIST = 6
+_POSES = 192  # candidates of `find_poses` for each insertion
+
+
+def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Generator) -> Array:
+    """Misalignments (count, 3) of an insertion from their prior: the task's, and that the part was inserted."""
+    task = problem.recordings.task
+    limit = np.maximum(np.asarray(task.misalignment), 1e-9)
+    found = problem.recordings.inserted.get(insertion)
+    if found is None:
+        return task.draw_misalignment(rng, count)
+    result = np.zeros((0, 3))
+    while len(result) < count:
+        # in_hole(misalignment, found) is a pose in the hole.
+        pose = rng.normal(size=(8 * count, 3)) * _FREE
+        yaw = pose[:, 2] - found[2]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x = pose[:, 0] - cos * found[0] + sin * found[1]
+        y = pose[:, 1] - sin * found[0] - cos * found[1]
+        drawn = np.column_stack([x, y, yaw])
+        inside = drawn[(np.abs(drawn) <= 1.2 * limit).all(1)]
+        result = np.vstack([result, inside if len(inside) else drawn])
+    return result[:count]
+
+
+def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
+    """Negative log prior of misalignments (m, 3)."""
+    found = problem.recordings.inserted.get(insertion)
+    if found is None:
+        return np.zeros(len(poses))
+    return np.asarray(0.5 * ((in_hole(poses, found[None]) / _FREE) ** 2).sum(1))
+
+
+def best_poses(
+    problem: Problem, point: Array, candidates: list[Array], *, shortlist: int = _SHORTLIST
+) -> tuple[list[Array], list[Array], list[Array]]:
+    """The best candidates of each insertion: poses (k, 3), their costs (k,), and start heights (k, attempts) [sd].
+
+    Candidates are first compared up to the size of the flow maps, which depends on the start height, then with the best
+    of several start heights.
+    """
+    short = [_by_shape(problem, point, i, poses, shortlist) for i, poses in enumerate(candidates)]
+    return _with_heights(problem, point, short)
+
+
+def _rows(problem: Problem, insertion: int) -> NDArray[np.int64]:
+    return np.flatnonzero(problem.recordings.insertion == insertion)
+
+
+def _simulate(
+    problem: Problem, point: Array, rows: NDArray[np.int64], poses: Array, heights: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    values = {name: np.full(len(rows), value) for name, value in problem.values(point).items()}
+    return problem.predicted(values, rows, poses, heights)
+
+
+def _by_shape(problem: Problem, point: Array, insertion: int, poses: Array, keep: int) -> Array:
+    """The poses whose flow maps have the shape of the recorded ones."""
+    attempts, m = _rows(problem, insertion), len(poses)
+    if not len(attempts):
+        return poses[:keep]
+    rows = np.repeat(attempts, m)
+    z = np.repeat(problem.heights(point)[attempts], m)
+    flow, ok = _simulate(problem, point, rows, np.tile(poses, (len(attempts), 1)), z)
+    model = problem.whiten(flow, rows)
+    data = problem.whiten(problem.data[rows], rows)
+    scale = np.clip((model * data).sum(1) / np.maximum((model**2).sum(1), 1e-12), 0.2, 5.0)
+    cost = np.where(ok, huber(scale[:, None] * model - data).sum(1) / CORRELATED, 1e9).reshape(len(attempts), m).sum(0)
+    return poses[np.argsort(cost + prior_cost(problem, insertion, poses))[:keep]]
+
+
+def _with_heights(problem: Problem, point: Array, short: list[Array]) -> tuple[list[Array], list[Array], list[Array]]:
+    """Costs of poses with the best start height of each attempt."""
+    count = len(problem.fitted)
+    costs, heights = [], []
+    for insertion, poses in enumerate(short):
+        attempts, m, h = _rows(problem, insertion), len(poses), len(_HEIGHTS)
+        rows = np.repeat(attempts, m * h)
+        present = point[count:][rows]
+        tried = np.tile(_HEIGHTS, len(attempts) * m)
+        tried = np.where(tried == 0, present, tried)
+        flow, ok = _simulate(
+            problem,
+            point,
+            rows,
+            np.tile(np.repeat(poses, h, 0), (len(attempts), 1)),
+            problem.recordings.height_spread * tried,
+        )
+        fit = huber(problem.whiten(flow - problem.data[rows], rows)).sum(1) / CORRELATED + 0.5 * tried**2
+        cost = np.where(ok, fit, 1e9).reshape(len(attempts), m, h)
+        best = cost.argmin(2)
+        chosen = np.take_along_axis(tried.reshape(cost.shape), best[..., None], 2)[..., 0]
+        total = cost.min(2).sum(0) + prior_cost(problem, insertion, poses)
+        order = np.argsort(total)
+        short[insertion] = poses[order]
+        costs.append(total[order])
+        heights.append(chosen.T[order])
+    return short, costs, heights
+
+
+def find_poses(problem: Problem, parameters: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses."""
+    point = np.zeros(problem.size)
+    point[: len(parameters)] = parameters
+    insertions = int(problem.recordings.insertion.max()) + 1
+    best: list[Array] | None = None
+    for spread in (None, 2e-3, 1e-3):
+        candidates = []
+        for i in range(insertions):
+            drawn = draw_poses(problem, i, _POSES if spread is None else _POSES // 2, rng)
+            if best is not None and spread is not None:
+                near = best[i][0] + rng.normal(size=(_POSES // 2, 3)) * spread * np.array([1.0, 1.0, 35.0])
+                drawn = np.vstack([best[i], near, drawn])
+            candidates.append(drawn)
+        best, _, heights = best_poses(problem, point, candidates)
+    assert best is not None
+    for i in range(insertions):
+        point[len(parameters) + _rows(problem, i)] = heights[i][0]
+    return point, np.stack([poses[0] for poses in best])

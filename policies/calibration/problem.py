@@ -1,0 +1,183 @@
+"""The least-squares problem of a calibration: residuals of flow maps, priors, and their derivatives."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.policies.calibration.pad_model import PadModel
+from gelflow.policies.calibration.parameters import Parameter, parameters
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.calibration.shear_model import QUANTITIES, Descents, ShearModel
+
+Array = NDArray[np.float64]
+
+MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
+CORRELATED = 9.0  # neighbouring markers that share this error: their residuals count as one
+DRIFT = 1e-3  # standard deviation of a common shift of all markers of a pad [N]
+_HUBER = 3.0  # residuals beyond this many standard deviations count linearly
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """Residuals of all attempts at a point, and their Jacobian."""
+
+    residuals: Array  # (n, markers * 2), whitened
+    jacobian: Array  # (n, markers * 2, unknowns)
+
+
+class Problem:
+    """Residuals of recorded flow maps as a function of whitened unknowns.
+
+    The unknowns are the parameters, then the start height of each attempt; all have a standard normal prior. Poses are
+    separate: the forces do not change with a pose until a contact point crosses an edge of the hole, so that poses have
+    no useful gradient and are searched (`gelflow.policies.calibration.poses`).
+    """
+
+    def __init__(self, recordings: Recordings, *, threads: int | None = None) -> None:
+        if not len(recordings):
+            raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
+        self.recordings = recordings
+        self.fitted: tuple[Parameter, ...] = parameters(recordings)
+        self.model = ShearModel(recordings.task, settle=recordings.settle, threads=threads)
+        self._pads = PadModel([pad.positions for pad in self.model.scene.pads])
+        self._scale = 1.0 if recordings.unit == "N" else _displacement_scale(self.model)
+        n = len(recordings)
+        flow = recordings.flow.reshape(n, -1, 2) / self._scale
+        self.data = flow
+        self.markers = flow.shape[1]
+        self.noise = recordings.noise() / self._scale
+        self._power = np.sqrt((flow**2).mean((1, 2)))
+        self.set_model_error(MODEL_ERROR)
+
+    def set_model_error(self, relative: float) -> None:
+        """Set the error of flow maps that residuals allow for; large values make the cost smooth."""
+        self.sigma: Array = np.sqrt(self.noise**2 + (relative * self._power) ** 2 + 1e-12)
+        # Subtracting this part of a pad's mean whitens residuals with a common shift.
+        self._shift = 1 - self.sigma / np.sqrt(self.sigma**2 + self.markers * DRIFT**2)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.fitted) + len(self.recordings)
+
+    def values(self, point: Array) -> dict[str, Array]:
+        """Values of the parameters from points (…, unknowns)."""
+        return {p.name: p.value(point[..., i]) for i, p in enumerate(self.fitted)}
+
+    def heights(self, point: Array) -> Array:
+        """Start heights (…, n) [m] from points (…, unknowns)."""
+        return self.recordings.height_spread * point[..., len(self.fitted) :]
+
+    def predicted(
+        self, values: Mapping[str, Array], rows: NDArray[np.int64], misalignment: Array, z: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Flow maps (m, markers, 2) [N] of the attempts `rows` (m,), and whether they could be simulated."""
+        pose = in_hole(misalignment, self.recordings.planar_pose[rows])
+        shear, ok = self.model.shear(
+            {name: values[name] for name in QUANTITIES}, Descents(pose, z, self.recordings.depth[rows])
+        )
+        return self._pads.read(shear, values), ok
+
+    def flow(self, point: Array, misalignment: Array) -> Array:
+        """Flow maps (n, markers, 2) of all attempts, in the unit of the recordings; zero where a simulation fails."""
+        n = len(self.recordings)
+        values = {name: np.full(n, value) for name, value in self.values(point).items()}
+        poses = misalignment[self.recordings.insertion]
+        return self._scale * self.predicted(values, np.arange(n), poses, self.heights(point))[0]
+
+    def recorded_flow(self) -> Array:
+        """Recorded flow maps (n, markers, 2), in the unit of the recordings."""
+        return self._scale * self.data
+
+    def whiten(self, difference: Array, rows: NDArray[np.int64]) -> Array:
+        """Whitened residuals (m, markers * 2) of differences (m, markers, 2) of the attempts `rows`."""
+        per_pad = difference.reshape(len(rows), 2, -1, 2)
+        per_pad = per_pad - self._shift[rows][:, None, None, None] * per_pad.mean(2, keepdims=True)
+        return np.asarray(per_pad.reshape(len(rows), -1) / self.sigma[rows][:, None])
+
+    def residuals(self, point: Array, misalignment: Array) -> tuple[Array, bool]:
+        """Whitened residuals (n, markers * 2) with the misalignment (insertions, 3) of each insertion."""
+        n = len(self.recordings)
+        values = {name: np.full(n, value) for name, value in self.values(point).items()}
+        rows = np.arange(n)
+        flow, ok = self.predicted(values, rows, misalignment[self.recordings.insertion], self.heights(point))
+        return self.whiten(flow - self.data, rows), bool(ok.all())
+
+    def normal_equations(self, residuals: Array, jacobian: Array, point: Array) -> tuple[Array, Array]:
+        """Gauss-Newton Hessian and gradient of `cost`, from flat residuals (m,) and their Jacobian (m, unknowns)."""
+        weights = huber_weights(residuals) / CORRELATED
+        return jacobian.T @ (weights[:, None] * jacobian) + np.eye(self.size), jacobian.T @ (
+            weights * residuals
+        ) + point
+
+    def linearize(self, point: Array, misalignment: Array) -> Linearization:
+        """Residuals and their exact Jacobian."""
+        n, count = len(self.recordings), len(self.fitted)
+        pose = in_hole(misalignment[self.recordings.insertion], self.recordings.planar_pose)
+        reading, slopes = self._readings(point, Descents(pose, self.heights(point), self.recordings.depth))
+        rows = np.arange(n)
+        jacobian = np.zeros((n, self.markers * 2, self.size))
+        for i in range(count):
+            jacobian[:, :, i] = self.whiten(slopes[i], rows)
+        jacobian[rows, :, count + rows] = self.whiten(slopes[count], rows)
+        return Linearization(self.whiten(reading - self.data, rows), jacobian)
+
+    def reading_slopes(self, point: Array, descents: Descents) -> Array:
+        """Derivatives of readings [N] with respect to the parameters and the start height, (m, markers * 2, count + 1).
+
+        `descents` may be others than the recorded ones.
+        """
+        slopes = self._readings(point, descents)[1]
+        return np.stack([slope.reshape(len(slope), -1) for slope in slopes], -1)
+
+    def _readings(self, point: Array, descents: Descents) -> tuple[Array, list[Array]]:
+        """Readings (m, markers, 2), and their derivatives by each whitened parameter and by the start height."""
+        values = {name: float(value) for name, value in self.values(point).items()}
+        directions = [*QUANTITIES, "z"]
+        shear, slopes = self.model.derivatives({q: values[q] for q in QUANTITIES}, descents, directions)
+        one = {name: np.asarray(value) for name, value in values.items()}
+        of_pads = self._pads.derivatives(shear, values)
+        changes = []
+        for i, parameter in enumerate(self.fitted):
+            name, slope = parameter.name, parameter.slope(float(point[i]))
+            if name in QUANTITIES:
+                changes.append(slope * self._pads.read(slopes[:, directions.index(name)], one))
+            else:
+                changes.append(slope * of_pads[name])
+        changes.append(self.recordings.height_spread * self._pads.read(slopes[:, -1], one))
+        return self._pads.read(shear, one), changes
+
+    def cost(self, residuals: Array, point: Array) -> float:
+        """Robust negative log posterior."""
+        return float(huber(residuals).sum() / CORRELATED + 0.5 * point @ point)
+
+
+def huber(residuals: Array) -> Array:
+    """Half the square of residuals, linear beyond the limit."""
+    size = np.abs(residuals)
+    return np.where(size <= _HUBER, 0.5 * residuals**2, _HUBER * (size - 0.5 * _HUBER))
+
+
+def huber_weights(residuals: Array) -> Array:
+    """Weights of residuals in iteratively reweighted least squares."""
+    return np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12))
+
+
+def in_hole(misalignment: Array, planar_pose: Array) -> Array:
+    """Gripper poses in the hole frame (…, 3) from misalignments and planar poses (…, 3)."""
+    x, y, yaw = np.moveaxis(misalignment, -1, 0)
+    px, py, turn = np.moveaxis(planar_pose, -1, 0)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([x + cos * px - sin * py, y + sin * px + cos * py, yaw + turn], -1)
+
+
+def _displacement_scale(model: ShearModel) -> float:
+    """Displacement of a marker per force of the scene's gel [mm/N]."""
+    forces = np.zeros((1, model.scene.num_markers, 3))
+    forces[0, 0, 0] = 1.0
+    from gelflow.sim.displacement import marker_displacement
+
+    return float(1e3 * marker_displacement(model.scene, forces, np.float64)[0, 0, 0])

@@ -1,0 +1,68 @@
+"""Recorded attempts, as arrays: what a calibration reads of sessions."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.observation import Unit
+from gelflow.task import InsertionTask
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Attempts with contact of one or several insertions, n in all.
+
+    `planar_pose` is that of the gripper in the taught frame of the hole. The misalignment of an insertion is the pose
+    of this frame in the true frame of the hole; with it, the pose of the gripper in the hole frame is known.
+    """
+
+    task: InsertionTask
+    insertion: NDArray[np.int64]  # (n,), counted from 0
+    planar_pose: Array  # x [m], y [m], yaw [rad], shape (n, 3)
+    depth: Array  # of the gripper at the reading, below the start of the attempt [m], shape (n,)
+    flow: Array  # change of the marker vectors since the start, in `unit`, shape (n, pads, rows, cols, 2)
+    unit: Unit
+    # Insertion → planar pose (3,) in which its part entered the hole.
+    inserted: Mapping[int, Array] = field(default_factory=dict)
+    settle: float = 0.0  # time between the end of the motion and the reading [s]
+    grasp_force: float | None = None  # commanded [N]; None: not recorded
+    grasp_height: float | None = None  # of the pad centres above the part's centre, by the lab file [m]
+    height_spread: float = 0.2e-3 / math.sqrt(3)  # standard deviation of the start height of an attempt [m]
+
+    def __len__(self) -> int:
+        return len(self.insertion)
+
+    def of(self, insertions: NDArray[np.int64]) -> "Recordings":
+        """The attempts of some insertions, counted from 0 again."""
+        rows = np.isin(self.insertion, insertions)
+        number = {int(old): new for new, old in enumerate(np.unique(self.insertion[rows]))}
+        return Recordings(
+            self.task,
+            np.array([number[int(i)] for i in self.insertion[rows]], dtype=np.int64),
+            self.planar_pose[rows],
+            self.depth[rows],
+            self.flow[rows],
+            self.unit,
+            {number[i]: pose for i, pose in self.inserted.items() if i in number},
+            self.settle,
+            self.grasp_force,
+            self.grasp_height,
+            self.height_spread,
+        )
+
+    def noise(self) -> float:
+        """Standard deviation of the difference of two readings of a marker, in `unit`.
+
+        From the second differences of the flow maps across rows and columns, in which smooth fields cancel; the median
+        ignores the edges of contacts.
+        """
+        f = self.flow
+        corner = f[:, :, 2:, 2:] + f[:, :, 2:, :-2] + f[:, :, :-2, 2:] + f[:, :, :-2, :-2]
+        edge = f[:, :, 2:, 1:-1] + f[:, :, :-2, 1:-1] + f[:, :, 1:-1, 2:] + f[:, :, 1:-1, :-2]
+        second = corner - 2 * edge + 4 * f[:, :, 1:-1, 1:-1]
+        return float(np.median(np.abs(second)) / 0.6745 / 6)

@@ -1,0 +1,114 @@
+"""Recordings for a calibration, from the sessions of the insertion runner."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import UsageError
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.session.reader import SessionReader
+from gelflow.session.records import Decision
+from gelflow.task import InsertionTask
+
+_SETTLE = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
+_HEIGHT = 0.3e-3  # standard deviation of a part's height in the gripper, per attempt [m]
+
+
+def read_recordings(paths: Sequence[Path]) -> Recordings:
+    """Attempts with contact of one or several sessions of one task.
+
+    Insertions are numbered over all sessions. Raises UsageError when a session is of another task or part, its flow
+    maps are not in millimetres, or there is no attempt with contact.
+    """
+    task: InsertionTask | None = None
+    rows: list[dict[str, Any]] = []
+    inserted: dict[int, np.ndarray[Any, Any]] = {}
+    labs: list[tuple[float, float]] = []
+    number = 0
+    for path in paths:
+        with SessionReader(path) as session:
+            described = session.description()
+            own = _task(path, described)
+            if task is not None and own.to_json() != task.to_json():
+                raise UsageError(f"{path}: the session has another part or task than {paths[0]}; calibrate it alone")
+            task = own
+            labs.append(_grasp(path, described, own))
+            found, entered = _attempts(path, session, number)
+        rows += found
+        inserted |= entered
+        number = max([number, *(row["insertion"] + 1 for row in found), *(i + 1 for i in entered)])
+    if task is None or not rows:
+        raise UsageError(
+            f"{', '.join(map(str, paths))}: no attempt with contact is recorded, so nothing can be fitted; record "
+            "insertions in which the part touches the rim"
+        )
+    keep = sorted({row["insertion"] for row in rows})
+    new = {old: k for k, old in enumerate(keep)}
+    return Recordings(
+        task,
+        np.array([new[row["insertion"]] for row in rows], dtype=np.int64),
+        np.array([row["planar_pose"] for row in rows], dtype=float),
+        np.array([row["depth"] for row in rows], dtype=float),
+        np.stack([row["flow"] for row in rows]),
+        "mm",
+        {new[i]: pose for i, pose in inserted.items() if i in new},
+        settle=_SETTLE,
+        grasp_force=float(np.mean([force for force, _ in labs])),
+        grasp_height=float(np.mean([height for _, height in labs])),
+        height_spread=_HEIGHT,
+    )
+
+
+def _task(path: Path, described: dict[str, Any]) -> InsertionTask:
+    data = described.get("task")
+    if not isinstance(data, dict) or data.get("name") != "insertion":
+        name = data.get("name") if isinstance(data, dict) else data
+        raise UsageError(f"{path}: a calibration needs a session of the task insertion, got {name!r}")
+    return InsertionTask.from_json(dict(data))
+
+
+def _grasp(path: Path, described: dict[str, Any], task: InsertionTask) -> tuple[float, float]:
+    """Commanded grasp force [N], and height of the pad centres above the part's centre [m]."""
+    try:
+        lab = described["lab"]
+        above_face = float(lab["part"]["grasp_height"])
+        return float(lab["gripper"]["grasp_force"]), above_face - task.part.size[2] / 2
+    except (KeyError, TypeError):
+        raise UsageError(f"{path}: the session has no lab file with grasp_force and grasp_height") from None
+
+
+def _attempts(
+    path: Path, session: SessionReader, first: int
+) -> tuple[list[dict[str, Any]], dict[int, np.ndarray[Any, Any]]]:
+    """Attempts with contact, and planar poses of inserted parts, by insertion counted from `first`."""
+    decisions: dict[tuple[int, int], Decision] = {}
+    rows, inserted = [], {}
+    for record in session.records(["/decision", "/attempt"]):
+        value: Any = record.value
+        if record.topic == "/decision":
+            decisions[value.insertion, value.attempt] = value
+            continue
+        insertion = first + int(value["insertion"])
+        planar = np.array(value["planar_pose"], dtype=float)
+        if value["outcome"] == "inserted":
+            inserted[insertion] = planar
+        decision = decisions.get((int(value["insertion"]), int(value["attempt"])))
+        if decision is None or not value["contact"] or value.get("slipped"):
+            continue
+        if decision.unit != "mm":
+            raise UsageError(
+                f"{path}: flow maps are in {decision.unit!r}, expected mm; give the cameras of the lab file a scale"
+            )
+        depth = decision.depths[-1] - decision.depths[0] if decision.depths else float(value["depth"])
+        rows.append({"insertion": insertion, "planar_pose": planar, "depth": depth, "flow": _vectors(decision)})
+    return rows, inserted
+
+
+def _vectors(decision: Decision) -> np.ndarray[Any, Any]:
+    """Marker vectors (pads, rows, cols, 2) of the last frame."""
+    channels, rows, cols = decision.flow.shape
+    sensors = len(decision.tracked)
+    frames = decision.flow.reshape(channels // (2 * sensors), sensors, 2, rows, cols)
+    return np.asarray(frames[-1].transpose(0, 2, 3, 1) * decision.divisor, dtype=float)

@@ -1,0 +1,356 @@
+"""Marker forces of recorded descents as a function of physical parameters, with exact derivatives.
+
+A descent is simulated as in `InsertionAttempts`: the part comes to rest in the closed gripper, far above the hole, and
+is then lowered from a pose in the hole frame. Values of many descents are computed in one batch. Derivatives come from
+forward-mode differentiation of the core (dual numbers), one direction at a time; the grasp at rest, which all descents
+with equal parameters share, is differentiated once.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import SimulationError, UsageError
+from gelflow.geometry import rotation_matrices, yaw_quaternion
+from gelflow.sim import _core
+from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
+from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
+from gelflow.sim.tasks.insertion import ARM_JOINTS, DESCENT_TIME, SETTLE_TIME, insertion_scene, simulator_parameters
+from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
+from gelflow.sim.tasks.parts.part_scene import hole_parameters
+from gelflow.sim.tasks.parts.registry import part_geometry
+from gelflow.task import InsertionTask
+
+Array = NDArray[np.float64]
+
+CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "marker_ks", "hole_kn", "hole_mu")
+QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
+_WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
+POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
+_FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
+
+
+@dataclass(frozen=True)
+class Descents:
+    """Gripper poses of n descents in the hole frame, and their depths."""
+
+    pose: Array  # x [m], y [m], yaw [rad], shape (n, 3)
+    z: Array  # height of the lower face at the start above the task's start height [m], shape (n,)
+    depth: Array  # of the gripper's target at the reading, below the start [m], shape (n,)
+
+    def __getitem__(self, rows: NDArray[np.int64]) -> "Descents":
+        return Descents(self.pose[rows], self.z[rows], self.depth[rows])
+
+
+@dataclass(frozen=True)
+class _Grasp:
+    """The part at rest in the gripper, one row for each descent, or derivatives: then q has nv entries."""
+
+    q: Array
+    anchors: Array
+    u: Array
+    params: Array
+    shear: Array  # (n, markers, 2)
+
+
+class ShearModel:
+    """Change of the shear forces of the markers from the grasp at rest to the end of a descent.
+
+    Parameters
+    ----------
+    task: task of the descents
+    settle: time at the end of a descent until the reading [s]; 0 for the training environment, which reads in motion
+    threads: of the simulator
+    """
+
+    def __init__(self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None) -> None:
+        self.task = task
+        self.scene = insertion_scene(task)
+        self._threads = threads
+        step = self.scene.step
+        self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)
+        self.step_depth = task.descent / round(DESCENT_TIME / step)  # of one step of a descent [m]
+        self._geometry = part_geometry(task.part)
+        self._clear_height = max(0.1, task.part.depth + task.part.size[2])
+        self._part_q = self.scene.q("part").start
+        self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
+        self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
+        self._sims: dict[int, Simulator] = {}
+
+    def _sim(self, count: int) -> Simulator:
+        if count not in self._sims:
+            self._sims.clear()
+            self._sims[count] = Simulator(self.scene, num_envs=count, threads=self._threads)
+        return self._sims[count]
+
+    # Values
+
+    def shear(self, values: Mapping[str, Array], descents: Descents) -> tuple[Array, NDArray[np.bool_]]:
+        """Change of the shear forces (n, markers, 2) [N], and whether the simulation succeeded (n,).
+
+        `values` has the `QUANTITIES`, shape (n,) each.
+        """
+        n = len(descents.depth)
+        sim = self._sim(n)
+        grasp, anchored, held = self._grasp(sim, values)
+        q, controls = self._start(grasp, descents)
+        steps = self._steps(descents.depth)
+        u = np.repeat(controls[None], int(steps.max()) + self._hold_steps, axis=0)
+        z = self._arm_u[2]
+        for i, (count, depth) in enumerate(zip(steps, descents.depth, strict=True)):
+            first = int(steps.max()) - count  # descents end at the same time; before, the gripper is at rest
+            u[first : first + count, i, z] -= depth * np.arange(1, count + 1) / count
+            u[first + count :, i, z] -= depth
+        sim.reset()
+        trajectory = sim.rollout(
+            u, q=q, v=np.zeros_like(sim.v), anchors=grasp.anchors, anchored=anchored, read_after=[len(u)]
+        )
+        ok = (trajectory.status == 0) & held
+        change = trajectory.tactile[0, :, :, :2] - grasp.shear
+        return np.where(ok[:, None, None], change, 0.0), ok
+
+    def _steps(self, depth: Array) -> NDArray[np.int64]:
+        return np.maximum(1, np.round(depth / self.step_depth)).astype(np.int64)
+
+    def _params(self, sim: Simulator, values: Mapping[str, Array]) -> Array:
+        """Parameters of the simulator, (n, parameters)."""
+        params = np.repeat(self._default[None], len(values["pad_kn"]), axis=0)
+        for name, column in self._columns(sim, values).items():
+            params[:, name] = column
+        return params
+
+    @cached_property
+    def _default(self) -> Array:
+        """Parameters of the scene, with a right jaw that is force controlled."""
+        sim = Simulator(self.scene, threads=1)
+        for name in ("hold_right.kp", "hold_right.kd"):
+            sim.param(name)[:] = 0.0
+        return np.array(sim.params[0])
+
+    def _columns(self, sim: Simulator, values: Mapping[str, Array]) -> dict[int, Array]:
+        """Values by column of the parameters; linear in `values` but for the damping of the markers."""
+        damping = np.full_like(values["pad_kn"], NOMINAL_PAD_VALUES["marker_kd"])
+        named = simulator_parameters({"marker_kd": damping, **values}, elastic=True)
+        return {sim.param_index[name]: column for name, column in hole_parameters(self.scene, named).items()}
+
+    def _closed(self, values: Mapping[str, Array], params: Array, sim: Simulator) -> tuple[Array, Array]:
+        """Initial positions and controls of the closing gripper, far above the hole."""
+        n, scene, height = len(params), self.scene, values["grasp_height"]
+        q, u = np.tile(scene.q0, (n, 1)), np.zeros((n, scene.nu))
+        q[:, self._part_q + 2] = self._clear_height
+        q[:, self._arm_q[2]] = self._clear_height + height
+        for finger, pad in _FINGERS:
+            gaps = pad_gaps(scene, self._geometry, pad, height)
+            q[:, scene.q(finger)] += indentation(gaps, values["grasp_force"], values["pad_kn"])[:, None]
+            u[:, scene.u(finger)] = values["grasp_force"]
+        u[:, scene.u("hold_left")] = q[:, scene.q("finger_left").start]
+        u[:, self._arm_u] = q[:, self._arm_q]
+        u[:, self._arm_u[2]] += self._weight(params, sim) / values["arm_stiffness"]
+        return q, u
+
+    def _weight(self, params: Array, sim: Simulator) -> Array:
+        masses = [sim.param_index[f"{body.name}.mass"] for body in self.scene.bodies]
+        return np.asarray(-float(self.scene.gravity[2]) * params[:, masses].sum(1))
+
+    def _grasp(
+        self, sim: Simulator, values: Mapping[str, Array]
+    ) -> tuple[_Grasp, NDArray[np.uint8], NDArray[np.bool_]]:
+        """The part at rest in the gripper, which friction anchors are set, and whether the simulation succeeded."""
+        sim.params[:] = params = self._params(sim, values)
+        sim.reset()
+        q, u = self._closed(values, params, sim)
+        sim.q[:] = q
+        sim.step(u, self._settle_steps)
+        shear = np.array(sim.tactile()[:, :, :2])
+        dropped = np.abs(sim.q[:, self._part_q + 2] - self._clear_height) > 5e-3
+        grasp = _Grasp(sim.q.copy(), sim.anchors.copy(), u, params, shear)
+        return grasp, sim.anchored.copy(), (sim.status == 0) & ~dropped
+
+    def _start(self, grasp: _Grasp, descents: Descents) -> tuple[Array, Array]:
+        """Positions and controls of the grasps at the starts of the descents."""
+        q, u, at = grasp.q.copy(), grasp.u.copy(), self._part_q
+        part = grasp.q[:, at : at + 7]
+        lift = self.task.start_height + self.task.part.size[2] / 2 + descents.z - part[:, 2]
+        x, y, yaw = descents.pose.T
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        q[:, self._arm_q] = np.column_stack([x, y, q[:, self._arm_q[2]] + lift, yaw])
+        q[:, at] = x + cos * part[:, 0] - sin * part[:, 1]
+        q[:, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
+        q[:, at + 2] += lift
+        turn = np.stack([yaw_quaternion(angle) for angle in yaw])
+        q[:, at + 3 : at + 7] = _product(turn, part[:, 3:])
+        u[:, self._arm_u] = np.column_stack([x, y, u[:, self._arm_u[2]] + lift, yaw])
+        return q, u
+
+    # Derivatives
+
+    def derivatives(
+        self, values: Mapping[str, float], descents: Descents, wanted: Sequence[str]
+    ) -> tuple[Array, Array]:
+        """Change of the shear forces (n, markers, 2) [N] and its derivatives (n, directions, markers, 2).
+
+        All descents share `values`. Directions are those of `wanted`, names of `QUANTITIES` [per unit] or `POSE` [per m
+        or rad]. Raises SimulationError when a step fails.
+        """
+        sim = self._sim(1)
+        rows = {name: np.array([value]) for name, value in values.items()}
+        params = self._params(sim, rows)
+        q, u = self._closed(rows, params, sim)
+        anchored = np.zeros(sim.anchors.shape[1], np.uint8)
+        zero = self._zero(sim)
+        start = (params[0], q[0], np.zeros_like(zero.anchors), np.repeat(u, self._settle_steps, 0), anchored)
+        grasp, settled = None, {}
+        for name in wanted:
+            tangent = zero if name in POSE or name in _WITHOUT_GRASP else self._closing(sim, name, rows, params)
+            if grasp is not None and tangent is zero:
+                settled[name] = zero
+                continue
+            end = self._dual(sim, start, tangent)
+            anchored = end.anchored
+            grasp = _state(end.end, u[0], params[0])
+            settled[name] = _state(end.derivative, tangent.u, tangent.params)
+        if grasp is None:
+            raise UsageError("derivatives need at least one direction")
+        for name in wanted:
+            if name in QUANTITIES:
+                settled[name] = _with_params(settled[name], self._param_direction(sim, name, params[0], values))
+        results = [self._descend(sim, grasp, anchored, settled, descents[np.array([i])], wanted)
+                   for i in range(len(descents.depth))]  # fmt: skip
+        return np.stack([r[0] for r in results]), np.stack([r[1] for r in results])
+
+    def _descend(
+        self,
+        sim: Simulator,
+        grasp: _Grasp,
+        anchored: NDArray[np.uint8],
+        settled: Mapping[str, _Grasp],
+        descent: Descents,
+        wanted: Sequence[str],
+    ) -> tuple[Array, Array]:
+        """Value and derivatives of one descent."""
+        one = _Grasp(*(np.asarray(values)[None] for values in vars(grasp).values()))
+        q, controls = self._start(one, descent)
+        count, depth, z = int(self._steps(descent.depth)[0]), float(descent.depth[0]), self._arm_u[2]
+        u = np.repeat(controls, count + self._hold_steps, axis=0)
+        u[:count, z] -= depth * np.arange(1, count + 1) / count
+        u[count:, z] -= depth
+        start = (grasp.params, q[0], grasp.anchors, u, anchored)
+        change, slopes = None, []
+        for name in wanted:
+            tangent = self._placed(sim, name, settled[name], q[0], descent)
+            end = self._dual(sim, start, tangent)
+            change = _shear(end.end.tactile) - grasp.shear
+            slopes.append(_shear(end.derivative.tactile) - settled[name].shear)
+        assert change is not None
+        return change, np.stack(slopes)
+
+    def _zero(self, sim: Simulator) -> _Grasp:
+        markers = (self.scene.num_markers, 2)
+        na = sim.anchors.shape[1:]
+        return _Grasp(
+            np.zeros(sim.model.nv),
+            np.zeros(na),
+            np.zeros(self.scene.nu),
+            np.zeros(sim.params.shape[1]),
+            np.zeros(markers),
+        )
+
+    def _param_direction(self, sim: Simulator, name: str, params: Array, values: Mapping[str, float]) -> Array:
+        """Derivative of the simulator's parameters with respect to a quantity."""
+        direction = np.zeros_like(params)
+        if name in CONTACT_QUANTITIES or name == "arm_stiffness":
+            unit = {key: np.array([float(key == name)]) for key in values}
+            for column, value in self._columns(sim, {**unit, "marker_kd": np.zeros(1)}).items():
+                direction[column] = value[0]
+        return direction
+
+    def _closing(self, sim: Simulator, name: str, values: Mapping[str, Array], params: Array) -> _Grasp:
+        """Derivative of the closing gripper's start with respect to a quantity."""
+        zero, scene = self._zero(sim), self.scene
+        number = {key: float(value[0]) for key, value in values.items()}
+        direction = self._param_direction(sim, name, params[0], number)
+        q, u = zero.q.copy(), zero.u.copy()
+        if name == "grasp_height":
+            q[self._arm_q[2]] = u[self._arm_u[2]] = 1.0
+        if name == "arm_stiffness":
+            u[self._arm_u[2]] = -float(self._weight(params, sim)[0]) / number["arm_stiffness"] ** 2
+        force, kn = number["grasp_force"], number["pad_kn"]
+        for finger, pad in _FINGERS:
+            gaps = pad_gaps(scene, self._geometry, pad, values["grasp_height"])
+            inverse = _points_in_contact(gaps[0], force, kn)
+            # δ = (F / kn + Σ gaps) / k with k points in contact; the first position equals the first velocity here.
+            change = {"grasp_force": inverse / kn, "pad_kn": -inverse * force / kn**2}.get(name, 0.0)
+            q[scene.q(finger).start] = change
+            if finger == "finger_left":
+                u[scene.u("hold_left")] = change
+            u[scene.u(finger)] = float(name == "grasp_force")
+        return _Grasp(q, zero.anchors, u, direction, zero.shear)
+
+    def _placed(self, sim: Simulator, name: str, settled: _Grasp, start: Array, descent: Descents) -> _Grasp:
+        """Derivative of the start of a descent, from that of the grasp at rest and of the pose."""
+        q, u, at = settled.q.copy(), settled.u.copy(), sim.joint_v("part")
+        x, y, yaw = descent.pose[0]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        lift = -q[at + 2]
+        q[at : at + 3] = cos * q[at] - sin * q[at + 1], sin * q[at] + cos * q[at + 1], 0.0
+        q[self._arm_q] = 0.0, 0.0, q[self._arm_q[2]] + lift, 0.0
+        u[self._arm_u] = 0.0, 0.0, u[self._arm_u[2]] + lift, 0.0
+        if name in POSE:
+            axis = ARM_JOINTS.index(f"arm_{name}")
+            q[self._arm_q[axis]] = u[self._arm_u[axis]] = 1.0
+            if name == "yaw":
+                offset = start[self._part_q : self._part_q + 2] - (x, y)
+                q[at : at + 2] += -offset[1], offset[0]
+                # The rotation of a free joint is a tangent vector in the frame of its body.
+                q[at + 3 : at + 6] += rotation_matrices(start[None, self._part_q + 3 : self._part_q + 7])[0][2]
+            else:
+                q[at + axis] += 1.0
+        return _Grasp(q, settled.anchors, u, settled.params, settled.shear)
+
+    def _dual(
+        self, sim: Simulator, start: tuple[Array, Array, Array, Array, NDArray[np.uint8]], tangent: _Grasp
+    ) -> _core.DirectionalRollout:
+        params, q, anchors, u, anchored = start
+        v, history = np.zeros(sim.model.nv), np.zeros(sim.history.shape[1])
+        result = _core.directional_rollout(
+            sim.model,
+            _core.RolloutInput(params=params, q=q, v=v, anchors=anchors, history=history, u=u, anchored=anchored),
+            _core.RolloutInput(
+                params=tangent.params,
+                q=tangent.q,
+                v=v,
+                anchors=tangent.anchors,
+                history=history,
+                u=np.repeat(tangent.u[None], len(u), axis=0),
+            ),
+        )
+        if result.status:
+            raise SimulationError(f"a recorded descent cannot be simulated: {STATUS_MESSAGES[result.status]}")
+        return result
+
+
+def _state(end: _core.RolloutEnd, u: Array, params: Array) -> _Grasp:
+    return _Grasp(np.array(end.q), np.array(end.anchors).reshape(-1, 3), u, params, _shear(end.tactile))
+
+
+def _with_params(grasp: _Grasp, params: Array) -> _Grasp:
+    return _Grasp(grasp.q, grasp.anchors, grasp.u, params, grasp.shear)
+
+
+def _shear(tactile: Array) -> Array:
+    return np.array(tactile).reshape(-1, 3)[:, :2]
+
+
+def _points_in_contact(gaps: Array, force: float, stiffness: float) -> float:
+    """1 / number of the springs in contact, see `indentation`."""
+    count = np.arange(1, len(gaps) + 1)
+    return 1.0 / float(count[np.argmin((force + stiffness * np.cumsum(gaps)) / (stiffness * count))])
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Products of quaternions w x y z, (n, 4)."""
+    w, v, w2, v2 = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
+    return np.hstack([w * w2 - (v * v2).sum(1, keepdims=True), w * v2 + w2 * v + np.cross(v, v2)])

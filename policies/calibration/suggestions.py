@@ -1,0 +1,64 @@
+"""What to record next: attempts whose flow maps have the most information about the parameters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import SimulationError
+from gelflow.policies.calibration.fit import FitResult
+from gelflow.policies.calibration.problem import CORRELATED, Problem
+from gelflow.policies.calibration.shear_model import Descents
+
+Array = NDArray[np.float64]
+
+_DEPTH = 0.8e-3  # of a usual descent that contact stops [m]
+# Text, offset from the centre of the hole [m, m, rad], and depth beyond the usual one [m].
+_CANDIDATES: tuple[tuple[str, tuple[float, float, float], float], ...] = (
+    ("one attempt 4 mm to the side along x", (4e-3, 0.0, 0.0), 0.0),
+    ("one attempt 4 mm to the side along y", (0.0, 4e-3, 0.0), 0.0),
+    ("one attempt with 8° yaw", (0.0, 0.0, np.radians(8)), 0.0),
+    ("one attempt 4 mm along x and y with 5° yaw", (4e-3, 4e-3, np.radians(5)), 0.0),
+    ("one attempt 4 mm along x, pressed 0.5 mm deeper", (4e-3, 0.0, 0.0), 0.5e-3),
+    ("one attempt 4 mm along y, pressed 0.5 mm deeper", (0.0, 4e-3, 0.0), 0.5e-3),
+    ("one attempt 4 mm along x and y with 5° yaw, pressed 0.5 mm deeper", (4e-3, 4e-3, np.radians(5)), 0.5e-3),
+)
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """One attempt, and how it narrows the intervals."""
+
+    text: str
+    pose: tuple[float, float, float]  # of the gripper in the hole frame [m, m, rad]
+    depth: float  # [m]
+    gain: float  # decrease of the parameters' entropy [nat]
+    narrowed: dict[str, float]  # parameter → width of its interval relative to the present one, below 0.9
+
+
+def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggestion]:
+    """The `count` attempts with the highest information, the best first."""
+    information = np.linalg.inv(result.covariance)
+    before = np.sqrt(np.diag(result.covariance))
+    found = []
+    for text, pose, deeper in _CANDIDATES:
+        depth = _DEPTH + deeper
+        try:
+            after = np.linalg.inv(information + _information(problem, result, pose, depth))
+        except SimulationError:
+            continue
+        gain = 0.5 * float(np.linalg.slogdet(result.covariance)[1] - np.linalg.slogdet(after)[1])
+        ratio = np.sqrt(np.diag(after)) / before
+        narrowed = {p.name: float(r) for p, r in zip(problem.fitted, ratio, strict=True) if r < 0.9}
+        found.append(Suggestion(text, pose, depth, gain, narrowed))
+    return sorted(found, key=lambda suggestion: -suggestion.gain)[:count]
+
+
+def _information(problem: Problem, result: FitResult, pose: tuple[float, float, float], depth: float) -> Array:
+    """Fisher information of one attempt about the parameters; its start height is unknown."""
+    descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
+    sigma = float(np.median(problem.sigma))
+    jacobian = problem.reading_slopes(result.best.point, descents)[0] / sigma
+    full = jacobian.T @ jacobian / CORRELATED
+    full[-1, -1] += 1.0
+    return np.asarray(full[:-1, :-1] - np.outer(full[:-1, -1], full[-1, :-1]) / full[-1, -1])

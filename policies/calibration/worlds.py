@@ -1,0 +1,123 @@
+"""Random worlds with known truth, and insertions recorded in them by the simulation without wires."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.observation import FlowMap
+from gelflow.policies.calibration.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
+from gelflow.policies.calibration.problem import in_hole
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.checkpoint import default_checkpoint, load_policy
+from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, InsertionAttempts
+from gelflow.sim.tasks.randomization import Fixed, LogUniform, Randomization, Uniform
+from gelflow.task import INSERTION, InsertionTask
+
+Array = NDArray[np.float64]
+
+_AS_PUBLISHED = ("dead_markers", "noisy_markers", "crosstalk", "gel_creep", "gel_time", "start_height")  # not widened
+
+
+def widened(table: Randomization) -> Randomization:
+    """The table with ranges from a third of the lower limit to three times the upper one; of heights three times."""
+    changes = {}
+    for name in table:
+        given = table[name].distribution
+        if name in _AS_PUBLISHED or isinstance(given, Fixed):
+            continue
+        assert isinstance(given, Uniform | LogUniform)
+        if name == "grasp_height":
+            center, half = (given.low + given.high) / 2, WIDENING * (given.high - given.low) / 2
+            changes[name] = (center - half, center + half)
+        else:
+            changes[name] = (given.low / WIDENING, given.high * WIDENING)
+    return table.replace(**changes)
+
+
+@dataclass(frozen=True)
+class RecordedWorld:
+    """Recordings of a world, and its true values, which the calibration does not see."""
+
+    recordings: Recordings
+    truth: dict[str, float]
+    misalignment: Array  # (insertions, 3), of the recorded insertions
+    noise: float  # standard deviation of the difference of two readings [N]
+
+
+def record_world(
+    seed: int, *, task: InsertionTask = INSERTION, insertions: int = 5, attempts: int = 2, threads: int | None = None
+) -> RecordedWorld:
+    """Insertions with the shipped policy in the world of a seed; the first `attempts` of each are recorded.
+
+    Raises UsageError when the world cannot hold its part, or no attempt has contact.
+    """
+    rng = np.random.default_rng((seed, 0xCA1))
+    drawn = widened(FULL_RANDOMIZATION).sample(rng, 1, friction="elastic")
+    fixed = {name: float(value[0]) for name, value in drawn.items()}
+    world = InsertionAttempts(
+        insertions,
+        task=task,
+        randomization=FULL_RANDOMIZATION.replace(**fixed),
+        threads=threads,
+    )
+    misalignment = task.draw_misalignment(rng, insertions)
+    world.draw(rng, misalignment=misalignment)
+    all_rows = np.arange(insertions)
+    world.sensors.copy(all_rows, world.sensors, np.zeros_like(all_rows))  # the same pads in all insertions
+    policies = [load_policy(default_checkpoint(), task=task) for _ in range(insertions)]
+    planar, active = np.zeros((insertions, 3)), np.ones(insertions, dtype=bool)
+    rows: list[tuple[int, Array, float, Array]] = []
+    inserted: dict[int, Array] = {}
+    for attempt in range(task.attempts):
+        if not active.any():
+            break
+        world.pose[:] = in_hole(misalignment, planar)
+        result = world.attempt(rng, which=active)
+        for k, i in enumerate(np.flatnonzero(active)):
+            if result.failed[k]:
+                raise UsageError(f"world {seed} cannot be simulated")
+            if result.inserted[k]:
+                inserted[int(i)] = planar[i].copy()
+                active[i] = False
+                continue
+            flow = _vectors(result.image[k], float(result.divisor[k]), task)
+            if attempt < attempts:
+                rows.append((int(i), planar[i].copy(), float(result.depth[k]), flow))
+            observed = FlowMap(result.image[k], float(result.divisor[k]), "N", np.zeros((2, 1, 1), bool))
+            planar[i] = task.corrected(planar[i], policies[i].act(observed))
+    if not rows:
+        raise UsageError(f"world {seed}: no attempt had contact")
+    kept = sorted({row[0] for row in rows})
+    new = {old: k for k, old in enumerate(kept)}
+    recordings = Recordings(
+        task,
+        np.array([new[row[0]] for row in rows], dtype=np.int64),
+        np.stack([row[1] for row in rows]),
+        np.array([row[2] for row in rows]),
+        np.stack([row[3] for row in rows]),
+        "N",
+        {new[i]: pose for i, pose in inserted.items() if i in new},
+        grasp_force=fixed["grasp_force"] * float(np.exp(COMMANDED_FORCE * rng.normal())),
+        grasp_height=fixed["grasp_height"] + TAUGHT_HEIGHT * float(rng.normal()),
+    )
+    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
+    return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
+
+
+def _truth(values: dict[str, float], gain: Array, turn: Array) -> dict[str, float]:
+    ratio = values["gel_time"] / 0.225
+    lag = 1 - values["gel_creep"] * ratio * (1 - np.exp(-1 / ratio))  # a linear rise of the force during a descent
+    names = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "marker_ks", "hole_kn", "hole_mu",
+             "arm_stiffness", "grasp_force", "grasp_height", "crosstalk")  # fmt: skip
+    pads = {f"gain_{side}": float(gain[k] * lag) for k, side in enumerate(("left", "right"))}
+    turns = {f"turn_{side}": float(turn[k]) for k, side in enumerate(("left", "right"))}
+    return {**{name: values[name] for name in names}, **pads, **turns}
+
+
+def _vectors(image: NDArray[np.float32], divisor: float, task: InsertionTask) -> Array:
+    """Marker vectors (pads, rows, cols, 2) of the last frame of a flow map."""
+    grid = task.grid
+    frames = image.reshape(-1, task.sensors, 2, grid.rows, grid.cols)
+    return np.asarray(frames[-1].transpose(0, 2, 3, 1) * divisor, dtype=float)
