@@ -17,6 +17,7 @@ from gelflow.sim.tasks.insertion import NOMINAL
 Array = NDArray[np.float64]
 
 KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
+REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
 ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
 _CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
 
@@ -30,10 +31,13 @@ class Estimate:
     low: float
     high: float
     relative_width: float  # of the interval, relative to that of the prior
+    reproduced: bool  # the fit reproduces the recordings
 
     @property
     def verdict(self) -> str:
-        """Whether the recordings determine the parameter: known, partly or unknown."""
+        """Whether the recordings determine the parameter: known, partly or unknown; unknown if the fit is poor."""
+        if not self.reproduced:
+            return "unknown"
         return "known" if self.relative_width < KNOWN else "partly" if self.relative_width < PARTLY else "unknown"
 
 
@@ -63,6 +67,11 @@ class Calibration:
     unit: str
     suggestions: tuple[Suggestion, ...]
     fit: FitResult
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether the fit reproduces the recordings to within the noise and the expected error of the model."""
+        return self.fit.best.chi <= REPRODUCED
 
     @property
     def explained(self) -> bool | None:
@@ -130,6 +139,7 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[Estima
             float(p.value(low[i])),
             float(p.value(high[i])),
             float((high[i] - low[i]) / (2 * 1.96)),
+            result.best.chi <= REPRODUCED,
         )
         for i, p in enumerate(fitted)
     )

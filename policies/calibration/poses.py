@@ -10,6 +10,7 @@ Array = NDArray[np.float64]
 _FREE = (1.3e-3, 1.3e-3, np.radians(2.5))  # standard deviation of the pose of an inserted part in its hole [m, m, rad]
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
+_NEAR = np.array([2e-3, 2e-3, 0.07])  # spread of new poses around the best one, at first [m, m, rad]
 _POSES = 192  # candidates of `find_poses` for each insertion
 
 
@@ -43,15 +44,15 @@ def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
 
 
 def best_poses(
-    problem: Problem, point: Array, candidates: list[Array], *, shortlist: int = _SHORTLIST
+    problem: Problem, point: Array, candidates: list[Array], *, range_of_heights: float = 1.0
 ) -> tuple[list[Array], list[Array], list[Array]]:
     """The best candidates of each insertion: poses (k, 3), their costs (k,), and start heights (k, attempts) [sd].
 
     Candidates are first compared up to the size of the flow maps, which depends on the start height, then with the best
-    of several start heights.
+    of several start heights: `range_of_heights` is 1 for their whole range, less for a range around those of `point`.
     """
-    short = [_by_shape(problem, point, i, poses, shortlist) for i, poses in enumerate(candidates)]
-    return _with_heights(problem, point, short)
+    short = [_by_shape(problem, point, i, poses, _SHORTLIST) for i, poses in enumerate(candidates)]
+    return _with_heights(problem, point, short, range_of_heights)
 
 
 def _rows(problem: Problem, insertion: int) -> NDArray[np.int64]:
@@ -80,7 +81,9 @@ def _by_shape(problem: Problem, point: Array, insertion: int, poses: Array, keep
     return poses[np.argsort(cost + prior_cost(problem, insertion, poses))[:keep]]
 
 
-def _with_heights(problem: Problem, point: Array, short: list[Array]) -> tuple[list[Array], list[Array], list[Array]]:
+def _with_heights(
+    problem: Problem, point: Array, short: list[Array], range_of_heights: float
+) -> tuple[list[Array], list[Array], list[Array]]:
     """Costs of poses with the best start height of each attempt."""
     count = len(problem.fitted)
     costs, heights = [], []
@@ -89,6 +92,8 @@ def _with_heights(problem: Problem, point: Array, short: list[Array]) -> tuple[l
         rows = np.repeat(attempts, m * h)
         present = point[count:][rows]
         tried = np.tile(_HEIGHTS, len(attempts) * m)
+        if range_of_heights < 1:
+            tried = present + range_of_heights * tried
         tried = np.where(tried == 0, present, tried)
         flow, ok = _simulate(
             problem,
@@ -115,16 +120,16 @@ def find_poses(problem: Problem, parameters: Array, rng: np.random.Generator) ->
     point[: len(parameters)] = parameters
     insertions = int(problem.recordings.insertion.max()) + 1
     best: list[Array] | None = None
-    for spread in (None, 2e-3, 1e-3):
+    for size in (1.0, 0.5, 0.25, 0.12, 0.06):  # of the ranges around the best poses and heights
         candidates = []
         for i in range(insertions):
-            drawn = draw_poses(problem, i, _POSES if spread is None else _POSES // 2, rng)
-            if best is not None and spread is not None:
-                near = best[i][0] + rng.normal(size=(_POSES // 2, 3)) * spread * np.array([1.0, 1.0, 35.0])
-                drawn = np.vstack([best[i], near, drawn])
-            candidates.append(drawn)
-        best, _, heights = best_poses(problem, point, candidates)
+            if best is None:
+                candidates.append(draw_poses(problem, i, _POSES, rng))
+            else:
+                near = best[i][0] + size * rng.normal(size=(_POSES // 4, 3)) * _NEAR
+                candidates.append(np.vstack([best[i], near]))
+        best, _, heights = best_poses(problem, point, candidates, range_of_heights=size)
+        for i in range(insertions):
+            point[len(parameters) + _rows(problem, i)] = heights[i][0]
     assert best is not None
-    for i in range(insertions):
-        point[len(parameters) + _rows(problem, i)] = heights[i][0]
     return point, np.stack([poses[0] for poses in best])

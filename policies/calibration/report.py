@@ -38,6 +38,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
             "not_modelled": result.not_modelled(),
+            "reproduced": result.reproduced,
         },
         "record_next": [
             {"text": s.text, "pose": list(s.pose), "depth": s.depth, "gain": s.gain, "narrowed": s.narrowed}
@@ -140,6 +141,11 @@ def error_lines(result: Calibration) -> list[str]:
         lines.append(
             f"{len(maps.recorded)} {kind} flow maps: error {before:.3g} {result.unit} before, "
             f"{after:.3g} {result.unit} after calibration; noise {result.noise:.3g} {result.unit}"
+        )
+    if not result.reproduced:
+        lines.append(
+            f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "
+            "from noise and model; no parameter counts as known, and the intervals are not reliable"
         )
     if result.explained:
         lines.append(f"the held-out error is at most {ALLOWED_ERROR:g} times the noise")

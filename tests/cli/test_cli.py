@@ -26,6 +26,7 @@ COMMON_OPTIONS = {
     "calibrate-camera": {"--json", "--out"},
     "run": {"--json", "--out", "--checkpoint"},
     "robot": set(),  # its actions have options of their own
+    "calibrate": {"--json", "--out", "--seed", "--quick"},
     "replay": {"--json", "--out", "--checkpoint"},
     "recover": {"--json", "--out"},
     "mock": {"--json", "--out", "--seed", "--preset"},

@@ -1,0 +1,235 @@
+"""Calibration: exact derivatives, the training environment as a world with known truth, sessions, reports."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
+from gelflow.policies.calibration.calibration import Calibration, calibrate
+from gelflow.policies.calibration.fit import FitSettings, fit
+from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.report import error_lines, page, plain_report
+from gelflow.policies.calibration.session_recordings import read_recordings
+from gelflow.policies.calibration.shear_model import POSE, QUANTITIES, Descents, ShearModel
+from gelflow.policies.calibration.worlds import RecordedWorld, record_world
+from gelflow.session import SessionRecorder
+from gelflow.session.records import Decision, describe_session
+from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
+from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
+from gelflow.task import INSERTION
+
+WORLD = 8  # all five parts are inserted, with little noise
+LITTLE = FitSettings(starts=1, points=1, poses=16, steps=1)
+VALUES = {
+    **{name: value for name, value in NOMINAL_PAD_VALUES.items() if name in QUANTITIES},
+    "hole_kn": 5e3,
+    "hole_mu": 1.5,
+    "arm_stiffness": 1e5,
+    "grasp_force": 12.0,
+    "grasp_height": 0.0,
+}
+LAB = {"gripper": {"grasp_force": 12.0}, "part": {"grasp_height": 0.03}}
+
+
+@pytest.fixture(scope="module")
+def world() -> RecordedWorld:
+    return record_world(WORLD)
+
+
+@pytest.fixture(scope="module")
+def calibrated(world: RecordedWorld) -> Calibration:
+    return calibrate(world.recordings.of(np.array([0, 1])), settings=LITTLE)
+
+
+def test_the_model_gives_the_forces_of_the_training_environment() -> None:
+    environment = InsertionAttempts(2, randomization=NOMINAL.replace(noise=0.0), threads=1)
+    pose = np.array([[3e-3, -1e-3, 0.05], [1e-3, 4e-3, -0.1]])
+    environment.draw(np.random.default_rng(0), misalignment=pose)
+    result = environment.attempt(np.random.default_rng(0))
+    shear, ok = ShearModel(INSERTION, threads=1).shear(
+        {name: np.full(2, value) for name, value in VALUES.items()}, Descents(pose, np.zeros(2), result.depth)
+    )
+    expected = (result.image * result.divisor[:, None, None, None]).reshape(2, 2, 2, -1)
+    assert ok.all()
+    assert np.abs(shear.reshape(2, 2, -1, 2).transpose(0, 1, 3, 2) - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+def test_derivatives_of_the_forces_agree_with_finite_differences() -> None:
+    model = ShearModel(INSERTION, threads=1)
+    values = {**VALUES, "grasp_height": -1e-3, "arm_stiffness": 1e4}
+    descents = Descents(np.array([[1e-3, 4e-3, -0.1]]), np.array([-3e-5]), np.array([0.9e-3]))
+    names = [*QUANTITIES, *POSE]
+    shear, slopes = model.derivatives(values, descents, names)
+    largest = np.abs(shear).max()
+    for k, name in enumerate(names):
+        step = 1e-5 * abs(values.get(name, 1e-3)) if name in values else 1e-8
+        sides = []
+        for sign in (1, -1):
+            moved, pose, z = dict(values), descents.pose.copy(), descents.z.copy()
+            if name == "z":
+                z += sign * step
+            elif name in POSE:
+                pose[:, POSE.index(name)] += sign * step
+            else:
+                moved[name] += sign * step
+            rows = {key: np.array([value]) for key, value in moved.items()}
+            sides.append(model.shear(rows, Descents(pose, z, descents.depth))[0])
+        difference = (sides[0] - sides[1]) / (2 * step)
+        floor = 1e-9 * largest / step  # of rounding errors in the difference
+        assert np.abs(difference - slopes[:, k]).max() < 1e-5 * np.abs(slopes[:, k]).max() + floor, name
+
+
+def test_the_jacobian_of_the_whole_fit_agrees_with_finite_differences(world: RecordedWorld) -> None:
+    recordings = world.recordings.of(np.array([0]))
+    problem = Problem(recordings, threads=1)
+    point = np.random.default_rng(1).normal(size=problem.size) * 0.3
+    poses = world.misalignment[:1]
+    line = problem.linearize(point, poses)
+    values, _ = problem.residuals(point, poses)
+    assert np.abs(values - line.residuals).max() < 1e-6 * np.abs(values).max()
+    for i in range(problem.size):
+        agreements = []
+        for step in (1e-4, 1e-5):
+            shift = step * np.eye(problem.size)[i]
+            up, down = (problem.residuals(point + sign * shift, poses)[0] for sign in (1, -1))
+            agreements.append(np.abs((up - down) / (2 * step) - line.jacobian[:, :, i]).max())
+        assert min(agreements) < 1e-5 * np.abs(line.jacobian[:, :, i]).max() + 1e-6, i
+
+
+def test_the_noise_is_estimated_from_the_flow_maps(world: RecordedWorld) -> None:
+    assert world.noise < world.recordings.noise() < 2 * world.noise
+
+
+def test_poses_of_a_known_world_reproduce_its_flow_maps(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.array([0])), threads=1)
+    truth = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted])
+    found = find_poses(problem, truth, np.random.default_rng(0))
+    recorded = problem.recorded_flow()
+    assert np.sqrt(((problem.flow(*found) - recorded) ** 2).mean()) < 0.3 * np.sqrt((recorded**2).mean())
+
+
+def test_a_calibration_reduces_the_error(calibrated: Calibration) -> None:
+    maps = calibrated.fitted
+    assert maps.error(maps.after) < 0.7 * maps.error(maps.before)
+    assert calibrated.held_out is not None
+    assert all(e.low <= e.value <= e.high for e in calibrated.estimates)
+    assert {e.verdict for e in calibrated.estimates} <= {"known", "partly", "unknown"}
+    assert calibrated.suggestions
+
+
+def test_a_fit_is_reproducible(world: RecordedWorld) -> None:
+    settings = FitSettings(starts=1, points=1, poses=4, steps=1)
+    first, second = (fit(world.recordings.of(np.array([0])), seed=1, settings=settings) for _ in range(2))
+    np.testing.assert_array_equal(first.best.point, second.best.point)
+
+
+def test_the_report_is_one_self_contained_page(calibrated: Calibration) -> None:
+    text = page(calibrated, [Path("a<b>.mcap")], INSERTION.grid)
+    assert "data:image/png;base64," in text
+    assert "a&lt;b&gt;.mcap" in text
+    assert 'src="http' not in text
+    report = json.loads(json.dumps(plain_report(calibrated, [Path("a.mcap")]), allow_nan=False))
+    assert set(report["parameters"]) == {e.parameter.name for e in calibrated.estimates}
+    assert all(name in text for name in report["parameters"])
+
+
+def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: Calibration) -> None:
+    poor = dataclasses.replace(calibrated.fit.best, chi=2.0)
+    estimates = tuple(dataclasses.replace(e, reproduced=False, relative_width=0.01) for e in calibrated.estimates)
+    result = dataclasses.replace(
+        calibrated, estimates=estimates, fit=dataclasses.replace(calibrated.fit, starts=(poor,))
+    )
+    assert {e.verdict for e in result.estimates} == {"unknown"}
+    assert any("does not reproduce" in line for line in error_lines(result))
+
+
+def write_session(path: Path, world: RecordedWorld, *, contact: bool = True, **task: Any) -> Path:
+    """A session with the attempts of the first two insertions of a world."""
+    recordings = world.recordings.of(np.array([0, 1]))
+    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab=LAB)
+    described["task"] = {**described["task"], **task}
+    with SessionRecorder(path, ScaledClock()) as recorder:
+        recorder.metadata(described)
+        attempts = {0: 0, 1: 0}
+        for i, flow in enumerate(recordings.flow):
+            insertion = int(recordings.insertion[i])
+            attempt = attempts[insertion]
+            attempts[insertion] += 1
+            divisor = 10 * float(np.linalg.norm(flow, axis=-1).max())
+            image = (10 * flow / divisor).transpose(0, 3, 1, 2).reshape(-1, *flow.shape[1:3]).astype(np.float32)
+            decision = Decision(
+                insertion=insertion,
+                attempt=attempt,
+                tracked=((1, 2), (1, 2)),
+                reference=(1, 1),
+                frames=((2, 2),),
+                flow=image,
+                divisor=divisor,
+                unit="mm",
+                action=np.zeros(3),
+                correction=np.zeros(3),
+                depths=(0.0, float(recordings.depth[i])),
+            )
+            recorder.decision(decision.to_json())
+            recorder.attempt_end(
+                {
+                    "insertion": insertion,
+                    "attempt": attempt,
+                    "outcome": "not inserted",
+                    "planar_pose": recordings.planar_pose[i].tolist(),
+                    "depth": float(recordings.depth[i]),
+                    "contact": contact,
+                    "slipped": False,
+                }
+            )
+        for insertion, planar in recordings.inserted.items():
+            values = {"insertion": insertion, "attempt": attempts[insertion], "outcome": "inserted"}
+            recorder.attempt_end({**values, "planar_pose": planar.tolist(), "depth": 1e-3, "contact": False})
+    return path
+
+
+def test_recordings_are_read_from_sessions(tmp_path: Path, world: RecordedWorld) -> None:
+    path, other = (write_session(tmp_path / name, world) for name in ("a.mcap", "b.mcap"))
+    expected = world.recordings.of(np.array([0, 1]))
+    read = read_recordings([path, other])
+    n = len(expected)
+    assert read.insertion.tolist() == [*expected.insertion, *(expected.insertion + 2)]
+    np.testing.assert_allclose(read.flow[:n], 10 * expected.flow, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(read.depth[n:], expected.depth)
+    assert sorted(read.inserted) == [0, 1, 2, 3]
+    assert read.grasp_force == 12.0
+    assert read.grasp_height == pytest.approx(0.0)
+
+
+def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
+    with pytest.raises(UsageError, match="needs a session of the task insertion, got 'pushing'"):
+        read_recordings([write_session(tmp_path / "pushing.mcap", world, name="pushing")])
+    with pytest.raises(UsageError, match="no attempt with contact"):
+        read_recordings([write_session(tmp_path / "free.mcap", world, contact=False)])
+    usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
+    with pytest.raises(UsageError, match="another part or task"):
+        read_recordings([usual, deeper])
+
+
+def test_the_command_writes_a_report_and_overwrites_nothing(
+    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, out = write_session(tmp_path / "a.mcap", world), tmp_path / "out"
+    assert main(["calibrate", str(session), "--quick", "--out", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "report.json").read_text())
+    assert printed["attempts"]["held_out"] > 0
+    before = (out / "report.html").read_bytes()
+    assert main(["calibrate", str(session), "--quick", "--out", str(out)]) == 2
+    assert "exists; name a new folder with --out" in capsys.readouterr().err
+    assert (out / "report.html").read_bytes() == before
+    assert main(["calibrate", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "other")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not (tmp_path / "other").exists()
