@@ -131,7 +131,7 @@ class ShearModel:
         return np.array(sim.params[0])
 
     def _columns(self, sim: Simulator, values: Mapping[str, Array]) -> dict[int, Array]:
-        """Values by column of the parameters; linear in `values` but for the damping of the markers."""
+        """Values by column of the parameters; linear in `values`, except for the damping of the markers."""
         damping = np.full_like(values["pad_kn"], NOMINAL_PAD_VALUES["marker_kd"])
         named = simulator_parameters({"marker_kd": damping, **values}, elastic=True)
         return {sim.param_index[name]: column for name, column in hole_parameters(self.scene, named).items()}

@@ -1,4 +1,4 @@
-"""What to record next: attempts whose flow maps have the most information about the parameters."""
+"""Attempts to record next: those whose flow maps have the most information about the parameters."""
 
 from dataclasses import dataclass
 
