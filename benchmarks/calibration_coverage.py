@@ -5,7 +5,7 @@ import sys
 import script
 from rich.table import Table
 
-from gelflow.policies.calibration.coverage import measure_coverage
+from gelflow.policies.calibration.experiment.coverage import measure_coverage
 from gelflow.policies.calibration.fit import FitSettings
 
 _QUICK = FitSettings(starts=1, points=1, poses=16, steps=1)

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
-from gelflow.policies.calibration.parameters import Parameter
+from gelflow.policies.calibration.model.parameters import Parameter
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.suggestions import Suggestion, suggest
-from gelflow.sim.tasks.insertion import NOMINAL
 
 Array = NDArray[np.float64]
 
@@ -48,7 +47,7 @@ class FlowMaps:
     recorded: Array
     before: Array
     after: Array
-    insertion: NDArray[np.int64]  # (n,)
+    names: tuple[str, ...]  # of the attempts, (n,)
 
     def error(self, simulated: Array) -> float:
         """Root mean square difference of a component of a marker vector."""
@@ -162,18 +161,7 @@ def _flow_maps(problem: Problem, point: Array, rng: np.random.Generator, *, pose
 
     With `poses` those of a fit are taken for the calibrated values.
     """
-    before = find_poses(problem, _scene_point(problem), rng)
+    before = find_poses(problem, problem.scene_point(), rng)
     after = find_poses(problem, point, rng) if poses is None else (poses.best.point, poses.best.misalignment)
     recorded = problem.recorded_flow()
-    return FlowMaps(recorded, problem.flow(*before), problem.flow(*after), problem.recordings.insertion)
-
-
-def _scene_point(problem: Problem) -> Array:
-    """Whitened parameters with the values of the scene, and the force and height of the lab file."""
-    point = np.zeros(len(problem.fitted))
-    nominal = NOMINAL.sample(np.random.default_rng(0), 1, friction="elastic")
-    for i, parameter in enumerate(problem.fitted):
-        if parameter.name in nominal and not parameter.name.startswith("grasp"):
-            value = 0.0 if parameter.name == "crosstalk" else nominal[parameter.name]
-            point[i] = float(np.squeeze(parameter.whitened(np.asarray(value))))
-    return point
+    return FlowMaps(recorded, problem.flow(*before), problem.flow(*after), problem.recordings.names)

@@ -1,5 +1,7 @@
 """Search of the misalignment of each insertion: random poses, compared with the recorded flow maps."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,8 @@ _FREE = (1.3e-3, 1.3e-3, np.radians(2.5))  # standard deviation of the pose of a
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
 _NEAR = np.array([2e-3, 2e-3, 0.07])  # spread of new poses around the best one, at first [m, m, rad]
+_SIZES = (1.0, 0.5, 0.25, 0.12, 0.06)  # of the ranges of poses and heights in the rounds of `find_poses`
+SEARCH_ROUNDS = len(_SIZES)
 _POSES = 192  # candidates of `find_poses` for each insertion
 
 
@@ -114,13 +118,18 @@ def _with_heights(
     return short, costs, heights
 
 
-def find_poses(problem: Problem, parameters: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def find_poses(
+    problem: Problem,
+    parameters: Array,
+    rng: np.random.Generator,
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[Array, Array]:
     """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses."""
     point = np.zeros(problem.size)
     point[: len(parameters)] = parameters
     insertions = int(problem.recordings.insertion.max()) + 1
     best: list[Array] | None = None
-    for size in (1.0, 0.5, 0.25, 0.12, 0.06):  # of the ranges around the best poses and heights
+    for number, size in enumerate(_SIZES):
         candidates = []
         for i in range(insertions):
             if best is None:
@@ -131,5 +140,6 @@ def find_poses(problem: Problem, parameters: Array, rng: np.random.Generator) ->
         best, _, heights = best_poses(problem, point, candidates, range_of_heights=size)
         for i in range(insertions):
             point[len(parameters) + _rows(problem, i)] = heights[i][0]
+        progress(number + 1)
     assert best is not None
     return point, np.stack([poses[0] for poses in best])

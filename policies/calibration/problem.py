@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.calibration.pad_model import PadModel
-from gelflow.policies.calibration.parameters import Parameter, parameters
+from gelflow.policies.calibration.model.pad_model import PadModel
+from gelflow.policies.calibration.model.parameters import Parameter, parameters
+from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.policies.calibration.shear_model import QUANTITIES, Descents, ShearModel
+from gelflow.sim.tasks.insertion import NOMINAL
 
 Array = NDArray[np.float64]
 
@@ -87,6 +88,16 @@ class Problem:
         values = {name: np.full(n, value) for name, value in self.values(point).items()}
         poses = misalignment[self.recordings.insertion]
         return self._scale * self.predicted(values, np.arange(n), poses, self.heights(point))[0]
+
+    def scene_point(self) -> Array:
+        """Whitened parameters with the values of the scene, and the grasp of the recordings."""
+        point = np.zeros(len(self.fitted))
+        nominal = NOMINAL.sample(np.random.default_rng(0), 1, friction="elastic")
+        for i, parameter in enumerate(self.fitted):
+            if parameter.name in nominal and not parameter.name.startswith("grasp"):
+                value = 0.0 if parameter.name == "crosstalk" else float(nominal[parameter.name][0])
+                point[i] = float(parameter.whitened(np.array(value)))
+        return point
 
     def recorded_flow(self) -> Array:
         """Recorded flow maps (n, markers, 2), in the unit of the recordings."""

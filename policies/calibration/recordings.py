@@ -27,6 +27,7 @@ class Recordings:
     depth: Array  # of the gripper at the reading, below the start of the attempt [m], shape (n,)
     flow: Array  # change of the marker vectors since the start, in `unit`, shape (n, pads, rows, cols, 2)
     unit: Unit
+    names: tuple[str, ...]  # of the attempts, (n,)
     # Insertion → planar pose (3,) in which its part entered the hole.
     inserted: Mapping[int, Array] = field(default_factory=dict)
     settle: float = 0.0  # time between the end of the motion and the reading [s]
@@ -48,6 +49,7 @@ class Recordings:
             self.depth[rows],
             self.flow[rows],
             self.unit,
+            tuple(name for name, row in zip(self.names, rows, strict=True) if row),
             {number[i]: pose for i, pose in self.inserted.items() if i in number},
             self.settle,
             self.grasp_force,

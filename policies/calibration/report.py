@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.figures import VERMILION, add_arrows, draw_flow_map
 from gelflow.observation import Grid
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
-from gelflow.policies.calibration.pad_model import SIDES
+from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
 
 FORMAT = 1
-_MAX_SHOWN = 6  # attempts in the picture
 
 
 def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any]:
@@ -73,23 +71,11 @@ def _errors(maps: FlowMaps) -> dict[str, float]:
 
 def flow_picture(result: Calibration, grid: Grid) -> bytes:
     """A PNG of recorded (blue) and simulated (red, narrower) flow maps: held-out attempts, or else fitted ones."""
-    from matplotlib.figure import Figure  # deferred: slow to import
-
     maps = result.fitted if result.held_out is None else result.held_out
-    count = min(len(maps.recorded), _MAX_SHOWN)
-    figure = Figure(figsize=(9.0, 2.7 * count + 0.5), layout="constrained")
-    axes = figure.subplots(count, 4, squeeze=False)
-    for i, line in enumerate(axes):
-        recorded = maps.recorded[i].reshape(2, -1, 2)
-        longest = max(float(np.linalg.norm(recorded, axis=-1).max()), 1e-30)
-        for k, axis in enumerate(line):
-            simulated = (maps.before, maps.after)[k // 2][i].reshape(2, -1, 2)
-            draw_flow_map(axis, grid, recorded[k % 2].T / longest)
-            add_arrows(axis, grid, simulated[k % 2].T / longest, color=VERMILION, width=0.004)
-            axis.set_title(f"{SIDES[k % 2]} pad, {('before', 'calibrated')[k // 2]}", fontsize=8)
-        line[0].set_ylabel(f"attempt {i + 1}\nlongest arrow {longest:.3g} {result.unit}", fontsize=8)
     kind = "fitted" if result.held_out is None else "held-out"
-    figure.supxlabel(f"{kind} attempts; blue: recorded, red: simulated; fingertip down", fontsize=8)
+    simulated = [("before", maps.before), ("calibrated", maps.after)]
+    note = f"{kind} attempts; "
+    figure = draw_flow_maps(maps.recorded, simulated, maps.names, grid, result.unit, note=note)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=100)
     return data.getvalue()

@@ -53,6 +53,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         np.array([row["depth"] for row in rows], dtype=float),
         np.stack([row["flow"] for row in rows]),
         "mm",
+        tuple(row["name"] for row in rows),
         {new[i]: pose for i, pose in inserted.items() if i in new},
         settle=_SETTLE,
         grasp_force=float(np.mean([force for force, _ in labs])),
@@ -102,7 +103,15 @@ def _attempts(
                 f"{path}: flow maps are in {decision.unit!r}, expected mm; give the cameras of the lab file a scale"
             )
         depth = decision.depths[-1] - decision.depths[0] if decision.depths else float(value["depth"])
-        rows.append({"insertion": insertion, "planar_pose": planar, "depth": depth, "flow": _vectors(decision)})
+        rows.append(
+            {
+                "insertion": insertion,
+                "name": f"insertion {insertion}, attempt {decision.attempt}",
+                "planar_pose": planar,
+                "depth": depth,
+                "flow": _vectors(decision),
+            }
+        )
     return rows, inserted
 
 

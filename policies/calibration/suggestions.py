@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.fit import FitResult
+from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.problem import CORRELATED, Problem
-from gelflow.policies.calibration.shear_model import Descents
 
 Array = NDArray[np.float64]
 

@@ -12,13 +12,13 @@ from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibration import Calibration, calibrate
+from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings, fit
+from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.report import error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import read_recordings
-from gelflow.policies.calibration.shear_model import POSE, QUANTITIES, Descents, ShearModel
-from gelflow.policies.calibration.worlds import RecordedWorld, record_world
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
@@ -216,6 +216,30 @@ def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: R
     usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
     with pytest.raises(UsageError, match="another part or task"):
         read_recordings([usual, deeper])
+
+
+def test_replay_compares_flow_maps_with_the_simulation(
+    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, picture = write_session(tmp_path / "a.mcap", world), tmp_path / "maps.png"
+    assert main(["replay", str(session), "--simulate", "--out", str(picture), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    names = [a["name"] for a in printed["attempts"]]
+    assert names[0] == "insertion 0, attempt 0"
+    assert len(names) == len(world.recordings.of(np.array([0, 1])))
+    assert all(0 <= a["relative_error"] < 2 and -1 <= a["cosine"] <= 1.000001 for a in printed["attempts"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["replay", str(session), "--simulate", "--checkpoint", "x.safetensors"]) == 2
+    assert "leave one of them out" in capsys.readouterr().err
+
+
+def test_replay_warns_of_flow_maps_with_nothing_in_common(
+    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flow = np.random.default_rng(0).normal(size=world.recordings.flow.shape)
+    noise = dataclasses.replace(world, recordings=dataclasses.replace(world.recordings, flow=flow))
+    assert main(["replay", str(write_session(tmp_path / "a.mcap", noise)), "--simulate"]) == 0
+    assert "insertion 0, attempt 0: recorded and simulated flow map have nothing in common" in capsys.readouterr().out
 
 
 def test_the_command_writes_a_report_and_overwrites_nothing(

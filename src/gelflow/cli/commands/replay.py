@@ -28,7 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("session", type=Path, metavar="SESSION", help="a recorded session (.mcap)")
     add_checkpoint(parser, default="the policy of the session")
-    add_out(parser, "a picture (.png) of flow maps and corrections, recorded and recomputed")
+    parser.add_argument(
+        "--simulate", action="store_true", help="compare the flow maps with the simulation instead, error per decision"
+    )
+    add_out(parser, "a picture (.png) of flow maps and corrections, recorded and recomputed or simulated")
     add_json(parser)
 
 
@@ -39,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """
     from gelflow.policies.checkpoint import load_policy
 
+    if args.simulate:
+        return _replay_in_simulation(args)
     output = Output(args.json)
     with SessionReader(args.session) as session:
         description = session.description()
@@ -61,6 +66,14 @@ def run(args: argparse.Namespace) -> int:
 
         draw_comparisons(comparisons, task.grid, args.out)
     return _show(output, result, args.out if comparisons else None)
+
+
+def _replay_in_simulation(args: argparse.Namespace) -> int:
+    from gelflow.cli.simulated_replay import replay_in_simulation  # deferred: loads the simulator
+
+    if args.checkpoint is not None:
+        raise UsageError("--checkpoint names a policy, and --simulate evaluates none; leave one of them out")
+    return replay_in_simulation(args)
 
 
 @dataclass(frozen=True)

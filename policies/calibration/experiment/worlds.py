@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
-from gelflow.policies.calibration.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
+from gelflow.policies.calibration.model.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_policy
@@ -98,6 +98,7 @@ def record_world(
         np.array([row[2] for row in rows]),
         np.stack([row[3] for row in rows]),
         "N",
+        tuple(f"insertion {row[0]}, pose {k}" for k, row in enumerate(rows)),
         {new[i]: pose for i, pose in inserted.items() if i in new},
         grasp_force=fixed["grasp_force"] * float(np.exp(COMMANDED_FORCE * rng.normal())),
         grasp_height=fixed["grasp_height"] + TAUGHT_HEIGHT * float(rng.normal()),

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.policies.calibration.shear_model import QUANTITIES
 from gelflow.sim.tasks.insertion import insertion_randomization
 from gelflow.sim.tasks.randomization import LogUniform, Uniform
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from gelflow.errors import GelflowError
 from gelflow.policies.calibration.calibration import calibrate
+from gelflow.policies.calibration.experiment.worlds import record_world
 from gelflow.policies.calibration.fit import FitSettings
-from gelflow.policies.calibration.worlds import record_world
 
 
 def measure_coverage(

@@ -1,0 +1,55 @@
+"""Recorded flow maps beside those of the simulation."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.recordings import Recordings
+
+Array = NDArray[np.float64]
+
+NOTHING_IN_COMMON = 0.5  # largest cosine of two flow maps that have nothing in common
+
+
+@dataclass(frozen=True)
+class SimulatedSession:
+    """Recorded and simulated flow maps of n attempts, (n, markers, 2) each, in the unit of the recordings."""
+
+    recorded: Array
+    simulated: Array
+
+    @property
+    def error(self) -> float:
+        """Root mean square difference of a component of a marker vector, over all attempts."""
+        return float(np.sqrt(((self.simulated - self.recorded) ** 2).mean()))
+
+    @property
+    def relative_error(self) -> Array:
+        """Length of the difference of each attempt relative to that of its recorded flow map, (n,)."""
+        return np.asarray(_length(self.simulated - self.recorded) / np.maximum(_length(self.recorded), 1e-30))
+
+    @property
+    def cosine(self) -> Array:
+        """Cosine between recorded and simulated flow map of each attempt, (n,); 0 if there is no simulated contact."""
+        product = _length(self.simulated) * _length(self.recorded)
+        return np.asarray((self.simulated * self.recorded).sum((1, 2)) / np.maximum(product, 1e-30))
+
+
+def _length(flow: Array) -> Array:
+    return np.asarray(np.sqrt((flow**2).sum((1, 2))))
+
+
+def simulate(
+    recordings: Recordings, *, seed: int = 0, progress: Callable[[int], None] = lambda done: None
+) -> SimulatedSession:
+    """Simulate the recorded attempts with the values of the scene; poses and start heights are searched.
+
+    `progress` gets the number of finished rounds of `SEARCH_ROUNDS`.
+    """
+    problem = Problem(recordings)
+    point, poses = find_poses(problem, problem.scene_point(), np.random.default_rng(seed), progress)
+    return SimulatedSession(problem.recorded_flow(), problem.flow(point, poses))

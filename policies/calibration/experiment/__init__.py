@@ -1,0 +1,1 @@
+"""Calibrations in random worlds with known truth."""

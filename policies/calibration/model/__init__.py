@@ -1,0 +1,1 @@
+"""Forces and readings of the pads as functions of the fitted parameters."""

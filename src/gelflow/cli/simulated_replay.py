@@ -1,0 +1,59 @@
+"""`gelflow replay SESSION --simulate`: recorded flow maps beside those of the simulation."""
+
+import argparse
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.output import Output, progress_bar
+from gelflow.figures import save
+from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, simulate
+from gelflow.policies.calibration.flow_picture import draw_flow_maps
+from gelflow.policies.calibration.poses import SEARCH_ROUNDS
+from gelflow.policies.calibration.session_recordings import read_recordings
+
+
+def replay_in_simulation(args: argparse.Namespace) -> int:
+    """Simulate the attempts with contact of a session, and print the error of each flow map."""
+    output = Output(args.json)
+    recordings = read_recordings([args.session])
+    with progress_bar(count=True) as progress:
+        bar = progress.add_task("simulating", total=SEARCH_ROUNDS)
+        result = simulate(recordings, progress=lambda done: progress.update(bar, completed=done))
+    names, errors, cosines = recordings.names, result.relative_error, result.cosine
+    if args.out:
+        note = "values of the scene; "
+        figure = draw_flow_maps(
+            result.recorded, [("", result.simulated)], names, recordings.task.grid, recordings.unit, note=note
+        )
+        save(figure, args.out, make_folder=False)
+    strange = [name for name, cosine in zip(names, cosines, strict=True) if cosine < NOTHING_IN_COMMON]
+    if output.json:
+        output.result(
+            {
+                "unit": recordings.unit,
+                "noise": recordings.noise(),
+                "error": result.error,
+                "attempts": [
+                    {"name": name, "relative_error": float(error), "cosine": float(cosine)}
+                    for name, error, cosine in zip(names, errors, cosines, strict=True)
+                ],
+                "nothing_in_common": strange,
+                "picture": args.out,
+            }
+        )
+        return SUCCESS
+    table = Table("attempt", "error of the flow map", "cosine", box=SIMPLE_HEAD)
+    for name, error, cosine in zip(names, errors, cosines, strict=True):
+        table.add_row(name, f"{100 * error:.0f} %", f"{cosine:.2f}")
+    output.console.print(table)
+    output.text(
+        f"root mean square error {result.error:.3g} {recordings.unit} with the values of the scene, "
+        f"noise {recordings.noise():.3g} {recordings.unit}"
+    )
+    for name in strange:
+        output.text(f"warning: {name}: recorded and simulated flow map have nothing in common")
+    if args.out:
+        output.text(f"picture: {args.out}")
+    return SUCCESS
