@@ -17,7 +17,7 @@ Picture = NDArray[np.uint8]
 
 PANEL_SHARE = 0.27  # of the width of a picture
 _INK, _FRAME, _PAPER = (30, 30, 30), (150, 150, 150), (255, 255, 255)
-_FORCE_COLOR = (213, 94, 0)  # vermilion of gelflow.figures
+FORCE_COLOR = (213, 94, 0)  # vermilion of gelflow.figures
 _ARROW_SHARE = 0.22  # of the height of the picture: the longest contact force
 _HIDDEN = 0.45  # opacity of a marker behind a body
 _ARROW_CELL = 6.0  # side of the square in a panel that has one arrow [px]
@@ -122,8 +122,8 @@ def _draw_contact(picture: Picture, contact: ContactForce, view: View, length: f
     if (depth <= 0).any():
         return
     _arrow(picture, pixels[0], pixels[1], _PAPER, 5)
-    _arrow(picture, pixels[0], pixels[1], _FORCE_COLOR, 2)
-    _dot(picture, pixels[0], 3, _FORCE_COLOR)
+    _arrow(picture, pixels[0], pixels[1], FORCE_COLOR, 2)
+    _dot(picture, pixels[0], 3, FORCE_COLOR)
 
 
 def _draw_legend(picture: Picture, view: View, scales: ForceScales, tile: float, *, contacts: bool) -> None:
@@ -142,7 +142,7 @@ def _draw_legend(picture: Picture, view: View, scales: ForceScales, tile: float,
         start = np.array([78.0, height - 32.0])
         end = start + np.array([size, 0.0])
         _arrow(picture, start, end, _PAPER, 5)
-        _arrow(picture, start, end, _FORCE_COLOR, 2)
+        _arrow(picture, start, end, FORCE_COLOR, 2)
         _text(picture, f"contact force {quantity(scales.contact, 'N')}", (78, height - 42))
 
 
@@ -159,6 +159,17 @@ def _draw_panels(picture: Picture, pads: Sequence[PadReading], scales: ForceScal
         box[:] = (0.12 * box + 0.88 * np.array(_PAPER)).astype(np.uint8)
         cv2.rectangle(box, (0, 0), (box.shape[1] - 1, box.shape[0] - 1), _FRAME, 1)
         _draw_panel(box, pad, scales)
+
+
+def pad_panel(pad: PadReading, scales: ForceScales, size: tuple[int, int]) -> Picture:
+    """The panel of a pad alone, RGB (height, width, 3): normal forces as colours, shear forces as arrows, scales.
+
+    The pad is seen from outside with the fingertip down; `size` is width and height [px].
+    """
+    box = np.full((size[1], size[0], 3), 255, dtype=np.uint8)
+    cv2.rectangle(box, (0, 0), (size[0] - 1, size[1] - 1), _FRAME, 1)
+    _draw_panel(box, pad, scales)
+    return box
 
 
 def panel_width(width: int) -> int:

@@ -68,8 +68,7 @@ class RayCaster:
         owner = np.append(bodies_of_geoms, _NO_BODY)
         self._plane = np.append(self._model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, False)
         self._owner = np.where(self._plane, _NO_BODY - 1, owner)
-        palette = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _COLORS])
-        colors = np.where(owner[:, None] < 0, _WORLD_COLOR, palette[owner % len(palette)])
+        colors = body_colors(owner)
         colors[self._plane], colors[-1] = _PLANE_COLOR, _BACKGROUND
         self._colors = np.ascontiguousarray(colors.T, dtype=np.float32)  # by channel
         self._view: View | None = None  # that of the rays
@@ -159,6 +158,12 @@ class RayCaster:
             cosine = x[now] * x[before] + y[now] * y[before] + z[now] * z[before]
             edge[now][(owner[now] != owner[before]) | ((cosine < _CREASE) & faces[now])] = 1
         return edge
+
+
+def body_colors(bodies: NDArray[np.int64]) -> NDArray[np.int64]:
+    """RGB colours (n, 3) of bodies by their number; negative numbers are the world."""
+    palette = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in _COLORS])
+    return np.where(bodies[:, None] < 0, _WORLD_COLOR, palette[bodies % len(palette)])
 
 
 def _with_edges(picture: NDArray[np.float32], edges: NDArray[np.float32]) -> NDArray[np.uint8]:

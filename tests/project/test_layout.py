@@ -70,6 +70,8 @@ ALLOWED = [
     ("src/gelflow/cli", "gelflow.real.wsg.driver"),
     ("src/gelflow/cli", "gelflow.policies"),
     ("src/gelflow/cli", "gelflow.hardware_mocks"),
+    ("src/gelflow/cli", "gelflow.view"),
+    ("src/gelflow/view", "gelflow.sim"),
 ]
 REFUSED = [
     ("src/gelflow/session", "gelflow.sim"),
@@ -86,6 +88,7 @@ REFUSED = [
     ("hardware_mocks", "gelflow.perception"),
     ("hardware_mocks", "gelflow.perception.tracker"),
     ("sim", "gelflow.cli"),
+    ("sim", "gelflow.view"),
     ("sim/scene", "gelflow.sim.simulator"),
     ("sim/tasks", "gelflow.sim.benchmark"),
     ("real/wsg", "gelflow.real.runner.lab"),

@@ -1,0 +1,5 @@
+"""Pages in the browser that show scenes and running simulations, by viser (optional extra `view`)."""
+
+import lazy_loader as _lazy
+
+__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

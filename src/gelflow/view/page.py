@@ -1,0 +1,97 @@
+"""A page in the browser: viser's server on one port, behind the rules of `gelflow.view.access`."""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+from unittest import mock
+
+from gelflow.errors import UsageError
+from gelflow.view.access import Access, guarded, is_loopback
+
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
+_starting = threading.Lock()
+
+
+def import_viser() -> Any:
+    """The package viser. Raises UsageError with the command that installs it."""
+    try:
+        import viser  # deferred: optional, and slow to import
+    except ImportError as error:
+        raise UsageError(f"the viewer needs viser ({error}); install it with: pip install 'gelflow[view]'") from None
+    return viser
+
+
+class Page:
+    """An empty page that is served in the background until `close`.
+
+    Parameters
+    ----------
+    host: address to bind to; any other than a loopback address needs the random token in `url`
+    port: TCP port; 0 takes a free one
+
+    Raises UsageError when viser is not installed, and when the address is invalid or in use.
+    """
+
+    def __init__(self, *, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> None:
+        viser = import_viser()
+        access = Access.of(host)
+        listening = _listen(host, port)
+        self.port: int = listening.getsockname()[1]
+        with _starting, _served_on(listening, access):
+            self.server: Any = viser.ViserServer(host=host, port=self.port, verbose=False)
+        self.gui: Any = self.server.gui
+        self.scene: Any = self.server.scene
+        shown = host if is_loopback(host) else socket.gethostname() if host in ("0.0.0.0", "::", "") else host
+        address = f"[{shown}]" if ":" in shown else shown
+        self.url = f"http://{address}:{self.port}/" + (f"?token={access.token}" if access.token else "")
+        self.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+
+    def watched(self) -> bool:
+        """Whether a browser shows the page."""
+        return bool(self.server.get_clients())
+
+    def close(self) -> None:
+        """Stop serving; further calls have no effect."""
+        server, self.server = self.server, None
+        if server is not None:
+            with _starting, _quiet():
+                server.stop()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    if not (isinstance(port, int) and 0 <= port < 65536):
+        raise UsageError(f"port must be 0 to 65535, got {port!r}")
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(
+            f"cannot serve a page on {host} port {port}: {reason}; choose another --port or --host"
+        ) from None
+
+
+@contextlib.contextmanager
+def _served_on(listening: socket.socket, access: Access) -> Iterator[None]:
+    """Let the next server of viser use a socket and the rules: viser has no setting for either.
+
+    viser would take the next free port when one is in use, and serves its files to everybody.
+    """
+    import websockets.asyncio.server as websocket_server
+
+    real = websocket_server.serve
+    port = listening.getsockname()[1]
+
+    def serve(handler: Any, _host: Any, requested: int, *, process_request: Any, **options: Any) -> Any:
+        assert requested == port, "another server started at the same time"
+        return real(handler, sock=listening, process_request=guarded(process_request, access, port), **options)
+
+    with mock.patch.object(websocket_server, "serve", serve), _quiet():
+        yield
+
+
+def _quiet() -> Any:
+    """viser prints the address, without its token, and the end of its server to standard output."""
+    return mock.patch("rich.print")
