@@ -44,7 +44,10 @@ COMMANDS = {
 }
 
 # Commands whose modules are in a folder of gelflow.cli.commands.
-_FOLDERS = dict.fromkeys(("train", "sweep", "eval", "reproduce", "export"), "training")
+_FOLDERS = {
+    **dict.fromkeys(("train", "sweep", "eval", "reproduce", "export"), "training"),
+    **dict.fromkeys(("render", "render-scene", "view"), "pictures"),
+}
 
 
 def command_module(name: str) -> ModuleType:

@@ -1,0 +1,1 @@
+"""Commands that draw and show: render, render-scene, view."""
