@@ -12,6 +12,7 @@ import numpy as np
 from gelflow.observation import Grid
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
+from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.session.records import to_plain
 
 FORMAT = 1
@@ -28,6 +29,11 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": 0 if held_out is None else len(held_out.recorded),
         },
         "parameters": {e.parameter.name: _plain_estimate(e) for e in result.estimates},
+        "randomization": {
+            e.parameter.name: [e.low, e.high]
+            for e in result.estimates
+            if e.verdict != "unknown" and e.parameter.name in QUANTITIES
+        },
         "correlated": [{"parameters": [a, b], "correlation": r} for a, b, r in result.correlated],
         "flow_maps": {
             "unit": result.unit,

@@ -17,12 +17,14 @@ from gelflow.policies.calibration.fit import FitSettings, fit
 from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.ranges import read_ranges
 from gelflow.policies.calibration.report import error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
 from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
+from gelflow.sim.tasks.registry import make_task
 from gelflow.task import INSERTION
 
 WORLD = 8  # all five parts are inserted, with little noise
@@ -148,6 +150,44 @@ def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: 
     )
     assert {e.verdict for e in result.estimates} == {"unknown"}
     assert any("does not reproduce" in line for line in error_lines(result))
+
+
+def test_training_randomizes_within_the_intervals_of_a_calibration(tmp_path: Path, calibrated: Calibration) -> None:
+    file = tmp_path / "report.json"
+    ranges = {"arm_stiffness": [8e3, 2e4], "grasp_height": [-1e-3, 1e-3]}
+    file.write_text(json.dumps({**plain_report(calibrated, []), "randomization": ranges}))
+    table = make_task("insertion", 1, threads=1, ranges=read_ranges(file)).attempts.randomization  # type: ignore[attr-defined]
+    drawn = table.sample(np.random.default_rng(0), 1000, friction="elastic")
+    for name, (low, high) in ranges.items():
+        assert low <= drawn[name].min() < drawn[name].max() <= high
+    usual = make_task("insertion", 1, threads=1).attempts.randomization  # type: ignore[attr-defined]
+    assert table["pad_kn"] == usual["pad_kn"]
+
+
+def test_training_with_a_calibration_stores_its_ranges(tmp_path: Path) -> None:
+    file, out = tmp_path / "report.json", tmp_path / "run"
+    file.write_text(json.dumps({"format": 1, "randomization": {"arm_stiffness": [8e3, 2e4]}}))
+    options = ["--attempts", "256", "--envs", "64", "--out", str(out)]
+    assert main(["train", "insertion", "--calibration", str(file), *options]) == 0
+    stored = json.loads((out / "run.json").read_text())
+    assert stored["configuration"]["options"]["ranges"] == {"arm_stiffness": [8e3, 2e4]}
+    assert str(file) in stored["command"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{}", "is not the report.json of gelflow calibrate"),
+        ('{"format": 2, "randomization": {}}', "format must be 1, got 2"),
+        ('{"format": 1, "randomization": {}}', "determine no quantity"),
+        ('{"format": 1, "randomization": {"arm": [1, 2]}}', "invalid range of arm"),
+        ('{"format": 1, "randomization": {"pad_mu": [2, 1]}}', "invalid range of pad_mu"),
+    ],
+)
+def test_files_that_are_no_calibration_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "report.json").write_text(text)
+    with pytest.raises(UsageError, match=message):
+        read_ranges(tmp_path / "report.json")
 
 
 def write_session(path: Path, world: RecordedWorld, *, contact: bool = True, **task: Any) -> Path:

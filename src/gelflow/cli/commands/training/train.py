@@ -3,7 +3,7 @@
 import argparse
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import Progress, TaskProgressColumn, TimeElapsedColumn
 
@@ -54,6 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (insertion: {envs})")
     add_part(parser)
     add_randomization(parser)
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: ranges that it determined"
+    )
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
@@ -63,7 +66,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
     if args.task != "insertion":
-        refuse(args, part=None, algorithm=_DEFAULT)
+        refuse(args, part=None, algorithm=_DEFAULT, calibration=None)
         args.recipe = args.recipe or DEFAULT_RECIPE
         return train_task(args)
     if args.recipe is not None:
@@ -119,15 +122,24 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
         steps=attempts,
         envs=args.envs,
         minutes=float("inf") if args.minutes is None else args.minutes,
-        options={"task": part_task(args.part), **task_options(args)},
+        options={"task": part_task(args.part), **task_options(args), **_calibration_options(args)},
         command=_command(args, attempts),
         report=report,
     )
 
 
+def _calibration_options(args: argparse.Namespace) -> dict[str, Any]:
+    """Ranges of the randomization from `--calibration`."""
+    if args.calibration is None:
+        return {}
+    from gelflow.policies.calibration.ranges import read_ranges  # deferred: loads the simulator
+
+    return {"ranges": read_ranges(args.calibration)}
+
+
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
-    names = ("part", "minutes", "envs", "seed", "preset", "out")
+    names = ("part", "calibration", "minutes", "envs", "seed", "preset", "out")
     defaults = {"algorithm": _DEFAULT, "randomization": "default"}
     chosen = {name: getattr(args, name) for name, value in defaults.items() if getattr(args, name) != value}
     return command_with(args.task, chosen | {"attempts": attempts} | {name: getattr(args, name) for name in names})
