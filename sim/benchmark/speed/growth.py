@@ -177,7 +177,7 @@ def _environments(count: int) -> tuple[Workload, AccuracyCheck]:
 
 
 SWEEPS = (
-    Sweep("bodies", "independent bodies", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _bodies),
+    Sweep("bodies", "independent bodies", (1, 4, 16, 64, 128, 300, 1000), (1, 4, 32), _bodies),
     Sweep("chain", "bodies in a chain", (1, 2, 4, 8, 16, 32, 64, 100), (1, 4, 16), _links),
     Sweep("contacts", "contact points", (1, 10, 100, 1000, 3000, 10_000, 30_000, 100_000), (1, 100, 1000), _points),
     Sweep("markers", "markers", (100, 1024, 10_000, 30_625, 99_856, 300_304, 1_000_000), (100, 1024, 10_000), _markers),

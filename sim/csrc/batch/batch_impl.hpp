@@ -267,15 +267,21 @@ void Batch<T>::mass_matrix(T* out) {
   for (int e = 0; e < n; ++e, out += size) {
     kinematics(e, w);
     w.residual.setZero();
-    w.dg_dq.setZero();
-    w.dg_dv.setZero();
-    if (!model->tendons.empty()) w.mass.setZero();
+    find_coupled_islands<T>(*model, w);
+    w.dg_dq.set_zero();
+    w.dg_dv.set_zero();
+    if (!model->tendons.empty()) w.mass.set_zero();
     add_inverse_dynamics<true, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
     add_tendon_mass<T>(*model, params_of(e), w);
     for (const Joint& joint : model->joints) {
-      for (int k = joint.v; k < joint.v + joint.dofs; ++k) w.mass(k, k) += joint.params.in(params_of(e)).armature;
+      for (int k = joint.v; k < joint.v + joint.dofs; ++k)
+        w.mass.in_tree(k, k) += joint.params.in(params_of(e)).armature;
     }
-    for (int k = 0; k < model->nv; ++k) std::copy_n(&w.mass(k, 0), model->nv, out + k * model->nv);
+    std::fill_n(out, size, T(0));
+    for (int i = 0; i < model->nv; ++i) {
+      T* const row = out + static_cast<std::ptrdiff_t>(i) * model->nv;
+      w.layout.for_dofs(w.layout.island_of(i), [&](int j) { row[j] = w.mass(i, j); });
+    }
   }
 }
 

@@ -133,11 +133,11 @@ void subtract_arc_correction(const Model& m, int body, const PairFrame<T>& frame
     }
     dmoment_drotation -= step_length * (dmoment_dtheta * skew<T>(frame.angular));
     const M3<T> to_body = step_length * rotation.transpose();
-    w.dg_dq.template block<3, 3>(k + 3, k) -= to_body * sums.dmoment_dtranslation * frame.to_world.transpose();
-    w.dg_dq.template block<3, 3>(k + 3, k + 3) -=
+    w.dg_dq.template block_in_tree<3>(k + 3, k) -= to_body * sums.dmoment_dtranslation * frame.to_world.transpose();
+    w.dg_dq.template block_in_tree<3>(k + 3, k + 3) -=
         step_length * skew<T>(moment) + to_body * dmoment_drotation * rotation;
-    w.dg_dv.template block<3, 3>(k + 3, k) -= to_body * sums.dmoment_dlinear * frame.to_world.transpose();
-    w.dg_dv.template block<3, 3>(k + 3, k + 3) -=
+    w.dg_dv.template block_in_tree<3>(k + 3, k) -= to_body * sums.dmoment_dlinear * frame.to_world.transpose();
+    w.dg_dv.template block_in_tree<3>(k + 3, k + 3) -=
         to_body * (sums.dmoment_dangular + step_length * dmoment_dtheta) * rotation;
   }
 }

@@ -47,7 +47,8 @@ GELFLOW_INLINE void subtract_row(const T& beta_h, int r, Workspace<T>& w) {
   using P = Pack<T>;
   constexpr int width = pack_width<T>;
   const ContactJacobian<T>& c = w.jacobian;
-  const int row = c.dofs->dof[r];
+  const std::ptrdiff_t row = w.layout.row()[c.dofs->dof[r]];
+  T *const dq = w.dg_dq.data() + row, *const dv = w.dg_dv.data() + row;
   P s[6];
   for (int a = first_component; a < 6; ++a) s[a] = P(T(beta_h * c.s.at(r - r % width, a)[r % width]));
   for (int i = 0; i < c.n; i += width) {
@@ -58,9 +59,9 @@ GELFLOW_INLINE void subtract_row(const T& beta_h, int r, Workspace<T>& w) {
       if (coupled) jac_axis += s[a] * load<P>(c.axis_wrench.at(i, a));
     }
     if (coupled) jac_q -= load<P>(&c.dofs->axis_coupling[static_cast<std::size_t>(r) * c.n + i]) * jac_axis;
-    const std::ptrdiff_t at = row * w.dg_dq.outerStride() + c.dofs->start[i / width];
-    store(load<P>(w.dg_dq.data() + at) - jac_q, w.dg_dq.data() + at);
-    store(load<P>(w.dg_dv.data() + at) - jac_v, w.dg_dv.data() + at);
+    const int at = c.matrix_column[i / width];
+    store(load<P>(dq + at) - jac_q, dq + at);
+    store(load<P>(dv + at) - jac_v, dv + at);
   }
 }
 
@@ -111,7 +112,8 @@ void subtract_impulses(const PairDofs& pair, const T& beta_h, const V6<T>& wrenc
 }
 
 // Subtracts β h · (generalized contact forces) from w.residual; with derivatives also from w.dg_dq and w.dg_dv.
-// `cache`: the state of the candidate points in w. `add_impulses`: adds the absolute values to w.impulses.
+// `cache`: the state of the candidate points in w; with derivatives find_islands has found those of contacts that join
+// trees. `add_impulses`: adds the absolute values to w.impulses.
 template <bool derivatives, class T>
 void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>& start, CacheState cache,
                              bool add_impulses, Workspace<T>& w) {
@@ -123,8 +125,10 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
     // The step length serves the arc correction only, under BDF1, where β h = h.
     ContactSettings<T> settings = contact_settings<T>(m, contact, params, start.anchors, start.anchored, start.beta_h);
     settings.continuation = start.continuation;
-    find_candidate_points<T>(frame, set.cloud, settings, cache, w.candidates[n]);
-    if (!sum_forces<derivatives, T>(frame, w.candidates[n], settings, sums)) {
+    const bool joins_trees = derivatives && contact.first_tree >= 0;
+    if (!joins_trees) find_candidate_points<T>(frame, set.cloud, settings, cache, w.candidates[n]);
+    if ((joins_trees && !w.layout.share_island(contact.first_tree, contact.second_tree)) ||
+        !sum_forces<derivatives, T>(frame, w.candidates[n], settings, sums)) {
       if (!is_finite(frame.finiteness_probe())) w.residual[0] = frame.finiteness_probe();
       continue;
     }

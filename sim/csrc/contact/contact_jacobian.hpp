@@ -37,6 +37,7 @@ void contact_jacobian(const PairDofs& pair, int first, const PairFrame<T>& f, Wo
   const V6<T> twist = f.motion(first == world ? V6<T>(V6<T>::Zero()) : w.twist[first]);
   for (int i = 0; i < c.n; i += pack_width<T>) {
     const int at = c.dofs->start[i / pack_width<T>];
+    c.matrix_column[i / pack_width<T>] = w.layout.column()[at];
     const P sign = load<P>(&c.dofs->sign[i]);
     PackedMotion<T> s = packed_motion<T>(f, w.axis, at);
     s.angular = sign * s.angular;

@@ -64,31 +64,32 @@ template <class T>
 GELFLOW_INLINE void add_free_body_derivatives(const FreeBodyTerms<T>& b, const T& beta_h, const StepStart<T>* start,
                                               Workspace<T>& w) {
   const int k = b.k;
-  for (int i = 0; i < 3; ++i) w.mass(k + i, k + i) = b.mass;
-  w.dg_dv.template block<3, 3>(k + 3, k + 3) +=
+  for (int i = 0; i < 3; ++i) w.mass.in_tree(k + i, k + i) = b.mass;
+  w.dg_dv.template block_in_tree<3>(k + 3, k + 3) +=
       beta_h * (cross_columns<T>(b.spin, b.inertia) - skew<T>(b.angular_momentum));
   if (b.centered) {  // another environment may have another centre of mass: blocks are set, not assumed zero
-    w.mass.template block<3, 3>(k + 3, k + 3) = b.inertia;
-    w.mass.template block<3, 3>(k, k + 3).setZero();
-    w.mass.template block<3, 3>(k + 3, k).setZero();
+    w.mass.template block_in_tree<3>(k + 3, k + 3) = b.inertia;
+    w.mass.template block_in_tree<3>(k, k + 3).setZero();
+    w.mass.template block_in_tree<3>(k + 3, k).setZero();
     return;
   }
   const M3<T> arm = skew<T>(b.c), turned = b.mass * b.rotation;
-  w.mass.template block<3, 3>(k + 3, k + 3) = b.inertia - b.mass * (arm * arm);
-  w.mass.template block<3, 3>(k, k + 3) = -turned * arm;
-  w.mass.template block<3, 3>(k + 3, k) = arm * turned.transpose();
+  w.mass.template block_in_tree<3>(k + 3, k + 3) = b.inertia - b.mass * (arm * arm);
+  w.mass.template block_in_tree<3>(k, k + 3) = -turned * arm;
+  w.mass.template block_in_tree<3>(k + 3, k) = arm * turned.transpose();
   if (!start) return;
-  w.dg_dq.template block<3, 3>(k, k + 3) -= beta_h * (turned * skew<T>(b.y));
-  w.dg_dq.template block<3, 3>(k + 3, k + 3) +=
+  w.dg_dq.template block_in_tree<3>(k, k + 3) -= beta_h * (turned * skew<T>(b.y));
+  w.dg_dq.template block_in_tree<3>(k + 3, k + 3) +=
       beta_h * b.mass * (arm * skew<T>(b.rotation.transpose() * b.acceleration));
   const M3<T> jac_turn = beta_h * (skew<T>(b.before.u) * right_jacobian<T>(b.turn));
-  w.dg_dv.template block<3, 3>(k, k + 3) -= turned * jac_turn;
-  w.dg_dv.template block<3, 3>(k + 3, k + 3) -= b.mass * (arm * jac_turn);
+  w.dg_dv.template block_in_tree<3>(k, k + 3) -= turned * jac_turn;
+  w.dg_dv.template block_in_tree<3>(k + 3, k + 3) -= b.mass * (arm * jac_turn);
   if (start->history != nullptr) return;
   const MomentArmCorrection<T> arc(b.turn, true);
-  w.dg_dq.template block<3, 3>(k + 3, k + 3) += beta_h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
+  w.dg_dq.template block_in_tree<3>(k + 3, k + 3) += beta_h * (skew<T>(arc.value * b.c) * skew<T>(b.weight));
   for (int j = 0; j < 3; ++j) {
-    w.dg_dv.template block<3, 1>(k + 3, k + 3 + j) += beta_h * beta_h * cross<T>(arc.derivative[j] * b.c, b.weight);
+    w.dg_dv.template block_in_tree<1>(k + 3, k + 3 + j) +=
+        beta_h * beta_h * cross<T>(arc.derivative[j] * b.c, b.weight);
   }
 }
 

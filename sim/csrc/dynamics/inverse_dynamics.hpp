@@ -96,7 +96,7 @@ GELFLOW_INLINE void set_translation_mass(const Model& m, int j, Workspace<T>& w)
   const V3<T> momentum = w.composite[body].mass * bottom(s);
   for (const int k : m.bodies[body].dofs) {
     if (k > j) continue;
-    w.mass(k, j) = w.mass(j, k) = bottom(w.axis[k]).dot(momentum);
+    w.mass.in_tree(k, j) = w.mass.in_tree(j, k) = bottom(w.axis[k]).dot(momentum);
   }
 }
 
@@ -127,16 +127,16 @@ GELFLOW_INLINE void add_dof_derivatives(const Model& m, const T& beta_h, int j, 
     if (k > j && m.group_begin[k] != m.group_begin[j]) continue;
     const V6<T> sk = w.axis[k];
     const bool same_group = m.group_begin[k] == m.group_begin[j];
-    w.dg_dq(k, j) += beta_h * dot6<T>(sk, same_group ? force_q : moved_force_q);
-    w.dg_dv(k, j) += beta_h * dot6<T>(sk, force_v);
-    w.mass(k, j) = dot6<T>(sk, force_a);
+    w.dg_dq.in_tree(k, j) += beta_h * dot6<T>(sk, same_group ? force_q : moved_force_q);
+    w.dg_dv.in_tree(k, j) += beta_h * dot6<T>(sk, force_v);
+    w.mass.in_tree(k, j) = dot6<T>(sk, force_a);
     if (same_group) continue;
-    w.mass(j, k) = w.mass(k, j);
+    w.mass.in_tree(j, k) = w.mass.in_tree(k, j);
     if (m.translation_only[k]) continue;
     // The transposed entry, the force at dof j by the ancestor k, sums over the subtree of j. I is symmetric:
     // Sⱼᵀ I = (I Sⱼ)ᵀ.
-    w.dg_dq(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dq[k]) + rate_s.dot(top(w.p[k])));
-    w.dg_dv(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dv[k]) + rate_s.dot(top(sk)));
+    w.dg_dq.in_tree(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dq[k]) + rate_s.dot(top(w.p[k])));
+    w.dg_dv.in_tree(j, k) += beta_h * (dot6<T>(force_a, w.dmotion_dv[k]) + rate_s.dot(top(sk)));
   }
 }
 

@@ -199,14 +199,17 @@ void integrate(const Model& m, const T* q0, const T* q_rounding, const VX<T>& in
 
 // columns ← columns · ∂q_t/∂increment, where the columns refer to the tangent of q_t: Jr(φ) on rotational dofs.
 template <class T>
-void times_dposition_dincrement(const Model& m, const VX<T>& increment, typename Workspace<T>::Rows& columns) {
+void times_dposition_dincrement(const Model& m, const VX<T>& increment, const IslandLayout& layout,
+                                IslandMatrix<T>& columns) {
   for (const Joint& joint : m.joints) {
     if (!joint.has_quaternion()) continue;
     const int k = joint.angular_v();
     const M3<T> turn = right_jacobian<T>(vec3(increment.data() + k)).transpose();
-    for (Eigen::Index row = 0; row < columns.rows(); ++row) {
-      const V3<T> old = vec3(&columns(row, k)), turned = turn * old;
-      for (int a = 0; a < 3; ++a) columns(row, k + a) = turned[a];
+    const Island& island = layout.island_of(k);
+    T* entry = columns.data() + island.begin + layout.column()[k];
+    for (int row = 0; row < island.size; ++row, entry += island.stride) {
+      const V3<T> turned = turn * vec3<T>(entry);
+      for (int a = 0; a < 3; ++a) entry[a] = turned[a];
     }
   }
 }

@@ -5,7 +5,6 @@
 #pragma once
 
 #include <utility>
-#include <vector>
 
 #include "math/simd_pack.hpp"
 
@@ -15,7 +14,7 @@ constexpr int max_inverse_size = 16;
 
 // Partial pivoting: swaps row k with the row from k on whose entry in column k has the largest magnitude.
 template <class T, class Rows>
-T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
+T* pivot_row(Rows& a, int n, int k, int* pivots) {
   using std::abs;
   const std::ptrdiff_t stride = a.outerStride();
   T* const row = a.data() + k * stride;
@@ -34,7 +33,7 @@ T* pivot_row(Rows& a, int n, int k, std::vector<int>& pivots) {
 
 // Replaces the first n columns of `a`, stored in `packs` packs per row, by the inverse (Gauss-Jordan elimination).
 template <int packs, class T, class Rows>
-void invert(Rows& a, int n, std::vector<int>& pivots) {
+void invert(Rows& a, int n, int* pivots) {
   using P = Pack<T>;
   constexpr int width = pack_width<T>;
   const std::ptrdiff_t stride = a.outerStride();
@@ -67,7 +66,7 @@ void invert(Rows& a, int n, std::vector<int>& pivots) {
   }
 }
 template <class T, class Rows, int packs = 1>
-void invert(Rows& a, int n, std::vector<int>& pivots) {
+void invert(Rows& a, int n, int* pivots) {
   if constexpr ((packs + 1) * pack_width<T> <= max_inverse_size) {
     if (n > packs * pack_width<T>) return invert<T, Rows, packs + 1>(a, n, pivots);
   }
@@ -82,7 +81,7 @@ bool uses_inverse(int n) {
 // Factorizes (or inverts) `a` in place for `solve`. Rows are padded by at least one pack. For a singular matrix `solve`
 // returns values that are not finite.
 template <class T, class Rows>
-void factorize(Rows& a, int n, std::vector<int>& pivots) {
+void factorize(Rows& a, int n, int* pivots) {
   if constexpr (pack_width<T> > 1) {
     if (uses_inverse<T>(n)) return invert<T>(a, n, pivots);
   }
@@ -106,7 +105,7 @@ void factorize(Rows& a, int n, std::vector<int>& pivots) {
 
 // x = A⁻¹ b, with `a` and `pivots` from `factorize`.
 template <class T, class Rows>
-void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<T>& x) {
+void solve(const Rows& a, int n, const int* pivots, const T* b, T* x) {
   const std::ptrdiff_t stride = a.outerStride();
   const T* const start = a.data();
   if (uses_inverse<T>(n)) {
@@ -125,11 +124,11 @@ void solve(const Rows& a, int n, const std::vector<int>& pivots, const T* b, VX<
       }
       T products[width];
       sum_lanes(sums, width, products);
-      std::copy(products, products + std::min(width, n - i), x.data() + i);
+      std::copy(products, products + std::min(width, n - i), x + i);
     }
     return;
   }
-  std::copy(b, b + n, x.data());
+  std::copy(b, b + n, x);
   for (int k = 0; k < n; ++k) std::swap(x[k], x[pivots[k]]);
   for (int j = 0; j < n; ++j) {
     for (int i = j + 1; i < n; ++i) x[i] -= start[i * stride + j] * x[j];

@@ -1,7 +1,9 @@
 // The parts of a model that follow from all its elements together: the dofs that move each body, which dofs move the
 // axes of others, the dofs that change the relative motion of each pair of bodies, and the leaders of couplings.
 #include <algorithm>
+#include <map>
 
+#include "math/linear_solver.hpp"
 #include "model/definition_checks.hpp"
 #include "model/model_spec.hpp"
 
@@ -31,39 +33,62 @@ void find_translations(Model& m) {
 }
 
 void find_free_bodies(Model& m) {
-  for (std::size_t i = 0; i < m.bodies.size(); ++i) {
-    const auto is_child = [&](const Body& other) { return other.parent == static_cast<int>(i); };
-    Body& body = m.bodies[i];
-    body.is_free = body.joint_end == body.joint_begin + 1 && m.joints[body.joint_begin].type == JointType::free &&
-                   std::none_of(m.bodies.begin(), m.bodies.end(), is_child);
+  for (Body& body : m.bodies) {
+    body.is_free = body.joint_end == body.joint_begin + 1 && m.joints[body.joint_begin].type == JointType::free;
+  }
+  for (const Body& body : m.bodies) {
+    if (body.parent != world) m.bodies[body.parent].is_free = false;
   }
   for (int k = 0; k < m.nv; ++k) {
     if (!m.bodies[m.dof_body[k]].is_free) m.articulated_dofs.push_back(k);
   }
 }
 
-void find_ancestors(Model& m) {
-  m.ancestor_table.assign(static_cast<std::size_t>(m.nv) * m.nv, 0);
+// The root's first dof comes first among those of a tree. Dofs of other trees may lie between it and the last one.
+void find_trees(Model& m) {
+  std::vector<int> last(m.nv, -1);  // of the tree, at its first dof
+  for (int k = 0; k < m.nv; ++k) last[m.bodies[m.dof_body[k]].dofs.front()] = k;
   for (int k = 0; k < m.nv; ++k) {
-    for (const int j : m.bodies[m.dof_body[k]].dofs) {
-      if (j > k && m.group_begin[j] != m.group_begin[k]) continue;
-      m.ancestor_table[static_cast<std::size_t>(j) * m.nv + k] = 1;
-    }
+    if (m.trees.empty() || k >= m.trees.back().end) m.trees.push_back({k, k + 1});
+    m.trees.back().end = std::max(m.trees.back().end, last[k] + 1);
+    m.dof_tree.push_back(static_cast<int>(m.trees.size()) - 1);
+  }
+  // Smaller systems are solved at once.
+  m.has_islands = m.trees.size() > 1 && m.nv > max_inverse_size;
+}
+
+void couple_trees(Model& m, int first_dof, int second_dof) {
+  if (first_dof < 0 || second_dof < 0 || m.dof_tree[first_dof] == m.dof_tree[second_dof]) return;
+  m.coupled_trees.emplace_back(m.dof_tree[first_dof], m.dof_tree[second_dof]);
+}
+
+int first_dof(const Model& m, int body) { return body == world ? -1 : m.bodies[body].dofs.front(); }
+
+void find_coupled_trees(Model& m) {
+  for (const Coupling& c : m.couplings) couple_trees(m, c.dof, c.leader_dof);
+  for (const PolynomialCoupling& c : m.polynomial_couplings) couple_trees(m, c.dof, c.leader_dof);
+  for (const LoopClosure& c : m.loop_closures) couple_trees(m, first_dof(m, c.first), first_dof(m, c.second));
+  for (const Tendon& tendon : m.tendons) {
+    for (const Tendon::Term& term : tendon.terms) couple_trees(m, tendon.terms.front().dof, term.dof);
   }
 }
 
-// Packs of `width` neighbouring dofs that hold all dofs whose sign is not 0.
-PackedDofs pack_dofs(const Model& m, const std::vector<double>& signs, int width) {
+using Signs = std::map<int, double>;  // of the dofs that move one body of a pair and not the other
+
+// Packs of `width` neighbouring dofs that hold all dofs of the pair. With islands a pack holds dofs of one tree only,
+// because only these are neighbours in the matrices.
+PackedDofs pack_dofs(const Model& m, const Signs& signs, int width) {
   PackedDofs packed;
-  for (int k = 0; k < m.nv; ++k) {
-    if (signs[k] == 0 || (!packed.start.empty() && k < packed.start.back() + width)) continue;
-    packed.start.push_back(k);
+  for (const auto& [k, sign] : signs) {
+    const bool in_pack = !packed.start.empty() && k < packed.start.back() + width;
+    if (!in_pack || (m.has_islands && m.dof_tree[k] != m.dof_tree[packed.start.back()])) packed.start.push_back(k);
   }
   for (const int start : packed.start) {
     for (int k = start; k < start + width; ++k) {
-      const double sign = k < m.nv ? signs[k] : 0.0;
-      packed.sign.push_back(sign);
-      packed.dof.push_back(sign != 0 ? k : -1);
+      const auto found = signs.find(k);
+      const bool in_pack = found != signs.end() && (!m.has_islands || m.dof_tree[k] == m.dof_tree[start]);
+      packed.sign.push_back(in_pack ? found->second : 0.0);
+      packed.dof.push_back(in_pack ? k : -1);
     }
   }
   for (const int row : packed.dof) {
@@ -71,8 +96,8 @@ PackedDofs pack_dofs(const Model& m, const std::vector<double>& signs, int width
     packed.has_coupling.push_back(0);
     for (const int column : packed.dof) {
       const bool both = row >= 0 && column >= 0;
-      const bool counts = both && (signs[column] > 0 ? signs[row] > 0 && m.is_ancestor(column, row)
-                                                     : signs[row] > 0 || !m.is_ancestor(column, row));
+      const bool counts = both && (signs.at(column) > 0 ? signs.at(row) > 0 && m.is_ancestor(column, row)
+                                                        : signs.at(row) > 0 || !m.is_ancestor(column, row));
       packed.axis_coupling.push_back(counts ? 1.0 : 0.0);
       if (counts) packed.has_coupling.back() = 1;
     }
@@ -81,13 +106,14 @@ PackedDofs pack_dofs(const Model& m, const std::vector<double>& signs, int width
 }
 
 PairDofs pair_dofs(Model& m, int first, int second) {
-  std::vector<double> signs(m.nv, 0.0);  // a dof that moves both bodies cancels
+  Signs signs;  // a dof that moves both bodies cancels
   if (first != world) {
     for (const int k : m.bodies[first].dofs) signs[k] += 1;
   }
   if (second != world) {
     for (const int k : m.bodies[second].dofs) signs[k] -= 1;
   }
+  std::erase_if(signs, [](const auto& item) { return item.second == 0; });
   const PairDofs pair{pack_dofs(m, signs, 1), pack_dofs(m, signs, 4), pack_dofs(m, signs, 8)};
   for (const PackedDofs* packed : {&pair.single, &pair.four, &pair.eight}) {
     m.jacobian_columns = std::max(m.jacobian_columns, static_cast<int>(packed->dof.size()));
@@ -101,7 +127,8 @@ void build_kinematic_tree(Model& model) {
   find_body_dofs(model);
   find_translations(model);
   find_free_bodies(model);
-  find_ancestors(model);
+  find_trees(model);
+  find_coupled_trees(model);
 }
 
 void build_contact_pairs(Model& model) {
@@ -110,6 +137,11 @@ void build_contact_pairs(Model& model) {
     const PointSet& set = model.point_sets[contact.points];
     const Shape& shape = model.shapes[contact.shape];
     contact.pair = pair_dofs(model, set.mount.body, shape.body);
+    const int first = first_dof(model, set.mount.body), second = first_dof(model, shape.body);
+    if (model.has_islands && first >= 0 && second >= 0 && model.dof_tree[first] != model.dof_tree[second]) {
+      contact.first_tree = model.dof_tree[first];
+      contact.second_tree = model.dof_tree[second];
+    }
     contact.uses_arc_correction = set.mount.body != world && model.bodies[set.mount.body].is_free &&
                                   shape.body == world && shape.kind == ShapeKind::plane &&
                                   (set.radius == 0 || set.cloud.extent > 0);

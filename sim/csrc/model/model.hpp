@@ -3,9 +3,11 @@
 // and names.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "geometry/distance_grid.hpp"
@@ -117,7 +119,8 @@ struct Contact {
   ParamBlock<ContactParams> params;
   int anchor;  // first anchor slot, −1 under the viscous law
   PairDofs pair;
-  bool uses_arc_correction = false;  // a free body on a plane of the world (arc_correction.hpp)
+  int first_tree = -1, second_tree = -1;  // the trees that it joins; −1 if it joins none (solver/islands.hpp)
+  bool uses_arc_correction = false;       // a free body on a plane of the world (arc_correction.hpp)
 };
 
 struct Pad {
@@ -174,6 +177,11 @@ struct LoopClosure {
   PairDofs pair;
 };
 
+// Consecutive dofs, end excluded.
+struct DofRange {
+  int begin, end;
+};
+
 struct Actuator {
   std::string name;
   ActuatorKind kind;
@@ -222,9 +230,17 @@ struct Model : SolverOptions {
   std::vector<int> group_begin, group_end;
   std::vector<std::uint8_t> angular, translation_only;
   std::vector<int> articulated_dofs;  // dofs of bodies that are not free
-  std::vector<std::uint8_t> ancestor_table;
   // Moving dof j moves the axis of dof k: j is an ancestor of k, or in its group.
-  bool is_ancestor(int j, int k) const { return ancestor_table[static_cast<std::size_t>(j) * nv + k] != 0; }
+  bool is_ancestor(int j, int k) const {
+    const std::vector<int>& dofs = bodies[dof_body[k]].dofs;
+    return (j <= k || group_begin[j] == group_begin[k]) && std::binary_search(dofs.begin(), dofs.end(), j);
+  }
+
+  // The kinematic trees; trees whose dofs alternate count as one.
+  std::vector<DofRange> trees;
+  std::vector<int> dof_tree;                       // per dof
+  std::vector<std::pair<int, int>> coupled_trees;  // always in one island: by couplings, tendons and loop closures
+  bool has_islands = false;                        // the dofs may form several systems (solver/islands.hpp)
 };
 
 }  // namespace gelflow

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "math/simd_pack.hpp"
-#include "model/model.hpp"
+#include "model/island_matrix.hpp"
 
 namespace gelflow {
 
@@ -87,12 +87,18 @@ struct CandidatePoints {
 template <class T>
 struct ContactJacobian {
   explicit ContactJacobian(int capacity)
-      : s(capacity), y(capacity), dwrench_dq(capacity), dwrench_dv(capacity), axis_wrench(capacity) {}
+      : s(capacity),
+        y(capacity),
+        dwrench_dq(capacity),
+        dwrench_dv(capacity),
+        axis_wrench(capacity),
+        matrix_column(capacity) {}
   const PackedDofs* dofs = nullptr;
   int n = 0;         // columns, a whole number of packs
   SixPacks<T> s, y;  // S and Y, signs applied
   SixPacks<T> dwrench_dq, dwrench_dv,
-      axis_wrench;  // derivatives of the contact forces by the columns' dofs (contact_forces.hpp)
+      axis_wrench;                 // derivatives of the contact forces by the columns' dofs (contact_forces.hpp)
+  std::vector<int> matrix_column;  // per pack: the column of its first dof in w.dg_dq and w.dg_dv
 };
 
 // The start of a step: the arguments of its residual other than v_t.
@@ -115,8 +121,7 @@ struct StepStart {
 template <class T>
 struct Workspace {
   explicit Workspace(const Model& m)
-      : stride(m.nv + PointCloud::padding),
-        rotation(m.bodies.size()),
+      : rotation(m.bodies.size()),
         position(m.bodies.size()),
         twist(m.bodies.size()),
         acceleration(m.bodies.size()),
@@ -129,32 +134,29 @@ struct Workspace {
         p(m.nv),
         dmotion_dq(m.nv),
         dmotion_dv(m.nv),
-        residual(stride),
-        impulses(stride),
-        residual_scale(stride),
+        residual(m.nv + PointCloud::padding),
+        impulses(m.nv + PointCloud::padding),
+        residual_scale(m.nv + PointCloud::padding),
         increment(m.nv),
         generalized_acceleration(m.nv),
         velocity_change(m.nv),
         direction(m.nv),
         search_start(m.nv),
         best_velocity(m.nv),
-        mass(m.nv, stride),
-        dg_dq(m.nv, stride),
-        dg_dv(m.nv, stride),
+        layout(m, pack_width<T>),
+        mass(layout),
+        dg_dq(layout),
+        dg_dv(layout),
         dg_du(m.actuators.size()),
-        tangent(m.nv, stride),
+        tangent(layout),
         q(m.nq),
         pivots(m.nv),
+        gathered(m.nv),
+        solved(m.nv),
         jacobian(m.jacobian_columns),
         candidates(m.contacts.size()) {
     impulses.setZero();
-    mass.setZero();
-    tangent.setZero();
   }
-
-  // Rows of matrices are padded, so that packs can be added at any column.
-  using Rows = Eigen::Matrix<T, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
-  int stride;
 
   // Kinematics in the world frame; spatial vectors at the world's origin.
   std::vector<M3<PositionScalar<T>>> rotation;
@@ -168,20 +170,29 @@ struct Workspace {
   std::vector<V6<T>> p, dmotion_dq, dmotion_dv;  // P, Q and P − S × V_after per dof (inverse_dynamics.hpp)
 
   // Residual g of the step and its derivatives.
-  VX<T> residual, impulses, residual_scale;  // behind the last number as many zeros as rows have (newton.hpp)
+  VX<T> residual, impulses, residual_scale;  // padded with zeros (newton.hpp)
   VX<T> increment;                           // q_t = q_{t-1} ⊕ increment
   VX<T> generalized_acceleration;            // (v_t − v*)/(β h)
   VX<T> velocity_change;                     // v_t − v*
   VX<T> direction;                           // of Newton's method
   VX<T> search_start, best_velocity;         // start of the line search; iterate with the smallest residual
-  Rows mass, dg_dq, dg_dv;                   // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
+  IslandLayout layout;                       // of the matrices
+  IslandMatrix<T> mass, dg_dq, dg_dv;        // ∂g/∂v* = −mass, ∂g/∂q_t, ∂g/∂v_t at fixed q_t
   VX<T> dg_du;                               // ∂g_dof/∂u per actuator
-  Rows tangent;             // ∂g/∂v_t in all: dg_dv + dg_dq ∂q_t/∂v_t; then its factors (linear_solver.hpp)
+  IslandMatrix<T> tangent;  // ∂g/∂v_t in all: dg_dv + dg_dq ∂q_t/∂v_t; then its factors (linear_solver.hpp)
   VX<PositionScalar<T>> q;  // q_t of the trial velocity
   std::vector<int> pivots;
+  VX<T> gathered, solved;  // of an island whose dofs are not consecutive (solver/islands.hpp)
 
   ContactJacobian<T> jacobian;                 // of the current pair
   std::vector<CandidatePoints<T>> candidates;  // per contact
+
+  // Applies a new layout. Entries of the mass matrix between trees or dofs without a common subtree stay 0 from then on.
+  void fit_matrices(const Model& m) {
+    if (!layout.apply(m)) return;
+    for (IslandMatrix<T>* matrix : {&mass, &dg_dq, &dg_dv, &tangent}) matrix->fit(layout);
+    mass.set_zero();
+  }
 };
 
 }  // namespace gelflow

@@ -86,14 +86,15 @@ template <class T>
 void solve_nearly_singular(const Model& m, const T* params, const StepStart<T>& start, const VX<T>& v, const VX<T>& b,
                            Workspace<T>& w, VX<T>& multiplier) {
   evaluate<true, T>(m, params, start, v.data(), CacheState::stale, false, w);
-  reduce_couplings<T>(m, w.tangent);
-  remove_prescribed<T>(m, w.tangent);
-  w.tangent.leftCols(m.nv).transposeInPlace();
+  reduce_couplings<T>(m, w.layout, w.tangent);
+  remove_prescribed<T>(m, w.layout, w.tangent);
+  transpose_tangent<T>(w);
   for (const int k : m.articulated_dofs) {
-    if (m.angular[k]) w.tangent(k, k) += Eigen::NumTraits<T>::epsilon() * w.composite[m.dof_body[k]].inertia.trace();
+    if (m.angular[k])
+      w.tangent.in_tree(k, k) += Eigen::NumTraits<T>::epsilon() * w.composite[m.dof_body[k]].inertia.trace();
   }
-  factorize<T>(w.tangent, m.nv, w.pivots);
-  solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+  factorize_tangent<T>(w);
+  solve_tangent<T>(w, b, multiplier);
 }
 
 // Transforms g from the gradient at the substep's end to the gradient at its start, and adds to grad_u.
@@ -112,14 +113,14 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   }
   VX<T> b = g.v + r.beta_h * (dposition_dincrement_vjp<T>(m, w.increment, g.q) + grad_increment);
   reduce_couplings<T>(m, b);
-  reduce_couplings<T>(m, w.tangent);
-  const PrescribedGradient<T> prescribed(m, b, w.tangent);
+  reduce_couplings<T>(m, w.layout, w.tangent);
+  const PrescribedGradient<T> prescribed(m, w.layout, b, w.tangent);
   remove_prescribed<T>(m, b);
-  remove_prescribed<T>(m, w.tangent);
-  w.tangent.leftCols(m.nv).transposeInPlace();
-  factorize<T>(w.tangent, m.nv, w.pivots);
+  remove_prescribed<T>(m, w.layout, w.tangent);
+  transpose_tangent<T>(w);
+  factorize_tangent<T>(w);
   VX<T> multiplier(m.nv);
-  solve<T>(w.tangent, m.nv, w.pivots, b.data(), multiplier);
+  solve_tangent<T>(w, b, multiplier);
   if (!multiplier.allFinite()) [[unlikely]] {
     solve_nearly_singular<T>(m, params, start, r.v1, b, w, multiplier);
   }
@@ -128,8 +129,8 @@ void substep_vjp(const Model& m, const T* params, const T* u, const SubstepRecor
   for (std::size_t a = 0; a < m.actuators.size(); ++a) {
     grad_u[a] -= along_transmission<T>(m, m.actuators[a], multiplier) * w.dg_du[a];
   }
-  const VX<T> grad_q1 = g.q - w.dg_dq.leftCols(m.nv).transpose() * multiplier;
-  VX<T> grad_v_star = w.mass.leftCols(m.nv).transpose() * multiplier, grad_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
+  const VX<T> grad_q1 = g.q - transposed_times<T>(w, w.dg_dq, multiplier);
+  VX<T> grad_v_star = transposed_times<T>(w, w.mass, multiplier), grad_v_before = VX<T>::Zero(m.nv);  // v_{t-2}
   grad_increment += dposition_dincrement_vjp<T>(m, w.increment, grad_q1);
   free_bodies_vjp<T>(m, params, start, w, multiplier, grad_v_star, grad_increment, grad_v_before);
   g.q = dposition_dposition_vjp<T>(m, w.increment, grad_q1);

@@ -38,16 +38,26 @@ void reduce_absolute_couplings(const Model& m, VX<T>& x) {
   }
 }
 
+// Sets row and column k to those of the identity.
+template <class T>
+void set_identity_at(typename IslandMatrix<T>::Block& block, int k) {
+  block.row(k).setZero();
+  block.col(k).setZero();
+  block(k, k) = T(1);
+}
+
 // A ← Eᵀ A E.
 template <class T>
-void reduce_couplings(const Model& m, typename Workspace<T>::Rows& a) {
+void reduce_couplings(const Model& m, const IslandLayout& layout, IslandMatrix<T>& a) {
   for (const Coupling& c : m.couplings) {
+    const int dof = layout.column()[c.dof];
+    auto block = a.block(layout.island_of(c.dof));
     if (c.leader_dof >= 0) {
-      a.row(c.leader_dof) += T(c.ratio) * a.row(c.dof);
-      a.col(c.leader_dof) += T(c.ratio) * a.col(c.dof);
+      const int leader = layout.column()[c.leader_dof];
+      block.row(leader) += T(c.ratio) * block.row(dof);
+      block.col(leader) += T(c.ratio) * block.col(dof);
     }
-    for (int k = 0; k < m.nv; ++k) a(c.dof, k) = a(k, c.dof) = T(0);
-    a(c.dof, c.dof) = T(1);
+    set_identity_at<T>(block, dof);
   }
 }
 
@@ -58,10 +68,10 @@ void remove_prescribed(const Model& m, VX<T>& x) {
 }
 
 template <class T>
-void remove_prescribed(const Model& m, typename Workspace<T>::Rows& a) {
+void remove_prescribed(const Model& m, const IslandLayout& layout, IslandMatrix<T>& a) {
   for (const int k : m.prescribed_dofs) {
-    for (int j = 0; j < m.nv; ++j) a(k, j) = a(j, k) = T(0);
-    a(k, k) = T(1);
+    auto block = a.block(layout.island_of(k));
+    set_identity_at<T>(block, layout.column()[k]);
   }
 }
 
@@ -70,22 +80,25 @@ void remove_prescribed(const Model& m, typename Workspace<T>::Rows& a) {
 template <class T>
 class PrescribedGradient {
  public:
-  PrescribedGradient(const Model& m, const VX<T>& b, const typename Workspace<T>::Rows& a) : m_(m) {
+  PrescribedGradient(const Model& m, const IslandLayout& layout, const VX<T>& b, const IslandMatrix<T>& a)
+      : m_(m), layout_(layout) {
     for (const int k : m.prescribed_dofs) {
       b_.push_back(b[k]);
-      columns_.emplace_back(a.col(k));
+      columns_.emplace_back(a.block(layout.island_of(k)).col(layout.column()[k]));
     }
   }
   void add(const VX<T>& multiplier, VX<T>& grad_v) const {
     for (std::size_t i = 0; i < b_.size(); ++i) {
       T& sum = grad_v[m_.prescribed_dofs[i]];
       sum += b_[i];
-      for (int j = 0; j < m_.nv; ++j) sum -= columns_[i][j] * multiplier[j];
+      layout_.for_dofs(layout_.island_of(m_.prescribed_dofs[i]),
+                       [&](int j) { sum -= columns_[i][layout_.column()[j]] * multiplier[j]; });
     }
   }
 
  private:
   const Model& m_;
+  const IslandLayout& layout_;
   std::vector<T> b_;
   std::vector<VX<T>> columns_;
 };

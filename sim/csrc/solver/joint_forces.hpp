@@ -93,18 +93,18 @@ GELFLOW_INLINE void add_dof_forces(const Joint& joint, const JointParams<T>& p, 
   const T damping = p.damping, armature = p.armature;
   for (int k = joint.v; k < joint.v + joint.dofs; ++k) {
     w.residual[k] += beta_h * damping * v[k];
-    if constexpr (derivatives) w.dg_dv(k, k) += beta_h * damping;
+    if constexpr (derivatives) w.dg_dv.in_tree(k, k) += beta_h * damping;
     if (p.frictionloss != T(0)) {
       const DryFriction<T> friction = dry_friction<T>(p.frictionloss, v[k], creep);
       w.residual[k] += beta_h * friction.force;
       if (add_impulses) w.impulses[k] += beta_h * p.frictionloss;
-      if constexpr (derivatives) w.dg_dv(k, k) += beta_h * friction.dforce_dspeed;
+      if constexpr (derivatives) w.dg_dv.in_tree(k, k) += beta_h * friction.dforce_dspeed;
     }
     if (armature != T(0)) {
       w.residual[k] += armature * w.velocity_change[k];
       if constexpr (derivatives) {
-        w.dg_dv(k, k) += armature;
-        w.mass(k, k) += armature;
+        w.dg_dv.in_tree(k, k) += armature;
+        w.mass.in_tree(k, k) += armature;
       }
     }
   }
@@ -118,12 +118,12 @@ GELFLOW_INLINE void add_spring_and_limit(const Joint& joint, const JointParams<T
   const int k = joint.v;
   const T value(q[joint.q]);
   w.residual[k] += beta_h * stiffness * (value - springref);
-  if constexpr (derivatives) w.dg_dq(k, k) += beta_h * stiffness;
+  if constexpr (derivatives) w.dg_dq.in_tree(k, k) += beta_h * stiffness;
   const LimitForce<T> limit = limit_force<T>(p, value, v[k]);
   w.residual[k] += beta_h * limit.force;
   if constexpr (derivatives) {
-    w.dg_dq(k, k) += beta_h * limit.dforce_dq;
-    w.dg_dv(k, k) += beta_h * limit.dforce_dv;
+    w.dg_dq.in_tree(k, k) += beta_h * limit.dforce_dq;
+    w.dg_dv.in_tree(k, k) += beta_h * limit.dforce_dv;
   }
 }
 
@@ -160,8 +160,8 @@ GELFLOW_INLINE void subtract_actuator_impulse(const Model& m, const Actuator& ac
   w.residual[k] -= beta_h * gear * out.force;
   if (add_impulses) w.impulses[k] += beta_h * abs(gear * out.force);
   if constexpr (derivatives) {
-    w.dg_dq(k, k) -= beta_h * gear * gear * out.dforce_dlength;
-    w.dg_dv(k, k) -= beta_h * gear * gear * out.dforce_dspeed;
+    w.dg_dq.in_tree(k, k) -= beta_h * gear * gear * out.dforce_dlength;
+    w.dg_dv.in_tree(k, k) -= beta_h * gear * gear * out.dforce_dspeed;
   }
 }
 

@@ -4,7 +4,6 @@
 
 #include <algorithm>
 
-#include "math/linear_solver.hpp"
 #include "solver/couplings.hpp"
 #include "solver/residual.hpp"
 
@@ -57,11 +56,11 @@ bool at_rounding_floor(const Model& m, const T* params, const StepStart<T>& star
   const double momentum = mass * (speed + reach * spin) * (1 + real_part(start.beta_h) * spin);
   const auto bound_of_row = [&](int i) {
     double velocity_terms = m.angular[i] ? reach * momentum : momentum, position_terms = 0;
-    for (int j = 0; j < m.nv; ++j) {
+    w.layout.for_dofs(w.layout.island_of(i), [&](int j) {
       position_terms += std::abs(real_part(w.dg_dq(i, j))) * (m.angular[j] ? angle : reach);
       velocity_terms +=
           std::abs(real_part(w.dg_dv(i, j))) * (std::abs(real_part(v[j])) + std::abs(real_part(start.v_star[j])));
-    }
+    });
     return unit * (position_terms + velocity_terms + real_part(w.impulses[i]));
   };
   for (int i = 0; i < m.nv; ++i) {
@@ -163,8 +162,8 @@ class NewtonSolver {
     remove_prescribed<T>(m_, w_.residual);
     reduce_absolute_couplings<T>(m_, w_.impulses);
     if (!jacobian) return;
-    reduce_couplings<T>(m_, w_.tangent);
-    remove_prescribed<T>(m_, w_.tangent);
+    reduce_couplings<T>(m_, w_.layout, w_.tangent);
+    remove_prescribed<T>(m_, w_.layout, w_.tangent);
   }
   GELFLOW_INLINE void measure(bool jacobian) {
     evaluate_at_v(jacobian, CacheState::current);
@@ -199,9 +198,9 @@ class NewtonSolver {
     jacobian_reused_ = reuse;
     if (!reuse) {
       if (!jacobian_current_) measure(true);
-      factorize<T>(w_.tangent, m_.nv, w_.pivots);
+      factorize_tangent<T>(w_);
     }
-    gelflow::solve<T>(w_.tangent, m_.nv, w_.pivots, w_.residual.data(), w_.direction);
+    solve_tangent<T>(w_, w_.residual, w_.direction);
     expand_couplings<T>(m_, w_.direction);
   }
 

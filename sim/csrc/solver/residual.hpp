@@ -6,6 +6,7 @@
 #pragma once
 
 #include "dynamics/inverse_dynamics.hpp"
+#include "solver/islands.hpp"
 #include "solver/joint_forces.hpp"
 #include "solver/loop_closures.hpp"
 #include "solver/polynomial_couplings.hpp"
@@ -36,26 +37,27 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& start, const 
   forward_velocities<derivatives, T>(m, params, v, w.generalized_acceleration.data(), w);
   w.residual.setZero();
   if constexpr (derivatives) {
-    w.dg_dq.setZero();
-    w.dg_dv.setZero();
-    if (!m.tendons.empty()) w.mass.setZero();  // their entries are in no tree
+    if (m.has_islands) find_islands<T>(m, params, start, cache, w);
+    w.dg_dq.set_zero();
+    w.dg_dv.set_zero();
+    if (!m.tendons.empty()) w.mass.set_zero();  // their entries are in no tree
   }
   add_inverse_dynamics<derivatives, T>(m, params, beta_h, v, &start, w);
   if constexpr (derivatives) {
     add_tendon_mass<T>(m, params, w);
-    w.dg_dv += w.mass;
+    w.dg_dv.values() += w.mass.values();
   }
   if (add_impulses) {
-    for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
+    for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass.in_tree(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
   subtract_joint_forces<derivatives, T>(m, params, beta_h, w.q.data(), v, start.u, start.continuation, add_impulses, w);
   subtract_polynomial_couplings<derivatives, T>(m, params, beta_h, w.q.data(), v, add_impulses, w);
   subtract_contact_forces<derivatives, T>(m, params, start, cache, add_impulses, w);
   subtract_loop_closures<derivatives, T>(m, params, beta_h, add_impulses, w);
   if constexpr (derivatives) {
-    w.tangent = beta_h * w.dg_dq;
-    times_dposition_dincrement<T>(m, w.increment, w.tangent);
-    w.tangent += w.dg_dv;
+    w.tangent.values() = beta_h * w.dg_dq.values();
+    times_dposition_dincrement<T>(m, w.increment, w.layout, w.tangent);
+    w.tangent.values() += w.dg_dv.values();
   }
 }
 
