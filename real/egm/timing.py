@@ -39,10 +39,10 @@ class TimingCounters:
         if self._before is not None and sequence > self._before[0]:
             words[_LOST] += sequence - self._before[0] - 1
             jitter = abs((stamp - self._before[1]) - (controller_time - self._before[2]))
-            words[_JITTER + min(BINS - 1, int(jitter / BIN))] += 1
+            words[_JITTER + _bin(jitter)] += 1
         self._before = sequence, stamp, controller_time
         if answered == answered:
-            words[_ANSWER + min(BINS - 1, int((answered - stamp) / BIN))] += 1
+            words[_ANSWER + _bin(answered - stamp)] += 1
 
     def count_unanswered(self) -> None:
         """Count a message that arrived together with a newer one."""
@@ -53,6 +53,10 @@ class TimingCounters:
         words = self._words.tolist()
         jitter, answer = words[_JITTER:_ANSWER], words[_ANSWER : _ANSWER + BINS]
         return EgmTiming(cycles, words[_LOST], words[_UNANSWERED], _quantiles(jitter), _quantiles(answer))
+
+
+def _bin(seconds: float) -> int:
+    return int(min(max(seconds / BIN, 0.0), BINS - 1.0))
 
 
 def _quantiles(counts: list[int]) -> tuple[float, float, float, float]:

@@ -63,14 +63,14 @@ class TimeSync:
 
     def _read(self, factor: float) -> tuple[float, float]:
         """Robot time, and the wall time at which it was read [s]."""
-        words = self._words
-        # Limits are read before the delay: a reader that is interrupted in between returns a limit that robot time
-        # had already reached, so time never runs backwards.
-        limits = [(words[2 + 2 * slot], words[1 + 2 * slot]) for slot in range(_SLOTS)]
-        delay = words[0]
+        words = self._words.tolist()
         wall = time.monotonic()
-        now = wall * factor - delay
-        for limit, granted in limits:
+        # A process that is interrupted between the two would combine numbers of different times: robot time would run
+        # ahead, and backwards at the next reading.
+        while (again := self._words.tolist()) != words:
+            words, wall = again, time.monotonic()
+        now = wall * factor - words[0]
+        for granted, limit in zip(words[1::2], words[2::2], strict=True):
             if now > limit:
                 now = min(now, limit + max(0.0, wall - granted - _SLOT_TIMEOUT) * factor)
         return now, wall

@@ -42,6 +42,32 @@ def test_robot_time_stops_at_the_earliest_limit_and_does_not_jump_after_it(
     assert start + 0.5 <= other.now() < start + 0.5 + clock.delay
 
 
+def test_a_reader_that_is_interrupted_combines_numbers_of_one_moment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The simulation is late by 7 s while a reader is between the shared numbers and the wall clock."""
+    TimeSync.create(path := str(tmp_path / "time_sync"))
+    reader, writer = TimeSync(path), TimeSync(path)
+    wall = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: wall)
+    before = reader.now(1.0)
+
+    def interrupted() -> float:
+        nonlocal wall
+        if wall == 100.0:
+            wall = 108.0
+            writer.grant(SIMULATED_CELL, 101.0)
+            writer.absorb_delay(1.0)
+            writer.grant(SIMULATED_CELL, math.inf)
+        return wall
+
+    monkeypatch.setattr(time, "monotonic", interrupted)
+    during = reader.now(1.0)
+    after = reader.now(1.0)
+    assert before == 100.0 and writer.delay == 7.0
+    assert during == after == 101.0
+
+
 def test_sleep_waits_for_robot_time(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = synchronized
     start = clock.now()

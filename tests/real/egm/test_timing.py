@@ -36,6 +36,15 @@ def test_jitter_is_relative_to_the_clock_of_the_robot() -> None:
     assert timing.answer[:2] == pytest.approx((4e-4, 4e-4)) and timing.answer[3] == pytest.approx(1e-4 * BINS)
 
 
+@pytest.mark.parametrize("answered", [-1e6, -0.1, -1e-4, 1e6])
+def test_an_impossible_time_of_an_answer_counts_in_the_nearest_bin(answered: float) -> None:
+    shared = counters()
+    shared.add(0, 0.0, 0.0, answered)
+    timing = shared.read(1)
+    assert timing.answer[3] == pytest.approx(1e-4 if answered < 0 else 1e-4 * BINS)
+    assert timing.lost == timing.unanswered == 0 and all(map(math.isnan, timing.jitter))
+
+
 def test_driver_counts_missed_cycles() -> None:
     with ArmAndMock() as cell:
         cell.mock.lose(3, share=0.2)
