@@ -233,7 +233,7 @@ class Pushing(ControlTask):
         self._gripper_base, self._box_base = (scene.bodies[scene.body(name)].pose.position for name in _BODIES)
         self._pad_center = scene.pads[0].pose.position  # in the frame of the gripper
         box = next(shape for shape in scene.shapes if shape.name == "box")
-        self._half_size = box.size[:2]
+        self._half_size, self._half_height = box.size[:2], float(box.size[2])
         self._steps_per_force = max(1, round(task.force_period / task.control_period))
 
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
@@ -276,7 +276,9 @@ class Pushing(ControlTask):
             param(f"box.size.{axis}")[rows] = half
             param(f"box.points.scale.{axis}")[rows] = half / own
         param("box.mass")[rows] = self.mass[rows]
-        param("box.inertia.zz")[rows] = self.mass[rows] * (self.half_size[rows] ** 2).sum(1) / 3
+        squares = np.column_stack([self.half_size[rows], np.full(len(rows), self._half_height)]) ** 2
+        for k, axis in enumerate("xyz"):
+            param(f"box.inertia.{axis}{axis}")[rows] = self.mass[rows] * (squares.sum(1) - squares[:, k]) / 3
 
     def controls(self, actions: Any, steps: NDArray[np.int64]) -> Any:
         """Controls (N, nu) for actions (N, 3) in ±1, after `steps` (N,) control periods of the episodes."""

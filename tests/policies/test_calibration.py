@@ -126,6 +126,7 @@ def test_a_calibration_reduces_the_error(calibrated: Calibration) -> None:
     assert calibrated.suggestions
 
 
+@pytest.mark.slow
 def test_a_fit_is_reproducible(world: RecordedWorld) -> None:
     settings = FitSettings(starts=1, points=1, poses=4, steps=1)
     first, second = (fit(world.recordings.of(np.array([0])), seed=1, settings=settings) for _ in range(2))
@@ -164,6 +165,7 @@ def test_training_randomizes_within_the_intervals_of_a_calibration(tmp_path: Pat
     assert table["pad_kn"] == usual["pad_kn"]
 
 
+@pytest.mark.slow
 def test_training_with_a_calibration_stores_its_ranges(tmp_path: Path) -> None:
     file, out = tmp_path / "report.json", tmp_path / "run"
     file.write_text(json.dumps({"format": 1, "randomization": {"arm_stiffness": [8e3, 2e4]}}))
@@ -282,6 +284,7 @@ def test_replay_warns_of_flow_maps_with_nothing_in_common(
     assert "insertion 0, attempt 0: recorded and simulated flow map have nothing in common" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_report_and_overwrites_nothing(
     tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
 ) -> None:
