@@ -63,6 +63,7 @@ class MotionExecutor:
         self._lock = threading.Lock()
         self._goal: Pose | None = None
         self._speeds = (lab.arm.max_speed, math.radians(lab.arm.max_turn_speed_deg))
+        self._part_lock = threading.Lock()  # of the following three; taken before `_lock`
         self._part_expected = False
         self._held_width = math.nan  # of the gripper at the grasp [m]
         self._part_lost = ""  # the evidence that the part was lost
@@ -159,9 +160,9 @@ class MotionExecutor:
 
     def expect_part(self, held: bool) -> None:
         """Set whether a part is held from now on. When it is lost, the arm holds and `wait` raises PartLost."""
-        self._part_lost = ""
-        self._held_width = self._gripper.state().width
-        self._part_expected = held
+        width = self._gripper.state().width
+        with self._part_lock:
+            self._part_lost, self._held_width, self._part_expected = "", width, held
 
     def height_at(self, stamp: float) -> float:
         """Measured height of the gripper frame in the base frame at a robot time [m]."""
@@ -220,11 +221,15 @@ class MotionExecutor:
         gripper = self._gripper.state()
         if gripper.fault:
             raise PeerError(f"the gripper reports {gripper.fault}; inspect it before anything moves again")
-        if self._part_expected and not self._part_lost:
-            self._watch_part(gripper)
+        self.watch_part()
 
-    def _watch_part(self, gripper: GripperState) -> None:
+    def watch_part(self) -> None:
         """Hold when the gripper shows that the part is no longer held as it was grasped."""
+        with self._part_lock:
+            if self._part_expected and not self._part_lost:
+                self._compare_grasp(self._gripper.state())
+
+    def _compare_grasp(self, gripper: GripperState) -> None:
         change = gripper.width - self._held_width
         if gripper.grasp in ("part lost", "no part"):
             self._part_lost = "the gripper reports that the part was lost"

@@ -1,16 +1,21 @@
 """Insertion runner against the mock robot over pty, TCP, UDP and HTTP: insertions, lost parts, invalid actions."""
 
+import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tests.real.runner.harness import OraclePolicy, events, mean_displacement, plan_for
 
+from gelflow.clock import ScaledClock
 from gelflow.errors import SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
 from gelflow.real.runner.insertion.attempt import Attempt, Insertion
+from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
@@ -84,6 +89,41 @@ def test_lost_part_ends_its_insertion_and_the_next_one_starts(robot: MockRobot, 
     results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot, answer=lose), insertions=2))
     assert [result.outcome for result in results] == ["part lost", "inserted"]
     assert "part lost" in dict(events(tmp_path / "session.mcap"))
+
+
+class InterruptedGripper:
+    """A gripper whose state calls `on_read` once: another thread runs between two steps of the caller."""
+
+    def __init__(self) -> None:
+        self.grasp = "holding"
+        self.on_read: list[threading.Thread] = []
+
+    def state(self) -> Any:
+        while self.on_read:
+            thread = self.on_read.pop()
+            thread.start()
+            thread.join(0.5)
+        return SimpleNamespace(width=0.05, grasp=self.grasp, fault="")
+
+
+def test_a_lost_part_is_not_reported_again_once_none_is_expected() -> None:
+    """The watching thread runs while the runner states that no part is held any more."""
+    gripper = InterruptedGripper()
+    fakes: Any = {
+        "lab": SimpleNamespace(arm=SimpleNamespace(max_speed=0.1, max_turn_speed_deg=10.0)),
+        "supervisor": SimpleNamespace(),
+        "recorder": SimpleNamespace(event=lambda *_: None),
+    }
+    arm: Any = SimpleNamespace(hold=lambda: None)
+    motion = MotionExecutor(arm, gripper, [], clock=ScaledClock(), **fakes)  # type: ignore[arg-type]
+    motion.expect_part(True)
+    gripper.grasp = "part lost"
+    motion.watch_part()
+    with pytest.raises(PartLost, match="the gripper reports that the part was lost"):
+        motion.wait(0.0)
+    gripper.on_read = [threading.Thread(target=motion.watch_part)]
+    motion.expect_part(False)
+    motion.wait(0.0)
 
 
 @pytest.mark.parametrize("answer", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0]])
