@@ -51,9 +51,16 @@ def test_picture_of_a_bare_model(tmp_path: Path) -> None:
         (["--camera", "behind"], "no view 'behind'"),
     ],
 )
-def test_wrong_options_are_refused(options: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_refused_and_leave_no_file(
+    options: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
     assert main(["render-scene", "pushing", *options]) == 2
-    assert message in capsys.readouterr().err
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_controls_of_a_wrong_width_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

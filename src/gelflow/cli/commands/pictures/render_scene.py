@@ -1,6 +1,7 @@
 """`gelflow render-scene SCENE`: a picture or a film of a scene with bodies, contact forces and pads."""
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,10 +116,12 @@ def _frames(args: argparse.Namespace, steps: int, step: float, *, film: bool) ->
 def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, codec: str) -> None:
     import cv2
 
+    pictures = iter(pictures)
+    first = next(pictures)  # before the file is created: an error of the drawing leaves no empty film
     video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
     if not video.isOpened():
         raise UsageError(f"cannot write the film {path}; is its folder writable?")
-    for picture in pictures:
+    for picture in itertools.chain([first], pictures):
         video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
     video.release()
 
