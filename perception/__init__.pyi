@@ -3,6 +3,8 @@ from .calibration import fit_calibration as fit_calibration
 from .calibration import load_calibration as load_calibration
 from .calibration import save_calibration as save_calibration
 from .errors import TrackerInitError as TrackerInitError
+from .force.estimator import ForceEstimate as ForceEstimate
+from .force.estimator import ForceEstimator as ForceEstimator
 from .frames import CameraMount as CameraMount
 from .frames import decode_image as decode_image
 from .frames import tactile_frame as tactile_frame
@@ -20,6 +22,8 @@ from .tracker import TrackingResult as TrackingResult
 __all__ = [
     "Calibration",
     "CameraMount",
+    "ForceEstimate",
+    "ForceEstimator",
     "ImageSource",
     "MarkerTracker",
     "SensorProfile",

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.perception.force.estimator import ForceEstimate
+from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.mount_check import VisiblePart
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.tracker import TrackingResult
@@ -25,6 +27,7 @@ class TrackingSummary:
     largest_at: str = ""  # image and marker of the largest displacement
     first: TrackingResult | None = None
     pixels_per_mm: float | None = None  # uniform scale, where it is known and there is no calibration
+    largest_normal: ForceEstimate | None = None  # the forces of the image with the largest normal force
     visible: list[VisiblePart] = field(default_factory=list)  # possible visible parts of a partly visible grid
     _valid: list[float] = field(default_factory=list)  # share of each image
     _inferred: list[float] = field(default_factory=list)
@@ -44,6 +47,9 @@ class TrackingSummary:
         if len(self._newest) == 3:
             noise = _noise(self._newest[0] - 2 * self._newest[1] + self._newest[2], tracked.position)
             self._noise += [] if noise is None else [noise]
+        force, largest = step.force, self.largest_normal
+        if force is not None and (largest is None or force.normal > largest.normal):
+            self.largest_normal = force
         length = np.nan_to_num(np.linalg.norm(measured, axis=1), nan=-1.0)
         marker = int(length.argmax())
         if length[marker] > self.largest:
@@ -86,6 +92,7 @@ class TrackingSummary:
             "largest_displacement_px": self.largest if self.largest >= 0 else None,
             "largest_displacement_mm": self.largest_mm,
             "largest_displacement_at": self.largest_at,
+            "force": None if self.largest_normal is None else force_record(self.largest_normal),
             "seconds_per_image": self.frame_seconds(),
             "seconds_first_image": self.seconds[0],
         }

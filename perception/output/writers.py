@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.perception.force.estimator import ForceEstimate
+from gelflow.perception.force.image_forces import force_record
+from gelflow.perception.output.forces import SUFFIX, ForceTable, draw_force
 from gelflow.perception.overlay import draw_overlay
 from gelflow.perception.sources import SourceImage
 from gelflow.perception.tracker import TrackingResult
@@ -40,6 +43,7 @@ class TrackedImage:
     tracked: TrackingResult
     position_mm: Floats | None = None  # on the gel [mm], shape (markers, 2); None without a calibration
     displacement_mm: Floats | None = None  # [mm], shape (markers, 2); None without a calibration
+    force: ForceEstimate | None = None  # in the axes of the image; None without a gel, or if it is not known
 
 
 class TrackWriter(Protocol):
@@ -86,6 +90,19 @@ class CsvWriter:
         self._file.close()
 
 
+class ForceWriter:
+    """Table of the total forces, one row per image."""
+
+    def __init__(self, path: Path) -> None:
+        self._table = ForceTable(path)
+
+    def add(self, step: TrackedImage) -> None:
+        self._table.add(step.number, step.frame.name, step.frame.stamp, step.force)
+
+    def close(self) -> None:
+        self._table.close()
+
+
 class McapWriter:
     """Session with the images and their markers. `description` becomes the description of the session."""
 
@@ -114,6 +131,8 @@ class McapWriter:
         if step.displacement_mm is not None:
             values["displacement_mm"] = step.displacement_mm
         self._recorder.markers(self._sensor, stamp, values)
+        if step.force is not None:
+            self._recorder.force(self._sensor, stamp, force_record(step.force))
         if step.number % _SYNC_PERIOD == _SYNC_PERIOD - 1:
             self._recorder.attempt_end()
 
@@ -139,8 +158,8 @@ class _StampClock:
 class OverlayWriter:
     """Video of the overlays at the rate of the images, or with the suffix of a picture the last overlay."""
 
-    def __init__(self, path: Path, *, magnify: float) -> None:
-        self._path, self._magnify = path, magnify
+    def __init__(self, path: Path, *, magnify: float, forces: bool) -> None:
+        self._path, self._magnify, self._forces = path, magnify, forces
         self._waiting: list[TrackedImage] = []  # until the frame interval is known
         self._last: TrackedImage | None = None
         self._video: cv2.VideoWriter | None = None
@@ -178,7 +197,11 @@ class OverlayWriter:
             self._video.write(picture)
 
     def _draw(self, step: TrackedImage) -> NDArray[np.uint8]:
-        return draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
+        picture = draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
+        if self._forces:
+            enlarged = picture.shape[0] / step.frame.image.shape[0]
+            draw_force(picture, step.force, (step.tracked.position + 0.5) * enlarged - 0.5)
+        return picture
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:
@@ -188,26 +211,29 @@ def _png(image: NDArray[np.uint8]) -> bytes:
 
 
 def open_writer(
-    path: Path, *, sensor: str, magnify: float, millimetres: bool, description: Mapping[str, Any]
+    path: Path, *, sensor: str, magnify: float, millimetres: bool, forces: bool, description: Mapping[str, Any]
 ) -> TrackWriter:
-    """The writer for the suffix of `path`: .csv, .mcap, or a video or picture of overlays.
+    """The writer for the suffix of `path`: .forces.csv, .csv, .mcap, or a video or picture of overlays.
 
     Parameters
     ----------
     sensor: channel of the session, left or right
     magnify: length of the arrows of an overlay, relative to the displacement
     millimetres: whether a table has columns in mm
+    forces: whether forces are estimated
     description: description of the session
 
     Raises UsageError for another suffix, or when the file cannot be created.
     """
     suffix = path.suffix.lower()
+    if path.name.lower().endswith(SUFFIX):
+        return ForceWriter(path)
     if suffix == ".csv":
         return CsvWriter(path, millimetres=millimetres)
     if suffix == ".mcap":
         return McapWriter(path, sensor, description)
     check_suffix(path)
-    return OverlayWriter(path, magnify=magnify)
+    return OverlayWriter(path, magnify=magnify, forces=forces)
 
 
 def check_suffix(path: Path) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.elastic_layer import round_cell_compliance, square_cell_compliance
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.scene.elastic_layer import round_cell_compliance, square_cell_compliance
 from gelflow.toml_tables import TomlTable
 
 Array = NDArray[np.float64]

@@ -86,6 +86,26 @@ JSON: dict[str, JsonChannel] = {
         for sensor in SENSORS
     },
     **{
+        f"/{sensor}/force": JsonChannel(
+            "gelflow.Force",
+            {
+                "stamp": NUMBER,
+                "contact": FLAG,
+                "shear": NUMBERS,
+                "shear_deviation": NUMBERS,
+                "normal": NUMBER,
+                "normal_deviation": NUMBER,
+                "moment": NUMBER,
+                "moment_deviation": NUMBER,
+                "centre_mm": {"type": ["array", "null"], "items": NUMBER},
+                "contact_area_mm2": NUMBER,
+                "unexplained": NUMBER,
+            },
+            ("stamp", "contact", "shear", "shear_deviation", "normal", "normal_deviation"),
+        )
+        for sensor in SENSORS
+    },
+    **{
         f"/{sensor}/timing": JsonChannel(
             "gelflow.ImageTiming",
             {"stamp": NUMBER, "sequence": INTEGER, "camera_time": NUMBER},

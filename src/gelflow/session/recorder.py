@@ -125,6 +125,10 @@ class SessionRecorder:
         drawn = annotate(values, self._date(stamp))  # for viewers
         self._put(f"/{name}/annotations", drawn.SerializeToString(), stamp=stamp)
 
+    def force(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
+        """Record the forces on a gel in the image with that stamp; `values` follow the JSON schema `gelflow.Force`."""
+        self._json(f"/{_name(sensor)}/force", {"stamp": stamp, **values}, stamp=stamp)
+
     def arm_state(self, state: ArmState) -> None:
         """Record the measured pose, joints and status of the arm."""
         self._pose("/arm/pose", state.stamp, state.position, state.quaternion)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from gelflow.elastic_layer import half_space_response, layer_response
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import Scene, load_scene
-from gelflow.sim.scene.elastic_layer import half_space_response, layer_response
 from gelflow.sim.scene.gel import LayerGel, SpringGel
 from gelflow.sim.scene.geometry.sampling import disc_lattice
 from gelflow.sim.simulator import Simulator

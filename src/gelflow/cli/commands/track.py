@@ -4,6 +4,7 @@ import argparse
 import itertools
 import time
 from contextlib import ExitStack, closing
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_profile, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.gel_file import load_gel
 from gelflow.perception.calibration import Calibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.force.image_forces import GridScale, ImageForces
 from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
+from gelflow.perception.output.forces import SUFFIX, force_text
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
@@ -51,13 +55,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--pixels-per-mm", type=float, metavar="X", help="scale, without a calibration (default: pitch of the profile)"
     )
     parser.add_argument(
+        "--gel", type=Path, metavar="FILE", help="gel file (TOML): adds forces in newtons; needs a scale or calibration"
+    )
+    parser.add_argument(
         "--out",
         type=Path,
         action="append",
         default=[],
         metavar="FILE",
-        help="new file, repeatable; the suffix selects the content: .csv table, .mcap recording, .mkv, .avi, .mp4 "
-        "overlay video, .png, .jpg last overlay",
+        help="new file, repeatable; the suffix selects the content: .csv table, .forces.csv table of forces, .mcap "
+        "recording, .mkv, .avi, .mp4 overlay video, .png, .jpg last overlay",
     )
     parser.add_argument("--images", type=int, metavar="N", help="stop after N images (default: at the end, or Ctrl-C)")
     parser.add_argument(
@@ -79,6 +86,7 @@ def run(args: argparse.Namespace) -> int:
         args.rows, args.cols = profile.markers.rows, profile.markers.cols
     source = image_source(args.source, sensor=args.sensor, rate=args.rate, profile=profile)
     calibration = load_calibration(args.calibration) if args.calibration else None
+    args.gel = load_gel(args.gel) if args.gel else None
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
         _track(source, calibration, summary, args)
@@ -100,6 +108,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
     for file in args.out:
         check_suffix(file)
+        if file.name.endswith(SUFFIX) and args.gel is None:
+            raise UsageError(f"--out {file} needs the gel: give --gel FILE")
         if file.exists():
             raise UsageError(f"{file} exists; name a new file")
         if not file.parent.is_dir():
@@ -118,7 +128,7 @@ def _track(
     with ExitStack() as open_files, progress_bar(count=True) as progress:
         bar = progress.add_task("tracking", total=total)
         writers: list[TrackWriter] = []
-        tracker = MarkerTracker()
+        tracker, forces = MarkerTracker(), None
         for number, frame in enumerate(itertools.islice(source, args.images)):
             if number == 0 and calibration is not None:
                 calibration.check_size(frame.image)
@@ -132,8 +142,11 @@ def _track(
             if number == 0:
                 summary.pixels_per_mm = _scale(tracked, source, args)
                 # Files are created after the first image: a failed start leaves no empty files.
+                forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
                 writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
+            if forces is not None and step.displacement_mm is not None:
+                step = replace(step, force=forces.estimate(step.displacement_mm, tracked.valid))
             for writer in writers:
                 writer.add(step)
             summary.add(step, seconds)
@@ -175,12 +188,28 @@ def _scale(first: TrackingResult, source: ImageSource, args: argparse.Namespace)
     return first.spacing / pitch if pitch else None
 
 
+def _forces(
+    first: TrackingResult, calibration: Calibration | None, scale: float | None, args: argparse.Namespace
+) -> ImageForces | None:
+    """The estimator of forces, if there is a gel."""
+    if args.gel is None:
+        return None
+    if calibration is not None:
+        grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm)
+    elif scale is not None:
+        grid = GridScale(first.spacing / scale, scale)
+    else:
+        raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
+    return ImageForces(args.gel, first.rows, first.cols, grid)
+
+
 def _writers(args: argparse.Namespace, calibration: Calibration | None, summary: TrackingSummary) -> list[TrackWriter]:
     description = {
         "source": args.source,
         "profile": args.profile,
         "calibration": calibration,
         "pixels_per_mm": summary.pixels_per_mm,
+        "gel": None if args.gel is None else asdict(args.gel),
         "versions": software_versions(),
     }
     return [
@@ -188,6 +217,7 @@ def _writers(args: argparse.Namespace, calibration: Calibration | None, summary:
             file,
             sensor=args.sensor,
             magnify=args.magnify,
+            forces=args.gel is not None,
             millimetres=calibration is not None or summary.pixels_per_mm is not None,
             description=description,
         )
@@ -244,6 +274,8 @@ def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall
         mm = f", {largest_mm:.3f} mm" if largest_mm is not None else ""
         where = values["largest_displacement_at"]
         table.add_row("largest motion", f"{largest:.2f} px, {largest / spacing:.2f} of the spacing{mm} ({where})")
+    if summary.largest_normal is not None:
+        table.add_row("largest force", force_text(summary.largest_normal))
     usual, first = values["seconds_per_image"], values["seconds_first_image"]
     speed = f"{1 / usual:.0f} a second tracked ({1e3 * usual:.2f} ms each, the first {1e3 * first:.0f} ms)"
     table.add_row("speed", f"{speed}, {summary.images / wall:.0f} a second with reading and writing")

@@ -1,0 +1,1 @@
+"""Forces on the gel, from the displacements of its markers."""

@@ -1,0 +1,287 @@
+"""The loads on an elastic layer that explain the displacements of its markers.
+
+Each marker has two measured displacements and its cell three loads, so the displacements alone do not determine the
+loads: a pattern of normal loads and a matching pattern of shear displace the markers alike. What contacts have in
+common decides:
+
+- normal loads press (p ≥ 0);
+- within a contact the shear follows one rigid motion: t = (a + ω × (x − c)) p + r, with a ratio a, a twist ω about
+  the centre of pressure c, and a remainder r that is small, correlated between neighbours, and zero outside.
+
+For given a and ω this is a linear least squares problem in p ≥ 0 and r; a and ω follow from Gauss-Newton steps. The
+first fit of a contact tries several ratios, since the problem has several minima; the further ones begin with the
+last result. Lengths are in pitches and loads in units of Young's modulus times the area of a cell.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, lapack
+
+from gelflow.elastic_layer import square_cell_compliance
+from gelflow.perception.force.nonnegative import solve_nonnegative, solve_positive_definite
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+_RATIOS = (0.0, 0.1, 0.25, 0.5, 1.0)  # of shear to normal load, tried at the start of a contact
+_RATIO_DEVIATION = 1.0  # prior of a
+_TWIST_DEVIATION = 0.5  # prior of ω, per pitch
+_REMAINDER = 0.15  # r relative to the shear of the rigid motion
+_SMALLEST_LOAD = 0.03  # scale of the load of a cell where nothing is known
+_REMAINDER_FLOOR = 0.06
+_CORRELATION = 1.0  # length over which r is alike [pitches]
+_LOAD_PRIOR = 0.003 * 16  # weight of differences between neighbouring normal loads, relative to the largest ones
+_STEPS = 6  # of a first fit
+_LARGEST_CHANGE = 0.3  # of a in one step
+
+
+class LayerModel:
+    """Displacements of the markers of a regular grid under loads on their cells."""
+
+    def __init__(self, rows: int, cols: int, poisson_ratio: float, thickness: float) -> None:
+        """`thickness` in pitches."""
+        self.markers = n = rows * cols
+        blocks = square_cell_compliance(rows, cols, 1.0, poisson_ratio, thickness) * (1 + poisson_ratio) / np.pi
+        xx, xy, yy, xz, yz, _ = blocks
+        self.compliance = np.block([[xx, xy, xz], [xy, yy, yz]])  # (2n, 3n)
+        row, col = np.divmod(np.arange(n), cols)
+        self.position = np.stack([row - (rows - 1) / 2, col - (cols - 1) / 2], axis=1)
+        distance = ((self.position[:, None] - self.position) ** 2).sum(-1)
+        self.correlation = np.exp(-distance / (2 * _CORRELATION**2))
+        self.smoothing = self.correlation / self.correlation.sum(1).max()
+        neighbours = (distance < 1.5).astype(float) - np.eye(n)
+        neighbours[distance > 1.1] = 0.0
+        self.roughness = np.diag(neighbours.sum(1) + 0.01) - neighbours
+        self._gram: tuple[bytes, Array] = (b"", np.empty(0))
+
+    def gram(self, valid: NDArray[np.bool_]) -> Array:
+        """The product of the compliance of valid markers with itself, shape (3n, 3n)."""
+        key = valid.tobytes()
+        if self._gram[0] != key:
+            rows = self.compliance[np.concatenate([valid, valid])]
+            self._gram = (key, rows.T @ rows)
+        return self._gram[1]
+
+
+@dataclass
+class ContactFit:
+    """A fitted contact; the start of the next fit."""
+
+    ratio: Array  # a, shape (2,)
+    twist: float  # ω
+    centre: Array  # c, shape (2,)
+    normal: Array  # p, shape (n,)
+    remainder: Array  # r, shape (2, n)
+    cost: float
+    rigid_covariance: Array  # of the loads' sums: shear x, y, normal, moment; shape (4, 4)
+
+    def shear(self, position: Array) -> Array:
+        """Shear load of each cell, shape (2, n)."""
+        offset = position - self.centre
+        ratio_x = self.ratio[0] - self.twist * offset[:, 1]
+        ratio_y = self.ratio[1] + self.twist * offset[:, 0]
+        return np.stack([ratio_x, ratio_y]) * self.normal + self.remainder
+
+
+@dataclass
+class _Data:
+    """Normal equations of one image."""
+
+    gram: Array  # (3n, 3n)
+    projected: Array  # compliance ᵀ displacement, (3n,)
+    square: float  # of the displacements
+    weight: float  # 1 / variance of a displacement
+
+
+@dataclass
+class _Remainder:
+    """The equations of r, from its prior and one image."""
+
+    cells: Indices  # of r in x and y, as indices of the 3n loads
+    factor: Array  # Cholesky factor of the matrix
+
+
+@dataclass
+class _Loads:
+    """p and r for given ratios, and the equations that remain for p without r."""
+
+    field: Array  # the given ratios of shear to p, (2, n)
+    normal: Array  # p, (n,)
+    remainder: Array  # r at its cells
+    cost: float
+    matrix: Array  # of p, (n, n)
+    cross: Array  # between r and p, (cells, n)
+    response: Array  # of r to p, (cells, n)
+
+
+def fit_contact(
+    model: LayerModel, displacement: Array, valid: NDArray[np.bool_], noise: float, start: ContactFit | None
+) -> ContactFit:
+    """Fit the loads to the displacements of one image.
+
+    Parameters
+    ----------
+    displacement: [pitches], shape (n, 2); ignored where not valid
+    noise: standard deviation of a displacement along one axis [pitches]
+    start: the fit of the image before, None at the start of a contact
+    """
+    measured = np.where(valid[:, None], displacement, 0.0).T.ravel()
+    projected = measured @ model.compliance
+    data = _Data(model.gram(valid), projected, float(measured @ measured), 1 / noise**2)
+    if start is None:
+        fit = _first_fit(model, data)
+        for _ in range(_STEPS):
+            fit = _step(model, data, fit)
+        return fit
+    return _step(model, data, start)
+
+
+def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
+    """The best of the fits without twist, with ratios along the shear that a linear estimate finds."""
+    n = model.markers
+    precision = np.kron(np.eye(3), np.linalg.inv(model.correlation + 1e-4 * np.eye(n))) / (5 * _SMALLEST_LOAD) ** 2
+    estimate = solve_positive_definite(data.weight * data.gram + precision, data.weight * data.projected)
+    shear = estimate[: 2 * n].reshape(2, n)
+    total = shear.sum(1)
+    size = float(np.hypot(*total))
+    direction = total / size if size > 0 else total
+    lengths = np.hypot(*shear)
+    cells = max(float(lengths.sum() ** 2 / max((lengths**2).sum(), 1e-30)), 20.0)
+    envelope = np.full(n, 1.5 * _REMAINDER * size / cells + _REMAINDER_FLOOR * _SMALLEST_LOAD)
+    remainder = _remainder(model, data, envelope)
+    weights = model.smoothing @ lengths
+    centre = weights @ model.position / max(float(weights.sum()), 1e-30)
+    best: tuple[float, float, Array] | None = None
+    for ratio in _RATIOS if size > _REMAINDER_FLOOR else _RATIOS[:1]:
+        scale = max(size / max(ratio, 0.05) / cells, _SMALLEST_LOAD)
+        field = np.outer(ratio * direction, np.ones(n))
+        loads = _loads(model, data, remainder, field, scale, np.zeros(n))
+        if best is None or loads.cost < best[0]:
+            best = loads.cost, ratio, loads.normal
+    assert best is not None
+    cost, ratio, normal = best
+    return ContactFit(ratio * direction, 0.0, centre, normal, np.zeros((2, n)), cost, np.zeros((4, 4)))
+
+
+def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
+    """One step: p and r for the present a and ω, then a and ω by Gauss-Newton with all of them free."""
+    n, position = model.markers, model.position
+    ratio, twist, centre, normal = fit.ratio, fit.twist, fit.centre, fit.normal
+    if normal.any():
+        moved = normal @ position / normal.sum()
+        ratio = ratio + twist * np.array([-(moved[1] - centre[1]), moved[0] - centre[0]])
+        centre = moved
+    envelope = 1.5 * (model.smoothing @ (0.3 * np.sqrt(normal * normal.max()) + 0.7 * normal))
+    envelope *= _REMAINDER * (np.hypot(*ratio) + 1.3 * abs(twist)) + _REMAINDER_FLOOR
+    remainder = _remainder(model, data, envelope + 1e-6)
+    offset = position - centre
+    field = np.stack([ratio[0] - twist * offset[:, 1], ratio[1] + twist * offset[:, 0]])
+    loads = _loads(model, data, remainder, field, _load_scale(normal), normal)
+    change, covariance = _gauss_newton(data, remainder, loads, offset, np.array([*ratio, twist]))
+    rigid, pressed, rest = change
+    moved_normal = np.maximum(loads.normal + pressed, 0.0)
+    spread = np.zeros(2 * n)
+    spread[remainder.cells] = loads.remainder + rest
+    return ContactFit(
+        ratio=ratio + rigid[:2],
+        twist=float(twist + rigid[2]),
+        centre=centre,
+        normal=moved_normal,
+        remainder=spread.reshape(2, n),
+        cost=loads.cost,
+        rigid_covariance=covariance,
+    )
+
+
+def _gauss_newton(
+    data: _Data, remainder: _Remainder, loads: _Loads, offset: Array, rigid: Array
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """Changes of (a, ω), p and r in a step with all of them free, and the covariance of the sums of the loads.
+
+    `rigid` is (a, ω), `offset` the positions relative to the centre of pressure. r is eliminated first, then p.
+    """
+    n, normal, field = len(loads.normal), loads.normal, loads.field
+    pressed = np.flatnonzero(normal)
+    shear_xy = np.zeros((3, 2 * n))  # loads per unit of a and ω
+    shear_xy[0, :n] = shear_xy[1, n:] = normal
+    shear_xy[2] = np.concatenate([-offset[:, 1] * normal, offset[:, 0] * normal])
+    response = data.weight * (data.gram[:, : 2 * n] @ shear_xy.T)  # (3n, 3)
+    of_rest = _solve(remainder.factor, response[remainder.cells])
+    total = np.concatenate([(field * normal).ravel(), normal])
+    total[remainder.cells] += loads.remainder
+    prior = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
+    slope = shear_xy @ (data.weight * (data.projected - data.gram @ total)[: 2 * n]) - prior * rigid
+    own = shear_xy @ response[: 2 * n] + np.diag(prior) - response[remainder.cells].T @ of_rest
+    by_normal = response[2 * n :] + field[0][:, None] * response[:n] + field[1][:, None] * response[n : 2 * n]
+    by_normal = by_normal[pressed] - loads.cross[:, pressed].T @ of_rest
+
+    # Sums of the loads, as functions of (a, ω), p and r: shear x, y, normal, moment about the centre of pressure.
+    sums = np.zeros((3 * n, 4))
+    sums[:n, 0] = sums[n : 2 * n, 1] = sums[2 * n :, 2] = 1.0
+    sums[: 2 * n, 3] = np.concatenate([-offset[:, 1], offset[:, 0]])
+    sums_rest = sums[remainder.cells]
+    solved_rest = _solve(remainder.factor, sums_rest)
+    sums_normal = sums[2 * n :] + field[0][:, None] * sums[:n] + field[1][:, None] * sums[n : 2 * n]
+    sums_normal = sums_normal[pressed] - loads.response[:, pressed].T @ sums_rest
+    sums_rigid = shear_xy @ sums[: 2 * n] - of_rest.T @ sums_rest
+    covariance = sums_rest.T @ solved_rest
+    of_normal = np.zeros((pressed.size, 3))
+    if pressed.size:
+        both = np.column_stack([by_normal, sums_normal])
+        solved = solve_positive_definite(loads.matrix[np.ix_(pressed, pressed)], both)
+        of_normal = solved[:, :3]
+        own = own - by_normal.T @ of_normal
+        sums_rigid = sums_rigid - of_normal.T @ sums_normal
+        covariance = covariance + sums_normal.T @ solved[:, 3:]
+    solved = solve_positive_definite(own, np.column_stack([slope, sums_rigid]))
+    covariance = covariance + sums_rigid.T @ solved[:, 1:]
+    step = solved[:, 0] * min(1.0, _LARGEST_CHANGE / max(float(np.hypot(*solved[:2, 0])), 1e-30))
+    change = np.zeros(n)
+    change[pressed] = -of_normal @ step
+    return (step, change, -of_rest @ step - loads.response @ change), covariance
+
+
+def _remainder(model: LayerModel, data: _Data, envelope: Array) -> _Remainder:
+    """The prior of a remainder with standard deviation `envelope` (n,), zero where that is small."""
+    n = model.markers
+    cells = np.flatnonzero(envelope > 0.05 * envelope.max())
+    covariance = model.correlation[np.ix_(cells, cells)] * np.outer(envelope[cells], envelope[cells])
+    covariance[np.diag_indices(cells.size)] *= 1.01
+    precision = np.linalg.inv(covariance)
+    both = np.concatenate([cells, n + cells])
+    matrix = data.weight * data.gram[np.ix_(both, both)]
+    matrix[: cells.size, : cells.size] += precision
+    matrix[cells.size :, cells.size :] += precision
+    factor, info = lapack.dpotrf(matrix, lower=1)
+    if info != 0:
+        raise LinAlgError("the equations of the remainder are not positive definite")
+    return _Remainder(both, factor)
+
+
+def _loads(model: LayerModel, data: _Data, remainder: _Remainder, field: Array, scale: float, normal: Array) -> _Loads:
+    """p and r for the given ratios `field` (2, n); `scale` is that of p, `normal` a similar solution."""
+    n, gram, weight = model.markers, data.gram, data.weight
+    x, y, z = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+    rows = gram[z] + field[0][:, None] * gram[x] + field[1][:, None] * gram[y]
+    own = rows[:, z] + rows[:, x] * field[0] + rows[:, y] * field[1]
+    linear = data.projected[z] + field[0] * data.projected[x] + field[1] * data.projected[y]
+    cross = weight * rows[:, remainder.cells].T
+    right = weight * data.projected[remainder.cells]
+    solved = _solve(remainder.factor, np.vstack([cross.T, right]).T)
+    matrix = weight * own + _LOAD_PRIOR / scale**2 * model.roughness - cross.T @ solved[:, :-1]
+    linear = weight * linear - cross.T @ solved[:, -1]
+    normal = solve_nonnegative(matrix, linear, normal > 0)
+    rest = solved[:, -1] - solved[:, :-1] @ normal
+    cost = weight * data.square - float(right @ solved[:, -1]) - float(linear @ normal)
+    return _Loads(field, normal, rest, cost, matrix, cross, solved[:, :-1])
+
+
+def _solve(factor: Array, right: Array) -> Array:
+    return np.asarray(lapack.dpotrs(factor, right, lower=1)[0])
+
+
+def _load_scale(normal: Array) -> float:
+    """Mean of the ten largest loads."""
+    return max(float(np.sort(normal)[-10:].mean()), _SMALLEST_LOAD)

@@ -1,0 +1,175 @@
+"""Forces on a gel from the displacements of its markers, image by image."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
+
+from gelflow.errors import UsageError
+from gelflow.gel_file import ElasticGel
+from gelflow.observation import Grid
+from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
+
+Array = NDArray[np.float64]
+
+MAX_MARKERS = 1000  # the equations have (3 n)² entries
+_RELATIVE_NOISE = 0.01  # of the layer model, relative to the displacements
+_CONTACT_SIGNIFICANCE = 5.0  # standard deviations of the mean square displacement without a contact
+_FEWEST_MEASURED = 0.5  # of the markers
+_PRESSED = 0.1  # cells with this share of the largest normal load count as contact area
+# What the layer model and the shape of the contact add to the deviations, relative to the value; measured, see
+# docs/guide/sensing/forces.md.
+_SHEAR_ERROR, _NORMAL_ERROR, _MOMENT_ERROR = 0.015, 0.06, 0.06
+
+
+@dataclass(frozen=True)
+class ForceEstimate:
+    """Forces of an object on the gel, in the axes of the displacements; the normal force is positive in compression.
+
+    Deviations are standard deviations. Without a contact all forces are 0, and the deviations are those that the
+    noise of the displacements would cause.
+    """
+
+    contact: bool
+    shear: Array  # total force along the gel [N], shape (2,)
+    normal: float  # total force into the gel [N]
+    moment: float  # about the normal through the centre of pressure, from the first axis to the second [N m]
+    centre_of_pressure: Array | None  # [m], shape (2,); None without a contact
+    contact_area: float  # [m²], a multiple of the area of a marker's cell
+    shear_deviation: Array  # along each axis [N], shape (2,)
+    normal_deviation: float  # [N]
+    moment_deviation: float  # [N m]
+    shear_field: Array  # force on the cell of each marker [N], shape (markers, 2)
+    normal_field: Array  # [N], shape (markers,)
+    unexplained: float  # share of the displacements that these forces do not explain, rms
+
+
+class ForceEstimator:
+    """Forces on an elastic gel with a regular grid of markers.
+
+    The displacements are inverted with the elastic layer that the simulator uses too; `contact_fit` describes what
+    separates normal from shear forces. The fit of an image starts from that of the one before.
+    """
+
+    def __init__(self, gel: ElasticGel, grid: Grid, *, noise: float = 2e-6) -> None:
+        """`noise` is the standard deviation of a measured displacement along one axis [m].
+
+        Raises UsageError for a grid that is too large or too small, or a noise that is not above 0.
+        """
+        if grid.rows < 3 or grid.cols < 3 or grid.rows * grid.cols > MAX_MARKERS:
+            raise UsageError(
+                f"forces need a grid of at least 3 × 3 and at most {MAX_MARKERS} markers, got {grid.rows} × {grid.cols}"
+            )
+        if not 0 < noise < math.inf:
+            raise UsageError(f"noise must be above 0 m, got {noise:g}")
+        self.gel, self.grid = gel, grid
+        self._pitch = grid.pitch * 1e-3
+        self._noise = noise / self._pitch
+        self._positions = grid.positions() * 1e-3
+        self._blas = ThreadpoolController().select(user_api="blas")
+        self._model = LayerModel(grid.rows, grid.cols, gel.poisson_ratio, gel.thickness / self._pitch)
+        self._fit: ContactFit | None = None
+
+    def reset(self) -> None:
+        """Forget the contact of the image before."""
+        self._fit = None
+
+    def estimate(self, displacement: Array, valid: NDArray[np.bool_]) -> ForceEstimate | None:
+        """The forces for one image, or None if fewer than half of the markers are measured.
+
+        Parameters
+        ----------
+        displacement: from rest [m], shape (markers, 2), along rows and columns of the grid; ignored where not valid
+        valid: whether a marker is measured, shape (markers,)
+
+        Raises UsageError for arrays of another shape and valid displacements that are not finite.
+        """
+        displacement, valid = np.asarray(displacement, float), np.asarray(valid, bool)
+        markers = len(self._positions)
+        if displacement.shape != (markers, 2) or valid.shape != (markers,):
+            raise UsageError(
+                f"expected displacements of shape ({markers}, 2) and valid of shape ({markers},), got "
+                f"{displacement.shape} and {valid.shape}"
+            )
+        measured = displacement[valid] / self._pitch
+        if not np.isfinite(measured).all():
+            raise UsageError("a displacement of a valid marker is not finite")
+        if len(measured) < _FEWEST_MEASURED * markers:
+            self._fit = None
+            return None
+        # The matrices are small: threads of the linear algebra would only wait for each other.
+        with self._blas.limit(limits=1):
+            return self._estimate(displacement / self._pitch, valid, measured)
+
+    def _estimate(self, displacement: Array, valid: NDArray[np.bool_], measured: Array) -> ForceEstimate:
+        mean_square = float((measured**2).mean())
+        if mean_square < self._noise**2 * (1 + _CONTACT_SIGNIFICANCE / math.sqrt(measured.size / 2)):
+            self._fit = None
+            return self._no_contact()
+        noise = math.hypot(self._noise, _RELATIVE_NOISE * math.sqrt(mean_square))
+        fit = self._fit = fit_contact(self._model, displacement, valid, noise, self._fit)
+        if not fit.normal.any():
+            self._fit = None
+            return self._no_contact()
+        return self._contact(fit, displacement, valid)
+
+    def _contact(self, fit: ContactFit, displacement: Array, valid: NDArray[np.bool_]) -> ForceEstimate:
+        force = self.gel.youngs_modulus * self._pitch**2  # unit of the loads [N]
+        shear, normal = fit.shear(self._model.position), fit.normal
+        loads = np.concatenate([shear.ravel(), normal])
+        explained = (self._model.compliance @ loads).reshape(2, -1).T
+        left = np.linalg.norm((displacement - explained)[valid]) / np.linalg.norm(displacement[valid])
+        centre = normal @ self._positions / normal.sum()
+        arm = self._positions - centre
+        total = force * shear.sum(1)
+        pressed = float(force * normal.sum())
+        moment = float(force * (arm[:, 0] @ shear[1] - arm[:, 1] @ shear[0]))
+        spread = np.sqrt(np.diag(fit.rigid_covariance) * max(1.0, fit.cost / (2 * valid.sum())))
+        spread *= force * np.array([1.0, 1.0, 1.0, self._pitch])
+        modulus = self.gel.youngs_modulus_deviation
+        return ForceEstimate(
+            contact=True,
+            shear=total,
+            normal=pressed,
+            moment=moment,
+            centre_of_pressure=centre,
+            contact_area=float((normal > _PRESSED * normal.max()).sum()) * self._pitch**2,
+            shear_deviation=np.sqrt(
+                spread[:2] ** 2 + (_SHEAR_ERROR * np.linalg.norm(total)) ** 2 + (modulus * total) ** 2
+            ),
+            normal_deviation=math.hypot(spread[2], _NORMAL_ERROR * pressed, modulus * pressed),
+            moment_deviation=math.hypot(spread[3], _MOMENT_ERROR * moment, modulus * moment),
+            shear_field=force * shear.T,
+            normal_field=force * normal,
+            unexplained=float(left),
+        )
+
+    def _no_contact(self) -> ForceEstimate:
+        """No forces, with the deviations of sums that follow from the long-wave limits of the layer.
+
+        A uniform displacement u needs the shear G u / h on the layer; the first moment of the displacements that a
+        normal force N causes is 2 b N h² / G, with b from B in `elastic_layer` at small w.
+        """
+        kappa = 3 - 4 * self.gel.poisson_ratio
+        spreading = abs(1 - (1 - 2 * self.gel.poisson_ratio) * kappa) * 2 / (1 + kappa) ** 2
+        n, cell, thickness = len(self._positions), self._pitch**2, self.gel.thickness
+        noise, arm = self._noise * self._pitch, self._positions - self._positions.mean(0)
+        stiffness = self.gel.youngs_modulus / (2 * (1 + self.gel.poisson_ratio)) * cell
+        radius = math.sqrt(float((arm**2).sum()))
+        shear = stiffness / thickness * noise * math.sqrt(n)
+        return ForceEstimate(
+            contact=False,
+            shear=np.zeros(2),
+            normal=0.0,
+            moment=0.0,
+            centre_of_pressure=None,
+            contact_area=0.0,
+            shear_deviation=np.full(2, shear),
+            normal_deviation=stiffness / (2 * max(spreading, 0.01) * thickness**2) * noise * radius,
+            moment_deviation=stiffness / thickness * noise * radius,
+            shear_field=np.zeros((n, 2)),
+            normal_field=np.zeros(n),
+            unexplained=0.0,
+        )

@@ -1,0 +1,64 @@
+"""Forces on the gel in the axes of an image: right, down, and into the gel."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.gel_file import ElasticGel
+from gelflow.observation import Grid
+from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator
+
+_NOISE_PX = 0.05  # of a tracked displacement along one axis
+
+
+@dataclass(frozen=True)
+class GridScale:
+    """The scale of a tracked grid."""
+
+    pitch_mm: float
+    pixels_per_mm: float  # mean
+
+
+class ImageForces:
+    """Forces from tracked images of one camera."""
+
+    def __init__(self, gel: ElasticGel, rows: int, cols: int, scale: GridScale) -> None:
+        """Raises UsageError for a grid without forces, see `ForceEstimator`."""
+        noise = _NOISE_PX / scale.pixels_per_mm * 1e-3
+        self._estimator = ForceEstimator(gel, Grid(rows, cols, scale.pitch_mm), noise=noise)
+
+    def estimate(self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_]) -> ForceEstimate | None:
+        """Forces (right, down) for displacements (right, down) [mm], shape (markers, 2); None if few are valid."""
+        estimate = self._estimator.estimate(displacement_mm[:, ::-1] * 1e-3, valid)
+        return None if estimate is None else _exchanged_axes(estimate)
+
+
+def force_record(estimate: ForceEstimate) -> dict[str, Any]:
+    """The totals as plain data: forces [N], moments [N m], lengths [mm]."""
+    centre = estimate.centre_of_pressure
+    return {
+        "contact": estimate.contact,
+        "shear": estimate.shear,
+        "shear_deviation": estimate.shear_deviation,
+        "normal": estimate.normal,
+        "normal_deviation": estimate.normal_deviation,
+        "moment": estimate.moment,
+        "moment_deviation": estimate.moment_deviation,
+        "centre_mm": None if centre is None else 1e3 * centre,
+        "contact_area_mm2": 1e6 * estimate.contact_area,
+        "unexplained": estimate.unexplained,
+    }
+
+
+def _exchanged_axes(estimate: ForceEstimate) -> ForceEstimate:
+    centre = estimate.centre_of_pressure
+    return replace(
+        estimate,
+        shear=estimate.shear[::-1],
+        moment=-estimate.moment,
+        centre_of_pressure=None if centre is None else centre[::-1],
+        shear_deviation=estimate.shear_deviation[::-1],
+        shear_field=estimate.shear_field[:, ::-1],
+    )

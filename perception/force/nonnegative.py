@@ -1,0 +1,48 @@
+"""Least squares with variables that must not be negative, for small dense problems."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, lapack
+
+Array = NDArray[np.float64]
+
+_MAX_ITERATIONS = 60
+_FULL_EXCHANGES = 3  # without progress, before variables are exchanged one by one
+
+
+def solve_nonnegative(hessian: Array, linear: Array, start: NDArray[np.bool_]) -> Array:
+    """The x ≥ 0 with the smallest ½ xᵀ hessian x − linearᵀ x, shape (n,).
+
+    Block principal pivoting after Portugal, Júdice and Vicente (1994): the set of positive variables is exchanged at
+    all wrong ones together, and at a single one where that stops to improve. `start` is the first set, for example
+    that of a similar problem. `hessian` must be positive definite.
+    """
+    positive = start.copy()
+    x, fewest, exchanges = np.zeros(len(linear)), len(linear) + 1, _FULL_EXCHANGES
+    tolerance = 1e-9 * float(np.abs(linear).max(initial=0.0))
+    for _ in range(_MAX_ITERATIONS):
+        x[:] = 0.0
+        indices = np.flatnonzero(positive)
+        if indices.size:
+            x[indices] = solve_positive_definite(hessian[np.ix_(indices, indices)], linear[indices])
+        slope = hessian[:, indices] @ x[indices] - linear
+        wrong = np.where(positive, x < 0, slope < -tolerance)
+        count = int(wrong.sum())
+        if count == 0:
+            break
+        if count < fewest:
+            fewest, exchanges = count, _FULL_EXCHANGES
+        elif exchanges > 0:
+            exchanges -= 1
+        else:
+            wrong[: np.flatnonzero(wrong)[-1]] = False
+        positive ^= wrong
+    return np.maximum(x, 0.0)
+
+
+def solve_positive_definite(matrix: Array, right: Array) -> Array:
+    """Solution of a symmetric positive definite system. Raises LinAlgError for another matrix."""
+    _, solution, info = lapack.dposv(matrix, right, lower=1)
+    if info != 0:
+        raise LinAlgError("the matrix is not positive definite")
+    return np.asarray(solution).reshape(right.shape)

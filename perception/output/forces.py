@@ -1,0 +1,98 @@
+"""Tables and drawings of the forces on the gel."""
+
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.perception.force.estimator import ForceEstimate
+
+SUFFIX = ".forces.csv"
+
+_COLUMNS = (
+    *("frame", "image", "stamp", "contact"),
+    *("shear_right_n", "shear_down_n", "normal_n", "moment_n_mm"),
+    *("shear_right_sd_n", "shear_down_sd_n", "normal_sd_n", "moment_sd_n_mm"),
+    *("centre_right_mm", "centre_down_mm", "contact_area_mm2", "unexplained"),
+)
+_FORCE = (80, 220, 255)
+_EDGE = (0, 0, 0)
+
+
+class ForceTable:
+    """Table with one row per image. The cells of an image without an estimate are empty."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._file = path.open("x", encoding="utf-8", newline="")
+        except OSError as error:
+            raise UsageError(f"cannot create {path}: {error.strerror}") from None
+        self._writer = csv.writer(self._file)
+        self._writer.writerow(_COLUMNS)
+
+    def add(self, number: int, name: str, stamp: float, force: ForceEstimate | None) -> None:
+        """Write the row of one image."""
+        first = [number, name, f"{stamp:.6f}"]
+        if force is None:
+            self._writer.writerow([*first, *[""] * (len(_COLUMNS) - len(first))])
+        else:
+            centre = ["", ""] if force.centre_of_pressure is None else 1e3 * force.centre_of_pressure
+            values = [
+                *(*force.shear, force.normal, 1e3 * force.moment),
+                *(*force.shear_deviation, force.normal_deviation, 1e3 * force.moment_deviation),
+                *(*centre, 1e6 * force.contact_area, force.unexplained),
+            ]
+            cells = [value if isinstance(value, str) else f"{value:.5f}" for value in values]
+            self._writer.writerow([*first, int(force.contact), *cells])
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def force_text(force: ForceEstimate | None) -> str:
+    """The forces in one line, ± standard deviations."""
+    if force is None:
+        return "force unknown: too few markers measured"
+    if not force.contact:
+        return f"no contact: normal below {3 * force.normal_deviation:.2f} N"
+    shear, deviation = np.linalg.norm(force.shear), np.linalg.norm(force.shear_deviation) / np.sqrt(2)
+    return (
+        f"normal {force.normal:.2f} +- {force.normal_deviation:.2f} N, shear {shear:.2f} +- {deviation:.2f} N, "
+        f"moment {1e3 * force.moment:.1f} +- {1e3 * force.moment_deviation:.1f} N mm"
+    )
+
+
+def draw_force(picture: NDArray[np.uint8], force: ForceEstimate | None, position: NDArray[np.float64]) -> None:
+    """Draw the forces into an overlay: circles for the normal force of cells, an arrow for the total shear.
+
+    `position` are the markers in the picture [px], shape (markers, 2). The area of a circle is proportional to the
+    force, relative to the largest one; the arrow starts at the centre of pressure and has one pitch of length per
+    tenth of the ratio of shear to normal force.
+    """
+    _caption(picture, force_text(force))
+    if force is None or not force.contact:
+        return
+    pitch = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)))
+    share = np.sqrt(force.normal_field / force.normal_field.max())
+    for place, radius in zip(position, 0.5 * pitch * share, strict=True):
+        if radius > 0.05 * pitch:
+            cv2.circle(picture, _rounded(place), max(1, round(radius)), _FORCE, 1, cv2.LINE_AA)
+    centre = force.normal_field @ position / force.normal_field.sum()
+    tip = centre + 10 * pitch * force.shear / max(force.normal, 1e-9)
+    for colour, thickness in ((_EDGE, 5), (_FORCE, 2)):
+        cv2.arrowedLine(picture, _rounded(centre), _rounded(tip), colour, thickness, cv2.LINE_AA, 0, 0.15)
+
+
+def _caption(picture: NDArray[np.uint8], text: str) -> None:
+    for colour, thickness in ((_EDGE, 3), (_FORCE, 1)):
+        place = (8, picture.shape[0] - 10)
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, thickness, cv2.LINE_AA)
+
+
+def _rounded(point: NDArray[np.float64]) -> tuple[int, int]:
+    right, down = np.clip(point, -20000, 20000)
+    return round(float(right)), round(float(down))

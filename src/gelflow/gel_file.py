@@ -1,0 +1,42 @@
+"""Gel files: the elastic layer of a tactile sensor, as TOML."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from gelflow.errors import UsageError
+from gelflow.toml_tables import TomlTable, read_toml
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class ElasticGel:
+    """An isotropic elastic layer on a rigid back."""
+
+    youngs_modulus: float  # [Pa]
+    poisson_ratio: float
+    thickness: float  # [m]
+    youngs_modulus_deviation: float = 0.0  # standard deviation, relative to the modulus
+
+    def __post_init__(self) -> None:
+        if not 0 < self.youngs_modulus < math.inf:
+            raise UsageError(f"youngs_modulus must be above 0 Pa, got {self.youngs_modulus:g}")
+        if not -1 < self.poisson_ratio <= 0.5:
+            raise UsageError(f"poisson_ratio must be above -1 and at most 0.5, got {self.poisson_ratio:g}")
+        if not 0 < self.thickness < 1:
+            raise UsageError(f"thickness is in metres, above 0 and below 1, got {self.thickness:g}")
+        if not 0 <= self.youngs_modulus_deviation < 1:
+            raise UsageError(
+                "youngs_modulus_deviation is relative to the modulus, at least 0 and below 1, got "
+                f"{self.youngs_modulus_deviation:g}"
+            )
+
+
+def load_gel(path: Path) -> ElasticGel:
+    """The gel of a TOML file. Raises UsageError if the file is missing or wrong."""
+    table = TomlTable(read_toml(path), str(path))
+    table.check_keys(("format", "gel"))
+    if (written := table.integer("format")) != FORMAT:
+        raise UsageError(f"{path} has format {written}; this gelflow reads format {FORMAT}: update gelflow")
+    return table.table("gel").as_dataclass(ElasticGel)

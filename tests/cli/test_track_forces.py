@@ -1,0 +1,91 @@
+"""`gelflow track --gel`: forces in tables, recordings, pictures and the summary."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.gel_file import ElasticGel
+from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
+from gelflow.perception.synthetic.appearance import make_appearance
+from gelflow.perception.synthetic.pressed_layer import Press, PressedGel, PressedLayer
+from gelflow.session.reader import SessionReader
+
+GEL = "format = 1\n[gel]\nyoungs_modulus = 1.5e5\npoisson_ratio = 0.48\nthickness = 0.003\n"
+LOOK = make_appearance("clean", width=640, height=480)
+PRESS = Press("disc", (1.0, -2.0), 3.0, 0.0, normal=1.0, ratio=0.3, direction=0.0)  # shear down the image
+
+
+@pytest.fixture(scope="module")
+def pressed() -> PressedGel:
+    return PressedLayer(ElasticGel(1.5e5, 0.48, 3e-3), LOOK.grid).press(PRESS)
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory, pressed: PressedGel) -> Path:
+    """Six images: two at rest, then the load grows."""
+    folder = tmp_path_factory.mktemp("pressed")
+    (folder / "gel.toml").write_text(GEL)
+    (folder / "images").mkdir()
+    renderer = AccurateGelRenderer(LOOK)
+    for number, share in enumerate((0.0, 0.0, 0.25, 0.5, 0.75, 1.0)):
+        rendered = renderer.render(share * pressed.displacement_mm, number=number)
+        (folder / "images" / f"{number}.jpg").write_bytes(rendered.jpeg)
+    return folder
+
+
+def test_forces_are_written_everywhere(
+    images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / name for name in ("a.forces.csv", "a.mcap", "a.png")]
+    outputs = [text for file in files for text in ("--out", str(file))]
+    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
+    assert main(["track", str(images / "images"), *scale, *outputs, "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["force"]["normal"] == pytest.approx(pressed.normal, rel=0.1)
+    with files[0].open(newline="") as text:
+        rows = list(csv.DictReader(text))
+    assert [row["contact"] for row in rows] == ["0", "0", "1", "1", "1", "1"]
+    assert float(rows[-1]["normal_n"]) == pytest.approx(pressed.normal, rel=0.1)
+    assert float(rows[-1]["shear_down_n"]) == pytest.approx(pressed.shear[0], abs=0.03)
+    assert float(rows[-1]["shear_right_n"]) == pytest.approx(pressed.shear[1], abs=0.03)
+    assert float(rows[-1]["centre_down_mm"]) == pytest.approx(pressed.centre_mm[0], abs=0.3)
+    assert float(rows[0]["normal_n"]) == 0 and rows[0]["centre_down_mm"] == ""
+    with SessionReader(files[1]) as session:
+        recorded = [record.value for record in session.records(["/left/force"])]
+    assert [value["contact"] for value in recorded] == [False, False, True, True, True, True]
+    assert recorded[-1]["normal"] == pytest.approx(float(rows[-1]["normal_n"]), abs=1e-4)
+    assert cv2.imread(str(files[2])) is not None
+
+
+def test_the_summary_names_the_largest_force(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
+    assert main(["track", str(images / "images"), *scale]) == 0
+    printed = capsys.readouterr().out
+    assert "largest force" in printed and "normal" in printed and "N mm" in printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--gel", "gel.toml"], "millimetres"),
+        (["--out", "x.forces.csv"], "--gel"),
+        (["--gel", "none.toml", "--pixels-per-mm", "20"], "none.toml"),
+    ],
+)
+def test_forces_without_scale_or_gel_are_refused(
+    arguments: list[str],
+    named: str,
+    images: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "gel.toml").write_text(GEL)
+    assert main(["track", str(images / "images"), *arguments]) == 2
+    assert named in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["gel.toml"]
