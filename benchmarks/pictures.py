@@ -64,6 +64,7 @@ PICTURES: dict[str, tuple[str, Callable[[dict[str, Any], Path], None]]] = {
     "mesh_distance": ("mesh_distance", draw_mesh_distance),
     "order": ("order", draw_order),
     "reproduce_grasp": ("reproduce_grasp", draw_reproduction),
+    "reproduce_cap": ("reproduce_cap", draw_reproduction),
     **{f"tradeoff_{scene}": (f"tradeoff_{scene}", draw_tradeoff) for scene in scene_names()},
 }
 

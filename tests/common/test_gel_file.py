@@ -41,5 +41,5 @@ def test_wrong_files_are_refused(old: str, new: str, named: str, tmp_path: Path)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="gel.toml"):
+    with pytest.raises(UsageError, match=r"gel\.toml"):
         load_gel(tmp_path / "gel.toml")
