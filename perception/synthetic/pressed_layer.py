@@ -126,4 +126,4 @@ def _pressure(press: Press, offset: Array) -> Array:
         inside = np.maximum(np.abs(along), np.abs(across)) < press.size
     else:
         raise UsageError(f"shape must be one of {', '.join(SHAPES)}, got {press.shape!r}")
-    return inside.astype(float)
+    return np.asarray(inside, dtype=np.float64)
