@@ -8,7 +8,7 @@ import script
 from rich.console import Console
 from rich.table import Table
 
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.perception.benchmark.forces import measure_forces
 from gelflow.perception.synthetic.pressed_layer import SHAPES
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.appearance import make_appearance

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, lapack
 
-from gelflow.elastic_layer import square_cell_compliance
+from gelflow.gel.elastic_layer import square_cell_compliance
 from gelflow.perception.force.nonnegative import solve_nonnegative, solve_positive_definite
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from gelflow.errors import UsageError
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
 
@@ -19,8 +19,8 @@ _RELATIVE_NOISE = 0.01  # of the layer model, relative to the displacements
 _CONTACT_SIGNIFICANCE = 5.0  # standard deviations of the mean square displacement without a contact
 _FEWEST_MEASURED = 0.5  # of the markers
 _PRESSED = 0.1  # cells with this share of the largest normal load count as contact area
-# What the layer model and the shape of the contact add to the deviations, relative to the value; measured, see
-# docs/guide/sensing/forces.md.
+# Added to the deviations for errors of the layer model and of the contact's assumed shape, relative to the value;
+# measured, see docs/guide/sensing/forces.md.
 _SHEAR_ERROR, _NORMAL_ERROR, _MOMENT_ERROR = 0.015, 0.06, 0.06
 
 

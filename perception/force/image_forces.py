@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator
 

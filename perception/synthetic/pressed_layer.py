@@ -9,9 +9,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.elastic_layer import square_cell_compliance
 from gelflow.errors import UsageError
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.elastic_layer import square_cell_compliance
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 
 Shape = Literal["ball", "disc", "edge", "ring", "square"]

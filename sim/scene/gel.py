@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.elastic_layer import round_cell_compliance, square_cell_compliance
 from gelflow.errors import UsageError
+from gelflow.gel.elastic_layer import round_cell_compliance, square_cell_compliance
 from gelflow.observation import Grid
 from gelflow.toml_tables import TomlTable
 

@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.appearance import make_appearance
 from gelflow.perception.synthetic.pressed_layer import Press, PressedGel, PressedLayer

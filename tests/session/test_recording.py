@@ -63,6 +63,15 @@ MARKERS = {
 }
 
 
+FORCE = {
+    "contact": True,
+    "shear": np.array([0.5, -0.1]),
+    "shear_deviation": np.array([0.02, 0.01]),
+    "normal": 2.0,
+    "normal_deviation": 0.1,
+}
+
+
 def record_everything(recorder: SessionRecorder) -> None:
     recorder.metadata(describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab={"arm": {"port": 6510}}))
     recorder.image(0, CameraImage(b"\xff\xd8left\xff\xd9", 10.25, 3, camera_time=1.7e9))
@@ -70,6 +79,7 @@ def record_everything(recorder: SessionRecorder) -> None:
     joints = np.arange(6) / 7
     for sensor in (0, 1):
         recorder.markers(sensor, 10.75, MARKERS)
+        recorder.force(sensor, 10.75, FORCE)
     recorder.arm_state(ArmState(np.array([0.3, 0.1, 0.2]), TURN, joints, 11.0, True, True, "auto", ""))
     recorder.arm_command(11.5, [0.3, 0.1, 0.199], TURN, kind="command")
     recorder.arm_command(11.6, [0.3, 0.1, 0.1995], TURN, kind="applied")

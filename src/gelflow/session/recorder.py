@@ -116,17 +116,14 @@ class SessionRecorder:
         self._put(f"/{name}/image", message.SerializeToString(), stamp=image.stamp, sequence=image.sequence)
 
     def markers(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
-        """Record the markers of the image with that stamp; `values` follow the JSON schema `gelflow.Markers`.
-
-        The schema is in `session/channels.py`.
-        """
+        """Record the markers of the image with that stamp; `values` follow `gelflow.Markers` in `channels`."""
         name = _name(sensor)
         self._json(f"/{name}/markers", {"stamp": stamp, **values}, stamp=stamp)
         drawn = annotate(values, self._date(stamp))  # for viewers
         self._put(f"/{name}/annotations", drawn.SerializeToString(), stamp=stamp)
 
     def force(self, sensor: int, stamp: float, values: Mapping[str, Any]) -> None:
-        """Record the forces on a gel in the image with that stamp; `values` follow the JSON schema `gelflow.Force`."""
+        """Record the forces on a gel in the image with that stamp; `values` follow `gelflow.Force` in `channels`."""
         self._json(f"/{_name(sensor)}/force", {"stamp": stamp, **values}, stamp=stamp)
 
     def arm_state(self, state: ArmState) -> None:

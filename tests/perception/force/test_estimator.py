@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.benchmark.forces import measure_forces
 from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from gelflow.elastic_layer import half_space_response, layer_response
 from gelflow.errors import UsageError
+from gelflow.gel.elastic_layer import half_space_response, layer_response
 from gelflow.observation import Grid
 from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import Scene, load_scene

@@ -15,7 +15,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_profile, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
-from gelflow.gel_file import load_gel
+from gelflow.gel.gel_file import load_gel
 from gelflow.perception.calibration import Calibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces

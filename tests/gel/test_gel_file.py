@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.gel_file import ElasticGel, load_gel
+from gelflow.gel.gel_file import ElasticGel, load_gel
 
 TEXT = """
 format = 1

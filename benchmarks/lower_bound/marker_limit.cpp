@@ -1,6 +1,6 @@
 // Lower bound on the time per marker: the viscous law on a sphere as one loop over arrays of coordinates, without frames,
 // weights, broad phase or other shapes, and with results in separate arrays. From the repository's root:
-//     c++ -O3 -march=x86-64-v3 -fno-math-errno -fno-trapping-math benchmarks/marker_limit.cpp -o build/limit
+//     c++ -O3 -march=x86-64-v3 -fno-math-errno -fno-trapping-math benchmarks/lower_bound/marker_limit.cpp -o build/limit
 //     build/limit
 #include <algorithm>
 #include <chrono>

@@ -1,0 +1,1 @@
+"""The elastic layer of a gel, and the files that describe it."""
