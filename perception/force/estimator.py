@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from gelflow.errors import UsageError
+from gelflow.gel.creep import CreepCorrection
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
@@ -71,20 +72,25 @@ class ForceEstimator:
         self._blas = ThreadpoolController().select(user_api="blas")
         self._model = LayerModel(grid.rows, grid.cols, gel.poisson_ratio, gel.thickness / self._pitch)
         self._fit: ContactFit | None = None
+        self._creep = CreepCorrection(gel.creep, gel.creep_time)
 
     def reset(self) -> None:
-        """Forget the contact of the image before."""
+        """Forget the images before."""
         self._fit = None
+        self._creep.reset()
 
-    def estimate(self, displacement: Array, valid: NDArray[np.bool_]) -> ForceEstimate | None:
+    def estimate(
+        self, displacement: Array, valid: NDArray[np.bool_], stamp: float | None = None
+    ) -> ForceEstimate | None:
         """The forces for one image, or None if fewer than half of the markers are measured.
 
         Parameters
         ----------
         displacement: from rest [m], shape (markers, 2), along rows and columns of the grid; ignored where not valid
         valid: whether a marker is measured, shape (markers,)
+        stamp: time of the image [s]; needed for a gel with creep only
 
-        Raises UsageError for arrays of another shape and valid displacements that are not finite.
+        Raises UsageError for arrays of another shape, valid displacements that are not finite, and a missing stamp.
         """
         displacement, valid = np.asarray(displacement, float), np.asarray(valid, bool)
         markers = len(self._positions)
@@ -96,6 +102,11 @@ class ForceEstimator:
         measured = displacement[valid] / self._pitch
         if not np.isfinite(measured).all():
             raise UsageError("a displacement of a valid marker is not finite")
+        if self.gel.creep:
+            if stamp is None or not math.isfinite(stamp):
+                raise UsageError("a gel with creep needs the time of each image: give stamp [s]")
+            displacement = self._creep.undo(displacement, np.repeat(valid[:, None], 2, axis=1), stamp)
+            measured = displacement[valid] / self._pitch
         if len(measured) < _FEWEST_MEASURED * markers:
             self._fit = None
             return None

@@ -29,9 +29,14 @@ class ImageForces:
         noise = _NOISE_PX / scale.pixels_per_mm * 1e-3
         self._estimator = ForceEstimator(gel, Grid(rows, cols, scale.pitch_mm), noise=noise)
 
-    def estimate(self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_]) -> ForceEstimate | None:
-        """Forces (right, down) for displacements (right, down) [mm], shape (markers, 2); None if few are valid."""
-        estimate = self._estimator.estimate(displacement_mm[:, ::-1] * 1e-3, valid)
+    def estimate(
+        self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_], stamp: float
+    ) -> ForceEstimate | None:
+        """Forces (right, down) at `stamp` [s] for displacements (right, down) [mm], shape (markers, 2).
+
+        None if fewer than half of the markers are valid.
+        """
+        estimate = self._estimator.estimate(displacement_mm[:, ::-1] * 1e-3, valid, stamp)
         return None if estimate is None else _exchanged_axes(estimate)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.gel.gel_file import load_gel
 from gelflow.geometry import Pose
 from gelflow.observation import Grid
 from gelflow.sim.scene.contacts import CONTACT_PARAMS, FRICTION_LAWS, is_per_area, read_contact_params
@@ -106,13 +107,17 @@ def _read_pad(
         law=law,
         params=read_contact_params(table, law),
         collides=table.boolean("collides", default=False),
-        gel=_gel(table, markers),
+        gel=_gel(table, markers, folder),
     )
 
 
-def _gel(table: TomlTable, markers: _Markers) -> Gel | None:
+def _gel(table: TomlTable, markers: _Markers, folder: Path) -> Gel | None:
     if "gel" not in table.data:
         return None
+    if isinstance(table.data["gel"], str):
+        gel = load_gel(folder / table.string("gel"))
+        layer = {name: getattr(gel, name) for name in ("youngs_modulus", "poisson_ratio", "thickness")}
+        table = TomlTable({"gel": layer}, table.location)
     return read_gel(table.table("gel"), markers.positions, markers.axes, markers.grid, markers.area)
 
 

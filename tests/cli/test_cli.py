@@ -24,6 +24,7 @@ COMMON_OPTIONS = {
     "export": {"--json", "--out"},
     "track": {"--json", "--out"},
     "calibrate-camera": {"--json", "--out"},
+    "calibrate-gel": {"--json", "--out"},
     "run": {"--json", "--out", "--checkpoint"},
     "robot": set(),  # its actions have options of their own
     "calibrate": {"--json", "--out", "--seed", "--quick"},

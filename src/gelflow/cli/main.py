@@ -27,6 +27,7 @@ COMMANDS = {
     "export": "export a policy as an ONNX model",
     "track": "track markers in tactile images: a folder, a video, a stream or a camera",
     "calibrate-camera": "calibrate a camera in millimetres from one image of the gel at rest",
+    "calibrate-gel": "calibrate the stiffness of a gel with measured forces",
     "run": "run the insertion policy on the robot or on the mock robot",
     "robot": "after a stop: state of the devices; home, open, acknowledge, jog",
     "calibrate": "fit the simulator to recorded insertions: parameters with intervals, and a report",

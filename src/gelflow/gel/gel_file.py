@@ -1,11 +1,11 @@
 """Gel files: the elastic layer of a tactile sensor, as TOML."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from gelflow.errors import UsageError
-from gelflow.toml_tables import TomlTable, read_toml
+from gelflow.toml_tables import TomlTable, read_toml, toml_text
 
 FORMAT = 1
 
@@ -18,6 +18,8 @@ class ElasticGel:
     poisson_ratio: float
     thickness: float  # [m]
     youngs_modulus_deviation: float = 0.0  # standard deviation, relative to the modulus
+    creep: float = 0.0  # part of the deformation that follows the force with a lag, see `creep`
+    creep_time: float = 0.1  # time constant of this lag [s]
 
     def __post_init__(self) -> None:
         if not 0 < self.youngs_modulus < math.inf:
@@ -31,6 +33,20 @@ class ElasticGel:
                 "youngs_modulus_deviation is relative to the modulus, at least 0 and below 1, got "
                 f"{self.youngs_modulus_deviation:g}"
             )
+        if not 0 <= self.creep < 1 or not 0 < self.creep_time < math.inf:
+            raise UsageError(
+                f"creep must be at least 0 and below 1, and creep_time above 0 s, got {self.creep:g} and "
+                f"{self.creep_time:g}"
+            )
+
+
+def save_gel(gel: ElasticGel, path: Path) -> None:
+    """Write a new gel file. Raises UsageError if it exists or cannot be written."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(toml_text({"format": FORMAT, "gel": asdict(gel)}))
+    except OSError as error:
+        raise UsageError(f"cannot create {path}: {error.strerror}") from None
 
 
 def load_gel(path: Path) -> ElasticGel:

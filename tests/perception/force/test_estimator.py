@@ -134,7 +134,7 @@ def test_equal_displacements_give_equal_forces(layer: PressedLayer) -> None:
 def test_forces_in_the_axes_of_an_image(layer: PressedLayer) -> None:
     true = layer.press(replace(BALL, direction=0.0, twist=0.3))  # down in the image
     image = ImageForces(GEL, 10, 13, GridScale(1.5, 40.0))
-    found = image.estimate(true.displacement_mm[:, ::-1], VALID)
+    found = image.estimate(true.displacement_mm[:, ::-1], VALID, 0.0)
     assert found is not None and found.centre_of_pressure is not None
     np.testing.assert_allclose(found.shear, true.shear[::-1], atol=0.03)
     np.testing.assert_allclose(1e3 * found.centre_of_pressure, true.centre_mm[::-1], atol=0.3)
@@ -149,12 +149,12 @@ def test_the_sum_of_the_fields_is_the_total(layer: PressedLayer) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "named"),
-    [({"displacement": np.zeros((129, 2))}, "shape"), ({"displacement": np.full((130, 2), np.nan)}, "finite")],
+    ("displacement", "named"),
+    [(np.zeros((129, 2)), "shape"), (np.full((130, 2), np.nan), "finite")],
 )
-def test_wrong_displacements_are_refused(changed: dict[str, np.ndarray], named: str) -> None:
+def test_wrong_displacements_are_refused(displacement: np.ndarray, named: str) -> None:
     with pytest.raises(UsageError, match=named):
-        ForceEstimator(GEL, GRID).estimate(**{"displacement": np.zeros((130, 2)), "valid": VALID, **changed})
+        ForceEstimator(GEL, GRID).estimate(displacement, VALID)
 
 
 def test_grids_without_forces_are_refused() -> None:

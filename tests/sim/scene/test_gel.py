@@ -309,6 +309,17 @@ def test_markers_that_do_not_support_a_layer(tmp_path: Path, shape: str, why: st
     assert isinstance(scene_with(tmp_path, pad=shape + "gel = { compliance = 1.0 }").pads[0].gel, SpringGel)
 
 
+def test_a_gel_file_is_the_same_as_its_values(tmp_path: Path) -> None:
+    (tmp_path / "gel.toml").write_text(
+        "format = 1\n[gel]\nyoungs_modulus = 1e5\npoisson_ratio = 0.48\nthickness = 4e-3\ncreep = 0.1\n"
+    )
+    gel = scene_with(tmp_path, pad=RECTANGLE + 'gel = "gel.toml"').pads[0].gel
+    assert isinstance(gel, LayerGel)
+    assert (gel.youngs_modulus, gel.poisson_ratio, gel.thickness) == (1e5, 0.48, 4e-3)
+    with pytest.raises(UsageError, match=r"none\.toml"):
+        scene_with(tmp_path, pad=RECTANGLE + 'gel = "none.toml"')
+
+
 def test_displacement_needs_a_gel(tmp_path: Path) -> None:
     scene = scene_with(tmp_path, first=RECTANGLE + LAYER, second=RECTANGLE)
     with pytest.raises(UsageError, match=r"pad 'second' has no gel; give pads\.second\.gel in the scene"):

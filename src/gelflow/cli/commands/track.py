@@ -146,7 +146,7 @@ def _track(
                 writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
-                step = replace(step, force=forces.estimate(step.displacement_mm, tracked.valid))
+                step = replace(step, force=forces.estimate(step.displacement_mm, tracked.valid, frame.stamp))
             for writer in writers:
                 writer.add(step)
             summary.add(step, seconds)

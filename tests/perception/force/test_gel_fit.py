@@ -1,0 +1,112 @@
+"""Calibration of a gel: modulus, lag, thickness, and wrong tables."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gelflow.errors import UsageError
+from gelflow.gel.creep import deformation
+from gelflow.gel.gel_file import ElasticGel
+from gelflow.observation import Grid
+from gelflow.perception.force.estimator import ForceEstimator
+from gelflow.perception.force.gel_fit import fit_gel, read_samples
+from gelflow.perception.output.forces import ForceTable
+from gelflow.perception.synthetic.pressed_layer import SHAPES, PressedLayer, random_press
+
+TRUE = ElasticGel(youngs_modulus=2.1e5, poisson_ratio=0.48, thickness=3e-3)
+GUESS = replace(TRUE, youngs_modulus=1.5e5)
+GRID = Grid(10, 13, 1.5)
+VALID = np.ones(130, bool)
+RATE = 50.0
+
+
+@pytest.fixture(scope="module")
+def layer() -> PressedLayer:
+    return PressedLayer(TRUE, GRID)
+
+
+def record(
+    layer: PressedLayer, folder: Path, *, gel: ElasticGel = GUESS, creep: float = 0.0, seed: int = 0
+) -> tuple[Path, Path]:
+    """Five objects are pressed on and lifted; tables of the estimates with `gel` and of a scale at 50 Hz."""
+    rng = np.random.default_rng(seed)
+    share = np.concatenate([np.linspace(0, 1, 4), np.ones(10), np.linspace(1, 0, 3), np.zeros(6)])
+    stamps, rows = np.arange(5 * len(share)) / RATE, []
+    for shape in SHAPES:
+        rows += [(layer.press(random_press(shape, GRID, rng, normal=(1.0, 5.0))), part) for part in [1.0]]
+    estimator, table = ForceEstimator(gel, GRID), ForceTable(folder / "a.forces.csv")
+    lines = ["stamp,normal_n,shear_n"]
+    lagging = np.concatenate([deformation(share, stamps[: len(share)], creep, 0.1)] * 5)
+    for number, stamp in enumerate(stamps):
+        true, part = rows[number // len(share)][0], share[number % len(share)]
+        moved = 1e-3 * lagging[number] * true.displacement_mm + rng.normal(0, 1.5e-6, (130, 2))
+        table.add(number, f"{number}.jpg", stamp, estimator.estimate(moved, VALID))
+        lines.append(f"{stamp},{part * true.normal},{part * np.linalg.norm(true.shear)}")
+    table.close()
+    (folder / "scale.csv").write_text("\n".join(lines))
+    return folder / "a.forces.csv", folder / "scale.csv"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_modulus_from_a_scale(layer: PressedLayer, tmp_path: Path, seed: int) -> None:
+    fit = fit_gel(read_samples(*record(layer, tmp_path, seed=seed)), GUESS)
+    assert fit.contacts == 5 and fit.thickness is None and fit.creep_deviation is None
+    error = abs(fit.gel.youngs_modulus / TRUE.youngs_modulus - 1)
+    assert error < 0.04
+    assert error < 2.5 * fit.gel.youngs_modulus_deviation < 0.1
+    assert fit.normal is not None and fit.normal.value == pytest.approx(1.4, rel=0.08)
+    assert 0.2 < fit.largest_ratio < 0.9
+
+
+def test_lag_from_a_scale(layer: PressedLayer, tmp_path: Path) -> None:
+    fit = fit_gel(read_samples(*record(layer, tmp_path, creep=0.25)), GUESS)
+    assert fit.creep_deviation is not None
+    assert fit.gel.creep == pytest.approx(0.25, abs=0.08)
+    assert fit.gel.creep_time == pytest.approx(0.1, rel=0.5)
+    assert fit.gel.youngs_modulus == pytest.approx(TRUE.youngs_modulus, rel=0.04)
+
+
+def test_modulus_from_known_weights(layer: PressedLayer, tmp_path: Path) -> None:
+    estimates, _ = record(layer, tmp_path)
+    rng = np.random.default_rng(0)
+    weights = [layer.press(random_press(shape, GRID, rng, normal=(1.0, 5.0))).normal for shape in SHAPES]
+    (tmp_path / "weights.csv").write_text(
+        "image,normal_n\n" + "\n".join(f"{23 * k + 10}.jpg,{weight}" for k, weight in enumerate(weights))
+    )
+    fit = fit_gel(read_samples(estimates, tmp_path / "weights.csv"), GUESS)
+    assert fit.contacts == 5 and fit.shear is None
+    assert fit.gel.youngs_modulus == pytest.approx(TRUE.youngs_modulus, rel=0.08)
+
+
+def test_a_wrong_thickness_shows(layer: PressedLayer, tmp_path: Path) -> None:
+    wrong = replace(GUESS, thickness=4.5e-3)
+    fit = fit_gel(read_samples(*record(layer, tmp_path, gel=wrong)), wrong)
+    assert fit.thickness is not None
+    assert fit.thickness < 4e-3
+    assert fit.gel.youngs_modulus_deviation > 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("stamp,weight\n0,1\n", "normal_n"),
+        ("image,normal_n\n", "no rows"),
+        ("image,normal_n\nx.jpg,1\n", "agree"),
+        ("stamp,normal_n\n0,1\n0,2\n", "increase"),
+        ("stamp,normal_n\n0,one\n", "number"),
+        ("stamp,normal_n\n0,0\n9,0\n", "above 0"),
+    ],
+)
+def test_wrong_measurements_are_refused(layer: PressedLayer, tmp_path: Path, text: str, named: str) -> None:
+    estimates, scale = record(layer, tmp_path)
+    scale.write_text(text)
+    with pytest.raises(UsageError, match=named):
+        fit_gel(read_samples(estimates, scale), GUESS)
+
+
+def test_estimates_with_a_lag_are_refused(layer: PressedLayer, tmp_path: Path) -> None:
+    samples = read_samples(*record(layer, tmp_path))
+    with pytest.raises(UsageError, match="creep"):
+        fit_gel(samples, replace(GUESS, creep=0.1))
