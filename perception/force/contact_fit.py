@@ -76,6 +76,7 @@ class ContactFit:
     remainder: Array  # r, shape (2, n)
     cost: float
     rigid_covariance: Array  # of the loads' sums: shear x, y, normal, moment; shape (4, 4)
+    wanted: NDArray[np.bool_]  # cells outside of the contact that a normal load would improve, shape (n,)
 
     def shear(self, position: Array) -> Array:
         """Shear load of each cell, shape (2, n)."""
@@ -100,7 +101,7 @@ class _Remainder:
     """The equations of r, from its prior and one image."""
 
     cells: Indices  # of r in x and y, as indices of the 3n loads
-    factor: Array  # Cholesky factor of the matrix
+    factor: Array  # lower Cholesky factor of the matrix
 
 
 @dataclass
@@ -108,12 +109,12 @@ class _Loads:
     """p and r for given ratios, and the equations that remain for p without r."""
 
     field: Array  # the given ratios of shear to p, (2, n)
-    normal: Array  # p, (n,)
+    candidates: Indices  # cells that may be pressed, (m,)
+    normal: Array  # p of the candidates, (m,)
     remainder: Array  # r at its cells
     cost: float
-    matrix: Array  # of p, (n, n)
-    cross: Array  # between r and p, (cells, n)
-    response: Array  # of r to p, (cells, n)
+    matrix: Array  # of p, (m, m)
+    cross: Array  # between r and p, solved with the factor of r, (cells, m)
 
 
 def fit_contact(
@@ -157,12 +158,14 @@ def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
     for ratio in _RATIOS if size > _REMAINDER_FLOOR else _RATIOS[:1]:
         scale = max(size / max(ratio, 0.05) / cells, _SMALLEST_LOAD)
         field = np.outer(ratio * direction, np.ones(n))
-        loads = _loads(model, data, remainder, field, scale, np.zeros(n))
+        loads = _loads(model, data, remainder, field, scale, np.zeros(n), np.arange(n))
         if best is None or loads.cost < best[0]:
             best = loads.cost, ratio, loads.normal
     assert best is not None
     cost, ratio, normal = best
-    return ContactFit(ratio * direction, 0.0, centre, normal, np.zeros((2, n)), cost, np.zeros((4, 4)))
+    return ContactFit(
+        ratio * direction, 0.0, centre, normal, np.zeros((2, n)), cost, np.zeros((4, 4)), np.ones(n, bool)
+    )
 
 
 def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
@@ -178,69 +181,83 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
     remainder = _remainder(model, data, envelope + 1e-6)
     offset = position - centre
     field = np.stack([ratio[0] - twist * offset[:, 1], ratio[1] + twist * offset[:, 0]])
-    loads = _loads(model, data, remainder, field, _load_scale(normal), normal)
-    change, covariance = _gauss_newton(data, remainder, loads, offset, np.array([*ratio, twist]))
-    rigid, pressed, rest = change
-    moved_normal = np.maximum(loads.normal + pressed, 0.0)
-    spread = np.zeros(2 * n)
-    spread[remainder.cells] = loads.remainder + rest
+    candidates = np.flatnonzero(fit.wanted | (normal > 0) | (envelope > 0.05 * envelope.max()))
+    loads = _loads(model, data, remainder, field, _load_scale(normal), normal, candidates)
+    step = _gauss_newton(data, remainder, loads, offset, np.array([*ratio, twist]))
+    moved_normal, spread = np.zeros(n), np.zeros(2 * n)
+    moved_normal[candidates] = np.maximum(loads.normal + step.normal, 0.0)
+    spread[remainder.cells] = loads.remainder + step.remainder
     return ContactFit(
-        ratio=ratio + rigid[:2],
-        twist=float(twist + rigid[2]),
+        ratio=ratio + step.rigid[:2],
+        twist=float(twist + step.rigid[2]),
         centre=centre,
         normal=moved_normal,
         remainder=spread.reshape(2, n),
         cost=loads.cost,
-        rigid_covariance=covariance,
+        rigid_covariance=step.covariance,
+        wanted=step.wanted,
     )
 
 
-def _gauss_newton(
-    data: _Data, remainder: _Remainder, loads: _Loads, offset: Array, rigid: Array
-) -> tuple[tuple[Array, Array, Array], Array]:
-    """Changes of (a, ω), p and r in a step with all of them free, and the covariance of the sums of the loads.
+@dataclass
+class _Step:
+    """Changes of (a, ω), p and r in a step with all of them free."""
 
-    `rigid` is (a, ω), `offset` the positions relative to the centre of pressure. r is eliminated first, then p.
+    rigid: Array  # (3,)
+    normal: Array  # of the candidates
+    remainder: Array  # at its cells
+    covariance: Array  # of the sums of the loads, see `ContactFit`
+    wanted: NDArray[np.bool_]
+
+
+def _gauss_newton(data: _Data, remainder: _Remainder, loads: _Loads, offset: Array, rigid: Array) -> _Step:
+    """One step of Gauss-Newton: r is eliminated first, then p.
+
+    `rigid` is (a, ω), `offset` the positions relative to the centre of pressure.
     """
-    n, normal, field = len(loads.normal), loads.normal, loads.field
-    pressed = np.flatnonzero(normal)
+    n, field, cells = len(offset), loads.field, remainder.cells
+    x, y, z = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+    positive = np.flatnonzero(loads.normal)
+    pressed = loads.candidates[positive]
+    cross = loads.cross[:, positive]
+    normal = np.zeros(n)
+    normal[loads.candidates] = loads.normal
     shear_xy = np.zeros((3, 2 * n))  # loads per unit of a and ω
-    shear_xy[0, :n] = shear_xy[1, n:] = normal
-    shear_xy[2] = np.concatenate([-offset[:, 1] * normal, offset[:, 0] * normal])
+    shear_xy[0, x] = shear_xy[1, y] = normal
+    shear_xy[2, x], shear_xy[2, y] = -offset[:, 1] * normal, offset[:, 0] * normal
     response = data.weight * (data.gram[:, : 2 * n] @ shear_xy.T)  # (3n, 3)
-    of_rest = _solve(remainder.factor, response[remainder.cells])
     total = np.concatenate([(field * normal).ravel(), normal])
-    total[remainder.cells] += loads.remainder
+    total[cells] += loads.remainder
+    gradient = data.weight * (data.projected - data.gram @ total)
     prior = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
-    slope = shear_xy @ (data.weight * (data.projected - data.gram @ total)[: 2 * n]) - prior * rigid
-    own = shear_xy @ response[: 2 * n] + np.diag(prior) - response[remainder.cells].T @ of_rest
-    by_normal = response[2 * n :] + field[0][:, None] * response[:n] + field[1][:, None] * response[n : 2 * n]
-    by_normal = by_normal[pressed] - loads.cross[:, pressed].T @ of_rest
 
     # Sums of the loads, as functions of (a, ω), p and r: shear x, y, normal, moment about the centre of pressure.
     sums = np.zeros((3 * n, 4))
-    sums[:n, 0] = sums[n : 2 * n, 1] = sums[2 * n :, 2] = 1.0
-    sums[: 2 * n, 3] = np.concatenate([-offset[:, 1], offset[:, 0]])
-    sums_rest = sums[remainder.cells]
-    solved_rest = _solve(remainder.factor, sums_rest)
-    sums_normal = sums[2 * n :] + field[0][:, None] * sums[:n] + field[1][:, None] * sums[n : 2 * n]
-    sums_normal = sums_normal[pressed] - loads.response[:, pressed].T @ sums_rest
-    sums_rigid = shear_xy @ sums[: 2 * n] - of_rest.T @ sums_rest
-    covariance = sums_rest.T @ solved_rest
-    of_normal = np.zeros((pressed.size, 3))
+    sums[x, 0] = sums[y, 1] = sums[z, 2] = 1.0
+    sums[x, 3], sums[y, 3] = -offset[:, 1], offset[:, 0]
+    both = np.column_stack([response, sums])
+    of_rest = _lower(remainder.factor, both[cells])
+    of_normal = both[z] + field[0][:, None] * both[x] + field[1][:, None] * both[y]
+    of_normal = of_normal[pressed] - cross.T @ of_rest
+    of_rigid = np.column_stack([shear_xy @ response[: 2 * n] + np.diag(prior), shear_xy @ sums[: 2 * n]])
+    of_rigid -= of_rest[:, :3].T @ of_rest
+    covariance = of_rest[:, 3:].T @ of_rest[:, 3:]
+    solved = np.zeros((0, 7))
     if pressed.size:
-        both = np.column_stack([by_normal, sums_normal])
-        solved = solve_positive_definite(loads.matrix[np.ix_(pressed, pressed)], both)
-        of_normal = solved[:, :3]
-        own = own - by_normal.T @ of_normal
-        sums_rigid = sums_rigid - of_normal.T @ sums_normal
-        covariance = covariance + sums_normal.T @ solved[:, 3:]
-    solved = solve_positive_definite(own, np.column_stack([slope, sums_rigid]))
-    covariance = covariance + sums_rigid.T @ solved[:, 1:]
-    step = solved[:, 0] * min(1.0, _LARGEST_CHANGE / max(float(np.hypot(*solved[:2, 0])), 1e-30))
-    change = np.zeros(n)
-    change[pressed] = -of_normal @ step
-    return (step, change, -of_rest @ step - loads.response @ change), covariance
+        solved = solve_positive_definite(loads.matrix[np.ix_(positive, positive)], of_normal)
+        of_rigid -= of_normal[:, :3].T @ solved
+        covariance = covariance + of_normal[:, 3:].T @ solved[:, 3:]
+    slope = shear_xy @ gradient[: 2 * n] - prior * rigid
+    unknown = solve_positive_definite(of_rigid[:, :3], np.column_stack([slope, of_rigid[:, 3:]]))
+    covariance = covariance + of_rigid[:, 3:].T @ unknown[:, 1:]
+    step = unknown[:, 0] * min(1.0, _LARGEST_CHANGE / max(float(np.hypot(*unknown[:2, 0])), 1e-30))
+    change = np.zeros(len(loads.normal))
+    change[positive] = -solved[:, :3] @ step
+    rest = -_upper(remainder.factor, of_rest[:, :3] @ step + loads.cross @ change)
+    outside = np.ones(n, bool)
+    outside[loads.candidates] = False
+    wanted = gradient[z] + field[0] * gradient[x] + field[1] * gradient[y] > 0
+    return _Step(step, change, rest, covariance, wanted & outside)
 
 
 def _remainder(model: LayerModel, data: _Data, envelope: Array) -> _Remainder:
@@ -260,26 +277,44 @@ def _remainder(model: LayerModel, data: _Data, envelope: Array) -> _Remainder:
     return _Remainder(both, factor)
 
 
-def _loads(model: LayerModel, data: _Data, remainder: _Remainder, field: Array, scale: float, normal: Array) -> _Loads:
-    """p and r for the given ratios `field` (2, n); `scale` is that of p, `normal` a similar solution."""
+def _loads(
+    model: LayerModel,
+    data: _Data,
+    remainder: _Remainder,
+    field: Array,
+    scale: float,
+    normal: Array,
+    candidates: Indices,
+) -> _Loads:
+    """p and r for the given ratios `field` (2, n), with p = 0 outside of `candidates`.
+
+    `scale` is that of p, and `normal` (n,) a similar solution.
+    """
     n, gram, weight = model.markers, data.gram, data.weight
-    x, y, z = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
-    rows = gram[z] + field[0][:, None] * gram[x] + field[1][:, None] * gram[y]
-    own = rows[:, z] + rows[:, x] * field[0] + rows[:, y] * field[1]
-    linear = data.projected[z] + field[0] * data.projected[x] + field[1] * data.projected[y]
-    cross = weight * rows[:, remainder.cells].T
-    right = weight * data.projected[remainder.cells]
-    solved = _solve(remainder.factor, np.vstack([cross.T, right]).T)
-    matrix = weight * own + _LOAD_PRIOR / scale**2 * model.roughness - cross.T @ solved[:, :-1]
-    linear = weight * linear - cross.T @ solved[:, -1]
-    normal = solve_nonnegative(matrix, linear, normal > 0)
-    rest = solved[:, -1] - solved[:, :-1] @ normal
-    cost = weight * data.square - float(right @ solved[:, -1]) - float(linear @ normal)
-    return _Loads(field, normal, rest, cost, matrix, cross, solved[:, :-1])
+    along, across = field[:, candidates]
+    x, y, z = candidates, n + candidates, 2 * n + candidates
+    rows = gram[z] + along[:, None] * gram[x] + across[:, None] * gram[y]
+    own = rows[:, z] + rows[:, x] * along + rows[:, y] * across
+    linear = data.projected[z] + along * data.projected[x] + across * data.projected[y]
+    # Solved with the factor of r, so that products of two columns are what r explains.
+    columns = np.vstack([rows[:, remainder.cells], data.projected[remainder.cells]])
+    solved = weight * _lower(remainder.factor, columns.T)
+    cross, right = solved[:, :-1], solved[:, -1]
+    prior = _LOAD_PRIOR / scale**2 * model.roughness[np.ix_(candidates, candidates)]
+    matrix = weight * own + prior - cross.T @ cross
+    linear = weight * linear - cross.T @ right
+    loads = solve_nonnegative(matrix, linear, normal[candidates] > 0)
+    rest = _upper(remainder.factor, right - cross @ loads)
+    cost = weight * data.square - float(right @ right) - float(linear @ loads)
+    return _Loads(field, candidates, loads, rest, cost, matrix, cross)
 
 
-def _solve(factor: Array, right: Array) -> Array:
-    return np.asarray(lapack.dpotrs(factor, right, lower=1)[0])
+def _lower(factor: Array, right: Array) -> Array:
+    return np.asarray(lapack.dtrtrs(factor, right, lower=1)[0])
+
+
+def _upper(factor: Array, right: Array) -> Array:
+    return np.asarray(lapack.dtrtrs(factor, right, lower=1, trans=1)[0])
 
 
 def _load_scale(normal: Array) -> float:

@@ -171,7 +171,7 @@ def _lag(samples: ForceSamples) -> tuple[float, float, float | None]:
     known = samples.measured_normal if np.isfinite(samples.measured_normal).all() else samples.measured_shear
     estimated = samples.normal if known is samples.measured_normal else samples.shear
     none = 0.0, 0.1, None
-    if not samples.in_time or len(estimated) < _LAG_IMAGES or not np.isfinite(known).all():
+    if not samples.in_time or len(estimated) < _LAG_IMAGES or not np.isfinite(known).all() or not known.any():
         return none
     contacts = _contacts(samples)
 
