@@ -1,7 +1,7 @@
 """Sensor profiles: TOML files with the image of a camera and the printed markers of its gel."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.gel.gel_file import ElasticGel
 from gelflow.perception.frames import Reduction, decode_image
 from gelflow.toml_tables import TomlTable, read_toml, suggestion
 
@@ -71,6 +72,7 @@ class SensorProfile:
     title: str
     markers: PrintedMarkers = field(default_factory=PrintedMarkers)
     image: SensorImage = field(default_factory=SensorImage)
+    gel: ElasticGel | None = None  # a first guess
 
     def decode(self, data: bytes) -> Image:
         """The used part of a JPEG or PNG image, B G R, uint8. JPEG data are decoded at the reduced size.
@@ -130,4 +132,7 @@ def load_sensor_profile(name: str) -> SensorProfile:
     table = TomlTable(read_toml(path), str(path))
     if (written := table.integer("format")) != FORMAT:
         raise UsageError(f"{path} has format {written}; this gelflow reads format {FORMAT}: update gelflow")
-    return table.as_dataclass(SensorProfile)
+    # A gel has no defaults: it is read apart.
+    gel = table.table("gel").as_dataclass(ElasticGel) if "gel" in table.data else None
+    rest = TomlTable({name: value for name, value in table.data.items() if name != "gel"}, table.location)
+    return replace(rest.as_dataclass(SensorProfile), gel=gel)

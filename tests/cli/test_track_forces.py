@@ -61,6 +61,17 @@ def test_forces_are_written_everywhere(
     assert cv2.imread(str(files[2])) is not None
 
 
+def test_the_guess_of_a_profile_is_uncertain(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (images / "mine.toml").write_text(
+        'format = 1\ntitle = "mine"\n[markers]\npitch_mm = 1.5\n'
+        "[gel]\nyoungs_modulus = 1.5e5\nyoungs_modulus_deviation = 0.5\npoisson_ratio = 0.48\nthickness = 0.003\n"
+    )
+    profile = ["--profile", str(images / "mine.toml"), "--gel", "guess", "--json"]
+    assert main(["track", str(images / "images"), *profile]) == 0
+    force = json.loads(capsys.readouterr().out)["force"]
+    assert 0.5 < force["normal_deviation"] / force["normal"] < 0.55
+
+
 def test_the_summary_names_the_largest_force(images: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
     assert main(["track", str(images / "images"), *scale]) == 0
@@ -72,6 +83,7 @@ def test_the_summary_names_the_largest_force(images: Path, capsys: pytest.Captur
     ("arguments", "named"),
     [
         (["--gel", "gel.toml"], "millimetres"),
+        (["--gel", "guess"], "no guess"),
         (["--out", "x.forces.csv"], "--gel"),
         (["--gel", "none.toml", "--pixels-per-mm", "20"], "none.toml"),
     ],

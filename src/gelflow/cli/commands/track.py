@@ -15,7 +15,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_profile, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
-from gelflow.gel.gel_file import load_gel
+from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.calibration import Calibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces
@@ -25,7 +25,7 @@ from gelflow.perception.output.forces import SUFFIX, force_text
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
-from gelflow.perception.sensors.profile import load_sensor_profile
+from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
 from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
@@ -55,7 +55,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--pixels-per-mm", type=float, metavar="X", help="scale, without a calibration (default: pitch of the profile)"
     )
     parser.add_argument(
-        "--gel", type=Path, metavar="FILE", help="gel file (TOML): adds forces in newtons; needs a scale or calibration"
+        "--gel",
+        metavar="FILE",
+        help="gel file (TOML), or guess: that of the profile; adds forces in newtons, needs a scale or calibration",
     )
     parser.add_argument(
         "--out",
@@ -86,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         args.rows, args.cols = profile.markers.rows, profile.markers.cols
     source = image_source(args.source, sensor=args.sensor, rate=args.rate, profile=profile)
     calibration = load_calibration(args.calibration) if args.calibration else None
-    args.gel = load_gel(args.gel) if args.gel else None
+    args.gel = _gel(args.gel, profile)
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
         _track(source, calibration, summary, args)
@@ -186,6 +188,15 @@ def _scale(first: TrackingResult, source: ImageSource, args: argparse.Namespace)
         return scale
     pitch = source.profile.markers.pitch_mm
     return first.spacing / pitch if pitch else None
+
+
+def _gel(name: str | None, profile: SensorProfile) -> ElasticGel | None:
+    """The gel of a file, or the first guess of the profile."""
+    if name == "guess":
+        if profile.gel is None:
+            raise UsageError(f"the profile {profile.title!r} has no guess of the gel: give a gel file")
+        return profile.gel
+    return load_gel(Path(name)) if name else None
 
 
 def _forces(
