@@ -144,6 +144,7 @@ def test_the_mcap_library_and_the_foxglove_schemas_agree(session: Path) -> None:
         "/arm/joints": "foxglove.JointStates",
         "/tf": "foxglove.FrameTransform",
         "/flow_map": "foxglove.RawImage",
+        "/log": "foxglove.Log",
     }
     assert {topic: messages[topic][0].name for topic in expected} == expected
     image = messages["/left/image"][1]
@@ -165,6 +166,21 @@ def test_the_mcap_library_and_the_foxglove_schemas_agree(session: Path) -> None:
         assert set(described["required"]) <= set(value)
 
 
+def test_events_are_lines_of_a_log(tmp_path: Path) -> None:
+    with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
+        recorder.event("move", {"speed": 0.0251234567, "position": np.array([0.3, 0.1])})
+        recorder.event("stopped", {"reason": "the part is lost"})
+        recorder.event("tick")
+    with SessionReader(tmp_path / "a.mcap") as session:
+        lines = [record.value for record in session.records(["/log"])]
+    assert [line.message for line in lines] == [
+        "move: speed 0.0251235, position 0.3 0.1",
+        "stopped: reason the part is lost",
+        "tick",
+    ]
+    assert [line.Level.Name(line.level) for line in lines] == ["INFO", "ERROR", "INFO"]
+
+
 def test_chunks_are_small(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         for number in range(50):
@@ -181,7 +197,7 @@ def test_attempt_end_stores_all_records(tmp_path: Path) -> None:
             recorder.event("tick", {"number": number})
         recorder.attempt_end()
         shutil.copy(tmp_path / "a.mcap", tmp_path / "copy.mcap")
-    assert recover(tmp_path / "copy.mcap", tmp_path / "b.mcap").messages == 300
+    assert recover(tmp_path / "copy.mcap", tmp_path / "b.mcap").messages == 600  # each event is also a line of the log
 
 
 def test_records_are_flushed_periodically(tmp_path: Path) -> None:
@@ -194,7 +210,7 @@ def test_records_are_flushed_periodically(tmp_path: Path) -> None:
             shutil.copy(tmp_path / "a.mcap", tmp_path / "copy.mcap")
             with contextlib.suppress(PeerError):  # no complete message yet
                 found = recover(tmp_path / "copy.mcap", tmp_path / "b.mcap").messages
-    assert found == 1
+    assert found in (1, 2)  # the event, and its line of the log
 
 
 def test_many_threads_record_concurrently(tmp_path: Path) -> None:
@@ -211,7 +227,7 @@ def test_many_threads_record_concurrently(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
     with SessionReader(tmp_path / "a.mcap") as reader:
-        assert reader.counts() == {"/left/image": 200, "/right/image": 200, "/event": 400}
+        assert reader.counts() == {"/left/image": 200, "/right/image": 200, "/event": 400, "/log": 400}
         assert [r.value.sequence for r in reader.records(["/left/image"])] == list(range(200))
 
 
@@ -271,7 +287,7 @@ def test_an_exception_closes_the_file_and_is_reraised(tmp_path: Path) -> None:
         recorder.event("tick")
         raise KeyboardInterrupt
     with SessionReader(tmp_path / "a.mcap") as reader:
-        assert reader.counts() == {"/event": 1}
+        assert reader.counts() == {"/event": 1, "/log": 1}
 
 
 def test_misuse_of_the_recorder_raises_usage_errors(tmp_path: Path) -> None:

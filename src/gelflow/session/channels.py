@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
@@ -60,6 +61,7 @@ PROTOBUF: dict[str, Any] = {
     "/arm/applied": PoseInFrame,
     "/tf": FrameTransform,
     "/flow_map": RawImage,
+    "/log": Log,
 }
 
 JSON: dict[str, JsonChannel] = {

@@ -17,7 +17,6 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.annotations import annotate
 from gelflow.session.channels import BASE_FRAME, JSON, PROTOBUF, TOOL_FRAME
 from gelflow.session.records import FORMAT, SENSORS, Decision, to_json, to_plain
+from gelflow.session.viewer_messages import event_log, flow_image
 
 CHUNK_BYTES = 64 * 1024  # with the default of 1 MB a killed recorder loses many more records
 FLUSH_PERIOD = 0.25  # half of the largest loss by a crash [s, robot time]
@@ -168,18 +168,13 @@ class SessionRecorder:
         stamp = self._clock.now()
         self._json("/decision", {**to_plain(decision), "stamp": stamp}, stamp=stamp)
         # For viewers: all channels side by side. A replay reads the numbers of the decision record.
-        channels, rows, cols = checked.flow.shape
-        picture = np.ascontiguousarray(checked.flow.transpose(1, 0, 2).reshape(rows, channels * cols), dtype="<f4")
-        message = RawImage(
-            width=channels * cols, height=rows, encoding="32FC1", step=4 * channels * cols, data=picture.tobytes()
-        )
-        message.timestamp.FromNanoseconds(self._date(stamp))
-        self._put("/flow_map", message.SerializeToString(), stamp=stamp)
+        self._put("/flow_map", flow_image(checked.flow, self._date(stamp)).SerializeToString(), stamp=stamp)
 
     def event(self, name: str, values: Mapping[str, Any] | None = None) -> None:
         """Record an event: a grasp, a stop with its reason, an operator's answer."""
         stamp = self._clock.now()
         self._json("/event", {"stamp": stamp, "name": name, "values": values or {}}, stamp=stamp)
+        self._put("/log", event_log(name, values or {}, self._date(stamp)).SerializeToString(), stamp=stamp)
 
     def attempt_end(self, attempt: Mapping[str, Any] | None = None) -> None:
         """Record the result of an attempt (insertion, attempt, outcome and more) and store all records on the disk.
