@@ -166,21 +166,6 @@ def test_the_mcap_library_and_the_foxglove_schemas_agree(session: Path) -> None:
         assert set(described["required"]) <= set(value)
 
 
-def test_events_are_lines_of_a_log(tmp_path: Path) -> None:
-    with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
-        recorder.event("move", {"speed": 0.0251234567, "position": np.array([0.3, 0.1])})
-        recorder.event("stopped", {"reason": "the part is lost"})
-        recorder.event("tick")
-    with SessionReader(tmp_path / "a.mcap") as session:
-        lines = [record.value for record in session.records(["/log"])]
-    assert [line.message for line in lines] == [
-        "move: speed 0.0251235, position 0.3 0.1",
-        "stopped: reason the part is lost",
-        "tick",
-    ]
-    assert [line.Level.Name(line.level) for line in lines] == ["INFO", "ERROR", "INFO"]
-
-
 def test_chunks_are_small(tmp_path: Path) -> None:
     with SessionRecorder(tmp_path / "a.mcap", CLOCK) as recorder:
         for number in range(50):
