@@ -1,8 +1,8 @@
 """The loads on an elastic layer that explain the displacements of its markers.
 
 Each marker has two measured displacements and its cell three loads, so the displacements alone do not determine the
-loads: a pattern of normal loads and a matching pattern of shear displace the markers alike. What contacts have in
-common decides:
+loads: a pattern of normal loads and a matching pattern of shear displace the markers alike. The fit assumes properties
+that contacts share:
 
 - normal loads press (p ≥ 0);
 - within a contact the shear follows one rigid motion: t = (a + ω × (x − c)) p + r, with a ratio a, a twist ω about
@@ -51,8 +51,7 @@ class LayerModel:
         distance = ((self.position[:, None] - self.position) ** 2).sum(-1)
         self.correlation = np.exp(-distance / (2 * _CORRELATION**2))
         self.smoothing = self.correlation / self.correlation.sum(1).max()
-        neighbours = (distance < 1.5).astype(float) - np.eye(n)
-        neighbours[distance > 1.1] = 0.0
+        neighbours = (np.abs(distance - 1) < 0.1).astype(float)
         self.roughness = np.diag(neighbours.sum(1) + 0.01) - neighbours
         self._gram: tuple[bytes, Array] = (b"", np.empty(0))
 
