@@ -112,6 +112,7 @@ def mock_robot(view: CameraView) -> MockRobot:
     return MockRobot(FACTOR, MockRobotConfig(cell=cell, egm_port=free_port(socket.SOCK_DGRAM)))
 
 
+@pytest.mark.slow
 def test_preflight_names_the_visible_lines_of_a_cropped_view(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

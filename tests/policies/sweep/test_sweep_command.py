@@ -11,6 +11,7 @@ from gelflow.policies.checkpoint import load_checkpoint
 GRID = 'task = "insertion"\nseeds = [0, 1]\n[options]\nattempts = 16\nenvs = 4\n'
 
 
+@pytest.mark.slow
 def test_a_sweep_of_real_trainings_collects_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid, out = tmp_path / "tiny.toml", tmp_path / "sweep"
     grid.write_text(GRID)
