@@ -64,6 +64,12 @@ def forward(joints: Sequence[float]) -> PoseTuple:
     return position, columns_quaternion(matrix)
 
 
+def link_frames(joints: Sequence[float]) -> tuple[PoseTuple, ...]:
+    """Frames after each of the six joints in the base frame, by DH: position [m] and quaternion w x y z."""
+    chains = (_chain(joints, count) for count in range(1, 7))
+    return tuple((position, columns_quaternion(matrix)) for position, matrix in chains)
+
+
 def range_violation(joints: Sequence[float]) -> str:
     """Message that names the first joint outside its range; empty when all are within their ranges."""
     for number, (angle, (low, high)) in enumerate(zip(joints, JOINT_RANGES, strict=True), start=1):

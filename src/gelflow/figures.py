@@ -43,6 +43,16 @@ def add_arrows(axes: Any, grid: Grid, flow: NDArray[np.floating[Any]], *, color:
     axes.quiver(y, x, right, down, color=color, angles="xy", scale_units="xy", scale=1, width=width)
 
 
+def rasterize(figure: Any) -> NDArray[np.uint8]:
+    """A matplotlib figure as RGB pixels, shape (height, width, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # deferred: slow to import
+
+    canvas: Any = FigureCanvasAgg
+    drawn = canvas(figure)
+    drawn.draw()
+    return np.array(drawn.buffer_rgba(), dtype=np.uint8)[..., :3].copy()
+
+
 def save(figure: Any, path: str | Path, *, dpi: int = 100, make_folder: bool = True) -> None:
     """Write a matplotlib figure. Raises UsageError when the file cannot be written."""
     try:

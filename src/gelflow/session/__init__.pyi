@@ -12,6 +12,7 @@ from .records import Decision as Decision
 from .records import describe_session as describe_session
 from .recovery import RecoveryReport as RecoveryReport
 from .recovery import recover as recover
+from .time_index import TimeIndex as TimeIndex
 
 __all__ = [
     "SENSORS",
@@ -24,6 +25,7 @@ __all__ = [
     "RecoveryReport",
     "SessionReader",
     "SessionRecorder",
+    "TimeIndex",
     "describe_session",
     "draw_comparisons",
     "recover",

@@ -23,6 +23,11 @@ def draw_comparisons(comparisons: Sequence[Comparison], grid: Grid, path: str | 
     recomputed one in red and narrower. The view is from outside onto the pad, fingertip down, so x points down and y to
     the right. At most the first 40 decisions are drawn. Raises UsageError when the picture cannot be written.
     """
+    save(comparison_figure(comparisons, grid), path, make_folder=False)
+
+
+def comparison_figure(comparisons: Sequence[Comparison], grid: Grid) -> Any:
+    """The figure of `draw_comparisons`."""
     from matplotlib.figure import Figure  # deferred: slow to import
 
     shown = list(comparisons[:MAX_DECISIONS])
@@ -35,7 +40,7 @@ def draw_comparisons(comparisons: Sequence[Comparison], grid: Grid, path: str | 
     if any(_texts(comparison)[1] or _flow_differs(comparison) for comparison in shown):
         notes += "\nblue: recorded; red: recomputed, where it differs visibly"
     figure.supxlabel(notes, fontsize=8)
-    save(figure, path, make_folder=False)
+    return figure
 
 
 def _draw_row(line: Any, comparison: Comparison, grid: Grid) -> None:

@@ -58,7 +58,7 @@ def ordered_messages(
     waiting: list[tuple[int, int, int, Channel, Message]] = []
     for chunk, following in itertools.zip_longest(chunks, chunks[1:]):
         try:
-            found = _messages(stream, chunk, summary)
+            found = chunk_messages(stream, chunk, summary)
         except DECODE_ERRORS:
             if damage is None:
                 raise
@@ -86,7 +86,7 @@ def _has_topic(chunk: ChunkIndex, summary: Summary, topics: Collection[str] | No
     return topics is None or not channels or any(summary.channels[key].topic in topics for key in channels)
 
 
-def _messages(stream: BinaryIO, index: ChunkIndex, summary: Summary) -> list[tuple[Channel, Message]]:
+def chunk_messages(stream: BinaryIO, index: ChunkIndex, summary: Summary) -> list[tuple[Channel, Message]]:
     """All messages of a chunk. Raises one of `DECODE_ERRORS` when it is damaged."""
     stream.seek(index.chunk_start_offset + _RECORD_HEAD)
     data = stream.read(index.chunk_length - _RECORD_HEAD)

@@ -12,14 +12,15 @@ from typing import Any, BinaryIO
 import numpy as np
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap.reader import SeekingReader
-from mcap.records import Message
+from mcap.records import ChunkIndex, Message
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.geometry import Pose
 from gelflow.protocols import CameraImage
 from gelflow.session.channels import JSON, PROTOBUF
-from gelflow.session.messages import DECODE_ERRORS, Damage, expected_records, ordered_messages
+from gelflow.session.messages import DECODE_ERRORS, Damage, chunk_messages, expected_records, ordered_messages
 from gelflow.session.records import FORMAT, SENSORS, Decision
 
 
@@ -90,7 +91,7 @@ class SessionReader:
 
     def counts(self) -> dict[str, int]:
         """Number of records per topic; topics without records are omitted."""
-        summary = self._opened().get_summary()
+        summary = self.summary
         if summary is None or summary.statistics is None:
             return {}
         counts = summary.statistics.channel_message_counts
@@ -105,7 +106,7 @@ class SessionReader:
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])
             raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; the topics of a session are {known}")
-        summary = self._opened().get_summary()
+        summary = self.summary
         if summary is None or not summary.chunk_indexes:
             return  # the recorder has written no message
         read = _with_timing(topics)
@@ -137,9 +138,34 @@ class SessionReader:
         for record in self.records(["/decision"]):
             yield record.value
 
+    @property
+    def summary(self) -> Summary | None:
+        """The index of the file; None when the recorder has written no message. Raises UsageError before `open`."""
+        return self._opened().get_summary()
+
+    def chunk(self, index: ChunkIndex) -> list[tuple[str, Message]]:
+        """Topic and message of all records of a chunk. Raises PeerError when it is damaged."""
+        summary = self.summary
+        assert self._stream is not None and summary is not None
+        try:
+            return [(channel.topic, message) for channel, message in chunk_messages(self._stream, index, summary)]
+        except DECODE_ERRORS as error:
+            raise self._damaged(error) from error
+
+    def record(self, topic: str, message: Message) -> Record:
+        """A message as a record, without the time of the camera's own clock. Raises PeerError when it is damaged."""
+        try:
+            return self._record(topic, message, {})
+        except DECODE_ERRORS as error:
+            raise self._damaged(error) from error
+
+    def robot_time(self, nanoseconds: int) -> float:
+        """A log time of the file as robot time [s]."""
+        return (nanoseconds - self._epoch) / 1e9
+
     def _record(self, topic: str, message: Message, camera_times: dict[str, tuple[int, float]]) -> Record:
         """A message as a record; joins the times of the cameras' own clocks with their images."""
-        stamp = (message.publish_time - self._epoch) / 1e9
+        stamp = self.robot_time(message.publish_time)
         value = _decode(topic, message, stamp)
         sensor = topic.removeprefix("/").partition("/")[0]
         if topic == f"/{sensor}/timing":
@@ -147,7 +173,7 @@ class SessionReader:
         elif isinstance(value, CameraImage) and sensor in camera_times:
             sequence, camera_time = camera_times.pop(sensor)
             value = dataclasses.replace(value, camera_time=camera_time) if sequence == value.sequence else value
-        return Record(topic, (message.log_time - self._epoch) / 1e9, stamp, value)
+        return Record(topic, self.robot_time(message.log_time), stamp, value)
 
     def _opened(self) -> SeekingReader:
         if self._reader is None:

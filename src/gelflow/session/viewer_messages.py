@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from gelflow.session.records import to_plain
 
-_ERRORS = ("stopped", "arm stopped", "part lost")
-_WARNINGS = ("pad not readable", "reference repeated", "weight not shown", "camera latency")
+ERRORS = ("stopped", "arm stopped", "part lost")
+WARNINGS = ("pad not readable", "reference repeated", "weight not shown", "camera latency")
 
 
 def flow_image(flow: NDArray[np.float32], nanoseconds: int) -> RawImage:
@@ -27,11 +27,16 @@ def flow_image(flow: NDArray[np.float32], nanoseconds: int) -> RawImage:
 
 def event_log(name: str, values: Mapping[str, Any], nanoseconds: int) -> Log:
     """An event in words, as a line of a log."""
-    level = Log.ERROR if name in _ERRORS else Log.WARNING if name in _WARNINGS else Log.INFO
-    words = ", ".join(f"{key} {_text(value)}" for key, value in to_plain(values).items() if value is not None)
-    message = Log(level=level, name=name, message=f"{name}: {words}" if words else name)
+    level = Log.ERROR if name in ERRORS else Log.WARNING if name in WARNINGS else Log.INFO
+    message = Log(level=level, name=name, message=event_text(name, values))
     message.timestamp.FromNanoseconds(nanoseconds)
     return message
+
+
+def event_text(name: str, values: Mapping[str, Any]) -> str:
+    """An event in words: its name and its values."""
+    words = ", ".join(f"{key} {_text(value)}" for key, value in to_plain(values).items() if value is not None)
+    return f"{name}: {words}" if words else name
 
 
 def _text(value: Any) -> str:

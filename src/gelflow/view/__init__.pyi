@@ -1,4 +1,6 @@
+from .session.recorded_session import RecordedSession as RecordedSession
+from .session.session_page import SessionPage as SessionPage
 from .simulation_page import SimulationPage as SimulationPage
 from .simulation_page import open as open
 
-__all__ = ["SimulationPage", "open"]
+__all__ = ["RecordedSession", "SessionPage", "SimulationPage", "open"]

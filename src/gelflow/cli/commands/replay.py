@@ -14,14 +14,13 @@ from rich.table import Table
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_checkpoint, add_json, add_out
 from gelflow.cli.output import Output, progress_bar
-from gelflow.errors import PeerError, UsageError
-from gelflow.observation import TactileFrame
+from gelflow.cli.session_replay import recorded_checkpoint, recorded_perception
+from gelflow.errors import UsageError
 from gelflow.real.camera.latency import LatencyEstimate, combine_latencies
-from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
+from gelflow.session.decision_replay import Comparison, replay
 from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS, file_digest, from_plain, software_versions
-from gelflow.task import InsertionTask
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -47,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json)
     with SessionReader(args.session) as session:
         description = session.description()
-        task, perception = _perception(description)
-        policy = load_policy(args.checkpoint or _recorded_checkpoint(description), task=task)
+        task, perception = recorded_perception(description)
+        policy = load_policy(args.checkpoint or recorded_checkpoint(description), task=task)
         notes = _notes(description, args.checkpoint)
         for note in notes:
             output.text(f"note: {note}")
@@ -143,50 +142,6 @@ def _latency_lines(latencies: Sequence[Sequence[LatencyEstimate]]) -> Iterator[s
         hint = f": correct cameras.{name}.latency in the lab file" if together.low > 0 or together.high < 0 else ""
         grasps = "1 grasp" if len(estimates) == 1 else f"{len(estimates)} grasps"
         yield f"{name} camera: latency beyond that of the lab file {together}, from {grasps}{hint}"
-
-
-def _perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
-    """Task and perception of the session's description. Raises PeerError when the description lacks a part."""
-    from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
-    from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
-
-    try:
-        task = InsertionTask.from_json(dict(description["task"]))
-        mounts = [from_plain(CameraMount, mount, what="camera mount") for mount in description["mounts"]]
-        configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
-    except KeyError as error:
-        raise PeerError(f"the session's description lacks {error}; record it with describe_session") from error
-
-    class Tracker:
-        """The marker tracker on compressed images."""
-
-        def __init__(self, sensor: int) -> None:
-            self._tracker = MarkerTracker(configs[sensor])
-
-        def start(self, data: bytes) -> TrackingResult:
-            return self._tracker.start(decode_image(data))
-
-        def track(self, data: bytes) -> TrackingResult:
-            return self._tracker.track(decode_image(data))
-
-    def frame(tracked: Sequence[TrackingResult], stamp: float) -> TactileFrame:
-        return tactile_frame(tracked, mounts, stamp)
-
-    return task, PerceptionPipeline(Tracker, frame)
-
-
-def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
-    """The checkpoint of the session, at its recorded path or shipped with gelflow."""
-    from gelflow.policies.checkpoint import shipped_checkpoints
-
-    recorded = description.get("checkpoint")
-    if not recorded:
-        raise UsageError("the session names no checkpoint; name the policy's file with --checkpoint")
-    for path in (Path(recorded["path"]), *shipped_checkpoints()):
-        if path.is_file() and file_digest(path) == recorded["digest"]:
-            return path
-    wanted = f"{recorded['path']} (SHA-256 {recorded['digest'][:12]}…)"
-    raise UsageError(f"the session ran {wanted}, which is missing or has changed; name the file with --checkpoint")
 
 
 def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]:

@@ -1,21 +1,34 @@
-"""`gelflow view SCENE`: a page in the browser with a scene that can be moved and played."""
+"""`gelflow view`: a page in the browser with a scene that can be moved, or with recorded sessions."""
 
 import argparse
+import contextlib
 import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_preset
-from gelflow.cli.output import Output
+from gelflow.cli.options import add_checkpoint, add_json, add_preset
+from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.session.decision_replay import Comparison
+
+_SCENE_ONLY = {"num_envs": 1, "env": 0, "preset": None}  # options and their defaults
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a shipped scene, or a TOML, MJCF or URDF file")
+    parser.add_argument(
+        "shown", metavar="SCENE|SESSION", nargs="+",
+        help="name of a shipped scene, or a TOML, MJCF or URDF file; or one or two recorded sessions (.mcap)",
+    )  # fmt: skip
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="environments (default %(default)s)")
     parser.add_argument(
         "--env", type=int, default=0, metavar="N", help="environment that is shown (default %(default)s)"
     )
+    parser.add_argument(
+        "--replay", action="store_true", help="of a session: replay its decisions first, and mark those that differ"
+    )
+    add_checkpoint(parser, default="the policy of the session")
     parser.add_argument(
         "--port", type=int, default=8080, metavar="P", help="TCP port; 0: a free one (default %(default)s)"
     )
@@ -32,22 +45,74 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
+    sessions = [name for name in args.shown if name.endswith(".mcap")]
+    if sessions and (len(sessions) < len(args.shown) or len(sessions) > 2):
+        raise UsageError(f"name one scene, or one session or two, got {' '.join(args.shown)}")
+    if not sessions and len(args.shown) > 1:
+        raise UsageError(f"name one scene, got {' '.join(args.shown)}")
+    for name, default in _SCENE_ONLY.items():
+        if sessions and getattr(args, name) != default:
+            raise UsageError(f"--{name.replace('_', '-')} is for scenes, and {sessions[0]} is a session")
+    if args.replay and len(sessions) != 1:
+        raise UsageError("--replay needs one session, a file that ends with .mcap")
+    if args.checkpoint is not None and not args.replay:
+        raise UsageError("--checkpoint names the policy of --replay; add --replay")
+    from gelflow.view.page import import_viser
+
+    import_viser()
+    return _view_sessions(args, sessions) if sessions else _view_scene(args)
+
+
+def _view_scene(args: argparse.Namespace) -> int:
     if args.num_envs < 1:
         raise UsageError(f"--num-envs must be at least 1, got {args.num_envs}")
     from gelflow.sim.scene import load_scene
     from gelflow.sim.simulator import Simulator
-    from gelflow.view.page import import_viser
     from gelflow.view.simulation_page import SimulationPage
 
-    import_viser()
-    sim = Simulator(load_scene(args.scene, preset=args.preset), num_envs=args.num_envs)
+    sim = Simulator(load_scene(args.shown[0], preset=args.preset), num_envs=args.num_envs)
     with SimulationPage(sim, env=args.env, host=args.host, port=args.port, controls=True) as page:
-        output = Output(args.json)
-        output.text(f"open {page.url} in a browser; Ctrl-C ends")
-        output.result({"url": page.url})
-        sys.stdout.flush()  # it goes on
-        try:
-            page.run()
-        except KeyboardInterrupt:
-            return SUCCESS
+        return _serve(args, page.url, page.run)
+
+
+def _view_sessions(args: argparse.Namespace, paths: Sequence[str]) -> int:
+    from gelflow.view.session.recorded_session import RecordedSession
+    from gelflow.view.session.session_page import SessionPage
+
+    with contextlib.ExitStack() as stack:
+        sessions = [stack.enter_context(RecordedSession(path)) for path in paths]
+        comparisons = _replayed(Path(paths[0]), args.checkpoint) if args.replay else None
+        page = stack.enter_context(SessionPage(sessions, comparisons=comparisons, host=args.host, port=args.port))
+        return _serve(args, page.url, page.run)
+
+
+def _replayed(path: Path, checkpoint: Path | None) -> list[Comparison]:
+    """The decisions of a session, recomputed."""
+    from gelflow.cli.session_replay import recorded_checkpoint, recorded_perception
+    from gelflow.policies.checkpoint import load_policy
+    from gelflow.session.decision_replay import replay
+    from gelflow.session.messages import Damage
+    from gelflow.session.reader import SessionReader
+
+    with SessionReader(path) as session, progress_bar(count=True) as progress:
+        description = session.description()
+        task, perception = recorded_perception(description)
+        policy = load_policy(checkpoint or recorded_checkpoint(description), task=task)
+        bar = progress.add_task("replaying", total=session.counts().get("/decision", 0))
+        found = []
+        for comparison in replay(session, perception=perception, policy=policy, task=task, damage=Damage()):
+            found.append(comparison)
+            progress.advance(bar)
+    return found
+
+
+def _serve(args: argparse.Namespace, url: str, serve: Callable[[], None]) -> int:
+    output = Output(args.json)
+    output.text(f"open {url} in a browser; Ctrl-C ends")
+    output.result({"url": url})
+    sys.stdout.flush()  # it goes on
+    try:
+        serve()
+    except KeyboardInterrupt:
+        return SUCCESS
     return SUCCESS

@@ -1,0 +1,1 @@
+"""The robot on a page: its arm, gripper, part and hole."""

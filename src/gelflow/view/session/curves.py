@@ -1,0 +1,63 @@
+"""Curves over the time of a session: height of the part, shear of both pads, grip force."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.geometry import Pose
+from gelflow.session.records import SENSORS
+from gelflow.view.session.recorded_session import RecordedSession
+
+Array = NDArray[np.float64]
+SAMPLES = 500  # of a curve in the shown time
+_PER_ROUND = 10  # samples between two yields
+
+
+@dataclass
+class Curve:
+    """Samples of one quantity, in any order."""
+
+    label: str
+    samples: list[tuple[float, float]] = field(default_factory=list)  # robot time [s] and value
+
+    def ordered(self) -> tuple[Array, Array]:
+        """Times [s] and values, in order of time."""
+        values = np.array(sorted(self.samples), dtype=float).reshape(-1, 2)
+        return values[:, 0], values[:, 1]
+
+
+@dataclass
+class Curves:
+    """The curves of the time from `start` to `end` [s]."""
+
+    start: float
+    end: float
+    height: Curve = field(default_factory=lambda: Curve("height of the part [mm]"))
+    shear: tuple[Curve, ...] = field(
+        default_factory=lambda: tuple(Curve(f"{sensor} pad") for sensor in SENSORS)
+    )  # [mm]
+    force: Curve = field(default_factory=lambda: Curve("grip force [N]"))
+
+
+def read_curves(session: RecordedSession, curves: Curves, *, samples: int = SAMPLES) -> Iterator[None]:
+    """Add the samples of a session to `curves`; yields after some of them, first evenly spread over the time."""
+    markers = session.marker_reader()
+    poses = session.index.spread(["/arm/pose", "/gripper/state"], curves.start, curves.end, samples)
+    times = np.linspace(curves.start, curves.end, samples + 1)[1:]
+    order = sorted(range(samples), key=lambda k: f"{k:016b}"[::-1])  # each beginning is spread evenly
+    for number in range(samples):
+        for record in next(poses, []):
+            if isinstance(record.value, Pose):
+                height = record.value.position[2] if session.cell is None else session.cell.part_height(record.value)
+                curves.height.samples.append((record.time, 1e3 * float(height)))
+            else:
+                curves.force.samples.append((record.time, float(record.value["force"])))
+        time = float(times[order[number]])
+        for sensor, curve in enumerate(curves.shear):
+            shear = markers.shear(sensor, time)
+            if np.isfinite(shear):
+                curve.samples.append((time, shear))
+        if number % _PER_ROUND == _PER_ROUND - 1:
+            yield

@@ -1,0 +1,66 @@
+"""Attempts, decisions and other events of a session as marks on its time line."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gelflow.session.reader import Record
+from gelflow.session.viewer_messages import ERRORS, WARNINGS, event_text
+
+Kind = Literal["inserted", "not inserted", "decision", "difference", "warning", "stop"]
+_LONGEST = 90  # of a text [characters]
+_DESCEND = "descend"  # phase with which an attempt starts
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An event, or an attempt from `time` to `end` [s]."""
+
+    time: float
+    end: float
+    kind: Kind
+    text: str
+    insertion: int | None = None
+    attempt: int | None = None
+
+
+def phases(events: Sequence[Record]) -> list[tuple[float, str]]:
+    """Times [s] and names of the phases of a run."""
+    return [(e.stamp, str(e.value["values"]["state"])) for e in events if e.value["name"] == "state"]
+
+
+def marks(events: Sequence[Record], attempts: Sequence[Record], decisions: Sequence[Record]) -> list[Mark]:
+    """All marks of a session, in order of time."""
+    found = [*_attempts(attempts, phases(events)), *_events(events)]
+    for record in decisions:
+        decision = record.value
+        dx, dy, yaw = decision.action * (1e3, 1e3, 180 / np.pi)
+        text = f"decision: x {dx:+.2f} mm, y {dy:+.2f} mm, yaw {yaw:+.1f}°"
+        found.append(Mark(record.time, record.time, "decision", text, decision.insertion, decision.attempt))
+    return sorted(found, key=lambda mark: mark.time)
+
+
+def _attempts(attempts: Sequence[Record], run: Sequence[tuple[float, str]]) -> Iterable[Mark]:
+    """An attempt lasts from the descent before its record to the record."""
+    starts = [time for time, phase in run if phase == _DESCEND]
+    for record in attempts:
+        values = record.value
+        start = max((time for time in starts if time <= record.time), default=record.time)
+        outcome = str(values.get("outcome", "ended"))
+        insertion, attempt = values.get("insertion"), values.get("attempt")
+        text = f"insertion {insertion}, attempt {attempt}: {outcome}"
+        kind: Kind = "inserted" if outcome == "inserted" else "not inserted"
+        yield Mark(start, record.time, kind, text, insertion, attempt)
+
+
+def _events(events: Sequence[Record]) -> Iterable[Mark]:
+    for record in events:
+        name, values = str(record.value["name"]), record.value["values"]
+        if name == "arm stopped":
+            continue  # also the normal end of a run; a failure has the event "stopped" too
+        if name in ERRORS or name in WARNINGS:
+            text = event_text(name, values)
+            text = text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
+            yield Mark(record.time, record.time, "stop" if name in ERRORS else "warning", text)

@@ -1,0 +1,70 @@
+"""A moment of a session in words."""
+
+import math
+
+from gelflow.geometry import Pose
+from gelflow.session.decision_replay import Comparison
+from gelflow.view.session.moment import Moment
+from gelflow.view.session.recorded_session import RecordedSession
+
+
+def moment_text(moment: Moment, session: RecordedSession, *, comparison: Comparison | None = None) -> str:
+    """The state of run, arm, gripper and policy, as Markdown; `comparison` is that of the last decision."""
+    since = moment.time - session.start
+    lines = [f"**{since:.2f} s** of {session.end - session.start:.1f} s"]
+    if moment.phase:
+        lines[0] += f", phase **{moment.phase}**"
+    if moment.insertion is not None:
+        lines[0] += f", insertion {moment.insertion}, attempt {moment.attempt}"
+    if moment.flange is not None and session.cell is not None:
+        lines.append(arm_text(session.cell.gripper(moment.flange), session.cell.part_height(moment.flange)))
+    if moment.gripper is not None:
+        lines.append(gripper_text(moment))
+    if any(pad is not None and pad.tracked is not None for pad in moment.pads):
+        reference = session.reference_time(moment.time) - session.start
+        lines.append(f"markers: displacement since {reference:.2f} s, lines 5 times as long")
+    if moment.decision is not None:
+        lines.append(_decision_text(moment))
+    if comparison is not None:
+        lines.append(comparison_text(comparison))
+    lines += session.notes
+    if session.index.damaged:
+        lines.append(f"**{session.index.damaged} damaged parts of the file are not shown**")
+    return "  \n".join(lines)
+
+
+def arm_text(gripper: Pose, height: float) -> str:
+    """The pose of the gripper frame, and the height of the part's lower face [m], in words."""
+    x, y, z = 1e3 * gripper.position
+    return (
+        f"gripper at {x:.1f}, {y:.1f}, {z:.1f} mm, yaw {math.degrees(gripper.yaw):.1f}°; "
+        f"part {1e3 * height:.2f} mm above the floor"
+    )
+
+
+def gripper_text(moment: Moment) -> str:
+    """Width, force and grasp of the gripper in words."""
+    gripper = moment.gripper or {}
+    text = f"grip: {1e3 * float(gripper['width']):.2f} mm, {float(gripper['force']):.1f} N, {gripper['grasp']}"
+    return text + (f", **fault: {gripper['fault']}**" if gripper.get("fault") else "")
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Whether the replay repeated a decision, in words."""
+    if comparison.skipped:
+        return f"**replay: not recomputed, {comparison.skipped}**"
+    if comparison.identical:
+        return "replay: identical"
+    dx, dy, yaw = comparison.action * (1e3, 1e3, 180 / math.pi)
+    flow = f"by {comparison.flow_difference:.2g} of its longest arrow" if comparison.flow_difference else "identical"
+    return f"**replay differs**: correction x {dx:+.3f} mm, y {dy:+.3f} mm, yaw {yaw:+.2f}°; flow map {flow}"
+
+
+def _decision_text(moment: Moment) -> str:
+    decision = moment.decision
+    assert decision is not None
+    dx, dy, yaw = decision.action * (1e3, 1e3, 180 / math.pi)
+    return (
+        f"last decision (insertion {decision.insertion}, attempt {decision.attempt}): "
+        f"correction x {dx:+.2f} mm, y {dy:+.2f} mm, yaw {yaw:+.1f}°"
+    )

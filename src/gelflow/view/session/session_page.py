@@ -1,0 +1,252 @@
+"""The page of one recorded session, or of two side by side."""
+
+import queue
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from gelflow.errors import UsageError
+from gelflow.session.decision_replay import Comparison
+from gelflow.view.page import DEFAULT_HOST, DEFAULT_PORT, Page
+from gelflow.view.session.moment import Moment
+from gelflow.view.session.recorded_session import RecordedSession
+from gelflow.view.session.session_panel import SessionPanel
+
+_TICK = 0.04  # [s] of the loop of `run`
+_SPEEDS = ("0.1 ×", "0.25 ×", "1 ×", "4 ×", "16 ×")
+_RANGES = ("whole recording", "this attempt", "10 s")
+_START = "start"
+_FROM_START = "starts of the recordings"
+_PANEL_WIDTH = 560  # [px]
+_SLIDER_STEP = 0.01  # [s]
+
+
+class SessionPage:
+    """A page of recorded sessions with a time line that can be dragged.
+
+    Parameters
+    ----------
+    sessions: one or two open sessions
+    comparisons: the replay of the first session, None: it is not replayed
+    host: address to bind to; any other than a loopback address needs the random token in `url`
+    port: TCP port; 0 takes a free one
+
+    Raises UsageError for more than two sessions, for an address in use, and without viser.
+    """
+
+    def __init__(
+        self,
+        sessions: Sequence[RecordedSession],
+        *,
+        comparisons: Sequence[Comparison] | None = None,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+    ) -> None:
+        if not 1 <= len(sessions) <= 2:
+            raise UsageError(f"a page shows one session or two, got {len(sessions)}")
+        self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._page = Page(host=host, port=port)
+        self.url = self._page.url
+        self.time = 0.0  # since the start of the first recording [s]
+        self.playing = False
+        self._speed = 1.0
+        self._offsets = [0.0] * len(sessions)  # of the time of each session [s]
+        self._moments: list[Moment] = []
+        same = len({session.name for session in sessions}) < len(sessions)
+        self._names = [f"{s.reader.path.parent.name}/{s.name}" if same else s.name for s in sessions]
+        self._duration = max(session.end - session.start for session in sessions)
+        self._range = (0.0, self._duration)
+        self._add_controls()
+        folder = self._page.gui.add_folder("Decision") if len(sessions) == 1 and sessions[0].decisions else None
+        self._panels = [
+            self._add_panel(session, comparisons, number, folder) for number, session in enumerate(sessions)
+        ]
+        self._add_choices()
+        self._show_range(_RANGES[0])
+        self._go(0.0)
+
+    def __enter__(self) -> "SessionPage":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop serving the page. The sessions stay open."""
+        for panel in self._panels:
+            panel.close()
+        self._page.close()
+
+    def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
+        """Show what the page asks for, until `until()` is true or Ctrl-C."""
+        before = time.perf_counter()
+        while not until():
+            now = time.perf_counter()
+            changed = self._handle_events()
+            if self.playing:
+                self._go(self.time + self._speed * (now - before), moved=True)
+            elif not changed:
+                self._settle()
+            before = now
+            for panel in self._panels:
+                panel.refresh()
+            time.sleep(max(0.0, now + _TICK - time.perf_counter()))
+
+    def _add_panel(
+        self, session: RecordedSession, comparisons: Sequence[Comparison] | None, number: int, folder: Any
+    ) -> SessionPanel:
+        panel = self._page.gui.add_panel()
+        if number == 0:
+            panel.dock_left()
+        else:
+            panel.dock_right()
+        panel.set_width(_PANEL_WIDTH)
+        return SessionPanel(
+            self._page, panel, session, decision_panel=folder,
+            comparisons=comparisons if number == 0 else None, number=number,
+            name=self._names[number],
+        )  # fmt: skip
+
+    def _add_controls(self) -> None:
+        gui = self._page.gui
+        self._slider = gui.add_slider("time [s]", 0.0, max(self._duration, _SLIDER_STEP), _SLIDER_STEP, 0.0)
+        self._slider.on_update(self._dragged)
+        self._play = gui.add_button("Play")
+        self._play.on_click(lambda _: self._post(self._toggle))
+        speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
+        speed.on_update(lambda event: self._post(setattr, self, "_speed", float(event.target.value.split()[0])))
+        jump = gui.add_button_group("event", ("Previous", "Next"))
+        jump.on_click(lambda event: self._post(self._jump, event.target.value == "Next"))
+
+    def _add_choices(self) -> None:
+        """Choices that depend on the contents of the sessions."""
+        gui = self._page.gui
+        self._add_marks(gui)
+        shown = gui.add_dropdown("time line shows", _RANGES, initial_value=_RANGES[0])
+        shown.on_update(lambda event: self._post(self._show_range, event.target.value))
+        if len(self._panels) == 2:
+            align = gui.add_dropdown("same time at", (_FROM_START, *self._common_attempts()))
+            align.on_update(lambda event: self._post(self._align, event.target.value))
+        markers = gui.add_checkbox("markers", initial_value=True)
+        markers.on_update(lambda event: self._post(self._set_markers, event.target.value))
+
+    def _add_marks(self, gui: Any) -> None:
+        """The list of all marks of the first session, to jump to."""
+        first = self._panels[0]
+        self._marks = {
+            f"{mark.time - first.session.start:.2f} s {mark.text}": mark.time - first.session.start
+            for mark in first.marks
+        }
+        if self._marks:
+            chosen = gui.add_dropdown("go to", (_START, *self._marks), initial_value=_START)
+            chosen.on_update(lambda event: self._post(self._go, self._marks.get(event.target.value, 0.0)))
+
+    def _post(self, function: Callable[..., None], *values: Any) -> None:
+        """Let the thread of `run` call a function: the page has threads of its own."""
+        self._events.put(lambda: function(*values))
+
+    def _dragged(self, event: Any) -> None:
+        if event.client is not None:  # a person has moved it, not this program
+            self._post(self._go, float(event.target.value), False, True)
+
+    def _handle_events(self) -> bool:
+        """Handle what the page has sent; of several times only the last is shown."""
+        waiting: list[Callable[[], None]] = []
+        while True:
+            try:
+                waiting.append(self._events.get_nowait())
+            except queue.Empty:
+                break
+        for event in waiting:
+            event()
+        return self._show_if_moved()
+
+    def _toggle(self) -> None:
+        if not self.playing and self.time >= self._range[1]:
+            self.time = self._range[0]
+        self._set_playing(not self.playing)
+
+    def _set_playing(self, playing: bool) -> None:
+        self.playing = playing
+        self._play.label = "Pause" if playing else "Play"
+
+    def _set_markers(self, markers: bool) -> None:
+        for panel in self._panels:
+            panel.markers = markers
+        self._shown = None
+
+    def _go(self, seconds: float, moved: bool = False, dragged: bool = False) -> None:
+        """Go to a time [s] of the page."""
+        self.time = min(max(seconds, 0.0), self._duration)
+        if not self._range[0] <= self.time <= self._range[1]:
+            self._show_range(_RANGES[0])
+        if moved and self.time >= self._range[1]:
+            self._set_playing(False)
+        if not dragged:
+            self._slider.value = round(self.time, 2)
+        if moved:
+            self._show_if_moved()
+
+    _shown: float | None = None  # time that the panels show [s]
+
+    def _show_if_moved(self) -> bool:
+        if self._shown == self.time:
+            return False
+        self._shown = self.time
+        self._moments = [
+            panel.show(panel.session.start + self.time + offset)
+            for panel, offset in zip(self._panels, self._offsets, strict=True)
+        ]
+        return True
+
+    def _settle(self) -> None:
+        """Show what takes longer, while nothing moves."""
+        for panel, moment in zip(self._panels, self._moments, strict=True):
+            panel.show_decision(moment.decision)
+
+    def _jump(self, forward: bool) -> None:
+        times = sorted(self._marks.values())
+        if forward:
+            self._go(next((t for t in times if t > self.time + 1e-3), self._duration))
+        else:
+            self._go(next((t for t in reversed(times) if t < self.time - 1e-3), 0.0))
+
+    def _show_range(self, name: str) -> None:
+        start, end = 0.0, self._duration
+        if name == _RANGES[1]:
+            start, end = self._attempt_range()
+        elif name == _RANGES[2]:
+            start = min(max(self.time - 5.0, 0.0), max(self._duration - 10.0, 0.0))
+            end = min(start + 10.0, self._duration)
+        self._range = start, end
+        self._slider.min, self._slider.max = round(start, 2), max(round(end, 2), round(start, 2) + _SLIDER_STEP)
+        for panel, offset in zip(self._panels, self._offsets, strict=True):
+            panel.show_range(panel.session.start + start + offset, panel.session.start + end + offset)
+
+    def _attempt_range(self) -> tuple[float, float]:
+        """The attempt of the first session at the present time, or the last before; without one the whole recording."""
+        origin = self._panels[0].session.start
+        spans = [(m.time - origin, m.end - origin) for m in self._panels[0].marks if m.end > m.time]
+        before = [span for span in spans if span[0] <= self.time]
+        return before[-1] if before else spans[0] if spans else (0.0, self._duration)
+
+    def _common_attempts(self) -> list[str]:
+        """Names of the attempts that both sessions have."""
+        first, second = (_attempt_starts(panel) for panel in self._panels)
+        return [_attempt_name(key) for key in first if key in second]
+
+    def _align(self, name: str) -> None:
+        first, second = (_attempt_starts(panel) for panel in self._panels)
+        offset = next((second[key] - first[key] for key in first if _attempt_name(key) == name and key in second), 0.0)
+        self._offsets[1] = offset
+        self._shown = None
+        self._show_range(_RANGES[0])
+
+
+def _attempt_starts(panel: SessionPanel) -> dict[tuple[int | None, int | None], float]:
+    """Starts of the attempts [s] since the start of the recording."""
+    return {(m.insertion, m.attempt): m.time - panel.session.start for m in panel.marks if m.end > m.time}
+
+
+def _attempt_name(key: tuple[int | None, int | None]) -> str:
+    return f"insertion {key[0]}, attempt {key[1]}"

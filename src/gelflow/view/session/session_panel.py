@@ -1,0 +1,164 @@
+"""The part of a page that shows one recorded session."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gelflow.session.decision_replay import Comparison
+from gelflow.session.records import Decision
+from gelflow.view.page import Page
+from gelflow.view.robot.robot_view import RobotView
+from gelflow.view.session.curves import Curves, read_curves
+from gelflow.view.session.marks import Mark
+from gelflow.view.session.moment import Moment
+from gelflow.view.session.moment_text import moment_text
+from gelflow.view.session.pad_pictures import decision_picture, pads_picture
+from gelflow.view.session.recorded_session import RecordedSession
+from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
+
+_DECISION_PICTURES = 32  # that are kept
+_REDRAW = 5  # rounds of samples between two pictures of the curves
+
+
+class SessionPanel:
+    """Images, time line, text and robot of one session. All methods are for the thread of the page.
+
+    Parameters
+    ----------
+    page: where the panel is made
+    panel: panel of viser that contains it
+    session: the session
+    decision_panel: where the flow maps of decisions are shown; None: below the time line
+    comparisons: the decisions of its replay; None: it is not replayed
+    number: 0 for the first session of the page
+    name: title of the panel
+    """
+
+    def __init__(
+        self,
+        page: Page,
+        panel: Any,
+        session: RecordedSession,
+        *,
+        decision_panel: Any = None,
+        comparisons: Sequence[Comparison] | None = None,
+        number: int = 0,
+        name: str = "",
+    ) -> None:
+        self.session = session
+        self.markers = True
+        self._comparisons = {(c.recorded.insertion, c.recorded.attempt): c for c in comparisons or ()}
+        self._replayed = comparisons is not None
+        self.marks: list[Mark] = sorted([*session.marks, *self._differences()], key=lambda mark: mark.time)
+        self._robot = None
+        if session.cell is not None:
+            self._robot = RobotView(page, session.cell, root=f"/robot {number}", opacity=0.45 if number else 1.0)
+        with panel.add_tab(name):
+            self._text = page.gui.add_markdown("")
+            self._images = page.gui.add_image(np.full((10, 16, 3), 235, dtype=np.uint8), format="jpeg", jpeg_quality=85)
+            self._time_image = page.gui.add_image(np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8), format="png")
+            if decision_panel is None:
+                self._decision_image = _hidden_image(page)
+        if decision_panel is not None:
+            with decision_panel:
+                self._decision_image = _hidden_image(page)
+        self._pictures: OrderedDict[tuple[int, int], Any] = OrderedDict()
+        self._shown_decision: Decision | None = None
+        self._curves = Curves(session.start, session.end)
+        self._time_line: TimeLine | None = None
+        self._drawn: TimeLine | None = None
+        self._time = session.start
+        self._reading = threading.Event()
+        self._reader: threading.Thread | None = None
+
+    def show_range(self, start: float, end: float) -> None:
+        """Read and draw the curves from `start` to `end` [s] in the background."""
+        self.close()
+        self._curves = Curves(max(start, self.session.start), min(end, self.session.end))
+        self._reading = threading.Event()
+        self._reader = threading.Thread(
+            target=self._read, args=(self._curves, self._reading), name="curves", daemon=True
+        )
+        self._reader.start()
+
+    def show(self, time: float) -> Moment:
+        """Show the session at a robot time [s]: first what is known at once, then the markers."""
+        self._time = time = min(max(time, self.session.start), self.session.end)
+        if self.markers and not self.session.markers.is_ready():
+            self._show(self.session.at(time, markers=False))
+        moment = self.session.at(time, markers=self.markers)
+        self._show(moment)
+        return moment
+
+    def refresh(self) -> None:
+        """Show what has been read in the background."""
+        if self._time_line is not self._drawn:
+            self._drawn = self._time_line
+            self._show_time()
+
+    def show_decision(self, decision: Decision | None) -> None:
+        """Show the flow maps of a decision; drawing them takes a moment."""
+        if decision is self._shown_decision or self.session.cell is None:
+            return
+        self._shown_decision = decision
+        self._decision_image.visible = decision is not None
+        if decision is None:
+            return
+        key = decision.insertion, decision.attempt
+        if key not in self._pictures:
+            comparison = self._comparison(decision) or Comparison(decision, decision.observation, decision.action)
+            self._pictures[key] = decision_picture(comparison, self.session.cell.task.grid)
+            if len(self._pictures) > _DECISION_PICTURES:
+                self._pictures.popitem(last=False)
+        self._decision_image.image = self._pictures[key]
+
+    def close(self) -> None:
+        """End the reading in the background."""
+        self._reading.set()
+        if self._reader is not None:
+            self._reader.join()
+            self._reader = None
+
+    def _show(self, moment: Moment) -> None:
+        self._images.image = pads_picture(moment.pads, markers=self.markers)
+        if self._robot is not None:
+            width = None if moment.gripper is None else float(moment.gripper["width"])
+            self._robot.show(moment.joints, moment.flange, width, part_held=moment.part_held)
+        self._text.content = moment_text(moment, self.session, comparison=self._comparison(moment.decision))
+        self._show_time()
+
+    def _show_time(self) -> None:
+        if self._drawn is not None:
+            self._time_image.image = self._drawn.with_present(self._time)
+
+    def _read(self, curves: Curves, ended: threading.Event) -> None:
+        """In a thread: read the curves, and draw them from time to time."""
+        for number, _ in enumerate(read_curves(self.session, curves)):
+            if ended.is_set():
+                return
+            if number % _REDRAW == 0:
+                self._time_line = TimeLine(curves, self.marks, origin=self.session.start)
+        self._time_line = TimeLine(curves, self.marks, origin=self.session.start)
+
+    def _comparison(self, decision: Decision | None) -> Comparison | None:
+        return None if decision is None else self._comparisons.get((decision.insertion, decision.attempt))
+
+    def _differences(self) -> list[Mark]:
+        """Marks of the decisions that the replay did not repeat."""
+        found = []
+        for record in self.session.decisions:
+            key = record.value.insertion, record.value.attempt
+            comparison = self._comparisons.get(key)
+            if self._replayed and (comparison is None or not comparison.identical):
+                text = f"the replay of insertion {key[0]}, attempt {key[1]} differs"
+                if comparison is None or comparison.skipped:
+                    text = f"insertion {key[0]}, attempt {key[1]} could not be replayed"
+                found.append(Mark(record.time, record.time, "difference", text, *key))
+        return found
+
+
+def _hidden_image(page: Page) -> Any:
+    return page.gui.add_image(np.full((10, 16, 3), 255, dtype=np.uint8), format="png", visible=False)

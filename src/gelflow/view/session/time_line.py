@@ -1,0 +1,98 @@
+"""The picture of a session's time line: curves, attempts and events over time, and the present as a line."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.figures import BLUE, GREEN, ORANGE, PURPLE, VERMILION, rasterize
+from gelflow.view.session.curves import Curve, Curves
+from gelflow.view.session.marks import Mark
+
+Image = NDArray[np.uint8]
+WIDTH, HEIGHT = 640, 380  # [px]
+_PRESENT = np.array((0, 0, 0), dtype=np.uint8)
+_SPANS = {"inserted": (GREEN, ""), "not inserted": (ORANGE, "//")}  # colour and hatch of attempts
+_POINTS = {  # colour, symbol and name of marks without a duration
+    "decision": (BLUE, "D", "decision"),
+    "difference": (VERMILION, "X", "replay differs"),
+    "warning": (PURPLE, "v", "warning"),
+    "stop": (VERMILION, "s", "stop"),
+}
+
+
+class TimeLine:
+    """The time line of curves and marks; `with_present` draws the present into it."""
+
+    def __init__(self, curves: Curves, marks: Sequence[Mark], *, origin: float) -> None:
+        from matplotlib.figure import Figure  # deferred: slow to import
+
+        figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
+        figure.subplots_adjust(left=0.105, right=0.985, top=0.935, bottom=0.12, hspace=0.18)
+        axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.55, 1, 1, 1))
+        self._start, self._end = curves.start, curves.end
+        axes[0].set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
+        inside = [mark for mark in marks if mark.end >= curves.start and mark.time <= curves.end]
+        _draw_marks(axes[0], inside, origin)
+        handles, labels = axes[0].get_legend_handles_labels()
+        if labels:
+            figure.legend(handles, labels, loc="upper right", fontsize=7, ncols=len(labels), frameon=False, borderpad=0)
+        for axis in axes[1:]:
+            _shade(axis, inside, origin)
+            axis.grid(alpha=0.3)
+            axis.tick_params(labelsize=7)
+        _draw(axes[1], [curves.height], ["black"], origin)
+        axes[1].set_ylabel("height\n[mm]", fontsize=7)
+        _draw(axes[2], curves.shear, [BLUE, VERMILION], origin)
+        axes[2].set_ylabel("shear\n[mm]", fontsize=7)
+        axes[2].legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7)
+        _draw(axes[3], [curves.force], ["black"], origin)
+        axes[3].set_ylabel("grip\n[N]", fontsize=7)
+        axes[3].set_xlabel("time since the start of the recording [s]", fontsize=7)
+        figure.align_ylabels(axes)
+        self._picture: Image = rasterize(figure)
+        box = axes[1].get_window_extent()
+        self._left, self._right = float(box.x0), float(box.x1)
+
+    def with_present(self, time: float) -> Image:
+        """The picture with a line at a robot time [s], RGB of shape (HEIGHT, WIDTH, 3)."""
+        picture = self._picture.copy()
+        fraction = (time - self._start) / max(self._end - self._start, 1e-9)
+        if 0 <= fraction <= 1:
+            column = round(self._left + fraction * (self._right - self._left))
+            picture[: -round(0.1 * HEIGHT), max(column - 1, 0) : column + 1] = _PRESENT
+        return picture
+
+
+def _draw(axis: Any, curves: Sequence[Curve], colors: Sequence[str], origin: float) -> None:
+    for curve, color, style in zip(curves, colors, ("-", "--"), strict=False):
+        times, values = curve.ordered()
+        axis.plot(times - origin, values, style, color=color, linewidth=1.1, label=curve.label)
+
+
+def _shade(axis: Any, marks: Sequence[Mark], origin: float) -> None:
+    for mark in marks:
+        if mark.kind in _SPANS:
+            axis.axvspan(mark.time - origin, mark.end - origin, color=_SPANS[mark.kind][0], alpha=0.12, linewidth=0)
+
+
+def _draw_marks(axis: Any, marks: Sequence[Mark], origin: float) -> None:
+    """Attempts as bars, other marks as symbols above them."""
+    axis.set(ylim=(0, 2.2), yticks=[], ylabel="events")
+    axis.yaxis.label.set_fontsize(7)
+    axis.tick_params(bottom=False, labelbottom=False)
+    named: set[str] = set()
+    for mark in marks:
+        label: str | None = None if mark.kind in named else mark.kind
+        if mark.kind in _SPANS:
+            color, hatch = _SPANS[mark.kind]
+            axis.barh(
+                0.5, mark.end - mark.time, left=mark.time - origin, height=0.8, color=color, hatch=hatch,
+                edgecolor="white", linewidth=0.5, label=label,
+            )  # fmt: skip
+        else:
+            color, symbol, name = _POINTS[mark.kind]
+            label = None if mark.kind in named else name
+            axis.plot(mark.time - origin, 1.55, symbol, color=color, markersize=5, label=label, linestyle="none")
+        named.add(mark.kind)

@@ -1,0 +1,179 @@
+"""A recorded session at any time: markers relative to the start of the attempt, heights, marks, texts, pictures."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.common.manual_clock import ManualClock
+from tests.view.session.made_session import (
+    CONTACT,
+    GRASP_HEIGHT,
+    HOLE_HEIGHT,
+    MOUNT,
+    SHEAR,
+    joints_at,
+    make_session,
+)
+
+from gelflow.errors import PeerError, UsageError
+from gelflow.protocols import CameraImage
+from gelflow.real.kinematics import HOME, forward, link_frames
+from gelflow.session import SessionRecorder, describe_session
+from gelflow.session.decision_replay import Comparison
+from gelflow.task import INSERTION
+from gelflow.view.session.curves import Curves, read_curves
+from gelflow.view.session.moment_text import comparison_text, moment_text
+from gelflow.view.session.pad_pictures import decision_picture, pads_picture
+from gelflow.view.session.recorded_session import RecordedSession
+from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("session") / "made.mcap"
+    make_session(made)
+    return made
+
+
+@pytest.fixture
+def session(path: Path) -> Iterator[RecordedSession]:
+    with RecordedSession(path) as opened:
+        yield opened
+
+
+def test_marks_are_the_attempts_decisions_and_warnings(session: RecordedSession) -> None:
+    found = [(m.kind, round(m.time - session.start, 2), round(m.end - session.start, 2)) for m in session.marks]
+    assert found == [
+        ("not inserted", 3.0, 7.0),
+        ("warning", 6.0, 6.0),
+        ("decision", 7.0, 7.0),
+        ("inserted", 8.5, 11.0),
+    ]
+    assert session.marks[2].text == "decision: x +1.00 mm, y -2.00 mm, yaw +2.9°"
+
+
+@pytest.mark.parametrize(("seconds", "shear"), [(4.95, 0.0), (5.0, SHEAR), (6.8, SHEAR), (7.5, 0.0), (1.0, 0.0)])
+def test_markers_are_relative_to_the_start_of_the_attempt(
+    session: RecordedSession, seconds: float, shear: float
+) -> None:
+    for sensor in range(2):
+        assert session.markers.shear(sensor, session.start + seconds + 1e-3) == pytest.approx(shear, abs=5e-3)
+    moment = session.at(session.start + seconds + 1e-3)
+    for pad in moment.pads:
+        assert pad is not None and pad.tracked is not None
+        assert MOUNT.pixels_per_mm is not None
+        along = np.nanmean(pad.tracked.displacement[:, 1]) / MOUNT.pixels_per_mm  # the tip is below
+        assert along == pytest.approx(shear, abs=5e-3)
+
+
+def test_a_moment_is_what_was_recorded_last(session: RecordedSession) -> None:
+    moment = session.at(session.start + 6.55)
+    assert (moment.phase, moment.insertion, moment.attempt) == ("descend", 0, 0)
+    assert moment.part_held and moment.decision is None
+    assert moment.joints is not None and moment.flange is not None and session.cell is not None
+    seconds = 6.5
+    joints = joints_at(seconds)
+    np.testing.assert_allclose(moment.joints, joints, atol=1e-12)
+    position, _ = forward(joints.tolist())
+    np.testing.assert_allclose(moment.flange.position, position, atol=1e-12)
+    assert moment.pads[0] is not None
+    assert moment.pads[0].stamp == pytest.approx(session.start + seconds, abs=1e-6)
+    later = session.at(session.start + 7.2)
+    assert later.phase == "retreat" and later.attempt is None and later.decision is not None
+
+
+def test_height_is_that_of_the_lower_face_above_the_floor(session: RecordedSession) -> None:
+    moment = session.at(session.start + 6.55)
+    assert moment.flange is not None and session.cell is not None
+    gripper = session.cell.gripper(moment.flange).position[2]
+    assert session.cell.part_height(moment.flange) == pytest.approx(gripper - HOLE_HEIGHT - GRASP_HEIGHT)
+
+
+def test_curves_have_the_values_of_the_records(session: RecordedSession) -> None:
+    curves = Curves(session.start, session.end)
+    rounds = sum(1 for _ in read_curves(session, curves, samples=60))
+    assert rounds == 6
+    for curve in curves.shear:
+        times, values = curve.ordered()
+        seconds = times - session.start
+        inside = (seconds > CONTACT[0] + 0.1) & (seconds < CONTACT[1] - 0.1)
+        assert inside.sum() > 5
+        np.testing.assert_allclose(values[inside], SHEAR, atol=5e-3)
+        np.testing.assert_allclose(values[seconds < CONTACT[0] - 0.1], 0.0, atol=5e-3)
+    times, force = curves.force.ordered()
+    assert set(np.round(force, 6)) == {0.0, 12.0}
+    assert (np.diff(times) > 0).all()
+
+
+def test_text_states_numbers_and_differences(session: RecordedSession) -> None:
+    moment = session.at(session.start + 7.2)
+    text = moment_text(moment, session)
+    for part in ("**7.20 s** of 11.9 s", "phase **retreat**", "35.00 mm, 12.0 N, holding", "x +1.00 mm, y -2.00 mm"):
+        assert part in text
+    decision = moment.decision
+    assert decision is not None
+    repeated = Comparison(decision, decision.observation, decision.action)
+    assert comparison_text(repeated) == "replay: identical"
+    moved = Comparison(decision, decision.observation, decision.action + np.array([1e-3, 0.0, 0.0]))
+    assert "replay differs" in comparison_text(moved) and "x +2.000 mm" in comparison_text(moved)
+
+
+def test_pictures_show_displacements_and_the_present(session: RecordedSession) -> None:
+    rest, contact = (pads_picture(session.at(session.start + t).pads) for t in (4.0, 6.0))
+    assert rest.shape == contact.shape
+    assert (np.abs(rest.astype(int) - contact).max(-1) > 60).mean() > 0.01
+    line = TimeLine(Curves(session.start, session.end), session.marks, origin=session.start)
+    early, late = (line.with_present(session.start + t) for t in (1.0, 9.0))
+    assert early.shape == (HEIGHT, WIDTH, 3)
+    column = [int(np.flatnonzero((a != b).any(axis=(0, 2)))[0]) for a, b in ((early, late), (late, early))]
+    assert column[0] == column[1]
+    changed = np.flatnonzero((early != late).any(axis=(0, 2)))
+    width = changed[-1] - changed[0]
+    assert width / WIDTH == pytest.approx(8.0 / 11.9 * 0.88, abs=0.02)  # 0.88 of the picture are the axes
+    decision = session.decisions[0].value
+    assert decision_picture(Comparison(decision, decision.observation, decision.action), INSERTION.grid).std() > 5
+
+
+def test_links_of_the_arm_follow_each_other() -> None:
+    rng = np.random.default_rng(0)
+    for joints in (list(HOME), *rng.uniform(-1, 1, (5, 6)).tolist()):
+        frames = link_frames(joints)
+        assert len(frames) == 6
+        end, (position, quaternion) = frames[-1], forward(joints)
+        np.testing.assert_allclose(end[0], position, atol=1e-12)
+        np.testing.assert_allclose(np.abs(np.dot(end[1], quaternion)), 1.0, atol=1e-12)
+        np.testing.assert_allclose(frames[0][0], [0, 0, 0.29], atol=1e-12)
+        assert np.linalg.norm(np.subtract(frames[1][0], frames[0][0])) == pytest.approx(0.27)
+
+
+def test_what_a_session_lacks_is_stated_and_the_rest_is_shown(tmp_path: Path) -> None:
+    clock = ManualClock(5.0)
+    path = tmp_path / "poor.mcap"
+    with SessionRecorder(path, clock) as recorder:
+        recorder.metadata(
+            describe_session(task=INSERTION, trackers=[{"lines": 3}] * 2, mounts=[{}] * 2, lab={"arm": {}})
+        )
+        recorder.image(0, CameraImage(b"\xff\xd8no picture\xff\xd9", 5.0, 0))
+        clock.time = 6.0
+        recorder.event("stopped", {"reason": "test"})
+    with RecordedSession(path) as session:
+        assert session.cell is None
+        moment = session.at(session.end)
+        assert moment.pads[0] is not None and moment.pads[0].problem and moment.pads[1] is None
+        text = moment_text(moment, session)
+        assert "no robot is shown" in text and "no markers are shown" in text
+        assert pads_picture(moment.pads).ndim == 3
+        assert [mark.kind for mark in session.marks] == ["stop"]
+
+
+def test_files_that_are_no_sessions_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.mcap").write_text("hello")
+    with pytest.raises(UsageError, match="not an MCAP file"):
+        RecordedSession(tmp_path / "text.mcap")
+    with pytest.raises(UsageError, match="cannot open"):
+        RecordedSession(tmp_path / "none.mcap")
+    with SessionRecorder(tmp_path / "empty.mcap", ManualClock(1.0)):
+        pass
+    with pytest.raises(PeerError, match="nothing to show"):
+        RecordedSession(tmp_path / "empty.mcap")
