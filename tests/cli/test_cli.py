@@ -33,7 +33,7 @@ COMMON_OPTIONS = {
     "mock": {"--json", "--out", "--seed", "--preset"},
     "render": {"--json", "--out", "--seed"},
     "render-scene": {"--json", "--out", "--preset"},
-    "view": {"--json", "--preset"},
+    "view": {"--checkpoint", "--json", "--preset"},
     "bench": {"--json", "--out", "--quick", "--repeats"},
     "tradeoff": {"--json", "--out", "--quick", "--repeats"},
     "describe": {"--json", "--preset", "--repeats"},

@@ -13,7 +13,7 @@ from gelflow.task import InsertionTask
 
 @dataclass(frozen=True)
 class CellGeometry:
-    """What a page draws of a cell, and heights are measured from."""
+    """The parts of a cell that a page draws, and from which heights are measured."""
 
     task: InsertionTask
     tool: Pose  # the gripper frame in the frame of the flange

@@ -24,7 +24,7 @@ class PadImage:
 
 @dataclass(frozen=True)
 class Moment:
-    """What is known at `time`; None where nothing was measured yet."""
+    """The measurements known at `time`; None where nothing was measured yet."""
 
     time: float  # robot time [s]
     pads: tuple[PadImage | None, ...] = (None, None)

@@ -91,7 +91,7 @@ class RecordedSession:
         return min(self._descents[number - 1] + self._settle, time)
 
     def at(self, time: float, *, markers: bool = True) -> Moment:
-        """What was known at a robot time [s]; without `markers` the images are not tracked."""
+        """The measurements known at a robot time [s]; without `markers` the images are not tracked."""
         joints = self.index.latest("/arm/joints", time)
         flange = self.index.latest("/arm/pose", time)
         gripper = self.index.latest("/gripper/state", time)
