@@ -16,6 +16,7 @@ from gelflow.protocols import ArmState, Camera, Gripper, GripperState
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
+from gelflow.real.runner.checks import DataChecks
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.web_services.monitor import ControllerMonitor
@@ -28,6 +29,7 @@ _PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _BLOCKED_AFTER = 3.0  # without progress [s]
 _WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
+_CHECKS_PERIOD = 0.5  # between two records of the checks [s]
 _LEAST_WAIT = 0.004  # between two checks, for clocks faster than real time [s, wall]
 
 
@@ -56,7 +58,10 @@ class MotionExecutor:
         controller: ControllerMonitor | None = None,
     ) -> None:
         self._controller = controller
-        self._arm, self._gripper, self._cameras = arm, gripper, cameras
+        self.checks = DataChecks(
+            arm, gripper, cameras, lab=lab, clock=clock, supervisor=supervisor, recorder=recorder, controller=controller
+        )
+        self._arm, self._gripper = arm, gripper
         self._lab, self._clock = lab, clock
         self.supervisor = supervisor
         self._recorder = recorder
@@ -67,8 +72,10 @@ class MotionExecutor:
         self._part_expected = False
         self._held_width = math.nan  # of the gripper at the grasp [m]
         self._part_lost = ""  # the evidence that the part was lost
+        self._requested_stop = ""  # the reason, after `request_stop`
         self._ending = threading.Event()
         self._heights: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
+        self._checks_due = -math.inf  # time of their next record [s]
         self._cycles = 0
         self._flags = EgmFlag(0)
         self.on_cycles: Callable[[Sequence[EgmCycle]], None] = lambda cycles: None  # called with every cycle of EGM
@@ -76,6 +83,7 @@ class MotionExecutor:
         self._thread = threading.Thread(target=self._run, name="motion executor", daemon=True)
 
     def __enter__(self) -> "MotionExecutor":
+        self._raise_failure()
         self._thread.start()
         return self
 
@@ -115,12 +123,13 @@ class MotionExecutor:
         fastest = (self._lab.arm.max_speed, math.radians(self._lab.arm.max_turn_speed_deg))
         speeds = (fastest[0] if speed is None else speed, fastest[1] if turn_speed is None else turn_speed)
         try:
-            self._post(target, speeds)
+            with self._lock:  # so that no motion starts after `request_stop`
+                self._check_requested_stop()
+                self._post(target, speeds)
+                self._goal, self._speeds = target, speeds
         except SafetyError:
             self.hold()
             raise
-        with self._lock:
-            self._goal, self._speeds = target, speeds
         stamp = self._clock.now()
         tool = self._lab.tool_pose(target)
         self._recorder.arm_command(stamp, tool.position, tool.quaternion, kind="command")
@@ -178,6 +187,23 @@ class MotionExecutor:
                 later = earlier
         return later[1]
 
+    # Called from any thread
+
+    def request_stop(self, reason: str) -> None:
+        """Stop the arm now, for the rest of the run: it holds before this call returns, then the run ends.
+
+        For an operator's stop button, in addition to the robot's own. The next call of the runner raises SafetyError.
+        """
+        self._requested_stop = self._requested_stop or reason
+        if self._thread.is_alive():
+            with contextlib.suppress(GelflowError):
+                self.hold()  # the thread stops the arm within its next cycle
+        elif self.failure is None:
+            try:
+                self._check_requested_stop()
+            except SafetyError as error:
+                self._fail(error)
+
     # Thread
 
     def _run(self) -> None:
@@ -195,6 +221,7 @@ class MotionExecutor:
                         self._post(goal, speeds)
                         due = now + period
                 self._log()
+                self._record_checks(now)
             except Exception as error:  # noqa: BLE001 - a thread has no caller: the next call raises it
                 self._fail(error)
                 return
@@ -208,20 +235,14 @@ class MotionExecutor:
         self._arm.target(tool.position, tool.quaternion, lifetime=lifetime, speed=speeds[0], turn_speed=speeds[1])
 
     def _watch(self) -> None:
-        """Raise when data that motion relies on is stale, or a device reports a fault."""
-        now = self._clock.now()  # before the state is read: a delay of this thread in between is no age
-        state = self._arm.state()
-        self.supervisor.watch(state)
-        if self._controller is not None:
-            self._controller.check()
-        self._check_age("pose", now - state.stamp, self._lab.limits.stale_pose)
-        self._recorder.check()
-        for camera in self._cameras:
-            camera.latest()
-        gripper = self._gripper.state()
-        if gripper.fault:
-            raise PeerError(f"the gripper reports {gripper.fault}; inspect it before anything moves again")
+        """Raise when a stop was requested, data that motion relies on is stale, or a device reports a fault."""
+        self._check_requested_stop()
+        self.checks.test()
         self.watch_part()
+
+    def _check_requested_stop(self) -> None:
+        if self._requested_stop:
+            raise SafetyError(f"stopped: {self._requested_stop}; inspect the robot, then start a new run")
 
     def watch_part(self) -> None:
         """Hold when the gripper shows that the part is no longer held as it was grasped."""
@@ -239,11 +260,6 @@ class MotionExecutor:
             self.hold()
             self._recorder.event("part lost", {"grasp": gripper.grasp, "width": gripper.width})
 
-    @staticmethod
-    def _check_age(what: str, age: float, limit: float) -> None:
-        if age > limit:
-            raise PeerTimeout(f"the arm's {what} is {1e3 * age:.0f} ms old, at most {1e3 * limit:.0f} ms is allowed")
-
     def _log(self) -> None:
         records = self._arm.drain_log()
         self.on_cycles(records)
@@ -256,6 +272,12 @@ class MotionExecutor:
             self._flags = record.flags
         for event in self._arm.drain_events():
             self._recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
+
+    def _record_checks(self, now: float, *, always: bool = False) -> None:
+        """Record the state of all checks from time to time."""
+        if always or now >= self._checks_due:
+            self._checks_due = now + _CHECKS_PERIOD
+            self._recorder.checks(now, self.checks.states())
 
     def _gripper_heights(self, records: Sequence[EgmCycle]) -> list[float]:
         """Measured heights of the gripper frame in the base frame [m]: the third row of R t + p, vectorized."""
@@ -291,6 +313,7 @@ class MotionExecutor:
             lambda: self.supervisor.latch(reason),
             lambda: self._arm.stop(reason),
             self._log,
+            lambda: self._record_checks(self._clock.now(), always=True),
         ):
             # The first failure is reported; errors of the remaining actions are not.
             with contextlib.suppress(GelflowError):

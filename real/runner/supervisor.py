@@ -6,6 +6,7 @@ nothing moves for the rest of the run; an operator starts the next run.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ class Supervisor:
         self._lab = lab
         self._base_to_hole = lab.hole.pose.inverse()
         self.phases = PhaseMachine(on_phase)
+        self.last_bounds: tuple[TargetBound, ...] = ()  # of the last target that was checked
 
     @property
     def latched(self) -> str:
@@ -59,8 +61,12 @@ class Supervisor:
         if self.latched:
             raise SafetyError(f"motion is latched: {self.latched}; inspect the robot, then start a new run")
         self._check_numbers(target)
-        self._check_workspace(target)
-        self._check_change(target, previous, speed, turn_speed)
+        self.last_bounds = bounds = self._bounds(target, previous, speed, turn_speed)
+        for bound in bounds:
+            if not bound.ok:
+                raise SafetyError(f"target refused: {bound.refusal}")
+        if not (speed > 0 and turn_speed > 0):
+            raise SafetyError(f"target refused: speeds must be above 0, got {speed:g} m/s and {turn_speed:g} rad/s")
         return self._lab.tool_pose(target)
 
     def hole_coordinates(self, target: Pose) -> tuple[float, float, float, float]:
@@ -77,39 +83,51 @@ class Supervisor:
         if abs(float(np.linalg.norm(target.quaternion)) - 1) > 1e-6:
             raise SafetyError(f"target refused: its quaternion {_row(target.quaternion)} does not have length 1")
 
-    def _check_workspace(self, target: Pose) -> None:
-        space = self._lab.workspace
-        x, y, yaw, height = self.hole_coordinates(target)
-        local = self._base_to_hole @ target
-        bounds = (
-            ("x", 1e3 * abs(x), 1e3 * space.x, "mm"),
-            ("y", 1e3 * abs(y), 1e3 * space.y, "mm"),
-            ("yaw", math.degrees(abs(yaw)), space.yaw_deg, "°"),
-            ("tilt", math.degrees(local.tilt), space.tilt_deg, "°"),
-        )
-        for name, value, limit, unit in bounds:
-            if not value <= limit + _TOLERANCE:
-                raise SafetyError(f"target refused: |{name}| = {value:.2f} {unit} is outside ±{limit:g} {unit}")
-        if not space.height_min - _TOLERANCE <= height <= space.height_max + _TOLERANCE:
-            low, high = 1e3 * space.height_min, 1e3 * space.height_max
-            raise SafetyError(f"target refused: height {1e3 * height:.2f} mm is outside {low:g} to {high:g} mm")
-
-    def _check_change(self, target: Pose, previous: Pose, speed: float, turn_speed: float) -> None:
+    def _bounds(self, target: Pose, previous: Pose, speed: float, turn_speed: float) -> "tuple[TargetBound, ...]":
+        """The quantities of a target that have bounds."""
         space, arm = self._lab.workspace, self._lab.arm
+        x, y, yaw, height = self.hole_coordinates(target)
+        tilt = (self._base_to_hole @ target).tilt
         step = float(np.linalg.norm(target.position - previous.position))
         turn = math.degrees(angle_between(previous.quaternion, target.quaternion))
-        bounds = (
-            ("step", 1e3 * step, 1e3 * space.max_step, "mm"),
-            ("turn", turn, space.max_turn_deg, "°"),
-            ("speed", 1e3 * speed, 1e3 * arm.max_speed, "mm/s"),
-            ("turning speed", math.degrees(turn_speed), arm.max_turn_speed_deg, "°/s"),
+        return (
+            TargetBound("x", 1e3 * x, -1e3 * space.x, 1e3 * space.x, "mm"),
+            TargetBound("y", 1e3 * y, -1e3 * space.y, 1e3 * space.y, "mm"),
+            TargetBound("yaw", math.degrees(yaw), -space.yaw_deg, space.yaw_deg, "°"),
+            TargetBound("tilt", math.degrees(tilt), 0.0, space.tilt_deg, "°"),
+            TargetBound("height", 1e3 * height, 1e3 * space.height_min, 1e3 * space.height_max, "mm"),
+            TargetBound("step", 1e3 * step, 0.0, 1e3 * space.max_step, "mm"),
+            TargetBound("turn", turn, 0.0, space.max_turn_deg, "°"),
+            TargetBound("speed", 1e3 * speed, 0.0, 1e3 * arm.max_speed, "mm/s"),
+            TargetBound("turning speed", math.degrees(turn_speed), 0.0, arm.max_turn_speed_deg, "°/s"),
         )
-        for name, value, limit, unit in bounds:
-            # The comparison is false for NaN.
-            if not value <= limit * (1 + _TOLERANCE):
-                raise SafetyError(f"target refused: {name} {value:.4g} {unit} is more than {limit:.4g} {unit}")
-        if not (speed > 0 and turn_speed > 0):
-            raise SafetyError(f"target refused: speeds must be above 0, got {speed:g} m/s and {turn_speed:g} rad/s")
+
+
+@dataclass(frozen=True)
+class TargetBound:
+    """One quantity of a target and its allowed range."""
+
+    name: str
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the value is within its range; False for NaN."""
+        tolerance = _TOLERANCE * max(1.0, abs(self.high))
+        return self.low - tolerance <= self.value <= self.high + tolerance
+
+    @property
+    def text(self) -> str:
+        """Value and range in words."""
+        return f"{self.value:.4g} {self.unit}, allowed {self.low:g} to {self.high:g} {self.unit}"
+
+    @property
+    def refusal(self) -> str:
+        """The reason why a target with this value is refused."""
+        return f"{self.name} {self.value:.4g} {self.unit} is outside {self.low:g} to {self.high:g} {self.unit}"
 
 
 def not_ready_reason(state: ArmState) -> str:

@@ -156,5 +156,8 @@ JSON: dict[str, JsonChannel] = {
         },
         ("insertion", "attempt", "tracked", "reference", "frames", "flow", "flow_shape", "divisor", "unit", "action"),
     ),
+    "/checks": JsonChannel(
+        "gelflow.Checks", {"stamp": NUMBER, "checks": {"type": "array", "items": TABLE}}, ("stamp", "checks")
+    ),
     "/event": JsonChannel("gelflow.Event", {"stamp": NUMBER, "name": TEXT, "values": TABLE}, ("name", "values")),
 }

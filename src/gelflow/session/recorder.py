@@ -7,7 +7,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -158,6 +158,10 @@ class SessionRecorder:
     def gripper_command(self, stamp: float, name: str, values: Mapping[str, Any]) -> None:
         """Record a command to the gripper: its name, and its arguments in SI units."""
         self._json("/gripper/command", {"stamp": stamp, "name": name, "values": values}, stamp=stamp)
+
+    def checks(self, stamp: float, checks: Sequence[Any]) -> None:
+        """Record the state of the checks of a run: each has a name, whether it is ok, and a text."""
+        self._json("/checks", {"stamp": stamp, "checks": checks}, stamp=stamp)
 
     def decision(self, decision: Mapping[str, Any]) -> None:
         """Record a decision, `Decision(...).to_json()`. Raises UsageError when a replay could not recompute it."""

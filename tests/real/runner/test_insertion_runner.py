@@ -112,7 +112,7 @@ def test_a_lost_part_is_not_reported_again_once_none_is_expected() -> None:
     fakes: Any = {
         "lab": SimpleNamespace(arm=SimpleNamespace(max_speed=0.1, max_turn_speed_deg=10.0)),
         "supervisor": SimpleNamespace(),
-        "recorder": SimpleNamespace(event=lambda *_: None),
+        "recorder": SimpleNamespace(event=lambda *_: None, check=lambda: None),
     }
     arm: Any = SimpleNamespace(hold=lambda: None)
     motion = MotionExecutor(arm, gripper, [], clock=ScaledClock(), **fakes)  # type: ignore[arg-type]

@@ -169,7 +169,7 @@ def test_motors_off_and_bad_jogs_are_refused_without_motion(robot: MockRobot, op
         (["z", "--yes"], "give an axis and an amount"),
         (["--yes"], "give an axis and an amount"),
         (["x", "1", "--to", "load"], "give an axis and an amount"),
-        (["x", "17", "--yes"], "target refused: |x| = 17.00 mm is outside ±16 mm"),
+        (["x", "17", "--yes"], "target refused: x 17 mm is outside -16 to 16 mm"),
     ):
         code, _ = operator.run("jog", *arguments)
         assert code == 2 and expected in operator.errors and operator.errors.count("\n") == 1, arguments

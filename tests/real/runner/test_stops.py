@@ -13,10 +13,12 @@ import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
 from gelflow.cli.mock_lab import lab_for
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab_file import save_lab
+from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.run_plan import run_insertions
+from gelflow.session.reader import SessionReader
 
 
 @pytest.mark.parametrize(
@@ -52,6 +54,42 @@ def test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run(
     # The recording is complete and contains the reason.
     recorded = dict(events(plan.session))
     assert expected.lower() in recorded["stopped"]["reason"].lower()
+
+
+def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobot, tmp_path: Path) -> None:
+    executors: list[MotionExecutor] = []
+    plan = plan_for(robot, tmp_path, OraclePolicy(robot), on_motion=executors.append)
+    finish = BackgroundRun(lambda: run_insertions(plan))
+    wait_for(lambda: moving(robot), during=finish)
+    executors[0].request_stop("the operator pressed stop")
+    with pytest.raises(SafetyError, match="the operator pressed stop"):
+        executors[0].go(executors[0].pose())
+    with pytest.raises(SafetyError, match="stopped: the operator pressed stop"):
+        finish()
+    executors[0].request_stop("again")
+    answers = robot.arm.report.answers
+    time.sleep(0.2)
+    assert robot.arm.report.answers == answers
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
+    with SessionReader(plan.session) as session:
+        checks = [record.value["checks"] for record in session.records(["/checks"])]
+    names = [check["name"] for check in checks[-1]]
+    assert names[:7] == ["arm", "measured pose", "recording", "left camera", "right camera", "gripper", "motion"]
+    assert {"target: x", "target: height", "target: turning speed"} <= set(names)
+    assert all(check["ok"] for check in checks[-2])
+    failed = {check["name"]: check["text"] for check in checks[-1] if not check["ok"]}
+    assert "the operator pressed stop" in failed["motion"]
+
+
+def test_a_stop_before_the_first_motion_moves_nothing(robot: MockRobot, tmp_path: Path) -> None:
+    before = robot.cell.arm_pose()[0]
+
+    def stop(motion: MotionExecutor) -> None:
+        motion.request_stop("the operator pressed stop")
+
+    with pytest.raises(SafetyError, match="the operator pressed stop"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), on_motion=stop))
+    assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-9)
 
 
 def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,11 +38,11 @@ def test_valid_target_is_not_changed() -> None:
 @pytest.mark.parametrize(
     ("target", "named"),
     [
-        (gripper(x=0.0161), r"\|x\| = 16\.10 mm is outside ±16 mm"),
-        (gripper(x=-0.05), r"\|x\| = 50\.00 mm"),
-        (gripper(y=0.0161), r"\|y\|"),
-        (gripper(yaw=math.radians(-16.1)), r"\|yaw\| = 16\.10 °"),
-        (gripper(height=0.0005), r"height 0\.50 mm is outside 1 to 60 mm"),
+        (gripper(x=0.0161), r"x 16\.1 mm is outside -16 to 16 mm"),
+        (gripper(x=-0.05), r"x -50 mm"),
+        (gripper(y=0.0161), r"refused: y 16\.1 mm"),
+        (gripper(yaw=math.radians(-16.1)), r"yaw -16\.1 °"),
+        (gripper(height=0.0005), r"height 0\.5 mm is outside 1 to 60 mm"),
         (gripper(height=0.061), "height"),
         (gripper(x=math.nan), "not finite"),
         (gripper(height=math.inf), "not finite"),
@@ -56,15 +56,25 @@ def test_target_outside_the_workspace_is_refused(target: Pose, named: str) -> No
 
 
 def test_large_steps_and_high_speeds_are_refused() -> None:
-    with pytest.raises(SafetyError, match=r"step 57 mm is more than 50 mm"):
+    with pytest.raises(SafetyError, match=r"step 57 mm is outside 0 to 50 mm"):
         check(gripper(height=0.059), gripper(height=0.002))
-    with pytest.raises(SafetyError, match=r"speed 21 mm/s is more than 20 mm/s"):
+    with pytest.raises(SafetyError, match=r"speed 21 mm/s is outside 0 to 20 mm/s"):
         check(gripper(), speed=0.021)
-    with pytest.raises(SafetyError, match=r"turning speed 11\.46 °/s is more than 10 °/s"):
+    with pytest.raises(SafetyError, match=r"turning speed 11\.46 °/s is outside 0 to 10 °/s"):
         check(gripper(), turn_speed=0.2)
     for speed in (0.0, -1.0, math.nan):
         with pytest.raises(SafetyError, match="speed"):
             check(gripper(), speed=speed)
+
+
+def test_bounds_of_the_last_target_are_known_also_when_it_is_refused() -> None:
+    supervisor = Supervisor(LAB)
+    supervisor.check(gripper(x=0.003), gripper(), speed=0.01, turn_speed=0.1)
+    assert all(bound.ok for bound in supervisor.last_bounds)
+    assert supervisor.last_bounds[0].text == "3 mm, allowed -16 to 16 mm"
+    with pytest.raises(SafetyError):
+        supervisor.check(gripper(y=0.02, height=0.07), gripper(), speed=0.01, turn_speed=0.1)
+    assert [bound.name for bound in supervisor.last_bounds if not bound.ok] == ["y", "height"]
 
 
 def test_latch_keeps_its_first_reason() -> None:
