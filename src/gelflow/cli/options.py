@@ -127,3 +127,25 @@ def check_at_least(args: argparse.Namespace, **limits: int) -> None:
         value = getattr(args, name)
         if value is not None and not value >= limit:
             raise UsageError(f"--{name.replace('_', '-')} must be at least {limit}, got {value}")
+
+
+def add_page_address(parser: argparse.ArgumentParser, *, of: str = "") -> None:
+    """`--port` and `--host`: the address of a page."""
+    parser.add_argument(
+        "--port", type=int, default=8080, metavar="P", help=f"TCP port{of}; 0: a free one (default %(default)s)"
+    )
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="H",
+        help=f"address to serve on{of}; other machines reach 0.0.0.0 and need the token in the printed address "
+        "(default %(default)s)",
+    )
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """`--view` and its address: a page that shows the run while it happens."""
+    parser.add_argument(
+        "--view", action="store_true", help="show the run in the browser while it happens, with a stop button"
+    )
+    add_page_address(parser, of=" of --view")

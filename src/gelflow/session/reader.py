@@ -3,7 +3,8 @@
 import dataclasses
 import fcntl
 import json
-from collections.abc import Collection, Iterator
+import threading
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -47,6 +48,7 @@ class SessionReader:
         self.epoch = 0.0  # date of the robot time 0 as seconds since 1970; 0 in files that contain no dates
         self._epoch = 0  # the same [ns]
         self._stream: BinaryIO | None = None
+        self._reading = threading.Lock()  # of the stream's position
         self._reader: SeekingReader | None = None
 
     def open(self) -> "SessionReader":
@@ -91,7 +93,7 @@ class SessionReader:
 
     def counts(self) -> dict[str, int]:
         """Number of records per topic; topics without records are omitted."""
-        summary = self.summary
+        summary = self._opened().get_summary()
         if summary is None or summary.statistics is None:
             return {}
         counts = summary.statistics.channel_message_counts
@@ -144,11 +146,13 @@ class SessionReader:
         return self._opened().get_summary()
 
     def chunk(self, index: ChunkIndex) -> list[tuple[str, Message]]:
-        """Topic and message of all records of a chunk. Raises PeerError when it is damaged."""
+        """Topic and message of all records of a chunk; for any thread. Raises PeerError when it is damaged."""
         summary = self.summary
         assert self._stream is not None and summary is not None
         try:
-            return [(channel.topic, message) for channel, message in chunk_messages(self._stream, index, summary)]
+            with self._reading:
+                found = chunk_messages(self._stream, index, summary)
+            return [(channel.topic, message) for channel, message in found]
         except DECODE_ERRORS as error:
             raise self._damaged(error) from error
 
@@ -183,15 +187,19 @@ class SessionReader:
     def _check_format(self, reader: SeekingReader) -> None:
         for metadata in reader.iter_metadata():
             if metadata.name == "gelflow":
-                written = int(metadata.metadata["format"])
-                if written > FORMAT:
-                    raise UsageError(
-                        f"{self.path} has session format {written}; this gelflow reads format {FORMAT}: update gelflow"
-                    )
-                self._epoch = int(metadata.metadata.get("epoch_ns", "0"))
-                self.epoch = self._epoch / 1e9
+                self._take_metadata(metadata.metadata)
                 return
         raise UsageError(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
+
+    def _take_metadata(self, metadata: Mapping[str, str]) -> None:
+        """The date of robot time 0. Raises UsageError for a newer format."""
+        written = int(metadata["format"])
+        if written > FORMAT:
+            raise UsageError(
+                f"{self.path} has session format {written}; this gelflow reads format {FORMAT}: update gelflow"
+            )
+        self._epoch = int(metadata.get("epoch_ns", "0"))
+        self.epoch = self._epoch / 1e9
 
     def _unfinished(self, stream: BinaryIO) -> str:
         if is_being_recorded(stream):

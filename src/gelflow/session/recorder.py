@@ -63,7 +63,7 @@ class SessionRecorder:
         path: str | Path,
         clock: Clock,
         *,
-        queue_size: int = 4096,
+        queue_size: int = 16384,
         max_delay: float = MAX_DELAY,
         epoch: float | None = None,
     ) -> None:

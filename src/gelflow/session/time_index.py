@@ -3,7 +3,7 @@
 import threading
 from bisect import bisect_right
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from mcap.records import ChunkIndex, Message
@@ -27,25 +27,39 @@ class TimeIndex:
         summary = session.summary
         if summary is None or not summary.chunk_indexes:
             raise PeerError(f"{session.path} contains no records: there is nothing to show")
-        self._session = session
+        self._session, self._channels = session, summary.channels
         self._lock = threading.Lock()
-        self._chunks: list[ChunkIndex] = sorted(
-            summary.chunk_indexes, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)
-        )
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._damaged: set[int] = set()
-        self.start = session.robot_time(self._chunks[0].message_start_time)  # of the first record [s]
-        self.end = session.robot_time(max(chunk.message_end_time for chunk in self._chunks))  # of the last record [s]
-        self._topics: dict[str, list[int]] = {channel.topic: [] for channel in summary.channels.values()}
-        for number, chunk in enumerate(self._chunks):
-            # A chunk without an index may contain every topic.
-            for channel in chunk.message_index_offsets or summary.channels:
-                self._topics[summary.channels[channel].topic].append(number)
+        self._chunks: list[ChunkIndex] = []
         # Chunks overlap in time by a little: a record may be later than the first ones of the following chunks.
-        starts = np.array([chunk.message_start_time for chunk in self._chunks])
-        ends = np.maximum.accumulate([chunk.message_end_time for chunk in self._chunks])
-        self._starts = [session.robot_time(int(t)) for t in starts]
-        self._ends = [session.robot_time(int(t)) for t in ends]  # of all chunks up to this one
+        self._starts: list[float] = []  # [s]
+        self._ends: list[float] = []  # of all chunks up to this one [s]
+        self._topics: dict[str, list[int]] = {}
+        self.extend(summary.chunk_indexes)
+        self.start = self._starts[0]  # of the first record, robot time [s]
+
+    @property
+    def end(self) -> float:
+        """Time of the last record, robot time [s]."""
+        return self._ends[-1]
+
+    def extend(self, chunks: Iterable[ChunkIndex]) -> None:
+        """Add chunks, which are later than those before: a session that is being recorded grows."""
+        ordered = sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+        for chunk in ordered:
+            number = len(self._chunks)
+            start, end = (
+                self._session.robot_time(chunk.message_start_time),
+                self._session.robot_time(chunk.message_end_time),
+            )
+            # Written one after the other, a chunk may still begin a little before the one in front of it.
+            self._starts.append(max(start, self._starts[-1]) if self._starts else start)
+            self._ends.append(max(end, self._ends[-1]) if self._ends else end)
+            self._chunks.append(chunk)
+            # A chunk without an index may contain every topic.
+            for channel in chunk.message_index_offsets or self._channels:
+                self._topics.setdefault(self._channels[channel].topic, []).append(number)
 
     @property
     def damaged(self) -> int:

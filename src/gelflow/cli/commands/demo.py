@@ -22,6 +22,7 @@ from gelflow.cli.options import (
     add_preset,
     add_quick,
     add_seed,
+    add_view,
     check_at_least,
     checkpoint_for,
     part_task,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from gelflow.policies.networks.flow_map_policy import NetworkPolicy
     from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.lab import Lab
+    from gelflow.view.live.live_view import LiveView
 
 _DELAY_NOTE = 0.1  # share of the wall time that robot time must have waited for a note below the table
 _EPISODES = 100  # parts in simulation without the mock robot
@@ -48,6 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-real-time", action="store_true", help="omit the last insertion, which runs at factor 1")
     add_part(parser)
     add_checkpoint(parser)
+    add_view(parser)
     add_quick(parser)
     add_seed(parser, default=1)
     add_preset(parser)
@@ -57,6 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Insert the parts, show the results, and compare with the same policy in simulation."""
+    from gelflow.cli.live_page import live_page
     from gelflow.policies.checkpoint import load_policy
 
     check_at_least(args, insertions=1, seed=0)
@@ -67,20 +71,8 @@ def run(args: argparse.Namespace) -> int:
     checkpoint = checkpoint_for(task, args.checkpoint)
     policy = load_policy(checkpoint, task=task)
     _clear(args.out)
-    count = 1 if args.quick else args.insertions
-    plan = _Series(
-        policy, task, args.part, checkpoint, args.out,
-        count=count, factor=args.factor, seed=args.seed, preset=args.preset,
-        title=f"Insertions with the mock robot at {args.factor:g} times real time",
-    )  # fmt: skip
-    results = [_run_series(output, plan)]
-    if not (args.no_real_time or args.quick) and results[0].error is None:
-        plan = _Series(
-            policy, task, args.part, checkpoint, args.out,
-            count=1, factor=1.0, seed=args.seed + count, preset=args.preset,
-            title="One more in real time (factor 1)", name="session-real-time", pictures="insertion-real-time",
-        )  # fmt: skip
-        results.append(_run_series(output, plan))
+    with live_page(args, output) as view:
+        results = _run_all(output, args, policy, task, checkpoint, view)
     first = results[0]
     robot, truth = (sum(part) for part in zip(*first.successes(), strict=True)) if first.insertions else (0, 0)
     parts = len(first.insertions)
@@ -99,6 +91,31 @@ def run(args: argparse.Namespace) -> int:
     return SUCCESS
 
 
+def _run_all(
+    output: Output,
+    args: argparse.Namespace,
+    policy: "NetworkPolicy",
+    task: InsertionTask,
+    checkpoint: Path,
+    view: "LiveView | None",
+) -> "list[_SeriesResult]":
+    """The insertions at the requested factor, and one in real time."""
+    count = 1 if args.quick else args.insertions
+    plan = _Series(
+        policy, task, args.part, checkpoint, args.out,
+        count=count, factor=args.factor, seed=args.seed, preset=args.preset,
+        title=f"Insertions with the mock robot at {args.factor:g} times real time", view=view,
+    )  # fmt: skip
+    results = [_run_series(output, plan)]
+    if not (args.no_real_time or args.quick) and results[0].error is None:
+        plan = replace(
+            plan, count=1, factor=1.0, seed=args.seed + count, title="One more in real time (factor 1)",
+            name="session-real-time", pictures="insertion-real-time",
+        )  # fmt: skip
+        results.append(_run_series(output, plan))
+    return results
+
+
 @dataclass(frozen=True)
 class _Series:
     """Insertions with one mock robot, recorded in one session."""
@@ -115,6 +132,7 @@ class _Series:
     title: str
     name: str = "session"
     pictures: str = "insertion"
+    view: "LiveView | None" = None
 
 
 @dataclass(frozen=True)
@@ -153,6 +171,7 @@ class _Observer:
 
 def _run_series(output: Output, series: _Series) -> _SeriesResult:
     """Start a mock robot, insert the parts, draw the pictures, and print the table."""
+    from gelflow.cli.live_page import motion_observer
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
@@ -177,7 +196,9 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
         )
         error = None
         with interruptible() as at_once:
-            plan = replace(plan, on_motion=lambda motion: at_once.append(motion.hold))
+            plan = replace(plan, on_motion=motion_observer(series.view, at_once))
+            if series.view is not None:
+                series.view.show(plan.session)
             try:
                 run_insertions(plan)
             except GelflowError as caught:

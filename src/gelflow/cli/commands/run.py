@@ -17,11 +17,20 @@ from gelflow.cli.insertion_text import (
     insertion_to_json,
     preflight_table,
 )
-from gelflow.cli.options import add_checkpoint, add_json, add_out, add_part, check_at_least, checkpoint_for, part_task
+from gelflow.cli.options import (
+    add_checkpoint,
+    add_json,
+    add_out,
+    add_part,
+    add_view,
+    check_at_least,
+    checkpoint_for,
+    part_task,
+)
 from gelflow.cli.output import Output
 from gelflow.cli.prompt import read_line
 from gelflow.cli.way_out import way_out
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
 
 if TYPE_CHECKING:
@@ -37,6 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_part(parser)
     add_checkpoint(parser)
     parser.add_argument("--insertions", type=int, default=1, metavar="N", help="number of parts (default %(default)s)")
+    add_view(parser)
     parser.add_argument("--dry-run", action="store_true", help="connect, check and read; send no motion")
     add_out(parser, "folder of the recording (default sessions/DATE-TIME)", folder=True)
     add_json(parser)
@@ -44,6 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the insertions and print each attempt. A negative result: a part was not inserted."""
+    from gelflow.cli.live_page import live_page, motion_observer
     from gelflow.policies.checkpoint import load_policy
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
@@ -71,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
         on_warning=warnings.append,
     )
     if args.dry_run:
+        if args.view:
+            raise UsageError("--view shows a run, and --dry-run moves nothing; leave one of them out")
         with interruptible():
             return _dry_run(output, plan)
     passed = False
@@ -80,9 +93,11 @@ def run(args: argparse.Namespace) -> int:
         passed = True
         output.console.print(preflight_table(items), ATTEMPT_HEADER, sep="\n")
 
-    with interruptible() as at_once:
+    with live_page(args, output) as view, interruptible() as at_once:
+        if view is not None:
+            view.show(session)
         try:
-            plan = dataclasses.replace(plan, on_motion=lambda motion: at_once.append(motion.hold))
+            plan = dataclasses.replace(plan, on_motion=motion_observer(view, at_once))
             results = run_insertions(dataclasses.replace(plan, on_preflight=on_preflight))
         except GelflowError as error:
             if hint := way_out(str(error), args.lab, moved=passed):

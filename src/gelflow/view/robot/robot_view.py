@@ -35,6 +35,7 @@ class RobotView:
     def __init__(self, page: Page, cell: CellGeometry, *, root: str = "/robot", opacity: float = 1.0) -> None:
         self._page, self._cell, self._root = page, cell, root
         self._opacity = None if opacity == 1 else opacity
+        self._node = page.scene.add_frame(root, show_axes=False)
         self._links = [page.scene.add_frame(f"{root}/arm/{k}", show_axes=False, visible=False) for k in range(1, 7)]
         self._gripper = page.scene.add_frame(f"{root}/gripper", show_axes=False, visible=False)
         self._add_arm()
@@ -64,6 +65,10 @@ class RobotView:
             for node, side in zip(self._fingers, (-1, 1), strict=True):
                 node.position = (side * opening / 2, 0.0, 0.0)
             self._part.visible = part_held
+
+    def remove(self) -> None:
+        """Remove the robot from the page."""
+        self._node.remove()
 
     def _add_arm(self) -> None:
         self._cylinder("arm/base", 0.08, 0.12, (0.0, 0.0, 0.06), _ARM)

@@ -40,6 +40,13 @@ class Curves:
     )  # [mm]
     force: Curve = field(default_factory=lambda: Curve("grip force [N]"))
 
+    def add(self, later: "Curves") -> None:
+        """Append the samples of the time that follows."""
+        pairs = zip((self.height, *self.shear, self.force), (later.height, *later.shear, later.force), strict=True)
+        for own, added in pairs:
+            own.samples += added.samples
+        self.end = later.end
+
 
 def read_curves(session: RecordedSession, curves: Curves, *, samples: int = SAMPLES) -> Iterator[None]:
     """Add the samples of a session to `curves`; yields after some of them, first evenly spread over the time."""

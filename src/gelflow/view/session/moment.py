@@ -1,6 +1,6 @@
 """The state of a robot, its sensors and its policy at one time, as pages show it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ class Moment:
     insertion: int | None = None
     attempt: int | None = None  # of this insertion
     decision: Decision | None = None  # the last one before
+    checks: Sequence[Mapping[str, Any]] = ()  # of the run: name, ok, text
 
     @property
     def part_held(self) -> bool:

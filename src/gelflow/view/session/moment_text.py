@@ -68,3 +68,13 @@ def _decision_text(moment: Moment) -> str:
         f"last decision (insertion {decision.insertion}, attempt {decision.attempt}): "
         f"correction x {dx:+.2f} mm, y {dy:+.2f} mm, yaw {yaw:+.1f}°"
     )
+
+
+def checks_text(moment: Moment) -> str:
+    """The state of every check of the run, as Markdown; those that fail first."""
+    if not moment.checks:
+        return ""
+    failed = [f"**{check['name']}: {check['text']}**" for check in moment.checks if not check["ok"]]
+    good = [f"{check['name']}: {check['text']}" for check in moment.checks if check["ok"]]
+    head = f"**{len(failed)} of {len(moment.checks)} checks fail**" if failed else f"all {len(good)} checks pass"
+    return "  \n".join([head, *failed, *good])

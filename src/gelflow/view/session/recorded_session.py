@@ -8,6 +8,7 @@ from typing import Any
 
 from gelflow.errors import GelflowError, PeerError
 from gelflow.geometry import Pose
+from gelflow.session.live_reader import LiveReader
 from gelflow.session.messages import Damage
 from gelflow.session.reader import Record, SessionReader
 from gelflow.session.records import SENSORS
@@ -23,29 +24,34 @@ _STORY = ("/event", "/attempt", "/decision")
 class RecordedSession:
     """An open session file and its events. Use it as a context manager.
 
+    Parameters
+    ----------
+    path: the file
+    live: whether it is being recorded; `refresh` then adds what has been recorded since
+
     Raises UsageError for a file that is no session, PeerError for one that is unfinished, damaged or empty.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.reader = SessionReader(path).open()
+    def __init__(self, path: str | Path, *, live: bool = False) -> None:
+        self._live = LiveReader(path).open() if live else None
+        self.reader: SessionReader = self._live or SessionReader(path).open()
         try:
             self.index = TimeIndex(self.reader)
             self.description = self._description()
             self.notes: list[str] = []  # what the page cannot show, and why
             self.cell = self._cell()
-            damage = Damage()
-            story: dict[str, list[Record]] = {topic: [] for topic in _STORY}
-            for record in self.reader.records(_STORY, damage=damage):
-                story[record.topic].append(record)
+            story = list(self.reader.records(_STORY, damage=Damage()))
         except GelflowError:
             self.reader.close()
             raise
         self.name = self.reader.path.name
-        self.start, self.end = self.index.start, self.index.end  # robot time [s]
-        self.marks: list[Mark] = marks(story["/event"], story["/attempt"], story["/decision"])
-        self.decisions = story["/decision"]
-        self._phases = phases(story["/event"])
-        self._descents = [time for time, phase in self._phases if phase == "descend"]
+        self.start = self.index.start  # robot time [s]
+        self.marks: list[Mark] = []
+        self.decisions: list[Record] = []
+        self._story: list[Record] = []
+        self._phases: list[tuple[float, str]] = []
+        self._descents: list[float] = []
+        self._add(story)
         lab = self.description.get("lab") or {}
         self._settle = float(lab.get("descent", {}).get("settle", 0.0))  # rest before the reference images [s]
         self.markers = self.marker_reader()
@@ -57,6 +63,39 @@ class RecordedSession:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.reader.close()
+
+    @property
+    def end(self) -> float:
+        """Time of the last record, robot time [s]."""
+        return self.index.end
+
+    @property
+    def growing(self) -> bool:
+        """Whether the session is still being recorded."""
+        return self._live is not None and not self._live.finished
+
+    def refresh(self) -> bool:
+        """Add what has been recorded since the last call; whether there was anything. Only for live sessions."""
+        if self._live is None:
+            return False
+        found = self._live.update()
+        self.index.extend(found)
+        added = []
+        for chunk in found:
+            messages = [entry for entry in self._live.chunk(chunk) if entry[0] in _STORY]
+            added += [self._live.record(topic, message) for topic, message in messages]
+        if added:
+            self._add(added)
+        return bool(found)
+
+    def _add(self, records: list[Record]) -> None:
+        """Add events, attempts and decisions."""
+        self._story += records
+        of_topic = {topic: [record for record in self._story if record.topic == topic] for topic in _STORY}
+        self._phases = phases(of_topic["/event"])
+        self._descents = [time for time, phase in self._phases if phase == "descend"]
+        self.decisions = of_topic["/decision"]
+        self.marks = marks(of_topic["/event"], of_topic["/attempt"], of_topic["/decision"])
 
     def _description(self) -> Mapping[str, Any]:
         """The description of the session; empty for recordings of `gelflow track`."""
@@ -95,6 +134,7 @@ class RecordedSession:
         joints = self.index.latest("/arm/joints", time)
         flange = self.index.latest("/arm/pose", time)
         gripper = self.index.latest("/gripper/state", time)
+        checks = self.index.latest("/checks", time)
         phase = bisect_right(self._phases, time, key=lambda entry: entry[0])
         attempt = next((m for m in self.marks if m.end > m.time and m.time <= time <= m.end), None)
         decision = next((r.value for r in reversed(self.decisions) if r.time <= time), None)
@@ -108,4 +148,5 @@ class RecordedSession:
             insertion=attempt.insertion if attempt else None,
             attempt=attempt.attempt if attempt else None,
             decision=decision,
+            checks=tuple(checks.value["checks"]) if checks is not None else (),
         )

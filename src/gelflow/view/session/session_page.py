@@ -19,6 +19,9 @@ _START = "start"
 _FROM_START = "starts of the recordings"
 _PANEL_WIDTH = 560  # [px]
 _SLIDER_STEP = 0.01  # [s]
+_FOLLOW_PERIOD = 0.2  # between two pictures of a growing session [s]
+_FOLLOW_SHARE = 0.25  # of a core that these pictures take at most
+_LONGEST_PAUSE = 1.0  # between them, on a busy machine [s]
 
 
 class SessionPage:
@@ -30,6 +33,9 @@ class SessionPage:
     comparisons: the replay of the first session, None: it is not replayed
     host: address to bind to; any other than a loopback address needs the random token in `url`
     port: TCP port; 0 takes a free one
+    page: an existing page, instead of a new one at host and port; it is not closed
+
+    A session that is being recorded grows; the page follows its end until the time is dragged.
 
     Raises UsageError for more than two sessions, for an address in use, and without viser.
     """
@@ -41,27 +47,38 @@ class SessionPage:
         comparisons: Sequence[Comparison] | None = None,
         host: str = DEFAULT_HOST,
         port: int = DEFAULT_PORT,
+        page: Page | None = None,
     ) -> None:
         if not 1 <= len(sessions) <= 2:
             raise UsageError(f"a page shows one session or two, got {len(sessions)}")
         self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._page = Page(host=host, port=port)
+        self._own_page = page is None
+        self._page = Page(host=host, port=port) if page is None else page
         self.url = self._page.url
         self.time = 0.0  # since the start of the first recording [s]
         self.playing = False
         self._speed = 1.0
+        self._before = time.perf_counter()
+        self._next_follow = 0.0
         self._offsets = [0.0] * len(sessions)  # of the time of each session [s]
         self._moments: list[Moment] = []
         same = len({session.name for session in sessions}) < len(sessions)
         self._names = [f"{s.reader.path.parent.name}/{s.name}" if same else s.name for s in sessions]
         self._duration = max(session.end - session.start for session in sessions)
         self._range = (0.0, self._duration)
-        self._add_controls()
-        folder = self._page.gui.add_folder("Decision") if len(sessions) == 1 and sessions[0].decisions else None
+        self._live = any(session.growing for session in sessions)
+        self._following = self._live  # the end of a session that is being recorded
+        self._folder = self._page.gui.add_folder("Time")
+        with self._folder:
+            self._add_controls()
+        single = len(sessions) == 1 and (self._live or sessions[0].decisions)
+        folder = self._page.gui.add_folder("Decision and checks") if single else None
+        self._decision_folder = folder
         self._panels = [
             self._add_panel(session, comparisons, number, folder) for number, session in enumerate(sessions)
         ]
-        self._add_choices()
+        with self._folder:
+            self._add_choices()
         self._show_range(_RANGES[0])
         self._go(0.0)
 
@@ -75,22 +92,55 @@ class SessionPage:
         """Stop serving the page. The sessions stay open."""
         for panel in self._panels:
             panel.close()
-        self._page.close()
+        if self._own_page:
+            self._page.close()
+
+    def remove(self) -> None:
+        """Remove everything from the page, which stays."""
+        for panel in self._panels:
+            panel.remove()
+        self._folder.remove()
+        if self._decision_folder is not None:
+            self._decision_folder.remove()
 
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
         """Show what the page asks for, until `until()` is true or Ctrl-C."""
-        before = time.perf_counter()
         while not until():
             now = time.perf_counter()
-            changed = self._handle_events()
-            if self.playing:
-                self._go(self.time + self._speed * (now - before), moved=True)
-            elif not changed:
-                self._settle()
-            before = now
-            for panel in self._panels:
-                panel.refresh()
+            self.update()
             time.sleep(max(0.0, now + _TICK - time.perf_counter()))
+
+    def update(self) -> None:
+        """Show what the page has asked for, and what has been recorded, since the last call."""
+        now = time.perf_counter()
+        self._grow()
+        changed = self._handle_events()
+        if self.playing:
+            self._go(self.time + self._speed * (now - self._before), moved=True)
+        elif not changed or self._live:
+            self._settle()
+        self._before = now
+        for panel in self._panels:
+            panel.refresh()
+
+    def _grow(self) -> None:
+        """Add what has been recorded; show its end when it is followed."""
+        if not self._live:
+            return
+        grown = [panel.session.refresh() for panel in self._panels]
+        if not any(grown):
+            return
+        whole = self._range == (0.0, self._duration)
+        self._duration = max(panel.session.end - panel.session.start for panel in self._panels)
+        if whole:
+            self._range = (0.0, self._duration)
+            self._slider.max = max(round(self._duration, 2), _SLIDER_STEP)
+        self._refresh_marks()
+        if self._following and time.perf_counter() >= self._next_follow:
+            now, used = time.perf_counter(), time.thread_time()
+            self._go(self._duration, moved=True)
+            pause = (time.thread_time() - used) / _FOLLOW_SHARE
+            self._next_follow = now + min(max(_FOLLOW_PERIOD, pause), _LONGEST_PAUSE)
 
     def _add_panel(
         self, session: RecordedSession, comparisons: Sequence[Comparison] | None, number: int, folder: Any
@@ -111,6 +161,8 @@ class SessionPage:
         gui = self._page.gui
         self._slider = gui.add_slider("time [s]", 0.0, max(self._duration, _SLIDER_STEP), _SLIDER_STEP, 0.0)
         self._slider.on_update(self._dragged)
+        if self._live:
+            gui.add_button("Follow the robot").on_click(lambda _: self._post(self._follow))
         self._play = gui.add_button("Play")
         self._play.on_click(lambda _: self._post(self._toggle))
         speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1 ×")
@@ -132,14 +184,32 @@ class SessionPage:
 
     def _add_marks(self, gui: Any) -> None:
         """The list of all marks of the first session, to jump to."""
+        self._marks: dict[str, float] = {}
+        self._chosen = gui.add_dropdown("go to", (_START,), initial_value=_START)
+        self._chosen.on_update(self._mark_chosen)
+        self._refresh_marks()
+
+    def _refresh_marks(self) -> None:
         first = self._panels[0]
-        self._marks = {
+        found = {
             f"{mark.time - first.session.start:.2f} s {mark.text}": mark.time - first.session.start
             for mark in first.marks
         }
-        if self._marks:
-            chosen = gui.add_dropdown("go to", (_START, *self._marks), initial_value=_START)
-            chosen.on_update(lambda event: self._post(self._go, self._marks.get(event.target.value, 0.0)))
+        if list(found) != list(self._marks):
+            self._marks = found
+            self._chosen.options = (_START, *found)
+
+    def _mark_chosen(self, event: Any) -> None:
+        if event.client is not None:  # not a change of the list
+            self._post(self._go_to_mark, event.target.value)
+
+    def _go_to_mark(self, name: str) -> None:
+        self._following = False
+        self._go(self._marks.get(name, 0.0))
+
+    def _follow(self) -> None:
+        self._following = True
+        self._set_playing(False)
 
     def _post(self, function: Callable[..., None], *values: Any) -> None:
         """Let the thread of `run` call a function: the page has threads of its own."""
@@ -147,7 +217,11 @@ class SessionPage:
 
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # a person has moved it, not this program
-            self._post(self._go, float(event.target.value), False, True)
+            self._post(self._drag, float(event.target.value))
+
+    def _drag(self, seconds: float) -> None:
+        self._following = False
+        self._go(seconds, dragged=True)
 
     def _handle_events(self) -> bool:
         """Handle what the page has sent; of several times only the last is shown."""
@@ -162,6 +236,7 @@ class SessionPage:
         return self._show_if_moved()
 
     def _toggle(self) -> None:
+        self._following = False
         if not self.playing and self.time >= self._range[1]:
             self.time = self._range[0]
         self._set_playing(not self.playing)
@@ -205,6 +280,7 @@ class SessionPage:
             panel.show_decision(moment.decision)
 
     def _jump(self, forward: bool) -> None:
+        self._following = False
         times = sorted(self._marks.values())
         if forward:
             self._go(next((t for t in times if t > self.time + 1e-3), self._duration))

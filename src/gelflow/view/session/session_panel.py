@@ -3,6 +3,7 @@
 import threading
 from collections import OrderedDict
 from collections.abc import Sequence
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,15 @@ from gelflow.view.robot.robot_view import RobotView
 from gelflow.view.session.curves import Curves, read_curves
 from gelflow.view.session.marks import Mark
 from gelflow.view.session.moment import Moment
-from gelflow.view.session.moment_text import moment_text
+from gelflow.view.session.moment_text import checks_text, moment_text
 from gelflow.view.session.pad_pictures import decision_picture, pads_picture
 from gelflow.view.session.recorded_session import RecordedSession
 from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
 
 _DECISION_PICTURES = 32  # that are kept
+_GROWTH = 1.0  # period in which curves of a growing session are extended [s]
+_GROWTH_SAMPLES = 4  # in a second of robot time
+_DRAWING_SHARE = 4  # pause after drawing, in durations of drawing
 _REDRAW = 5  # rounds of samples between two pictures of the curves
 
 
@@ -52,11 +56,12 @@ class SessionPanel:
         self.markers = True
         self._comparisons = {(c.recorded.insertion, c.recorded.attempt): c for c in comparisons or ()}
         self._replayed = comparisons is not None
-        self.marks: list[Mark] = sorted([*session.marks, *self._differences()], key=lambda mark: mark.time)
-        self._robot = None
+        self._panel = panel
+        self._robot: RobotView | None = None
         if session.cell is not None:
             self._robot = RobotView(page, session.cell, root=f"/robot {number}", opacity=0.45 if number else 1.0)
-        with panel.add_tab(name):
+        panel_tab = panel.add_tab(name)
+        with panel_tab:
             self._text = page.gui.add_markdown("")
             self._images = page.gui.add_image(np.full((10, 16, 3), 235, dtype=np.uint8), format="jpeg", jpeg_quality=85)
             self._time_image = page.gui.add_image(np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8), format="png")
@@ -65,6 +70,10 @@ class SessionPanel:
         if decision_panel is not None:
             with decision_panel:
                 self._decision_image = _hidden_image(page)
+        with decision_panel or panel_tab:
+            self._checks_folder = page.gui.add_folder("Checks", visible=False)
+            with self._checks_folder:
+                self._checks = page.gui.add_markdown("")
         self._pictures: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._shown_decision: Decision | None = None
         self._curves = Curves(session.start, session.end)
@@ -74,9 +83,14 @@ class SessionPanel:
         self._reading = threading.Event()
         self._reader: threading.Thread | None = None
 
+    @property
+    def marks(self) -> list[Mark]:
+        """Marks of the session, and of the differences of its replay."""
+        return sorted([*self.session.marks, *self._differences()], key=lambda mark: mark.time)
+
     def show_range(self, start: float, end: float) -> None:
         """Read and draw the curves from `start` to `end` [s] in the background."""
-        self.close()
+        self._stop_reading()
         self._curves = Curves(max(start, self.session.start), min(end, self.session.end))
         self._reading = threading.Event()
         self._reader = threading.Thread(
@@ -117,6 +131,17 @@ class SessionPanel:
 
     def close(self) -> None:
         """End the reading in the background."""
+        self._stop_reading()
+
+    def remove(self) -> None:
+        """Remove everything from the page."""
+        self._stop_reading()
+        self._panel.remove()
+        self._decision_image.remove()
+        if self._robot is not None:
+            self._robot.remove()
+
+    def _stop_reading(self) -> None:
         self._reading.set()
         if self._reader is not None:
             self._reader.join()
@@ -127,6 +152,8 @@ class SessionPanel:
         if self._robot is not None:
             width = None if moment.gripper is None else float(moment.gripper["width"])
             self._robot.show(moment.joints, moment.flange, width, part_held=moment.part_held)
+        self._checks.content = checks_text(moment)
+        self._checks_folder.visible = bool(moment.checks)
         self._text.content = moment_text(moment, self.session, comparison=self._comparison(moment.decision))
         self._show_time()
 
@@ -135,12 +162,26 @@ class SessionPanel:
             self._time_image.image = self._drawn.with_present(self._time)
 
     def _read(self, curves: Curves, ended: threading.Event) -> None:
-        """In a thread: read the curves, and draw them from time to time."""
+        """In a thread: read the curves, and draw them from time to time; of a growing session also what is added."""
         for number, _ in enumerate(read_curves(self.session, curves)):
             if ended.is_set():
                 return
             if number % _REDRAW == 0:
-                self._time_line = TimeLine(curves, self.marks, origin=self.session.start)
+                self._draw(curves)
+        self._draw(curves)
+        while self.session.growing and not ended.wait(_GROWTH):
+            added = Curves(curves.end, self.session.end)
+            if added.end - added.start > _GROWTH / 2:
+                for _ in read_curves(
+                    self.session, added, samples=round(_GROWTH_SAMPLES * (added.end - added.start)) + 1
+                ):
+                    pass
+                curves.add(added)
+            begun = perf_counter()
+            self._draw(curves)
+            ended.wait(_DRAWING_SHARE * (perf_counter() - begun))
+
+    def _draw(self, curves: Curves) -> None:
         self._time_line = TimeLine(curves, self.marks, origin=self.session.start)
 
     def _comparison(self, decision: Decision | None) -> Comparison | None:

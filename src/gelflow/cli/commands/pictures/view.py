@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_preset
+from gelflow.cli.options import add_checkpoint, add_json, add_page_address, add_preset
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.session.decision_replay import Comparison
@@ -29,16 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--replay", action="store_true", help="of a session: replay its decisions first, and mark those that differ"
     )
     add_checkpoint(parser, default="the policy of the session")
-    parser.add_argument(
-        "--port", type=int, default=8080, metavar="P", help="TCP port; 0: a free one (default %(default)s)"
-    )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        metavar="H",
-        help="address to serve on; other machines reach 0.0.0.0 and need the token in the printed address "
-        "(default %(default)s)",
-    )
+    add_page_address(parser)
     add_preset(parser)
     add_json(parser)
 
