@@ -85,6 +85,7 @@ def record_everything(recorder: SessionRecorder) -> None:
     recorder.arm_command(11.6, [0.3, 0.1, 0.1995], TURN, kind="applied")
     recorder.gripper_state(GripperState(0.021, 0.0, float("nan"), True, "holding", "", 12.0))
     recorder.gripper_command(12.5, "grasp", {"width": 0.02, "speed": 0.02, "force": 15.0})
+    recorder.checks(12.75, [{"name": "arm", "ok": True, "text": "motors on"}])
     recorder.decision(a_decision().to_json())
     recorder.event("contact", {"shear_mm": np.float32(0.25), "path": Path("a/b")})
     recorder.attempt_end({"insertion": 0, "attempt": 0, "outcome": "missed"})
