@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -109,6 +110,11 @@ def _spread(rows: Sequence[FailureRange]) -> float:
 
 def draw_failures(path: Path, ranges: Sequence[FailureRange]) -> None:
     """Failure rate over each quantity, with 95 % confidence intervals."""
+    save(failure_figure(ranges), path, dpi=100)
+
+
+def failure_figure(ranges: Sequence[FailureRange]) -> Any:
+    """The figure of `draw_failures`."""
     from matplotlib.figure import Figure  # deferred: slow to import
 
     groups = _by_quantity(ranges)
@@ -136,4 +142,4 @@ def draw_failures(path: Path, ranges: Sequence[FailureRange]) -> None:
         axes.remove()
     for axes in grid[:, 0]:
         axes.set_ylabel("failures [%]")
-    save(figure, path, dpi=100)
+    return figure

@@ -1,6 +1,7 @@
 """The progress of a training run as a picture."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ def read_curve(table: Path) -> dict[str, Array]:
 
 def draw(path: Path, table: Path, *, title: str) -> None:
     """Draws success rate and reward over the environment steps of the run with the given progress table."""
+    save(figure_of(table, title=title), path, dpi=120)
+
+
+def figure_of(table: Path, *, title: str) -> Any:
+    """The figure of `draw`."""
     from matplotlib.figure import Figure  # imported on use: slow
 
     curve = read_curve(table)
@@ -43,4 +49,4 @@ def draw(path: Path, table: Path, *, title: str) -> None:
     bottom.legend(loc="lower right")
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
-    save(figure, path, dpi=120)
+    return figure

@@ -1,5 +1,6 @@
 """Cameras of pictures, and the default view of a scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim.arguments import shown
-from gelflow.sim.drawing.scene_drawing import SceneDrawing
+from gelflow.sim.drawing.scene_drawing import Mark, SceneDrawing
 from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
 from gelflow.toml_tables import suggestion
 
@@ -52,8 +53,10 @@ class Camera:
         return np.asarray(np.array(self.target) + self.distance * self.axes[2])
 
 
-def framing_camera(drawings: list[SceneDrawing], view: str = "oblique", *, aspect: float = 1.0) -> Camera:
-    """A camera that sees the moving bodies, the pads and what is near them in all drawings of a scene.
+def framing_camera(
+    drawings: list[SceneDrawing], view: str = "oblique", *, aspect: float = 1.0, marks: Sequence[Mark] = ()
+) -> Camera:
+    """A camera that sees the moving bodies, the pads, what is near them in all drawings of a scene, and marks.
 
     `view` is one of `VIEWS`, `aspect` width by height of the picture. Raises UsageError on an unknown view.
     """
@@ -63,7 +66,7 @@ def framing_camera(drawings: list[SceneDrawing], view: str = "oblique", *, aspec
     points = [pad.positions for drawing in drawings for pad in drawing.pads]
     points += [np.array([pose.position for pose in drawing.poses]) for drawing in drawings if not moving and not points]
     points += moving
-    corners = np.concatenate(points)
+    corners = np.concatenate([*points, *(mark.points for mark in marks)])
     size = float(np.ptp(corners, axis=0).max())
     for geom in drawings[0].geoms:
         if geom.body == WORLD and geom.kind != "plane":

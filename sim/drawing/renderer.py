@@ -40,14 +40,16 @@ class Renderer:
         """See `render`."""
         drawing = scene_drawing(self._sim, env)
         if not isinstance(camera, Camera):
-            # Framed at the start of the scene, so that the camera rests while the bodies move.
-            camera = self.camera([self._at_start()], camera, size)
+            # Framed at the start of the scene and with the marks, so that the camera rests while the bodies move.
+            camera = self.camera([self._at_start()], camera, size, marks=marks)
         return self.draw(drawing, size, camera, title=title, marks=marks)
 
-    def camera(self, drawings: list[SceneDrawing], view: str, size: tuple[int, int]) -> Camera:
-        """A camera with a view of `VIEWS` that has all drawings beside the panels of the pads."""
+    def camera(
+        self, drawings: list[SceneDrawing], view: str, size: tuple[int, int], *, marks: Sequence[Mark] = ()
+    ) -> Camera:
+        """A camera with a view of `VIEWS` that has all drawings and marks beside the panels of the pads."""
         width, height = _checked_size(size)
-        return framing_camera(drawings, view, aspect=(width - _panels(drawings[0], width)) / height)
+        return framing_camera(drawings, view, aspect=(width - _panels(drawings[0], width)) / height, marks=marks)
 
     def draw(
         self,

@@ -36,7 +36,7 @@ COMMANDS = {
     "mock": "start the mock robot: gripper, arm and two cameras with their network protocols",
     "render": "render gel images with known marker positions",
     "render-scene": "draw a scene or a rollout of it: a picture or a film with bodies, contact forces and pads",
-    "view": "look at a scene, or at recorded sessions, in the browser",
+    "view": "look at a scene, recorded sessions or a training in the browser",
     "bench": "measure the speed of the simulator and the tracker",
     "tradeoff": "measure speed and error of a scene for many settings and for the presets",
     "describe": "describe a scene: model, omissions, size, and time of a step",

@@ -10,7 +10,7 @@ from gelflow.sim.drawing.annotations import marker_colors, quantity, round_scale
 from gelflow.sim.drawing.camera import VIEWS, framing_camera
 from gelflow.sim.drawing.film import film_pictures, record_rollout
 from gelflow.sim.drawing.ray_caster import RayCaster, View
-from gelflow.sim.drawing.scene_drawing import scene_drawing
+from gelflow.sim.drawing.scene_drawing import Mark, scene_drawing
 
 VERMILION = np.array([213, 94, 0])
 
@@ -75,6 +75,18 @@ def test_camera_frames_the_moving_bodies_from_every_view() -> None:
         camera = framing_camera([drawing], name)
         pixels, depth = View(camera, (200, 200), (100.0, 100.0)).project(drawing.pads[0].positions)
         assert (depth > 0).all() and (pixels > 0).all() and (pixels < 200).all()
+
+
+def test_camera_frames_marks_as_well() -> None:
+    """The goal of a box lies outside of the view of the box alone."""
+    drawing = scene_drawing(gs.Simulator(gs.load_scene("pushing")))
+    goal = Mark(np.array([[0.4, -0.2, 0.0], [0.5, -0.2, 0.0]]), "goal")
+    inside = []
+    for marks in ([], [goal]):
+        camera = framing_camera([drawing], marks=marks)
+        pixels, depth = View(camera, (200, 200), (100.0, 100.0)).project(goal.points)
+        inside.append(bool((depth > 0).all() and (pixels > 0).all() and (pixels < 200).all()))
+    assert inside == [False, True]
 
 
 def test_film_has_one_camera_and_the_pictures_of_the_rollout() -> None:

@@ -1,4 +1,4 @@
-"""`gelflow view`: a page in the browser with a scene that can be moved, or with recorded sessions."""
+"""`gelflow view`: a page in the browser with a scene that can be moved, recorded sessions, or a training."""
 
 import argparse
 import contextlib
@@ -18,8 +18,9 @@ _SCENE_ONLY = {"num_envs": 1, "env": 0, "preset": None}  # options and their def
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument(
-        "shown", metavar="SCENE|SESSION", nargs="+",
-        help="name of a shipped scene, or a TOML, MJCF or URDF file; or one or two recorded sessions (.mcap)",
+        "shown", metavar="SCENE|SESSION|RUN", nargs="+",
+        help="name of a shipped scene, or a TOML, MJCF or URDF file; one or two recorded sessions (.mcap); or the "
+        "folder of a training",
     )  # fmt: skip
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="environments (default %(default)s)")
     parser.add_argument(
@@ -51,7 +52,18 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.view.page import import_viser
 
     import_viser()
-    return _view_sessions(args, sessions) if sessions else _view_scene(args)
+    if sessions:
+        return _view_sessions(args, sessions)
+    return _view_training(args) if Path(args.shown[0]).is_dir() else _view_scene(args)
+
+
+def _view_training(args: argparse.Namespace) -> int:
+    from gelflow.policies.reports.watched_training import WatchedTraining
+    from gelflow.view.training.training_page import TrainingPage
+
+    training = WatchedTraining(Path(args.shown[0]))
+    with TrainingPage(training, host=args.host, port=args.port) as page:
+        return _serve(args, page.url, page.run)
 
 
 def _view_scene(args: argparse.Namespace) -> int:

@@ -1,0 +1,83 @@
+"""A training that is watched: its curve, episodes of its newest policy, and the page that shows them."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.real.runner.harness import untrained_checkpoint
+from tests.view.browser import browser, needs_browser
+
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.policies.reports.watched_training import WatchedTraining
+from gelflow.view.training.training_page import TrainingPage
+
+HEADER = "steps,minutes,evaluated_success,success_low,success_high,evaluated_length,evaluated_reward\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "some training"
+    made.mkdir()
+    (made / "run.json").write_text("{}")
+    (made / "progress.csv").write_text(HEADER + "1000,0.1,0.5,0.4,0.6,3.0,-2.0\n")
+    return made
+
+
+def test_curve_is_drawn_again_when_the_table_has_grown(folder: Path) -> None:
+    training = WatchedTraining(folder, episodes=4)
+    first = training.curve()
+    assert first is not None and first.ndim == 3
+    assert training.curve() is None
+    with (folder / "progress.csv").open("a") as table:
+        table.write("2000,0.2,0.9,0.8,0.95,2.0,-1.0\n")
+    second = training.curve()
+    assert second is not None and not np.array_equal(first, second)
+
+
+def test_a_training_without_rows_and_policies_shows_nothing(folder: Path) -> None:
+    training = WatchedTraining(folder, episodes=4)
+    (folder / "progress.csv").write_text("")
+    assert training.curve() is None and training.evaluate() is None
+    (folder / "progress.csv").unlink()
+    assert training.curve() is None
+
+
+def test_newest_policy_is_evaluated_once(folder: Path) -> None:
+    training = WatchedTraining(folder, episodes=40)
+    untrained_checkpoint(folder)
+    episodes = training.evaluate()
+    assert episodes is not None
+    assert "of 40 episodes succeed" in episodes.text and episodes.failures is not None
+    assert set(episodes.films) <= {"success", "failure"} and "failure" in episodes.films
+    for film in episodes.films.values():
+        assert len(film) >= 2 and film[0].shape == film[-1].shape
+    assert training.evaluate() is None
+
+
+def test_other_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UsageError, match=r"not the folder of a training: it has no run\.json"):
+        WatchedTraining(tmp_path)
+    assert main(["view", str(tmp_path), "--port", "0"]) == 2
+    error = capsys.readouterr().err
+    assert "not the folder of a training" in error and error.count("\n") == 1
+
+
+@needs_browser
+def test_page_shows_curve_results_and_films(folder: Path) -> None:
+    untrained_checkpoint(folder)
+    ended = threading.Event()
+    with TrainingPage(WatchedTraining(folder, episodes=8), port=0) as page, browser() as window:
+        loop = threading.Thread(target=lambda: page.run(until=ended.is_set))
+        loop.start()
+        try:
+            window.open(page.url)
+            window.wait(lambda: "some training" in window.text() and "of 8 episodes succeed" in window.text())
+            window.wait(lambda: "failure: picture" in window.text())
+            assert window.errors() == []
+            assert window.foreign_requests() == []
+            assert len(np.unique(window.picture().reshape(-1, 3), axis=0)) > 500  # not blank
+        finally:
+            ended.set()
+            loop.join()
