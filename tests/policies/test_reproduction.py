@@ -45,6 +45,7 @@ class Killed(Exception):
     """Ends a reproduction as a kill would."""
 
 
+@pytest.mark.slow
 def test_a_killed_reproduction_continues_and_gives_the_same_record(tmp_path: Path) -> None:
     whole = reproduce(PLAN, tmp_path / "whole", effort=TINY, command=COMMAND)
 

@@ -40,6 +40,7 @@ def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: p
         true_state(truth)  # the mock robot has ended
 
 
+@pytest.mark.slow
 def test_demo_inserts_a_part_and_its_session_replays(
     tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from tests.real.runner.harness import OraclePolicy, plan_for
 
 import gelflow.real
@@ -16,6 +17,7 @@ from gelflow.real.runner.run_plan import run_insertions
 EXAMPLE = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
 
 
+@pytest.mark.slow
 def test_part_is_inserted_at_the_speeds_of_the_example(robot: MockRobot, tmp_path: Path) -> None:
     """20 mm/s and 10°/s exceed what the controller follows: the first correction in yaw ended in a time-out."""
     lab = lab_for(robot)

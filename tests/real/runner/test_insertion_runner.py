@@ -78,6 +78,7 @@ def phases_of_moves_with_a_part(session: Path) -> set[str]:
     return phases
 
 
+@pytest.mark.slow
 def test_lost_part_ends_its_insertion_and_the_next_one_starts(robot: MockRobot, tmp_path: Path) -> None:
     lost: list[bool] = []
 
@@ -126,7 +127,9 @@ def test_a_lost_part_is_not_reported_again_once_none_is_expected() -> None:
     motion.wait(0.0)
 
 
-@pytest.mark.parametrize("answer", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0]])
+@pytest.mark.parametrize(
+    "answer", [[np.nan, 0, 0], *(pytest.param(answer, marks=pytest.mark.slow) for answer in ([0, np.inf, 0], [0, 0]))]
+)
 def test_invalid_action_of_the_policy_causes_no_motion(robot: MockRobot, tmp_path: Path, answer: list[float]) -> None:
     class InvalidPolicy:
         def reset(self) -> None: ...

@@ -86,6 +86,7 @@ def stopped_in_mid_descent(robot: MockRobot, folder: Path) -> str:
     return str(error.value)
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_path: Path, operator: Operator) -> None:
     assert "motors" in stopped_in_mid_descent(robot, tmp_path)
     status = operator.json("status")

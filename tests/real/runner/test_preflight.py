@@ -52,7 +52,7 @@ def test_preflight_reports_all_failed_checks_without_motion(robot: MockRobot, tm
     with pytest.raises(SafetyError) as error:
         run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
     message = str(error.value)
-    assert "gripper: it is not homed" in message and "pose: target refused: |y| = 50.00 mm" in message
+    assert "gripper: it is not homed" in message and "pose: target refused: y -50 mm" in message
     assert robot.arm.report.largest_step < 1e-9
     assert robot.cell.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
 

@@ -63,7 +63,7 @@ def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobo
     wait_for(lambda: moving(robot), during=finish)
     executors[0].request_stop("the operator pressed stop")
     with pytest.raises(SafetyError, match="the operator pressed stop"):
-        executors[0].go(executors[0].pose())
+        executors[0].go(executors[0].pose(), guarded=True)
     with pytest.raises(SafetyError, match="stopped: the operator pressed stop"):
         finish()
     executors[0].request_stop("again")
@@ -92,6 +92,7 @@ def test_a_stop_before_the_first_motion_moves_nothing(robot: MockRobot, tmp_path
     assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A record may be late by 2 s (wall); each fsync takes 5 s once the part moves, and no time before."""
     seconds = 0.0

@@ -105,9 +105,8 @@ def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, t
     assert not recorded(tmp_path, "insertion ended")
 
 
-@pytest.mark.parametrize(
-    "error", [pytest.param(-3e-3, id="too low"), pytest.param(3e-3, id="too high", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [pytest.param(-3e-3, id="too low"), pytest.param(3e-3, id="too high")])
 def test_rim_is_found_by_touch_when_the_hole_is_taught_3_mm_wrong(tmp_path: Path, error: float) -> None:
     with robot_in({"taught_error": {"z": error}}) as robot:
         result = insert(robot, tmp_path)
