@@ -8,7 +8,7 @@ not depend on that pose, so it is simulated once per part.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomi
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
 from gelflow.sim.trajectory import TouchStop, Trajectory
 from gelflow.task import INSERTION, InsertionTask
+
+if TYPE_CHECKING:
+    from gelflow.sim.drawing.scene_drawing import SceneDrawing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -175,6 +178,8 @@ class InsertionAttempts:
         self.pose: Array = np.zeros((num_envs, 3))
         self.drawn: dict[str, Array] = {}  # quantities of the latest `draw`, one value for each of its environments
         self.sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
+        self._jitter: Array = np.zeros(num_envs)  # of the start height in the last attempt [m]
+        self._last_step = np.zeros(num_envs, dtype=int)  # at which the last attempt ended
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
         self._stop_shear: Array = np.full(num_envs, np.inf)
         self._params = np.repeat(self.sim.params[:1], num_envs, axis=0)
@@ -249,6 +254,7 @@ class InsertionAttempts:
         chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
         rows = np.flatnonzero(chosen)
         jitter = rng.uniform(-1, 1, len(rows)) * self._start_height[rows]
+        self._jitter[rows] = jitter
         steps = sorted({self._reference_at, *self._frames})
         shear = np.zeros((len(steps), len(rows), self.scene.num_markers, 2))
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
@@ -262,6 +268,7 @@ class InsertionAttempts:
             height[part], inserted[part] = self._outcome(trajectory.q[-1, :n])
             failed[part] = trajectory.status[:n] != 0
             stopped = trajectory.stopped_at[:n]
+            self._last_step[rows[part]] = np.where(stopped < 0, self._steps, stopped)
             inserted[part] &= ~failed[part] & (stopped < 0)
             depth[part] = np.where(stopped < 0, self.task.descent, self.task.descent * stopped / self._steps)
         readings = self._readings(dict(zip(steps, shear, strict=True)), chosen, rng)
@@ -296,6 +303,18 @@ class InsertionAttempts:
         for name, values in self._end.items():
             getattr(self.sim, name)[0] = values[index]
         return self.sim
+
+    def drawings(self, index: int, count: int) -> "list[SceneDrawing]":
+        """Drawings of the last attempt of environment `index`, `count` of them evenly spread from its start to its end.
+
+        The attempt is simulated again, from the present pose. Raises SimulationError where it failed.
+        """
+        from gelflow.sim.drawing.film import record_rollout  # deferred: a policy in training draws nothing
+
+        rows, last = np.array([index]), max(int(self._last_step[index]), 1)
+        u = np.repeat(self._start(rows, self._jitter[rows])[None], last, axis=0)
+        u[:, 0, self._arm_u[2]] -= self.task.descent * np.arange(1, last + 1) / self._steps
+        return record_rollout(self.sim, u, np.linspace(0, last, count).round().astype(int).tolist())
 
     def _start(self, rows: Rows, jitter: Array) -> Array:
         """Set the state to the grasps `rows` at `pose`, the lower face at its start height; returns the controls."""

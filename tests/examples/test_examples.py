@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"
 LAST_LINE = {
+    "film_of_an_insertion.py": r"insertion\.gif: \d attempts, inserted True",
     "fit_friction.py": r"iteration 6: mu = 0\.500\d, loss .* mm²",
     "gymnasium_loop.py": r"attempt \d+: reward -?\d+\.\d+, inserted (True|False)",
     "mock_gripper.py": r"width 25\.0 mm, force 20\.0 N, holding",
@@ -24,10 +25,12 @@ LAST_LINE = {
 }
 
 
-def run(arguments: list[str]) -> str:
-    """Standard output of a Python process without a display."""
+def run(arguments: list[str], folder: Path | None = None) -> str:
+    """Standard output of a Python process without a display, in a working folder."""
     environment = os.environ | {"MPLBACKEND": "Agg"}
-    result = subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, timeout=120)
+    result = subprocess.run(
+        [sys.executable, *arguments], env=environment, capture_output=True, text=True, timeout=120, cwd=folder
+    )
     assert result.returncode == 0, result.stderr
     return result.stdout
 
@@ -37,8 +40,8 @@ def test_every_script_has_an_expected_output() -> None:
 
 
 @pytest.mark.parametrize("script", LAST_LINE)
-def test_script_runs(script: str) -> None:
-    last = run([str(EXAMPLES / script)]).splitlines()[-1]
+def test_script_runs(script: str, tmp_path: Path) -> None:
+    last = run([str(EXAMPLES / script)], tmp_path).splitlines()[-1]
     assert re.fullmatch(LAST_LINE[script], last), last
 
 
