@@ -177,3 +177,25 @@ def test_files_that_are_no_sessions_are_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(PeerError, match="nothing to show"):
         RecordedSession(tmp_path / "empty.mcap")
+
+
+def test_a_session_that_is_being_recorded_grows(tmp_path: Path) -> None:
+    clock = ManualClock(5.0)
+    path = tmp_path / "session.mcap"
+    with SessionRecorder(path, clock) as recorder:
+        recorder.event("state", {"state": "descend"})
+        recorder.attempt_end()  # stores everything
+        with RecordedSession(path) as session:
+            assert session.growing and session.end == pytest.approx(5.0)
+            assert not session.refresh()
+            clock.time = 7.0
+            recorder.attempt_end({"insertion": 0, "attempt": 0, "outcome": "inserted"})
+            assert session.refresh()
+            assert session.end == pytest.approx(7.0)
+            (mark,) = session.marks
+            assert mark.kind == "inserted"
+            assert (mark.time, mark.end) == pytest.approx((5.0, 7.0))
+            assert session.at(6.0).phase == "descend"
+            recorder.close()
+            session.refresh()
+            assert not session.growing

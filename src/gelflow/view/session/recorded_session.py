@@ -10,7 +10,7 @@ from gelflow.errors import GelflowError, PeerError
 from gelflow.geometry import Pose
 from gelflow.session.live_reader import LiveReader
 from gelflow.session.messages import Damage
-from gelflow.session.reader import Record, SessionReader
+from gelflow.session.reader import Record, SessionReader, is_being_recorded, open_recording
 from gelflow.session.records import SENSORS
 from gelflow.session.time_index import TimeIndex
 from gelflow.view.robot.cell_geometry import CellGeometry
@@ -27,12 +27,15 @@ class RecordedSession:
     Parameters
     ----------
     path: the file
-    live: whether it is being recorded; `refresh` then adds what has been recorded since
+    live: whether it is being recorded, None: find out; `refresh` then adds what has been recorded since
 
     Raises UsageError for a file that is no session, PeerError for one that is unfinished, damaged or empty.
     """
 
-    def __init__(self, path: str | Path, *, live: bool = False) -> None:
+    def __init__(self, path: str | Path, *, live: bool | None = None) -> None:
+        if live is None:
+            with open_recording(Path(path)) as stream:
+                live = is_being_recorded(stream)
         self._live = LiveReader(path).open() if live else None
         self.reader: SessionReader = self._live or SessionReader(path).open()
         try:
