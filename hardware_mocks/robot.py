@@ -24,6 +24,7 @@ from gelflow.hardware_mocks.faults.injector import Devices, FaultInjector
 from gelflow.hardware_mocks.faults.plan import FaultPlan
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
+from gelflow.hardware_mocks.simulated_cell.sensor_effects import DeviatingGel
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
@@ -88,7 +89,7 @@ class MockRobot:
         self.gripper = MockWsgGripper(self.cell, clock=clock, tcp_port=config.tcp_port, host=config.host)
         self.cameras = tuple(
             MockMjpegCamera(
-                _Gel(self.cell, finger, config),
+                _Gel(self.cell, finger, config, clock),
                 clock,
                 rate=config.cell.world.cameras[finger].rate,
                 host=config.host,
@@ -144,16 +145,19 @@ class MockRobot:
 class _Gel:
     """Image source of one camera."""
 
-    def __init__(self, cell: SimulatedCellProcess, finger: int, config: MockRobotConfig) -> None:
-        self._cell, self._finger = cell, finger
+    def __init__(self, cell: SimulatedCellProcess, finger: int, config: MockRobotConfig, clock: ScaledClock) -> None:
+        self._cell, self._finger, self._clock = cell, finger, clock
         appearance, lens = config.view(finger)
         self._renderer = FastGelRenderer(appearance, lens=lens)
         self._printed = config.print_error(finger)
+        world = config.cell.world
+        self._effects = DeviatingGel(world.sensor, world.markers.grid.positions(), finger)
         self._count = 0
 
     def __call__(self) -> bytes:
         self._count += 1
-        displacement = self._printed + self._cell.marker_displacement(self._finger)
+        moved = self._effects.apply(self._cell.marker_displacement(self._finger), self._clock.now())
+        displacement = self._printed + moved
         return self._renderer.encode(self._renderer.render(displacement, sequence=self._count))
 
 

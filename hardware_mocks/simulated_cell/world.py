@@ -108,6 +108,31 @@ class MarkerPrint:
 
 
 @dataclass(frozen=True)
+class SensorEffects:
+    """Deviations of both sensors from an elastic gel with perfect markers; 0: none."""
+
+    creep: float = 0.0  # part of the deformation that follows the force with a lag
+    creep_time: float = 0.1  # time constant of this lag [s]
+    crosstalk: float = 0.0  # part of a marker's motion that is the mean of its four nearest neighbours
+    gain_spread: float = 0.0  # standard deviation of the logarithm of a marker's gain
+    noisy: float = 0.0  # fraction of the markers with the following noise
+    noise_mm: float = 0.02  # standard deviation, per image
+    drift_mm: float = 0.0  # of all markers of a pad per minute, in a direction of its own
+
+    def __post_init__(self) -> None:
+        fractions = dict.fromkeys(("creep", "crosstalk", "noisy"), (0.0, 1.0))
+        _check(
+            self,
+            fractions | {"creep_time": (1e-3, 100), "gain_spread": (0, 1), "noise_mm": (0, 1), "drift_mm": (0, 10)},
+        )
+
+    @property
+    def ideal(self) -> bool:
+        """Whether there are no deviations."""
+        return not (self.creep or self.crosstalk or self.gain_spread or self.noisy or self.drift_mm)
+
+
+@dataclass(frozen=True)
 class CameraView:
     """Image of one camera."""
 
@@ -179,6 +204,7 @@ class World:
     hole: Hole = field(default_factory=Hole)
     taught_error: TaughtError = field(default_factory=TaughtError)
     markers: MarkerPrint = field(default_factory=MarkerPrint)
+    sensor: SensorEffects = field(default_factory=SensorEffects)
     left_camera: CameraView = field(default_factory=CameraView)
     right_camera: CameraView = field(default_factory=CameraView)
     arm: ArmDynamics = field(default_factory=ArmDynamics)

@@ -13,13 +13,30 @@ Array = NDArray[np.float64]
 
 def deformation(force: Array, stamps: Array, creep: float, time: float) -> Array:
     """x at `stamps` [s], shape (n,), of a gel at rest before the first one; `time` is τ [s]."""
-    steps = np.maximum(np.diff(stamps), 1e-9)
-    result, delayed = np.array(force, dtype=float), float(force[0])
-    for k, step in enumerate(steps, start=1):
-        ramp = (force[k] - force[k - 1]) * time / step
-        delayed = force[k] - ramp + (delayed - force[k - 1] + ramp) * np.exp(-step / time)
-        result[k] = force[k] + creep * (delayed - force[k])
-    return result
+    gel = CreepLag(creep, time)
+    return np.array(
+        [float(gel.follow(np.asarray(value), float(stamp))) for value, stamp in zip(force, stamps, strict=True)]
+    )
+
+
+class CreepLag:
+    """The deformations of a gel that follow a sequence of forces."""
+
+    def __init__(self, creep: float, time: float) -> None:
+        self._creep, self._time = creep, time
+        self._last: tuple[float, Array, Array] | None = None  # stamp, f, y
+
+    def follow(self, force: Array, stamp: float) -> Array:
+        """x for the force f at `stamp` [s]; the gel is at rest before the first one. Equal shapes."""
+        if self._last is None:
+            self._last = stamp, force, force
+            return force
+        before, force_before, delayed = self._last
+        step = max(stamp - before, 1e-9)
+        ramp = (force - force_before) * self._time / step
+        delayed = force - ramp + (delayed - force_before + ramp) * np.exp(-step / self._time)
+        self._last = stamp, force, delayed
+        return np.asarray(force + self._creep * (delayed - force))
 
 
 class CreepCorrection:
