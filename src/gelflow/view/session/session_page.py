@@ -59,6 +59,8 @@ class SessionPage:
         self.playing = False
         self._speed = 1.0
         self._before = time.perf_counter()
+        self._shown: float | None = None  # time that the panels show [s]
+        self._behind = False  # records have been added that are not shown yet
         self._next_follow = 0.0
         self._offsets = [0.0] * len(sessions)  # of the time of each session [s]
         self._moments: list[Moment] = []
@@ -127,20 +129,24 @@ class SessionPage:
         """Add what has been recorded; show its end when it is followed."""
         if not self._live:
             return
-        grown = [panel.session.refresh() for panel in self._panels]
-        if not any(grown):
-            return
+        if any([panel.session.refresh() for panel in self._panels]):
+            self._behind = True
+            self._extend()
+        if self._behind and self._following and time.perf_counter() >= self._next_follow:
+            self._behind = False
+            now, used = time.perf_counter(), time.thread_time()
+            self._go(self._duration, moved=True)
+            pause = (time.thread_time() - used) / _FOLLOW_SHARE
+            self._next_follow = now + min(max(_FOLLOW_PERIOD, pause), _LONGEST_PAUSE)
+
+    def _extend(self) -> None:
+        """Extend the time line to the present end."""
         whole = self._range == (0.0, self._duration)
         self._duration = max(panel.session.end - panel.session.start for panel in self._panels)
         if whole:
             self._range = (0.0, self._duration)
             self._slider.max = max(round(self._duration, 2), _SLIDER_STEP)
         self._refresh_marks()
-        if self._following and time.perf_counter() >= self._next_follow:
-            now, used = time.perf_counter(), time.thread_time()
-            self._go(self._duration, moved=True)
-            pause = (time.thread_time() - used) / _FOLLOW_SHARE
-            self._next_follow = now + min(max(_FOLLOW_PERIOD, pause), _LONGEST_PAUSE)
 
     def _add_panel(
         self, session: RecordedSession, comparisons: Sequence[Comparison] | None, number: int, folder: Any
@@ -208,7 +214,7 @@ class SessionPage:
         self._go(self._marks.get(name, 0.0))
 
     def _follow(self) -> None:
-        self._following = True
+        self._following = self._behind = True
         self._set_playing(False)
 
     def _post(self, function: Callable[..., None], *values: Any) -> None:
@@ -261,8 +267,6 @@ class SessionPage:
             self._slider.value = round(self.time, 2)
         if moved:
             self._show_if_moved()
-
-    _shown: float | None = None  # time that the panels show [s]
 
     def _show_if_moved(self) -> bool:
         if self._shown == self.time:
