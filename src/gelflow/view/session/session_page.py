@@ -129,7 +129,8 @@ class SessionPage:
         """Add what has been recorded; show its end when it is followed."""
         if not self._live:
             return
-        if any([panel.session.refresh() for panel in self._panels]):
+        grown = [panel.session.refresh() for panel in self._panels]
+        if any(grown):
             self._behind = True
             self._extend()
         if self._behind and self._following and time.perf_counter() >= self._next_follow:
