@@ -19,7 +19,7 @@ _SCENES: dict[str, tuple[Callable[[int, int], NDArray[np.float64]], int]] = {
     "rolling": (lambda n, size: np.full(size, 0.3), 12),
 }
 _COLUMNS = 3
-_ENVS = 32  # of which the one with the largest force is drawn
+_ENVS = 32  # number of environments; the picture shows the one with the largest force
 
 
 def main() -> None:

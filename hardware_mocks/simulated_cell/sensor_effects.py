@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from gelflow.gel.creep import CreepLag
 from gelflow.hardware_mocks.simulated_cell.world import SensorEffects
+from gelflow.sim.tasks.sensor_model import nearest_markers
 
 Array = NDArray[np.float64]
 _NEIGHBOURS = 4  # of a marker, in crosstalk
@@ -29,8 +30,7 @@ class DeviatingGel:
         self._noise = np.where(rng.random((count, 1)) < effects.noisy, effects.noise_mm, 0.0)
         direction = rng.uniform(0, 2 * np.pi)
         self._drift = effects.drift_mm / 60 * np.array([np.cos(direction), np.sin(direction)])  # [mm/s]
-        distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-        self._near = np.argsort(distance, axis=1, kind="stable")[:, 1 : _NEIGHBOURS + 1]
+        self._near = nearest_markers([positions])[0][:, :_NEIGHBOURS] if effects.crosstalk else None
         self._start: float | None = None
 
     def apply(self, displacement: Array, stamp: float) -> Array:
@@ -43,7 +43,7 @@ class DeviatingGel:
         if self._start is None:
             self._start = stamp
         shown = self._lag.follow(displacement, stamp) if self._effects.creep else displacement
-        if self._effects.crosstalk:
+        if self._near is not None:
             shown = shown + self._effects.crosstalk * (shown[self._near].mean(axis=1) - shown)
         noise = self._noise * self._rng.standard_normal(shown.shape) if self._effects.noisy else 0.0
         return np.asarray(self._gain * shown + noise + self._drift * (stamp - self._start))

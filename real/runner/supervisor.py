@@ -116,8 +116,7 @@ class TargetBound:
     @property
     def ok(self) -> bool:
         """Whether the value is within its range; False for NaN."""
-        tolerance = _TOLERANCE * max(1.0, abs(self.high))
-        return self.low - tolerance <= self.value <= self.high + tolerance
+        return self.low - _TOLERANCE <= self.value <= self.high + _TOLERANCE
 
     @property
     def text(self) -> str:

@@ -1,17 +1,44 @@
-"""Task, perception and policy of a recorded session, from its description."""
+"""Task, perception and policy of a recorded session, from its description, and its replay with a progress bar."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gelflow.cli.output import progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
-from gelflow.session.decision_replay import PerceptionPipeline
+from gelflow.protocols import Policy
+from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
+from gelflow.session.messages import Damage
+from gelflow.session.reader import SessionReader
 from gelflow.session.records import file_digest, from_plain
 from gelflow.task import InsertionTask
 
 
-def recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
+def recorded_pipeline(
+    description: Mapping[str, Any], checkpoint: Path | None
+) -> tuple[InsertionTask, PerceptionPipeline, Policy]:
+    """Task, perception and policy of a session; `checkpoint` replaces the recorded one."""
+    from gelflow.policies.checkpoint import load_policy
+
+    task, perception = _recorded_perception(description)
+    return task, perception, load_policy(checkpoint or _recorded_checkpoint(description), task=task)
+
+
+def replay_with_progress(
+    session: SessionReader, task: InsertionTask, perception: PerceptionPipeline, policy: Policy, *, damage: Damage
+) -> list[Comparison]:
+    """All decisions of a session, recomputed; damaged records are counted in `damage`."""
+    comparisons = []
+    with progress_bar(count=True) as progress:
+        bar = progress.add_task("replaying", total=session.counts().get("/decision", 0))
+        for comparison in replay(session, perception=perception, policy=policy, task=task, damage=damage):
+            comparisons.append(comparison)
+            progress.advance(bar)
+    return comparisons
+
+
+def _recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:
     """Task and perception of the session's description. Raises PeerError when the description lacks a part."""
     from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
     from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
@@ -41,7 +68,7 @@ def recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask, 
     return task, PerceptionPipeline(Tracker, frame)
 
 
-def recorded_checkpoint(description: Mapping[str, Any]) -> Path:
+def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
     """The checkpoint of the session, at its recorded path or shipped with gelflow."""
     from gelflow.policies.checkpoint import shipped_checkpoints
 

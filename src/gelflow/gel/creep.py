@@ -19,6 +19,12 @@ def deformation(force: Array, stamps: Array, creep: float, time: float) -> Array
     )
 
 
+def _delayed(force: Array, force_before: Array, delayed: Array, step: float, time: float) -> Array:
+    """y after a step [s] in which the force changed linearly from `force_before` to `force`."""
+    ramp = (force - force_before) * time / step
+    return np.asarray(force - ramp + (delayed - force_before + ramp) * np.exp(-step / time))
+
+
 class CreepLag:
     """The deformations of a gel that follow a sequence of forces."""
 
@@ -33,8 +39,7 @@ class CreepLag:
             return force
         before, force_before, delayed = self._last
         step = max(stamp - before, 1e-9)
-        ramp = (force - force_before) * self._time / step
-        delayed = force - ramp + (delayed - force_before + ramp) * np.exp(-step / self._time)
+        delayed = _delayed(force, force_before, delayed, step, self._time)
         self._last = stamp, force, delayed
         return np.asarray(force + self._creep * (delayed - force))
 
@@ -62,6 +67,5 @@ class CreepCorrection:
         slope = self._time / step * (decay - 1)
         lag = self._creep * (decay * (delayed - force_before) - slope * force_before)
         force = np.where(known, (deformation - lag) / (1 + self._creep * slope), force_before)
-        ramp = (force - force_before) * self._time / step
-        self._last = stamp, force, force - ramp + (delayed - force_before + ramp) * decay
+        self._last = stamp, force, _delayed(force, force_before, delayed, step, self._time)
         return np.asarray(force)

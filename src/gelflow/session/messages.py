@@ -52,7 +52,7 @@ def ordered_messages(
 
     A damaged chunk is counted in `damage`; without `damage` it raises one of `DECODE_ERRORS`.
     """
-    chunks = [chunk for chunk in summary.chunk_indexes if _has_topic(chunk, summary, topics)]
+    chunks = [chunk for chunk in summary.chunk_indexes if has_topic(chunk, summary, topics)]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
     # Chunks overlap in time by a little: messages wait until no later chunk can contain an earlier one.
     waiting: list[tuple[int, int, int, Channel, Message]] = []
@@ -80,7 +80,7 @@ def expected_records(summary: Summary, topics: Collection[str] | None) -> int:
     return sum(counts.get(channel.id, 0) for channel in channels if topics is None or channel.topic in topics)
 
 
-def _has_topic(chunk: ChunkIndex, summary: Summary, topics: Collection[str] | None) -> bool:
+def has_topic(chunk: ChunkIndex, summary: Summary, topics: Collection[str] | None) -> bool:
     """Whether a chunk contains messages of `topics`, or its index does not show it."""
     channels = chunk.message_index_offsets
     return topics is None or not channels or any(summary.channels[key].topic in topics for key in channels)

@@ -120,7 +120,7 @@ class TimeIndex:
         inside = [n for n in sorted(wanted) if self._starts[n] <= end and self._ends[n] >= start]
         if len(inside) > count:
             inside = [inside[k] for k in np.linspace(0, len(inside) - 1, count).round().astype(int)]
-        for position in _refining(len(inside)):
+        for position in refining_order(len(inside)):
             found = []
             for topic in topics:
                 for _, message in self._of_topic(inside[position], topic):
@@ -154,7 +154,7 @@ class TimeIndex:
             return None
 
 
-def _refining(count: int) -> Iterator[int]:
+def refining_order(count: int) -> Iterator[int]:
     """The numbers below `count` in an order in which every beginning is spread evenly: reversed bits."""
     bits = max(count - 1, 0).bit_length()
     for k in range(1 << bits):

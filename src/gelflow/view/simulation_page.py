@@ -1,8 +1,7 @@
 """A page that shows a simulator: in a loop of one's own (`open`), or driven from the page (`SimulationPage.run`)."""
 
-import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.view.body_text import body_text
 from gelflow.view.joint_sliders import Sliders, control_ranges, coordinates, read_coordinate, write_coordinate
 from gelflow.view.page import DEFAULT_HOST, DEFAULT_PORT, Page
+from gelflow.view.page_events import PageEvents
 from gelflow.view.scene_view import SceneView
 
 MAX_RATE = 20.0  # of the pictures on the page [1/s]
@@ -55,7 +55,8 @@ class SimulationPage:
         drawing = scene_drawing(sim, env)
         self._sim, self._scene = sim, sim.scene
         self.env = env
-        self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._events = PageEvents()
+        self._post = self._events.post
         self._next = 0.0
         self._steps = 0  # taken by `run`
         self.playing = False
@@ -109,14 +110,9 @@ class SimulationPage:
             self.update()
             time.sleep(max(0.0, now + _TICK - time.perf_counter()))
 
-    def _post(self, function: Callable[..., None], *values: Any) -> None:
-        """Let the thread of the simulator call a function: the page has threads of its own."""
-        self._events.put(lambda: function(*values))
-
     def _handle_events(self) -> None:
-        for event in _waiting(self._events):
+        if self._events.handle():
             self._next = 0.0
-            event()
 
     def _step(self) -> None:
         self._sim.step(self._u)
@@ -231,11 +227,3 @@ def open(sim: Simulator, *, env: int = 0, host: str = DEFAULT_HOST, port: int = 
     Parameters and errors are those of `SimulationPage`.
     """
     return SimulationPage(sim, env=env, host=host, port=port)
-
-
-def _waiting(events: "queue.SimpleQueue[Callable[[], None]]") -> Iterator[Callable[[], None]]:
-    while True:
-        try:
-            yield events.get_nowait()
-        except queue.Empty:
-            return

@@ -13,11 +13,11 @@ from rich.table import Table
 
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_checkpoint, add_json, add_out
-from gelflow.cli.output import Output, progress_bar
-from gelflow.cli.session_replay import recorded_checkpoint, recorded_perception
+from gelflow.cli.output import Output
+from gelflow.cli.session_replay import recorded_pipeline, replay_with_progress
 from gelflow.errors import UsageError
 from gelflow.real.camera.latency import LatencyEstimate, combine_latencies
-from gelflow.session.decision_replay import Comparison, replay
+from gelflow.session.decision_replay import Comparison
 from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS, file_digest, from_plain, software_versions
@@ -39,25 +39,17 @@ def run(args: argparse.Namespace) -> int:
 
     A negative result: a decision differs, could not be recomputed or is lost, or there is none.
     """
-    from gelflow.policies.checkpoint import load_policy
-
     if args.simulate:
         return _replay_in_simulation(args)
     output = Output(args.json)
     with SessionReader(args.session) as session:
         description = session.description()
-        task, perception = recorded_perception(description)
-        policy = load_policy(args.checkpoint or recorded_checkpoint(description), task=task)
+        task, perception, policy = recorded_pipeline(description, args.checkpoint)
         notes = _notes(description, args.checkpoint)
         for note in notes:
             output.text(f"note: {note}")
         total, damage = session.counts().get("/decision", 0), Damage()
-        comparisons = []
-        with progress_bar(count=True) as progress:
-            bar = progress.add_task("replaying", total=total)
-            for comparison in replay(session, perception=perception, policy=policy, task=task, damage=damage):
-                comparisons.append(comparison)
-                progress.advance(bar)
+        comparisons = replay_with_progress(session, task, perception, policy, damage=damage)
         latencies = _latencies(session, description)
     result = _Result(comparisons, total - len(comparisons), damage, notes, latencies)
     if args.out and comparisons:

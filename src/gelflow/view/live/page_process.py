@@ -33,7 +33,6 @@ class LivePage:
         self._path: Path | None = None
         self._session: RecordedSession | None = None
         self._shown: SessionPage | None = None
-        self._stopped_at = ""
 
     def run(self) -> None:
         """Serve the page until the run closes the link."""

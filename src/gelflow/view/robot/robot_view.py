@@ -39,6 +39,7 @@ class RobotView:
         self._links = [page.scene.add_frame(f"{root}/arm/{k}", show_axes=False, visible=False) for k in range(1, 7)]
         self._gripper = page.scene.add_frame(f"{root}/gripper", show_axes=False, visible=False)
         self._add_arm()
+        self._box("gripper/palm", _PALM, (0.0, 0.0, self._palm_height() + _PALM[2] / 2), _GRIPPER)
         self._fingers = [self._add_finger(sensor) for sensor in range(2)]
         self._part = self._add_part()
         self._add_hole()
@@ -93,13 +94,14 @@ class RobotView:
             opacity=self._opacity, side="double",
         )  # fmt: skip
 
+    def _palm_height(self) -> float:
+        """Height of the lower face of the gripper's housing, which touches the flange, above the pad centres [m]."""
+        return float(np.linalg.norm(self._cell.tool.position)) - _PALM[2]
+
     def _add_finger(self, sensor: int) -> Any:
         thickness, breadth = _FINGER_SIZE
-        above = float(np.linalg.norm(self._cell.tool.position)) - _PALM[2]
-        if sensor == 0:  # the housing is between flange and fingers
-            self._box("gripper/palm", _PALM, (0.0, 0.0, above + _PALM[2] / 2), _GRIPPER)
         node = self._page.scene.add_frame(f"{self._root}/gripper/finger {sensor}", show_axes=False)
-        side, height = (-1, 1)[sensor], max(above, 0.02) + _BELOW_PAD
+        side, height = (-1, 1)[sensor], max(self._palm_height(), 0.02) + _BELOW_PAD
         outside = side * (thickness / 2 + _PAD_SIZE[0])
         self._box(
             f"gripper/finger {sensor}/body", (thickness, breadth, height), (outside, 0.0, height / 2 - _BELOW_PAD),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.geometry import Pose
 from gelflow.session.records import SENSORS
+from gelflow.session.time_index import refining_order
 from gelflow.view.session.recorded_session import RecordedSession
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ def read_curves(session: RecordedSession, curves: Curves, *, samples: int = SAMP
     markers = session.marker_reader()
     poses = session.index.spread(["/arm/pose", "/gripper/state"], curves.start, curves.end, samples)
     times = np.linspace(curves.start, curves.end, samples + 1)[1:]
-    order = sorted(range(samples), key=lambda k: f"{k:016b}"[::-1])  # each beginning is spread evenly
+    order = list(refining_order(samples))
     for number in range(samples):
         for record in next(poses, []):
             if isinstance(record.value, Pose):

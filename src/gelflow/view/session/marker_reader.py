@@ -70,13 +70,11 @@ class MarkerReader:
     def shear(self, sensor: int, time: float) -> float:
         """Mean shear of a pad along its finger since the reference [mm]; NaN where the markers are not readable."""
         pad = self.pad(sensor, time)
-        if pad is None or pad.tracked is None:
+        if pad is None or pad.tracked is None or sensor >= len(self._mounts):
             return float("nan")
-        if sensor < len(self._mounts):
-            frame = tactile_frame([pad.tracked], [self._mounts[sensor]], pad.stamp)
-            along = frame.shear[0, frame.valid[0], 0]
-            return float(along.mean()) if len(along) and frame.unit == "mm" else float("nan")
-        return float("nan")
+        frame = tactile_frame([pad.tracked], [self._mounts[sensor]], pad.stamp)
+        along = frame.shear[0, frame.valid[0], 0]
+        return float(along.mean()) if len(along) and frame.unit == "mm" else float("nan")
 
     def _track(self, sensor: int, pixels: NDArray[np.uint8], time: float) -> TrackingResult | None:
         topic = f"/{SENSORS[sensor]}/markers"
@@ -98,9 +96,8 @@ class MarkerReader:
         """The markers in the reference image at a time [s]."""
         key = sensor, time
         if key not in self._references:
-            image = self._index.latest(f"/{SENSORS[sensor]}/image", time) or self._index.first(
-                f"/{SENSORS[sensor]}/image", time
-            )
+            topic = f"/{SENSORS[sensor]}/image"
+            image = self._index.latest(topic, time) or self._index.first(topic, time)
             if image is None:
                 raise PeerError("no reference image")
             self._references[key] = self._tracker(sensor).track(decode_image(image.value.data))

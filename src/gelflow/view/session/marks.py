@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.session.reader import Record
 from gelflow.session.viewer_messages import ERRORS, WARNINGS, event_text
@@ -31,20 +32,30 @@ def phases(events: Sequence[Record]) -> list[tuple[float, str]]:
     return [(e.stamp, str(e.value["values"]["state"])) for e in events if e.value["name"] == "state"]
 
 
+def descents(run: Sequence[tuple[float, str]]) -> list[float]:
+    """Times at which the descent of an attempt starts [s]."""
+    return [time for time, phase in run if phase == _DESCEND]
+
+
+def correction_text(action: NDArray[np.float64], digits: int = 2) -> str:
+    """A correction (dx [m], dy [m], dyaw [rad]) in words, with `digits` of a millimetre and one less of a degree."""
+    dx, dy, yaw = action * (1e3, 1e3, 180 / np.pi)
+    return f"x {dx:+.{digits}f} mm, y {dy:+.{digits}f} mm, yaw {yaw:+.{digits - 1}f}°"
+
+
 def marks(events: Sequence[Record], attempts: Sequence[Record], decisions: Sequence[Record]) -> list[Mark]:
     """All marks of a session, in order of time."""
     found = [*_attempts(attempts, phases(events)), *_events(events)]
     for record in decisions:
         decision = record.value
-        dx, dy, yaw = decision.action * (1e3, 1e3, 180 / np.pi)
-        text = f"decision: x {dx:+.2f} mm, y {dy:+.2f} mm, yaw {yaw:+.1f}°"
+        text = f"decision: {correction_text(decision.action)}"
         found.append(Mark(record.time, record.time, "decision", text, decision.insertion, decision.attempt))
     return sorted(found, key=lambda mark: mark.time)
 
 
 def _attempts(attempts: Sequence[Record], run: Sequence[tuple[float, str]]) -> Iterable[Mark]:
     """An attempt lasts from the descent before its record to the record."""
-    starts = [time for time, phase in run if phase == _DESCEND]
+    starts = descents(run)
     for record in attempts:
         values = record.value
         start = max((time for time in starts if time <= record.time), default=record.time)

@@ -4,6 +4,7 @@ import math
 
 from gelflow.geometry import Pose
 from gelflow.session.decision_replay import Comparison
+from gelflow.view.session.marks import correction_text
 from gelflow.view.session.moment import Moment
 from gelflow.view.session.recorded_session import RecordedSession
 
@@ -55,18 +56,16 @@ def comparison_text(comparison: Comparison) -> str:
         return f"**replay: not recomputed, {comparison.skipped}**"
     if comparison.identical:
         return "replay: identical"
-    dx, dy, yaw = comparison.action * (1e3, 1e3, 180 / math.pi)
     flow = f"by {comparison.flow_difference:.2g} of its longest arrow" if comparison.flow_difference else "identical"
-    return f"**replay differs**: correction x {dx:+.3f} mm, y {dy:+.3f} mm, yaw {yaw:+.2f}°; flow map {flow}"
+    return f"**replay differs**: correction {correction_text(comparison.action, 3)}; flow map {flow}"
 
 
 def _decision_text(moment: Moment) -> str:
     decision = moment.decision
     assert decision is not None
-    dx, dy, yaw = decision.action * (1e3, 1e3, 180 / math.pi)
     return (
         f"last decision (insertion {decision.insertion}, attempt {decision.attempt}): "
-        f"correction x {dx:+.2f} mm, y {dy:+.2f} mm, yaw {yaw:+.1f}°"
+        f"correction {correction_text(decision.action)}"
     )
 
 

@@ -9,13 +9,13 @@ from typing import Any
 from gelflow.errors import GelflowError, PeerError
 from gelflow.geometry import Pose
 from gelflow.session.live_reader import LiveReader
-from gelflow.session.messages import Damage
+from gelflow.session.messages import Damage, has_topic
 from gelflow.session.reader import Record, SessionReader, is_being_recorded, open_recording
 from gelflow.session.records import SENSORS
 from gelflow.session.time_index import TimeIndex
 from gelflow.view.robot.cell_geometry import CellGeometry
 from gelflow.view.session.marker_reader import MarkerReader
-from gelflow.view.session.marks import Mark, marks, phases
+from gelflow.view.session.marks import Mark, descents, marks, phases
 from gelflow.view.session.moment import Moment
 
 _STORY = ("/event", "/attempt", "/decision")
@@ -85,6 +85,8 @@ class RecordedSession:
         self.index.extend(found)
         added = []
         for chunk in found:
+            if not has_topic(chunk, self._live.summary, _STORY):
+                continue
             messages = [entry for entry in self._live.chunk(chunk) if entry[0] in _STORY]
             added += [self._live.record(topic, message) for topic, message in messages]
         if added:
@@ -96,7 +98,7 @@ class RecordedSession:
         self._story += records
         of_topic = {topic: [record for record in self._story if record.topic == topic] for topic in _STORY}
         self._phases = phases(of_topic["/event"])
-        self._descents = [time for time, phase in self._phases if phase == "descend"]
+        self._descents = descents(self._phases)
         self.decisions = of_topic["/decision"]
         self.marks = marks(of_topic["/event"], of_topic["/attempt"], of_topic["/decision"])
 

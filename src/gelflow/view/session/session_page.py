@@ -1,6 +1,5 @@
 """The page of one recorded session, or of two side by side."""
 
-import queue
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from gelflow.errors import UsageError
 from gelflow.session.decision_replay import Comparison
 from gelflow.view.page import DEFAULT_HOST, DEFAULT_PORT, Page
+from gelflow.view.page_events import PageEvents
 from gelflow.view.session.moment import Moment
 from gelflow.view.session.recorded_session import RecordedSession
 from gelflow.view.session.session_panel import SessionPanel
@@ -51,7 +51,8 @@ class SessionPage:
     ) -> None:
         if not 1 <= len(sessions) <= 2:
             raise UsageError(f"a page shows one session or two, got {len(sessions)}")
-        self._events: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._events = PageEvents()
+        self._post = self._events.post
         self._own_page = page is None
         self._page = Page(host=host, port=port) if page is None else page
         self.url = self._page.url
@@ -218,10 +219,6 @@ class SessionPage:
         self._following = self._behind = True
         self._set_playing(False)
 
-    def _post(self, function: Callable[..., None], *values: Any) -> None:
-        """Let the thread of `run` call a function: the page has threads of its own."""
-        self._events.put(lambda: function(*values))
-
     def _dragged(self, event: Any) -> None:
         if event.client is not None:  # a person has moved it, not this program
             self._post(self._drag, float(event.target.value))
@@ -232,14 +229,7 @@ class SessionPage:
 
     def _handle_events(self) -> bool:
         """Handle what the page has sent; of several times only the last is shown."""
-        waiting: list[Callable[[], None]] = []
-        while True:
-            try:
-                waiting.append(self._events.get_nowait())
-            except queue.Empty:
-                break
-        for event in waiting:
-            event()
+        self._events.handle()
         return self._show_if_moved()
 
     def _toggle(self) -> None:

@@ -65,18 +65,14 @@ class SessionPanel:
             self._text = page.gui.add_markdown("")
             self._images = page.gui.add_image(np.full((10, 16, 3), 235, dtype=np.uint8), format="jpeg", jpeg_quality=85)
             self._time_image = page.gui.add_image(np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8), format="png")
-            if decision_panel is None:
-                self._decision_image = _hidden_image(page)
-        if decision_panel is not None:
-            with decision_panel:
-                self._decision_image = _hidden_image(page)
         with decision_panel or panel_tab:
+            blank = np.full((10, 16, 3), 255, dtype=np.uint8)
+            self._decision_image = page.gui.add_image(blank, format="png", visible=False)
             self._checks_folder = page.gui.add_folder("Checks", visible=False)
             with self._checks_folder:
                 self._checks = page.gui.add_markdown("")
         self._pictures: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._shown_decision: Decision | None = None
-        self._curves = Curves(session.start, session.end)
         self._time_line: TimeLine | None = None
         self._drawn: TimeLine | None = None
         self._time = session.start
@@ -90,12 +86,10 @@ class SessionPanel:
 
     def show_range(self, start: float, end: float) -> None:
         """Read and draw the curves from `start` to `end` [s] in the background."""
-        self._stop_reading()
-        self._curves = Curves(max(start, self.session.start), min(end, self.session.end))
+        self.close()
+        curves = Curves(max(start, self.session.start), min(end, self.session.end))
         self._reading = threading.Event()
-        self._reader = threading.Thread(
-            target=self._read, args=(self._curves, self._reading), name="curves", daemon=True
-        )
+        self._reader = threading.Thread(target=self._read, args=(curves, self._reading), name="curves", daemon=True)
         self._reader.start()
 
     def show(self, time: float) -> Moment:
@@ -131,21 +125,17 @@ class SessionPanel:
 
     def close(self) -> None:
         """End the reading in the background."""
-        self._stop_reading()
-
-    def remove(self) -> None:
-        """Remove everything from the page."""
-        self._stop_reading()
-        self._panel.remove()
-        self._decision_image.remove()
-        if self._robot is not None:
-            self._robot.remove()
-
-    def _stop_reading(self) -> None:
         self._reading.set()
         if self._reader is not None:
             self._reader.join()
             self._reader = None
+
+    def remove(self) -> None:
+        """Remove the panel and the robot from the page."""
+        self.close()
+        self._panel.remove()
+        if self._robot is not None:
+            self._robot.remove()
 
     def _show(self, moment: Moment) -> None:
         self._images.image = pads_picture(moment.pads, markers=self.markers)
@@ -199,7 +189,3 @@ class SessionPanel:
                     text = f"insertion {key[0]}, attempt {key[1]} could not be replayed"
                 found.append(Mark(record.time, record.time, "difference", text, *key))
         return found
-
-
-def _hidden_image(page: Page) -> Any:
-    return page.gui.add_image(np.full((10, 16, 3), 255, dtype=np.uint8), format="png", visible=False)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_checkpoint, add_json, add_page_address, add_preset
-from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.session.decision_replay import Comparison
+from gelflow.session.reader import SessionReader
 
 _SCENE_ONLY = {"num_envs": 1, "env": 0, "preset": None}  # options and their defaults
 
@@ -84,29 +85,17 @@ def _view_sessions(args: argparse.Namespace, paths: Sequence[str]) -> int:
 
     with contextlib.ExitStack() as stack:
         sessions = [stack.enter_context(RecordedSession(path)) for path in paths]
-        comparisons = _replayed(Path(paths[0]), args.checkpoint) if args.replay else None
+        comparisons = _replayed(sessions[0].reader, args.checkpoint) if args.replay else None
         page = stack.enter_context(SessionPage(sessions, comparisons=comparisons, host=args.host, port=args.port))
         return _serve(args, page.url, page.run)
 
 
-def _replayed(path: Path, checkpoint: Path | None) -> list[Comparison]:
+def _replayed(session: SessionReader, checkpoint: Path | None) -> list[Comparison]:
     """The decisions of a session, recomputed."""
-    from gelflow.cli.session_replay import recorded_checkpoint, recorded_perception
-    from gelflow.policies.checkpoint import load_policy
-    from gelflow.session.decision_replay import replay
+    from gelflow.cli.session_replay import recorded_pipeline, replay_with_progress
     from gelflow.session.messages import Damage
-    from gelflow.session.reader import SessionReader
 
-    with SessionReader(path) as session, progress_bar(count=True) as progress:
-        description = session.description()
-        task, perception = recorded_perception(description)
-        policy = load_policy(checkpoint or recorded_checkpoint(description), task=task)
-        bar = progress.add_task("replaying", total=session.counts().get("/decision", 0))
-        found = []
-        for comparison in replay(session, perception=perception, policy=policy, task=task, damage=Damage()):
-            found.append(comparison)
-            progress.advance(bar)
-    return found
+    return replay_with_progress(session, *recorded_pipeline(session.description(), checkpoint), damage=Damage())
 
 
 def _serve(args: argparse.Namespace, url: str, serve: Callable[[], None]) -> int:
