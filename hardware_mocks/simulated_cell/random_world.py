@@ -18,6 +18,7 @@ _RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "cameras": {"noise": (0.5, 3.0), "blur_px": (0.8, 2.0), "light": (90.0, 150.0), "rate": (20.0, 40.0)},
     "arm": {"lag": (0.004, 0.025), "stiffness": (3e4, 3e5)},
     "part": {"mass": (0.04, 0.15)},
+    "sensor": {"creep": (0.0, 0.3), "crosstalk": (0.0, 0.2), "gain_spread": (0.0, 0.08), "drift_mm": (0.0, 0.05)},
     "lens": {"tilt": (-8.0, 8.0), "barrel": (-0.02, 0.06)},
 }
 
