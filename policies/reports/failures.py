@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,11 @@ class FailureRange:
         """As JSON data."""
         low, high = self.confidence_interval()
         return dataclasses.asdict(self) | {"rate": self.rate, "rate_low": low, "rate_high": high}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "FailureRange":
+        """From the data of `to_json`. Raises KeyError when one is missing."""
+        return cls(**{item.name: values[item.name] for item in dataclasses.fields(cls)})
 
 
 def failure_ranges(episodes: Episodes) -> list[FailureRange]:

@@ -1,11 +1,9 @@
 """A training that is watched while it runs: its curves, and episodes of its newest policy."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.figures import rasterize
@@ -13,23 +11,13 @@ from gelflow.policies.checkpoint import Checkpoint, load_checkpoint, load_networ
 from gelflow.policies.episodes import Film, record_films, run_episodes
 from gelflow.policies.recipes import DEFAULT, recipe_for
 from gelflow.policies.reports.failures import failure_figure, failure_ranges, worst_ranges
+from gelflow.policies.reports.shown_episodes import Image, ShownEpisodes
 from gelflow.policies.training.progress_curve import figure_of
 from gelflow.policies.training.run import CONFIGURATION, PROGRESS, STATE
 from gelflow.sim.tasks.task_batch import TaskBatch
 
-Image = NDArray[np.uint8]
 _ENVS = 32  # parallel environments
 _MAX_FRAMES = 150  # of a film
-
-
-@dataclass(frozen=True)
-class WatchedEpisodes:
-    """Episodes of one policy."""
-
-    text: str  # results in words, Markdown
-    failures: Image | None  # where failures lie; None without randomized quantities
-    films: dict[str, list[Image]] = field(default_factory=dict)  # "success" and "failure", as far as there are any
-    frames_per_second: float = 1.0
 
 
 class WatchedTraining:
@@ -46,7 +34,7 @@ class WatchedTraining:
 
     def __init__(self, folder: Path, *, episodes: int = 128, seed: int = 1) -> None:
         if not (folder / CONFIGURATION).is_file():
-            raise UsageError(f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train")
+            raise UsageError(f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train --out")
         self.folder, self._episodes, self._seed = folder, episodes, seed
         self._drawn = 0  # time of change of the curve that was drawn [ns]
         self._evaluated = ""  # digest of the policy
@@ -69,7 +57,7 @@ class WatchedTraining:
         self._drawn = changed
         return picture
 
-    def evaluate(self, progress: Callable[[str], None] = lambda text: None) -> WatchedEpisodes | None:
+    def evaluate(self, progress: Callable[[str], None] = lambda text: None) -> ShownEpisodes | None:
         """Episodes of the newest policy; None without a policy, and if it is that of the last call.
 
         Raises UsageError when the policy cannot act in the task, for example because its part file is missing.
@@ -106,7 +94,7 @@ class WatchedTraining:
         ]
         picture = rasterize(failure_figure(ranges)) if ranges else None
         shown = {name: film.frames for name, film in films.items()}
-        return WatchedEpisodes("  \n".join(lines), picture, shown, batch.frames_per_second)
+        return ShownEpisodes("  \n".join(lines), picture, shown, batch.frames_per_second)
 
     def _policy(self) -> Path | None:
         found = [path for path in self.folder.glob("*.safetensors") if path.name != STATE]

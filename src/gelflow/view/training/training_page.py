@@ -1,4 +1,4 @@
-"""The page of a training: curves as they come, films of the newest policy, and where its failures lie."""
+"""The page of a training or of an evaluation: curves as they come, films of the policy, where its failures lie."""
 
 import threading
 import time
@@ -36,7 +36,7 @@ class Episodes(Protocol):
 
 
 class Training(Protocol):
-    """A training that is watched; None stands for nothing new."""
+    """A training that is watched, or an evaluation; None stands for nothing new."""
 
     @property
     def name(self) -> str: ...
@@ -47,11 +47,11 @@ class Training(Protocol):
 
 
 class TrainingPage:
-    """A page that follows a training.
+    """A page that follows a training, or shows an evaluation.
 
     Parameters
     ----------
-    training: the training
+    training: the training or evaluation
     host: address to bind to; any other than a loopback address needs the random token in `url`
     port: TCP port; 0 takes a free one
 
@@ -68,13 +68,13 @@ class TrainingPage:
         panel.set_width(_PANEL_WIDTH)
         blank = np.full((10, 16, 3), 255, dtype=np.uint8)
         with panel.add_tab(training.name):
-            self._state = gui.add_markdown("waiting for the first update of the training")
+            self._state = gui.add_markdown("reading the folder")
             self._result = gui.add_markdown("")
             self._curve = gui.add_image(blank, format="png", visible=False)
             self._failures = gui.add_image(blank, format="png", visible=False)
         self._choice = gui.add_dropdown("film", ("none yet",), initial_value="none yet")
         self._choice.on_update(lambda _: self._restart())
-        self._caption = gui.add_markdown("Films show episodes of the newest policy.")
+        self._caption = gui.add_markdown("Films show episodes of the policy.")
         self._episodes: Episodes | None = None
         self._frame, self._due = 0, 0.0
         self._ending = threading.Event()

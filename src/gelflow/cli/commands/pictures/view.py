@@ -1,4 +1,4 @@
-"""`gelflow view`: a page in the browser with a scene that can be moved, recorded sessions, or a training."""
+"""`gelflow view`: a page in the browser with a scene that can be moved, recorded sessions, a training, or an evaluation."""
 
 import argparse
 import contextlib
@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "shown", metavar="SCENE|SESSION|RUN", nargs="+",
         help="name of a shipped scene, or a TOML, MJCF or URDF file; one or two recorded sessions (.mcap); or the "
-        "folder of a training",
+        "folder of a training or of gelflow eval --out",
     )  # fmt: skip
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="environments (default %(default)s)")
     parser.add_argument(
@@ -55,15 +55,17 @@ def run(args: argparse.Namespace) -> int:
     import_viser()
     if sessions:
         return _view_sessions(args, sessions)
-    return _view_training(args) if Path(args.shown[0]).is_dir() else _view_scene(args)
+    return _view_run(args) if Path(args.shown[0]).is_dir() else _view_scene(args)
 
 
-def _view_training(args: argparse.Namespace) -> int:
+def _view_run(args: argparse.Namespace) -> int:
+    from gelflow.policies.reports.saved_evaluation import SavedEvaluation, is_evaluation
     from gelflow.policies.reports.watched_training import WatchedTraining
     from gelflow.view.training.training_page import TrainingPage
 
-    training = WatchedTraining(Path(args.shown[0]))
-    with TrainingPage(training, host=args.host, port=args.port) as page:
+    folder = Path(args.shown[0])
+    shown = SavedEvaluation(folder) if is_evaluation(folder) else WatchedTraining(folder)
+    with TrainingPage(shown, host=args.host, port=args.port) as page:
         return _serve(args, page.url, page.run)
 
 

@@ -1,0 +1,75 @@
+"""The folder of an evaluation, read again and shown on a page."""
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.view.browser import browser, needs_browser
+
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.policies.reports.saved_evaluation import SavedEvaluation, is_evaluation
+from gelflow.view.training.training_page import TrainingPage
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("evaluation") / "some report"
+    assert main(["eval", "insertion", "--episodes", "8", "--envs", "4", "--out", str(made)]) == 0
+    return made
+
+
+def test_results_failures_and_films_are_those_of_the_files(folder: Path) -> None:
+    evaluation = SavedEvaluation(folder)
+    assert evaluation.name == "some report" and evaluation.curve() is None
+    shown = evaluation.evaluate()
+    assert shown is not None and evaluation.evaluate() is None
+    rows = json.loads((folder / "results.json").read_text())["results"]
+    assert "| corrections |" in shown.text
+    for row in rows:
+        assert f"| {row['name']} of 8 episodes | {row['success']:.1%} |" in shown.text
+    assert shown.failures is not None and shown.failures.ndim == 3
+    assert set(shown.films) == {path.stem for path in folder.glob("*.gif")}
+    for film in shown.films.values():
+        assert len(film) >= 2 and film[0].dtype == np.uint8 and film[0].shape == film[-1].shape
+    assert 0.1 < shown.frames_per_second <= 25
+
+
+def test_an_evaluation_that_is_written_again_is_read_again(folder: Path) -> None:
+    evaluation = SavedEvaluation(folder)
+    assert evaluation.evaluate() is not None
+    results = folder / "results.json"
+    results.write_text(results.read_text().replace('"policy"', '"another policy"'))
+    shown = evaluation.evaluate()
+    assert shown is not None and "another policy of 8" in shown.text
+
+
+@pytest.mark.parametrize("results", ["{", "{}", '{"results": [], "failures": []}', '{"results": [{"name": "x"}]}'])
+def test_damaged_results_are_refused(tmp_path: Path, results: str) -> None:
+    with pytest.raises(UsageError, match="not the folder of an evaluation"):
+        SavedEvaluation(tmp_path)
+    (tmp_path / "results.json").write_text(results)
+    (tmp_path / "episodes.csv").write_text("")
+    assert is_evaluation(tmp_path)
+    with pytest.raises(UsageError, match=r"cannot be read: .*; run gelflow eval again"):
+        SavedEvaluation(tmp_path).evaluate()
+
+
+@needs_browser
+def test_page_shows_the_evaluation(folder: Path) -> None:
+    ended = threading.Event()
+    with TrainingPage(SavedEvaluation(folder), port=0) as page, browser() as window:
+        loop = threading.Thread(target=lambda: page.run(until=ended.is_set))
+        loop.start()
+        try:
+            window.open(page.url)
+            window.wait(lambda: "some report" in window.text() and "oracle of 8 episodes" in window.text())
+            window.wait(lambda: "success: picture" in window.text())
+            assert window.errors() == []
+            assert window.foreign_requests() == []
+            assert len(np.unique(window.picture().reshape(-1, 3), axis=0)) > 500  # not blank
+        finally:
+            ended.set()
+            loop.join()
