@@ -34,7 +34,9 @@ class WatchedTraining:
 
     def __init__(self, folder: Path, *, episodes: int = 128, seed: int = 1) -> None:
         if not (folder / CONFIGURATION).is_file():
-            raise UsageError(f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train --out")
+            raise UsageError(
+                f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train --out"
+            )
         self.folder, self._episodes, self._seed = folder, episodes, seed
         self._drawn = 0  # time of change of the curve that was drawn [ns]
         self._evaluated = ""  # digest of the policy

@@ -1,4 +1,4 @@
-"""`gelflow view`: a page in the browser with a scene that can be moved, recorded sessions, a training, or an evaluation."""
+"""`gelflow view`: a page in the browser with a scene that can be moved, sessions, a training, or an evaluation."""
 
 import argparse
 import contextlib
