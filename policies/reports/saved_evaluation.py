@@ -34,9 +34,9 @@ class SavedEvaluation:
         """The folder's name."""
         return self.folder.resolve().name
 
-    def curve(self) -> None:
-        """Nothing: an evaluation has no learning curve."""
-        return
+    def curve(self) -> Image | None:
+        """None: an evaluation has no learning curve."""
+        return None
 
     def evaluate(self, progress: Callable[[str], None] = lambda text: None) -> ShownEpisodes | None:
         """The results, failures and films in the folder; None if nothing has changed since the last call.

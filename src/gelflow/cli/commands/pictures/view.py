@@ -1,4 +1,4 @@
-"""`gelflow view`: a page in the browser with a scene that can be moved, sessions, a training, or an evaluation."""
+"""`gelflow view`: a page in the browser with a scene that can be moved, with sessions, or with the result of a run."""
 
 import argparse
 import contextlib
