@@ -66,6 +66,7 @@ PICTURES: dict[str, tuple[str, Callable[[dict[str, Any], Path], None]]] = {
     "reproduce_grasp": ("reproduce_grasp", draw_reproduction),
     "reproduce_cap": ("reproduce_cap", draw_reproduction),
     "reproduce_pushing": ("reproduce_pushing", draw_reproduction),
+    "reproduce_insertion": ("reproduce_insertion", draw_reproduction),
     **{f"tradeoff_{scene}": (f"tradeoff_{scene}", draw_tradeoff) for scene in scene_names()},
 }
 
