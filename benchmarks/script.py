@@ -78,9 +78,7 @@ def finish(args: argparse.Namespace, record: dict[str, Any], *tables: Renderable
 
 def write(file: Path, record: dict[str, Any], as_json: bool, *tables: RenderableType) -> None:
     """Write the record to a file; print the tables, or the record if `as_json`."""
-    text = json.dumps(record, indent=1, allow_nan=False) + "\n"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text, encoding="utf-8")
+    text = save(file, record)
     if as_json:
         print(text, end="")
         return
@@ -88,3 +86,11 @@ def write(file: Path, record: dict[str, Any], as_json: bool, *tables: Renderable
     for table in tables:
         console.print(table)
     console.print(str(file), soft_wrap=True, markup=False)
+
+
+def save(file: Path, record: dict[str, Any]) -> str:
+    """Write the record to a file; returns the text."""
+    text = json.dumps(record, indent=1, allow_nan=False) + "\n"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+    return text

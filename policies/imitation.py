@@ -10,7 +10,7 @@ loss is bounded: the network learns to correct the most probable one (a mode), a
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import Checkpoint, task_differences
 from gelflow.policies.insertion_expert import expert_correction, part_tolerance
 from gelflow.policies.networks.flow_map_policy import insertion_task
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
@@ -44,7 +45,7 @@ class ImitationSettings:
     gradient_norm: float = 1.0  # largest norm of the gradient
     # Error of a correction that counts as 1 [m, m, rad]; None: `part_tolerance`.
     tolerance: tuple[float, float, float] | None = None
-    bounded: float = 0.9  # share of the bounded loss, reached after `bounded_after` of the training
+    bounded: float = 0.9  # share of the bounded loss, reached after the part `bounded_after` of the training
     bounded_after: float = 0.3
     # Largest standard deviation of the exploration, in units of the reach: at the start and at the end.
     exploration: tuple[float, float] = (0.4, 0.03)
@@ -90,16 +91,30 @@ class Imitation(Learner):
         self._optimizer = torch.optim.Adam(self._layers.parameters(), settings.learning_rate)
         self._tolerance = np.asarray(settings.tolerance or part_tolerance(self._description)) / architecture.reach
         self._basis = polynomial_basis(self._description.grid, architecture.degree)
-        self._scale: Array = np.ones(architecture.features(self._description))  # from the first update
+        self._scale: Array | None = None  # of the features; from the first update
         self._memory: deque[Attempts] = deque(maxlen=settings.memory)
         self._iterations = 0
+
+    def start_from(self, checkpoint: Checkpoint) -> None:
+        """Takes the weights of a policy, which may be that of another part.
+
+        Raises UsageError when its observations, actions or layers are others.
+        """
+        mine = self._description.to_json()
+        different = task_differences(_without_part(checkpoint.task), _without_part(mine))
+        if different or checkpoint.architecture != self._architecture:
+            layers = f"{checkpoint.architecture.to_json()} (here {self._architecture.to_json()})"
+            raise UsageError(f"training cannot start from a policy with other {different or layers}")
+        tensors = checkpoint.tensors
+        self._layers.load_state_dict({name: torch.tensor(tensors[name]) for name in self._layers.state_dict()})
+        self._scale = tensors["scale"].astype(float)
 
     def update(self) -> dict[str, float]:
         """One iteration: attempts of the present network with exploration, then updates of the network."""
         progress = min(1.0, self.steps / self._total)
         sigma = float(np.interp(progress, [0, 1], self._settings.exploration))
         with self.clock.share("simulation"):
-            if self._iterations == 0:
+            if self._scale is None:
                 self._scale = feature_scale(self.task, self._basis, self._seed)
             seed = int(np.random.SeedSequence([self._seed, self._iterations]).generate_state(1)[0])
             attempts, success, reward = collect(
@@ -117,7 +132,7 @@ class Imitation(Learner):
         settings = self._settings
         for group in self._optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - progress)
-        bounded = settings.bounded * min(1.0, progress / settings.bounded_after)
+        bounded = settings.bounded * min(1.0, progress / max(settings.bounded_after, 1e-9))
         scale = torch.as_tensor(self._tolerance, dtype=torch.float32)
         for _ in range(settings.updates):
             inputs, targets, starts = _draw_batch(self._memory, settings.batch, rng)
@@ -137,6 +152,7 @@ class Imitation(Learner):
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Tensors of the present network."""
+        assert self._scale is not None, "the first update sets the scale"
         tensors = {"basis": self._basis, "scale": self._scale, **self._layers.tensors()}
         return {name: values.astype(np.float32) for name, values in tensors.items()}
 
@@ -145,6 +161,7 @@ class Imitation(Learner):
         state = RunState(values={"iterations": self._iterations, "steps": self.steps, "memory": len(self._memory)})
         state.add("layers", self._layers.state_dict())
         state.add("optimizer", optimizer_tensors(self._optimizer))
+        assert self._scale is not None, "the first update sets the scale"
         state.add("fixed", {"scale": torch.from_numpy(self._scale)})
         for i, attempts in enumerate(self._memory):
             state.add(f"memory/{i}", {name: torch.from_numpy(values) for name, values in vars(attempts).items()})
@@ -160,6 +177,11 @@ class Imitation(Learner):
             arrays = {name: tensor.numpy() for name, tensor in state.part(f"memory/{i}").items()}
             self._memory.append(Attempts(**arrays))
         self._iterations, self.steps = state.values["iterations"], state.values["steps"]
+
+
+def _without_part(task: Mapping[str, Any]) -> dict[str, Any]:
+    """A description of the task, without part and misalignment."""
+    return {name: value for name, value in task.items() if name not in ("part", "misalignment", "workspace")}
 
 
 def architecture_for(task: InsertionTask) -> PolynomialGRU:

@@ -8,6 +8,7 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.backpropagation import Backpropagation, BackpropagationSettings
+from gelflow.policies.checkpoint import load_checkpoint
 from gelflow.policies.imitation import Imitation, ImitationSettings, architecture_for
 from gelflow.policies.insertion_ppo import InsertionPPO
 from gelflow.policies.networks.actor import ActorArchitecture
@@ -25,7 +26,7 @@ from gelflow.sim.tasks.pushing import Pushing, PushingTask
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.task_batch import TaskBatch
 
-DEFAULT, PAPER = "default", "paper"
+DEFAULT, PAPER, FINE_TUNING = "default", "paper", "fine-tuning"
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,12 @@ _RECIPES: dict[str, dict[str, Recipe]] = {
     },
     "insertion": {
         DEFAULT: _INSERTION,
+        FINE_TUNING: dataclasses.replace(
+            _INSERTION,
+            steps=50_000,
+            evaluate_every=16_384,
+            settings=ImitationSettings(memory=8, learning_rate=1e-3, bounded_after=0.0, exploration=(0.1, 0.03)),
+        ),
         "ppo": dataclasses.replace(
             _INSERTION,
             steps=200_000,
@@ -215,6 +222,7 @@ def training_run(
     envs: int | None = None,
     minutes: float = float("inf"),
     options: Mapping[str, Any] | None = None,
+    start: Path | None = None,
     command: Sequence[str] = (),
     report: Callable[[Progress], None] | None = None,
 ) -> TrainingRun:
@@ -226,10 +234,11 @@ def training_run(
     steps, envs: environment steps in total and parallel environments; None: those of the recipe
     minutes: time limit; a run that reaches it is not reproducible
     options: of the task's batch, such as `preset` and `friction`; JSON data, except `task`, the description
+    start: checkpoint of the policy that a recipe of fine-tuning starts from; others start from random weights
     command: that repeats the run, stored in the folder
     report: called after each update
 
-    Raises UsageError for an unknown task, recipe or option.
+    Raises UsageError for an unknown task, recipe or option, and for a checkpoint that the recipe cannot start from.
     """
     chosen, given = recipe_for(task, recipe), dict(options or {})
     total = chosen.steps if steps is None else steps
@@ -243,7 +252,15 @@ def training_run(
     )
     batch = chosen.make_task(envs, **given)
     learner = chosen.make_learner(batch, seed=seed, steps=total)
+    if (recipe == FINE_TUNING) != (start is not None):
+        needs = "needs" if start is None else "has no"
+        raise UsageError(f"the recipe {recipe} of {task} {needs} policy to start from")
+    origin = {}
+    if start is not None:
+        checkpoint = load_checkpoint(start)
+        learner.start_from(checkpoint)
+        origin["start"] = checkpoint.digest
     stored = {name: value for name, value in given.items() if name != "task"}  # the run stores the description
-    configuration = {"recipe": recipe, "options": stored, **chosen.configuration()}
+    configuration = {"recipe": recipe, "options": stored, **origin, **chosen.configuration()}
     validation = chosen.make_task(envs, **given)
     return TrainingRun(learner, validation, folder, settings, configuration, command, report, chosen.policy_name)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
-from gelflow.policies.calibration.model.parameters import Parameter
+from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
@@ -130,17 +130,21 @@ def calibrate(
 
 
 def _estimates(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[Estimate, ...]:
-    low, high = result.interval
+    """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is."""
+    ratio, of_ratio = gain_ratio(fitted)
+    directions = np.vstack([np.eye(len(fitted)), of_ratio])
+    low, high = result.interval(directions)
+    best = directions @ result.best.point[: result.count]
     return tuple(
         Estimate(
             p,
-            float(p.value(result.best.point[i])),
+            float(p.value(best[i])),
             float(p.value(low[i])),
             float(p.value(high[i])),
             float((high[i] - low[i]) / (2 * 1.96)),
             result.best.chi <= REPRODUCED,
         )
-        for i, p in enumerate(fitted)
+        for i, p in enumerate((*fitted, ratio))
     )
 
 

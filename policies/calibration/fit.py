@@ -61,16 +61,22 @@ class FitResult:
     @property
     def covariance(self) -> Array:
         """Covariance of the whitened parameters within a start, the mean of the starts."""
-        return np.asarray(np.mean([start.covariance[: self.count, : self.count] for start in self.starts], axis=0))
+        return np.asarray(np.mean(self._covariances, axis=0))
 
-    @property
-    def interval(self) -> tuple[Array, Array]:
-        """95 % intervals of the whitened parameters: from the lowest to the highest limit of all starts."""
-        spread = [1.96 * np.sqrt(np.diag(start.covariance)[: self.count]) for start in self.starts]
-        points = [start.point[: self.count] for start in self.starts]
+    def interval(self, directions: Array) -> tuple[Array, Array]:
+        """95 % intervals of linear combinations (k, count) of the whitened parameters.
+
+        They reach from the lowest to the highest limit of all starts.
+        """
+        points = [directions @ start.point[: self.count] for start in self.starts]
+        spread = [1.96 * np.sqrt(np.einsum("ki,ij,kj->k", directions, c, directions)) for c in self._covariances]
         low = np.min([p - s for p, s in zip(points, spread, strict=True)], axis=0)
         high = np.max([p + s for p, s in zip(points, spread, strict=True)], axis=0)
         return low, high
+
+    @property
+    def _covariances(self) -> list[Array]:
+        return [start.covariance[: self.count, : self.count] for start in self.starts]
 
 
 def fit(

@@ -12,8 +12,8 @@ import numpy as np
 from gelflow.observation import Grid
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
-from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.session.records import to_plain
+from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
 
 FORMAT = 1
 
@@ -29,11 +29,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": 0 if held_out is None else len(held_out.recorded),
         },
         "parameters": {e.parameter.name: _plain_estimate(e) for e in result.estimates},
-        "randomization": {
-            e.parameter.name: [e.low, e.high]
-            for e in result.estimates
-            if e.verdict != "unknown" and e.parameter.name in QUANTITIES
-        },
+        "randomization": randomization_ranges(result),
         "correlated": [{"parameters": [a, b], "correlation": r} for a, b, r in result.correlated],
         "flow_maps": {
             "unit": result.unit,
@@ -52,6 +48,18 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
     }
     plain: dict[str, Any] = to_plain(values)
     return plain
+
+
+def randomization_ranges(result: Calibration) -> dict[str, list[float]]:
+    """Quantity of the randomization → its 95 % interval, of those that the recordings determine at least partly."""
+    return {e.parameter.name: _range(e) for e in result.estimates
+            if e.verdict != "unknown" and e.parameter.name in DEFAULT_RANDOMIZATION}  # fmt: skip
+
+
+def _range(estimate: Estimate) -> list[float]:
+    """The interval; of a crosstalk from 0."""
+    least = 0.0 if estimate.parameter.name == "crosstalk" else -np.inf
+    return [max(estimate.low, least), max(estimate.high, least)]
 
 
 def _plain_estimate(estimate: Estimate) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import Checkpoint
 from gelflow.policies.networks.base import Architecture
 from gelflow.policies.training.state import RunState
 from gelflow.sim.tasks.task_batch import TaskBatch
@@ -59,6 +61,10 @@ class Learner(ABC):
     @abstractmethod
     def load(self, state: RunState) -> None:
         """Restores `state`."""
+
+    def start_from(self, checkpoint: Checkpoint) -> None:
+        """Takes the weights of a policy, before the first update. Raises UsageError where it cannot."""
+        raise UsageError(f"{type(self).__name__} cannot start from the weights of a policy")
 
     @abstractmethod
     def restart_episodes(self) -> None:

@@ -24,7 +24,7 @@ from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part
 from gelflow.sim.tasks.parts.registry import part_geometry
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, PAIR_QUANTITIES, SENSOR_QUANTITIES, SensorModel
 from gelflow.sim.trajectory import TouchStop, Trajectory
 from gelflow.task import INSERTION, InsertionTask
 
@@ -65,6 +65,7 @@ DEFAULT_RANDOMIZATION = Randomization(
         **NO_SENSOR_EFFECTS,
         # From the published 1e-5 N to the noise of image tracking.
         "noise": SENSOR_QUANTITIES["noise"],
+        **PAIR_QUANTITIES,
         "start_height": Quantity(Fixed(0.2e-3), "m", "half-range of the lower face's start height, per attempt"),
     }
 )

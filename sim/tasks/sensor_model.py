@@ -27,6 +27,12 @@ SENSOR_QUANTITIES: Mapping[str, Quantity] = {
     "pad_turn": Quantity(Uniform(0.0, 0.05), "rad", "standard deviation of a camera's rotation relative to its pad"),
     "pad_drift": Quantity(Uniform(0.0, 1e-3), "N", "standard deviation of a common shift of a pad, per reading"),
 }
+# Known differences between the two pads of a gripper, as a calibration finds them.
+PAIR_QUANTITIES: Mapping[str, Quantity] = {
+    "gain_ratio": Quantity(Fixed(1.0), "", "gain of the right pad relative to that of the left one"),
+    "turn_left": Quantity(Fixed(0.0), "rad", "rotation of the left camera relative to its pad"),
+    "turn_right": Quantity(Fixed(0.0), "rad", "rotation of the right camera relative to its pad"),
+}
 NO_SENSOR_EFFECTS: Mapping[str, Quantity] = {
     name: Quantity(Fixed(0.1 if name == "gel_time" else 0.0), row.unit, row.meaning)
     for name, row in SENSOR_QUANTITIES.items()
@@ -71,10 +77,14 @@ class SensorModel:
     @property
     def ideal(self) -> bool:
         """True while no environment has an effect: readings are the marker forces."""
-        return not any(level.any() for name, level in self._level.items() if name != "gel_time")
+        effects = any(level.any() for name, level in self._level.items() if name != "gel_time")
+        return not effects and bool((self.gain == 1).all()) and not self.turn.any()
 
     def draw(self, which: NDArray[np.bool_], sampled: Mapping[str, Array], rng: np.random.Generator) -> None:
-        """New pads in the environments `which`; `sampled` has the levels of all effects, (n,) each."""
+        """New pads in the environments `which`.
+
+        `sampled` has the levels of all effects, (n,) each, and may have `PAIR_QUANTITIES` of two pads.
+        """
         for name, level in self._level.items():
             level[which] = sampled[name]
         count, pads, total = int(which.sum()), self.gain.shape[1], len(self._pad_of)
@@ -89,6 +99,10 @@ class SensorModel:
 
         self.gain[which] = np.exp(spread("pad_gain", pads))
         self.turn[which] = spread("pad_turn", pads)
+        if "gain_ratio" in sampled:
+            root = np.sqrt(sampled["gain_ratio"])[:, None]
+            self.gain[which] *= np.hstack([1 / root, root])
+            self.turn[which] += np.column_stack([sampled["turn_left"], sampled["turn_right"]])
         self._found[which] = ~chosen("dead_markers")
         self._noise_factor[which] = np.where(chosen("noisy_markers"), _NOISY, 1.0)
         self.clear(which)

@@ -1,6 +1,8 @@
 """Random worlds with known truth, and insertions recorded in them by the simulation without wires."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +12,9 @@ from gelflow.observation import FlowMap
 from gelflow.policies.calibration.model.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.policies.checkpoint import default_checkpoint, load_policy
-from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, InsertionAttempts
+from gelflow.policies.checkpoint import default_checkpoint, load_network
+from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
+from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Randomization, Uniform
 from gelflow.task import INSERTION, InsertionTask
 
@@ -46,27 +49,44 @@ class RecordedWorld:
     noise: float  # standard deviation of the difference of two readings [N]
 
 
-def record_world(
-    seed: int, *, task: InsertionTask = INSERTION, insertions: int = 5, attempts: int = 2, threads: int | None = None
-) -> RecordedWorld:
-    """Insertions with the shipped policy in the world of a seed; the first `attempts` of each are recorded.
+def record_world(seed: int) -> RecordedWorld:
+    """Insertions with the shipped policy in the world of a seed, which differs from training in all quantities.
 
     Raises UsageError when the world cannot hold its part, or no attempt has contact.
     """
     rng = np.random.default_rng((seed, 0xCA1))
     drawn = widened(FULL_RANDOMIZATION).sample(rng, 1, friction="elastic")
-    fixed = {name: float(value[0]) for name, value in drawn.items()}
-    world = InsertionAttempts(
-        insertions,
-        task=task,
-        randomization=FULL_RANDOMIZATION.replace(**fixed),
-        threads=threads,
-    )
+    return record_insertions({name: float(value[0]) for name, value in drawn.items()}, rng)
+
+
+def record_insertions(
+    fixed: Mapping[str, float],
+    rng: np.random.Generator,
+    *,
+    task: InsertionTask = INSERTION,
+    insertions: int = 5,
+    attempts: int = 2,
+    **scene: Any,
+) -> RecordedWorld:
+    """Insertions with the shipped policy in a world; the first `attempts` of each are recorded.
+
+    Parameters
+    ----------
+    fixed: value of every quantity of the randomization
+    task: part and hole, and the observations of the policy
+    scene: options of `insertion_scene`, such as the friction law
+
+    Raises UsageError as `record_world`.
+    """
+    table = FULL_RANDOMIZATION.replace(**fixed)
+    world = InsertionAttempts(insertions, task=task, scene=insertion_scene(task, **scene), randomization=table)
     misalignment = task.draw_misalignment(rng, insertions)
     world.draw(rng, misalignment=misalignment)
     all_rows = np.arange(insertions)
     world.sensors.copy(all_rows, world.sensors, np.zeros_like(all_rows))  # the same pads in all insertions
-    policies = [load_policy(default_checkpoint(), task=task) for _ in range(insertions)]
+    shipped = load_network(default_checkpoint(), task=INSERTION)
+    assert isinstance(shipped, FlowMapNetwork)
+    policies = [NetworkPolicy(shipped) for _ in range(insertions)]
     planar, active = np.zeros((insertions, 3)), np.ones(insertions, dtype=bool)
     rows: list[tuple[int, Array, float, Array]] = []
     inserted: dict[int, Array] = {}
@@ -77,7 +97,7 @@ def record_world(
         result = world.attempt(rng, which=active)
         for k, i in enumerate(np.flatnonzero(active)):
             if result.failed[k]:
-                raise UsageError(f"world {seed} cannot be simulated")
+                raise UsageError("this world cannot be simulated")
             if result.inserted[k]:
                 inserted[int(i)] = planar[i].copy()
                 active[i] = False
@@ -88,7 +108,7 @@ def record_world(
             observed = FlowMap(result.image[k], float(result.divisor[k]), "N", np.zeros((2, 1, 1), bool))
             planar[i] = task.corrected(planar[i], policies[i].act(observed))
     if not rows:
-        raise UsageError(f"world {seed}: no attempt had contact")
+        raise UsageError("no attempt in this world has contact")
     kept = sorted({row[0] for row in rows})
     new = {old: k for k, old in enumerate(kept)}
     recordings = Recordings(
@@ -107,14 +127,15 @@ def record_world(
     return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
 
 
-def _truth(values: dict[str, float], gain: Array, turn: Array) -> dict[str, float]:
+def _truth(values: Mapping[str, float], gain: Array, turn: Array) -> dict[str, float]:
     ratio = values["gel_time"] / 0.225
     lag = 1 - values["gel_creep"] * ratio * (1 - np.exp(-1 / ratio))  # a linear rise of the force during a descent
     names = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "marker_ks", "hole_kn", "hole_mu",
              "arm_stiffness", "grasp_force", "grasp_height", "crosstalk")  # fmt: skip
     pads = {f"gain_{side}": float(gain[k] * lag) for k, side in enumerate(("left", "right"))}
     turns = {f"turn_{side}": float(turn[k]) for k, side in enumerate(("left", "right"))}
-    return {**{name: values[name] for name in names}, **pads, **turns}
+    of_pads = {**pads, **turns, "gain_ratio": float(gain[1] / gain[0])}
+    return {**{name: values[name] for name in names}, **of_pads}
 
 
 def _vectors(image: NDArray[np.float32], divisor: float, task: InsertionTask) -> Array:

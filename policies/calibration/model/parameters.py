@@ -11,6 +11,7 @@ from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.sim.tasks.insertion import insertion_randomization
 from gelflow.sim.tasks.randomization import LogUniform, Uniform
+from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,12 @@ def parameters(recordings: Recordings) -> tuple[Parameter, ...]:
     return tuple(fitted)
 
 
-def names(fitted: Sequence[Parameter]) -> list[str]:
-    """Names of parameters, in their order."""
-    return [parameter.name for parameter in fitted]
+def gain_ratio(fitted: Sequence[Parameter]) -> tuple[Parameter, Array]:
+    """Gain of the right pad relative to the left one, and its direction in the whitened parameters (count,)."""
+    by_name = {p.name: (i, p) for i, p in enumerate(fitted)}
+    (i, left), (k, right) = by_name["gain_left"], by_name["gain_right"]
+    width = math.hypot(left.width, right.width)
+    direction = np.zeros(len(fitted))
+    direction[i], direction[k] = -left.width / width, right.width / width
+    row = PAIR_QUANTITIES["gain_ratio"]
+    return Parameter("gain_ratio", row.unit, row.meaning, True, right.center / left.center, width), direction

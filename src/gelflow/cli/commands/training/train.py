@@ -57,6 +57,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: ranges that it determined"
     )
+    parser.add_argument(
+        "--start", type=Path, metavar="FILE", help="fine-tuning: start from the weights of this checkpoint"
+    )
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
@@ -66,7 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
     if args.task != "insertion":
-        refuse(args, part=None, algorithm=_DEFAULT, calibration=None)
+        refuse(args, part=None, algorithm=_DEFAULT, calibration=None, start=None)
         args.recipe = args.recipe or DEFAULT_RECIPE
         return train_task(args)
     if args.recipe is not None:
@@ -102,6 +105,10 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     from gelflow.policies import recipes  # deferred: torch is slow to import
 
     recipe = DEFAULT_RECIPE if args.algorithm == _DEFAULT else args.algorithm
+    if args.start is not None:
+        if args.algorithm != _DEFAULT:
+            raise UsageError(f"--start is for --algorithm {_DEFAULT}, got {args.algorithm}")
+        recipe = recipes.FINE_TUNING
     attempts = recipes.recipe_for("insertion", recipe).steps if args.attempts is None else args.attempts
     bar = progress.add_task("training", total=attempts)
 
@@ -123,6 +130,7 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
         envs=args.envs,
         minutes=float("inf") if args.minutes is None else args.minutes,
         options={"task": part_task(args.part), **task_options(args), **_calibration_options(args)},
+        start=args.start,
         command=_command(args, attempts),
         report=report,
     )
@@ -139,7 +147,7 @@ def _calibration_options(args: argparse.Namespace) -> dict[str, Any]:
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:
     """The command that repeats this training, with all defaults written out."""
-    names = ("part", "calibration", "minutes", "envs", "seed", "preset", "out")
+    names = ("part", "calibration", "start", "minutes", "envs", "seed", "preset", "out")
     defaults = {"algorithm": _DEFAULT, "randomization": "default"}
     chosen = {name: getattr(args, name) for name, value in defaults.items() if getattr(args, name) != value}
     return command_with(args.task, chosen | {"attempts": attempts} | {name: getattr(args, name) for name in names})

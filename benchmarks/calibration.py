@@ -1,0 +1,93 @@
+"""Calibration measured in simulated worlds: `coverage` of its intervals, or the `transfer` matrix of the insertion."""
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import script
+from rich.table import Table
+
+from gelflow.policies.calibration.experiment.coverage import measure_coverage
+from gelflow.policies.calibration.experiment.transfer import measure_world, worlds
+from gelflow.policies.calibration.fit import FitSettings
+
+_QUICK = FitSettings(starts=1, points=1, poses=16, steps=1)
+
+
+def main() -> int:
+    """Measure what the first argument names."""
+    chooser = argparse.ArgumentParser(add_help=False)
+    chooser.add_argument("measure", choices=("coverage", "transfer"))
+    chosen, rest = chooser.parse_known_args()
+    return coverage(rest) if chosen.measure == "coverage" else transfer(rest)
+
+
+def coverage(words: list[str]) -> int:
+    """Calibrate in random worlds and count how often the intervals contain the truth."""
+    arguments = script.parser(
+        coverage.__doc__ or "", out="calibration_coverage.json", quick="two worlds with little effort"
+    )
+    arguments.add_argument("--worlds", type=int, default=100, metavar="N", help="number of worlds (default 100)")
+    arguments.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first world (default 0)")
+    args = arguments.parse_args(words)
+    count = 2 if args.quick else args.worlds
+    seeds = range(args.first, args.first + count)
+    with script.progress("worlds", count) as advance:
+        result = measure_coverage(
+            seeds, settings=_QUICK if args.quick else FitSettings(), processes=2, progress=lambda world: advance(1)
+        )
+    table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
+    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
+    table.add_row(*(str(result[key]) for key in keys))
+    script.finish(args, script.header() | result, table)
+    return 0
+
+
+def transfer(words: list[str]) -> int:
+    """Evaluate the shipped policy in worlds that differ from training; calibrate and fine-tune where it fails.
+
+    Rows that --out already has are kept.
+    """
+    arguments = script.parser(
+        "Evaluate the shipped policy in worlds that differ from training; calibrate and fine-tune where it fails. Rows "
+        "that --out already has are kept.", out="transfer.json", quick="few insertions, no fine-tuning",
+    )  # fmt: skip
+    args = arguments.parse_args(words)
+    episodes, below = (32, 0.0) if args.quick else (512, 0.9)
+    rows = _rows(args.out)
+    with script.progress("worlds", len(worlds())) as advance:
+        for world in worlds():
+            if world.name not in rows:
+                with tempfile.TemporaryDirectory() as folder:
+                    rows[world.name] = measure_world(world, Path(folder), episodes=episodes, below=below, processes=2)
+                script.save(args.out, _record(rows))
+            advance(1)
+    table = Table("world", "shipped policy", "calibrated and fine-tuned")
+    for row in rows.values():
+        table.add_row(row["world"], *(_result(row, key) for key in ("before", "after")))
+    script.finish(args, _record(rows), table)
+    return 0
+
+
+def _rows(file: Path) -> dict[str, Any]:
+    """The rows of an earlier run."""
+    return {row["world"]: row for row in json.loads(file.read_text())["results"]} if file.is_file() else {}
+
+
+def _record(rows: dict[str, Any]) -> dict[str, Any]:
+    return script.header() | {"results": list(rows.values())}
+
+
+def _result(row: dict[str, Any], key: str) -> str:
+    if key not in row:
+        return str(row.get("refused", "")) if key == "after" else ""
+    result = row[key]
+    length = result["corrections"]
+    return f"{100 * result['success']:.1f} %" + ("" if length is None else f" ({length:.2f})")
+
+
+if __name__ == "__main__":
+    sys.exit(script.run(main))
