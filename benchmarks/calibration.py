@@ -19,10 +19,10 @@ _QUICK = FitSettings(starts=1, points=1, poses=16, steps=1)
 
 def main() -> int:
     """Measure what the first argument names."""
-    chooser = argparse.ArgumentParser(add_help=False)
-    chooser.add_argument("measure", choices=("coverage", "transfer"))
-    chosen, rest = chooser.parse_known_args()
-    return coverage(rest) if chosen.measure == "coverage" else transfer(rest)
+    chooser = argparse.ArgumentParser(description=__doc__)
+    chooser.add_argument("measure", choices=("coverage", "transfer"), help="each has --help of its own")
+    chosen = chooser.parse_args(sys.argv[1:2])
+    return coverage(sys.argv[2:]) if chosen.measure == "coverage" else transfer(sys.argv[2:])
 
 
 def coverage(words: list[str]) -> int:

@@ -53,7 +53,7 @@ def load_scene(
 
     Raises UsageError, in one line, on an unknown key or name, a missing file, or an element that is not supported.
     """
-    path = _find(scene)
+    path = find_scene(scene)
     data = scene_tables(path)
     presets = read_presets(TomlTable(data, str(path)), top_level_keys=_SOLVER_KEYS, element_tables=_ELEMENT_TABLES)
     if preset is not None:
@@ -116,7 +116,8 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
     )
 
 
-def _find(scene: str | Path) -> Path:
+def find_scene(scene: str | Path) -> Path:
+    """The file of a scene, by name or path. Raises UsageError for an unknown name."""
     if not isinstance(scene, str | Path):
         raise UsageError(f"scene must be a name or a path, got {type(scene).__name__}")
     path = Path(scene)

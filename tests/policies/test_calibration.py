@@ -11,17 +11,22 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
+from gelflow.policies.calibration.calibrated_scene import write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
+from gelflow.policies.calibration.experiment.transfer import World, measure_world, worlds
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings, fit
 from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.ranges import read_ranges
-from gelflow.policies.calibration.report import error_lines, page, plain_report
+from gelflow.policies.calibration.report import error_lines, page, plain_report, randomization_ranges
 from gelflow.policies.calibration.session_recordings import read_recordings
+from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
+from gelflow.sim.scene import load_scene
+from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
 from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
 from gelflow.sim.tasks.registry import make_task
@@ -124,6 +129,82 @@ def test_a_calibration_reduces_the_error(calibrated: Calibration) -> None:
     assert all(e.low <= e.value <= e.high for e in calibrated.estimates)
     assert {e.verdict for e in calibrated.estimates} <= {"known", "partly", "unknown"}
     assert calibrated.suggestions
+
+
+def test_the_ratio_of_the_gains_is_known_better_than_each_gain(calibrated: Calibration) -> None:
+    found = {e.parameter.name: e for e in calibrated.estimates}
+    ratio, left, right = (found[name] for name in ("gain_ratio", "gain_left", "gain_right"))
+    assert ratio.value == pytest.approx(right.value / left.value)
+    assert ratio.low <= ratio.value <= ratio.high
+    assert ratio.high / ratio.low < min(left.high / left.low, right.high / right.low)
+
+
+def test_ranges_of_the_randomization_are_those_of_quantities_it_has(calibrated: Calibration) -> None:
+    estimates = tuple(dataclasses.replace(e, relative_width=0.1, reproduced=True) for e in calibrated.estimates)
+    estimates = tuple(dataclasses.replace(e, low=-0.1) if e.parameter.name == "crosstalk" else e for e in estimates)
+    ranges = randomization_ranges(dataclasses.replace(calibrated, estimates=estimates))
+    assert {"gain_ratio", "turn_left", "turn_right", "crosstalk", "pad_kn"} <= set(ranges)
+    assert "gain_left" not in ranges and ranges["crosstalk"][0] == 0
+    batch = make_task("insertion", 1, ranges=ranges, threads=1)
+    batch.reset(batch.all, np.random.default_rng(0))
+
+
+def test_calibrated_scene_has_the_known_values_and_no_others(calibrated: Calibration, tmp_path: Path) -> None:
+    known = ("pad_ks", "marker_mu", "hole_kn", "arm_stiffness")
+    estimates = tuple(
+        dataclasses.replace(e, relative_width=0.1 if e.parameter.name in known else 1.0, reproduced=True)
+        for e in calibrated.estimates
+    )
+    value = {e.parameter.name: e.value for e in estimates}
+    assert [path.name for path in write_scene(dataclasses.replace(calibrated, estimates=estimates), tmp_path)] == [
+        "scene.toml",
+        "insertion.xml",
+    ]
+    shipped = Simulator(load_scene("insertion"), threads=1)
+    sim = Simulator(load_scene(tmp_path / "scene.toml"), threads=1)
+    assert list(sim.param_index) == list(shipped.param_index)
+    changed = {}
+    for name, index in sim.param_index.items():
+        if sim.params[0, index] != shipped.params[0, index]:
+            changed[name] = float(sim.params[0, index])
+    expected = {"left.mu": value["marker_mu"], "right.mu": value["marker_mu"]}
+    for side in ("left", "right"):
+        expected |= {f"pad_{side}.ks": value["pad_ks"], f"pad_{side}.kt": 10e-3 * value["pad_ks"]}
+    for wall in ("left", "right", "front", "back"):
+        expected |= {f"part_hole/wall_{wall}.kn": value["hole_kn"], f"part_hole/wall_{wall}.ks": value["hole_kn"] / 2}
+    for joint, scale in (("arm_x", 1), ("arm_y", 1), ("arm_z", 1), ("arm_yaw", 0.05)):
+        stiffness = scale * value["arm_stiffness"]
+        expected |= {f"{joint}.kp": stiffness, f"{joint}.kd": stiffness / 200}
+    assert changed == pytest.approx(expected)
+
+
+def test_calibration_without_known_parameters_writes_no_scene(calibrated: Calibration, tmp_path: Path) -> None:
+    estimates = tuple(dataclasses.replace(e, reproduced=False) for e in calibrated.estimates)
+    assert write_scene(dataclasses.replace(calibrated, estimates=estimates), tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_worlds_of_the_transfer_matrix_differ() -> None:
+    rows = worlds()
+    assert len({row.name for row in rows}) == len(rows) >= 30
+    contents = [(dict(row.values), dict(row.part), row.friction) for row in rows]
+    assert all(contents.count(row) == 1 for row in contents)
+
+
+def test_a_row_of_the_transfer_matrix(tmp_path: Path) -> None:
+    row = measure_world(World("low friction", {"hole_mu": 0.2}), tmp_path, episodes=8)
+    assert row["before"]["success"] == 1 and "after" not in row and not list(tmp_path.iterdir())
+    json.dumps(row, allow_nan=False)
+
+
+@pytest.mark.slow
+def test_a_row_that_is_calibrated_and_fine_tuned(tmp_path: Path) -> None:
+    world = World("unequal pads", {"gain_ratio": 2.0})
+    row = measure_world(world, tmp_path, episodes=32, below=1.1, settings=LITTLE, attempts=512)
+    assert row["after"]["episodes"] == 32 and set(row["verdicts"].values()) <= {"known", "partly", "unknown"}
+    stored = json.loads((tmp_path / "run.json").read_text())["configuration"]
+    assert stored["start"] == load_checkpoint(default_checkpoint()).digest
+    assert stored["options"].get("ranges", {}) == row["ranges"]
 
 
 @pytest.mark.slow

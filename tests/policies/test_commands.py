@@ -88,6 +88,12 @@ def test_the_evaluation_of_the_insertion_writes_a_report(tmp_path: Path, capsys:
         (["train", "insertion", "--minutes", "nan"], "above 0"),
         (["train", "insertion", "--seed", "-1"], "--seed"),
         (["train", "insertion", "--algorithm", "ppo", "--attempts", "0"], "above 0"),
+        (
+            ["train", "insertion", "--start", "nowhere.safetensors", "--out", "OUT"],
+            "no checkpoint at nowhere.safetensors",
+        ),
+        (["train", "insertion", "--start", "x", "--algorithm", "ppo"], "--start is for --algorithm imitation"),
+        (["train", "grasp", "--start", "x"], "--start is for the insertion, not for grasp"),
         (["train", "insertion", "--out", "pyproject.toml"], "pyproject.toml"),
     ],
 )

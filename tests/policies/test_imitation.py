@@ -192,6 +192,24 @@ def test_a_short_training_beats_random_actions_and_writes_its_files(tmp_path: Pa
         make_run(tmp_path).train()
 
 
+def test_a_fine_tuning_starts_with_the_weights_of_its_checkpoint(tmp_path: Path) -> None:
+    trained = make_run(tmp_path).train().checkpoint
+    checkpoint = load_checkpoint(trained)
+    learner = Imitation(ToyInsertion(32), SMALL, SETTINGS, seed=5, steps=8_192)
+    learner.start_from(checkpoint)
+    tensors = learner.tensors()
+    for name, values in checkpoint.tensors.items():
+        np.testing.assert_array_equal(tensors[name], values)
+    numbers = learner.update()
+    assert numbers["success"] > 0.8
+    np.testing.assert_array_equal(learner.tensors()["scale"], checkpoint.tensors["scale"])
+    for changed in ({"architecture": dataclasses.replace(SMALL, units=7)}, {"task": {**checkpoint.task, "descent": 1}}):
+        with pytest.raises(UsageError, match=r"cannot start from a policy with other .*(units|descent)"):
+            learner.start_from(dataclasses.replace(checkpoint, **changed))
+    other_part = {**checkpoint.task, "part": {"name": "mine"}, "misalignment": [0.0, 0.0, 0.0]}
+    learner.start_from(dataclasses.replace(checkpoint, task=other_part))
+
+
 class Killed(Exception):
     pass
 

@@ -9,7 +9,7 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid, TactileFrame, fill_invalid
 from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION, FULL_RANDOMIZATION, NOMINAL
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Normal, Quantity, Randomization, Uniform
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
+from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, PAIR_QUANTITIES, SENSOR_QUANTITIES, SensorModel
 
 GRID = Grid(13, 10, 1.5)
 ALL = np.ones(3, dtype=bool)
@@ -150,6 +150,21 @@ def test_gain_turn_drift_and_noise_of_pads() -> None:
     assert noisy.mean() == pytest.approx(0.2, abs=0.06)
     np.testing.assert_allclose(noise[~noisy], 0.1, rtol=0.35)
     np.testing.assert_allclose(noise[noisy], 1.0, rtol=0.35)
+
+
+def test_known_differences_of_two_pads() -> None:
+    model, rng = SensorModel([GRID.positions()] * 2, 3), np.random.default_rng(0)
+    table = Randomization({**NO_SENSOR_EFFECTS, **PAIR_QUANTITIES})
+    model.draw(ALL, table.sample(rng, 3, friction="elastic"), rng)
+    assert model.ideal
+    different = table.replace(gain_ratio=2.25, turn_left=np.pi / 2, turn_right=-np.pi / 2)
+    model.draw(ALL, different.sample(rng, 3, friction="elastic"), rng)
+    assert not model.ideal
+    forces = np.zeros((3, 260, 2))
+    forces[..., 0] = 3.0
+    left, right = np.split(model.read(forces, ALL, rng, interval=0), 2, axis=1)
+    np.testing.assert_allclose(left, np.broadcast_to([0.0, 2.0], left.shape), atol=1e-12)
+    np.testing.assert_allclose(right, np.broadcast_to([0.0, -4.5], right.shape), atol=1e-12)
 
 
 def test_full_randomization_contains_all_effects() -> None:

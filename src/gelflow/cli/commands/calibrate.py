@@ -11,6 +11,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_quick, add_seed
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.policies.calibration.calibrated_scene import SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitSettings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
@@ -22,7 +23,9 @@ _QUICK = FitSettings(starts=2, points=1, poses=24, steps=1)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("sessions", nargs="+", type=Path, metavar="SESSION", help="recorded sessions (.mcap)")
-    add_out(parser, "new folder for report.html and report.json", default=Path("out/calibration"), folder=True)
+    add_out(
+        parser, "new folder for report.html, report.json and scene.toml", default=Path("out/calibration"), folder=True
+    )
     add_seed(parser)
     add_quick(parser)
     add_json(parser)
@@ -31,7 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit, print the parameters, and write the report."""
     output = Output(args.json)
-    files = [args.out / "report.json", args.out / "report.html"]
+    files = [args.out / "report.json", args.out / "report.html", args.out / SCENE]
     for file in files:
         if file.exists():
             raise UsageError(f"{file} exists; name a new folder with --out")
@@ -51,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
         files[0].write_text(json.dumps(report, indent=2) + "\n")
         files[1].write_text(page(result, args.sessions, recordings.task.grid))
+        scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
     if output.json:
@@ -62,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     for line in advice_lines(result):
         output.text(f"record next: {line}")
     output.text(f"the report is {files[1]}")
+    if scene:
+        output.text(f"the scene with the known values is {scene[0]}")
     return SUCCESS
 
 
