@@ -59,8 +59,8 @@ class MockEgmReport:
     invalid: int = 0  # datagrams that were not references
     late: int = 0  # cycles that were skipped because this computer was busy
     first_error: float = 0.0  # distance from the pose to the first reference of the session [m]
-    largest_step: float = 0.0  # between two references while running [m]
-    largest_turn: float = 0.0  # between two references while running [rad]
+    largest_step: float = 0.0  # between two references while running, per cycle [m]
+    largest_turn: float = 0.0  # between two references while running, per cycle [rad]
     last_sequence: int = -1  # message count of the last answer
 
 
@@ -83,6 +83,7 @@ class Controller:
         self._measured_joints, self._measured_at = self._joints, pose  # joint angles of the plant's pose
         self._recent: deque[tuple[PoseTuple, Joints]] = deque(maxlen=4)  # last commands to the plant
         self._reference: EgmReference | None = None
+        self._late_before = 0  # skipped cycles until this reference
         self._motors = self._rapid = True
         self._random = random.Random(0)
         self.links = {direction: MessageFaults(ordered=False) for direction in ("in", "out")}
@@ -150,9 +151,14 @@ class Controller:
         if report.state != "running":
             return
         if last is not None:
-            report.largest_step = max(report.largest_step, math.dist(last.position, reference.position))
-            report.largest_turn = max(report.largest_turn, angle_between(last.quaternion, reference.quaternion))
-        self._reference = reference
+            cycles = 1 + report.late - self._late_before  # the sender moves on in cycles that this computer skipped
+            step, turn = (
+                math.dist(last.position, reference.position),
+                angle_between(last.quaternion, reference.quaternion),
+            )
+            report.largest_step = max(report.largest_step, step / cycles)
+            report.largest_turn = max(report.largest_turn, turn / cycles)
+        self._reference, self._late_before = reference, report.late
         if last is None or (last.position, last.quaternion) != (reference.position, reference.quaternion):
             try:
                 self._target_joints = joints_of(

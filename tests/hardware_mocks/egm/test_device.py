@@ -15,9 +15,11 @@ from ABBRobotEGM import EGM
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
-from gelflow.hardware_mocks.egm.controller import MockEgmConfig
+from gelflow.hardware_mocks.egm.controller import Controller, MockEgmConfig
 from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.plant import KinematicArm
+from gelflow.real.egm.codec import EgmReference, encode_sensor
+from gelflow.real.kinematics import HOME, forward
 
 START = np.array([0.40, 0.0, 0.30])
 DOWN = np.array([0.0, 0.0, 1.0, 0.0])
@@ -225,3 +227,21 @@ def test_killed_controller_is_detected(bench: Bench) -> None:
 def test_invalid_settings_are_refused(changes: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         MockEgmConfig(**changes)  # type: ignore[arg-type]
+
+
+def test_the_largest_step_is_that_of_one_cycle() -> None:
+    position, quaternion = forward(HOME)
+    controller = Controller(MockEgmConfig(), ScaledClock(), (position, quaternion))
+
+    def follow(sequence: int, rise: float) -> float:
+        moved = (position[0], position[1], position[2] + rise)
+        controller.receive(encode_sensor(EgmReference(sequence, 0.0, moved, quaternion)))
+        return controller.report.largest_step
+
+    assert follow(0, 0.0) == 0.0
+    controller.cycle(1)
+    assert follow(1, 1e-5) == pytest.approx(1e-5)
+    controller.cycle(4)  # this computer was busy: the sender has moved on for four cycles
+    assert follow(2, 5e-5) == pytest.approx(1e-5)
+    controller.cycle(1)
+    assert follow(3, 9e-5) == pytest.approx(4e-5)
