@@ -106,6 +106,7 @@ class Imitation(Learner):
             layers = f"{checkpoint.architecture.to_json()} (here {self._architecture.to_json()})"
             raise UsageError(f"training cannot start from a policy with other {different or layers}")
         tensors = checkpoint.tensors
+        checkpoint.architecture.network(self._description, tensors)  # checks names, shapes and values
         self._layers.load_state_dict({name: torch.tensor(tensors[name]) for name in self._layers.state_dict()})
         self._scale = tensors["scale"].astype(float)
 
@@ -143,6 +144,10 @@ class Imitation(Learner):
             torch.nn.utils.clip_grad_norm_(self._layers.parameters(), settings.gradient_norm)
             self._optimizer.step()
 
+    def _known_scale(self) -> Array:
+        assert self._scale is not None, "the first update sets the scale"
+        return self._scale
+
     def _network(self) -> PolynomialGRUNetwork:
         """The present network for inference."""
         return self._architecture.network(self._description, self.tensors())
@@ -152,8 +157,7 @@ class Imitation(Learner):
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Tensors of the present network."""
-        assert self._scale is not None, "the first update sets the scale"
-        tensors = {"basis": self._basis, "scale": self._scale, **self._layers.tensors()}
+        tensors = {"basis": self._basis, "scale": self._known_scale(), **self._layers.tensors()}
         return {name: values.astype(np.float32) for name, values in tensors.items()}
 
     def state(self) -> RunState:
@@ -161,8 +165,7 @@ class Imitation(Learner):
         state = RunState(values={"iterations": self._iterations, "steps": self.steps, "memory": len(self._memory)})
         state.add("layers", self._layers.state_dict())
         state.add("optimizer", optimizer_tensors(self._optimizer))
-        assert self._scale is not None, "the first update sets the scale"
-        state.add("fixed", {"scale": torch.from_numpy(self._scale)})
+        state.add("fixed", {"scale": torch.from_numpy(self._known_scale())})
         for i, attempts in enumerate(self._memory):
             state.add(f"memory/{i}", {name: torch.from_numpy(values) for name, values in vars(attempts).items()})
         return state
