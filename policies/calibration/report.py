@@ -5,7 +5,7 @@ import html
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration,
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
 from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
+from gelflow.sim.tasks.randomization import Fixed
+from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
 
 FORMAT = 1
 
@@ -51,9 +53,20 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
 
 
 def randomization_ranges(result: Calibration) -> dict[str, list[float]]:
-    """Quantity of the randomization → its 95 % interval, of those that the recordings determine at least partly."""
-    return {e.parameter.name: _range(e) for e in result.estimates
-            if e.verdict != "unknown" and e.parameter.name in DEFAULT_RANDOMIZATION}  # fmt: skip
+    """Quantity of the randomization → its 95 % interval, of those that the recordings determine at least partly.
+
+    Differences between the pads are included only where their interval excludes equal pads, which is the default.
+    """
+    return {
+        e.parameter.name: _range(e)
+        for e in result.estimates
+        if e.verdict != "unknown" and e.parameter.name in DEFAULT_RANDOMIZATION and not _equal_pads(e)
+    }
+
+
+def _equal_pads(estimate: Estimate) -> bool:
+    row = PAIR_QUANTITIES.get(estimate.parameter.name)
+    return row is not None and estimate.low <= cast(Fixed, row.distribution).value <= estimate.high
 
 
 def _range(estimate: Estimate) -> list[float]:
