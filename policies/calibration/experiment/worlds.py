@@ -1,6 +1,6 @@
 """Random worlds with known truth, and insertions recorded in them by the simulation without wires."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,9 +109,22 @@ def record_insertions(
             planar[i] = task.corrected(planar[i], policies[i].act(observed))
     if not rows:
         raise UsageError("no attempt in this world has contact")
+    recordings = _recordings(rows, task, inserted, fixed, rng)
+    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
     kept = sorted({row[0] for row in rows})
-    new = {old: k for k, old in enumerate(kept)}
-    recordings = Recordings(
+    return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
+
+
+def _recordings(
+    rows: Sequence[tuple[int, Array, float, Array]],
+    task: InsertionTask,
+    inserted: Mapping[int, Array],
+    fixed: Mapping[str, float],
+    rng: np.random.Generator,
+) -> Recordings:
+    """Recordings of attempts: insertion, planar pose, depth and marker vectors of each."""
+    new = {old: k for k, old in enumerate(sorted({row[0] for row in rows}))}
+    return Recordings(
         task,
         np.array([new[row[0]] for row in rows], dtype=np.int64),
         np.stack([row[1] for row in rows]),
@@ -123,8 +136,6 @@ def record_insertions(
         grasp_force=fixed["grasp_force"] * float(np.exp(COMMANDED_FORCE * rng.normal())),
         grasp_height=fixed["grasp_height"] + TAUGHT_HEIGHT * float(rng.normal()),
     )
-    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
-    return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
 
 
 def _truth(values: Mapping[str, float], gain: Array, turn: Array) -> dict[str, float]:
