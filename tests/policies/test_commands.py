@@ -103,3 +103,11 @@ def test_an_invalid_option_gives_a_message_of_one_line(
     assert main(arguments) == 2
     error = capsys.readouterr().err.strip()
     assert message in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error
+
+
+def test_fine_tuning_starts_from_the_shipped_policy(tmp_path: Path) -> None:
+    options = ["--attempts", "64", "--envs", "4", "--out", str(tmp_path / "run")]
+    assert main(["train", "insertion", *options, "--start"]) == 0
+    stored = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert stored["configuration"]["start"] == load_checkpoint(default_checkpoint()).digest
+    assert stored["configuration"]["recipe"] == "fine-tuning" and str(default_checkpoint()) in stored["command"]

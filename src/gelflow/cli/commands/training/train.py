@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from gelflow.policies.training.run import TrainingResult
 
 _DEFAULT = "imitation"
+_SHIPPED = Path("shipped")  # --start without a file
 _ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algorithm
 
 
@@ -58,8 +59,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: ranges that it determined"
     )
     parser.add_argument(
-        "--start", type=Path, metavar="FILE", help="fine-tuning: start from the weights of this checkpoint"
-    )
+        "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
+        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the shipped policy",
+    )  # fmt: skip
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
@@ -103,12 +105,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     from gelflow.policies import recipes  # deferred: torch is slow to import
+    from gelflow.policies.checkpoint import default_checkpoint
 
     recipe = DEFAULT_RECIPE if args.algorithm == _DEFAULT else args.algorithm
     if args.start is not None:
         if args.algorithm != _DEFAULT:
             raise UsageError(f"--start is for --algorithm {_DEFAULT}, got {args.algorithm}")
         recipe = recipes.FINE_TUNING
+        if args.start == _SHIPPED:
+            args.start = default_checkpoint()
     attempts = recipes.recipe_for("insertion", recipe).steps if args.attempts is None else args.attempts
     bar = progress.add_task("training", total=attempts)
 
