@@ -49,31 +49,30 @@ def coverage(words: list[str]) -> int:
 def transfer(words: list[str]) -> int:
     """Evaluate the shipped policy in worlds that differ from training; calibrate and fine-tune where it fails.
 
-    Rows that --out already has are kept.
+    The same command continues a run that was killed.
     """
-    arguments = script.parser(
-        "Evaluate the shipped policy in worlds that differ from training; calibrate and fine-tune where it fails. Rows "
-        "that --out already has are kept.", out="transfer.json", quick="few insertions, no fine-tuning",
-    )  # fmt: skip
+    arguments = script.parser(transfer.__doc__ or "", out="transfer.json", quick="few insertions, no fine-tuning")
     args = arguments.parse_args(words)
     episodes, below = (32, 0.0) if args.quick else (512, 0.9)
-    rows = _rows(args.out)
+    unfinished = args.out.with_suffix(".quick.part" if args.quick else ".part")
+    rows = _rows(unfinished)
     with script.progress("worlds", len(worlds())) as advance:
         for world in worlds():
             if world.name not in rows:
                 with tempfile.TemporaryDirectory() as folder:
                     rows[world.name] = measure_world(world, Path(folder), episodes=episodes, below=below, processes=2)
-                script.save(args.out, _record(rows))
+                script.save(unfinished, _record(rows))
             advance(1)
     table = Table("world", "shipped policy", "calibrated and fine-tuned")
     for row in rows.values():
         table.add_row(row["world"], *(_result(row, key) for key in ("before", "after")))
     script.finish(args, _record(rows), table)
+    unfinished.unlink(missing_ok=True)
     return 0
 
 
 def _rows(file: Path) -> dict[str, Any]:
-    """The rows of an earlier run."""
+    """The rows of a run that was killed."""
     return {row["world"]: row for row in json.loads(file.read_text())["results"]} if file.is_file() else {}
 
 

@@ -43,7 +43,7 @@ class SavedEvaluation:
 
         Raises UsageError when a file cannot be read.
         """
-        newest = max(path.stat().st_mtime_ns for path in self.folder.iterdir())
+        newest = max((path.stat().st_mtime_ns for path in self.folder.iterdir()), default=0)
         if newest == self._read:
             return None
         self._read = newest

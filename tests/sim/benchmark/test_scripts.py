@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from gelflow.policies.calibration.experiment import transfer
+
 SCRIPTS = Path(__file__).resolve().parents[3] / "benchmarks"
 NAMES = sorted(path.stem for path in SCRIPTS.glob("*.py") if path.stem != "script")
 
@@ -51,3 +53,26 @@ def test_pictures_are_drawn_from_the_committed_records(tmp_path: Path, monkeypat
 def test_missing_file_gives_status_2(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("compare_pushing", "missing.npz", monkeypatch=monkeypatch) == 2
     assert capsys.readouterr().err == "missing.npz: no such file\n"
+
+
+def test_only_an_unfinished_transfer_matrix_is_continued(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [transfer.World("first", {"hole_mu": 0.5}), transfer.World("second", {"hole_mu": 1.0})]
+    monkeypatch.setattr(transfer, "worlds", lambda: rows)
+    out, unfinished = tmp_path / "transfer.json", tmp_path / "transfer.quick.part"
+    arguments = ("transfer", "--quick", "--json", "--out", str(out))
+
+    def corrections() -> list[float]:
+        return [row["before"]["corrections"] for row in json.loads(out.read_text())["results"]]
+
+    assert run("calibration", *arguments, monkeypatch=monkeypatch) == 0
+    measured = corrections()
+    assert len(measured) == 2 and not unfinished.exists()
+    record = json.loads(out.read_text())
+    record["results"] = record["results"][:1]
+    record["results"][0]["before"]["corrections"] = 99.0  # neither run measures this
+    out.write_text(json.dumps(record))
+    assert run("calibration", *arguments, monkeypatch=monkeypatch) == 0
+    assert corrections() == measured
+    unfinished.write_text(json.dumps(record))
+    assert run("calibration", *arguments, monkeypatch=monkeypatch) == 0
+    assert corrections() == [99.0, measured[1]] and not unfinished.exists()

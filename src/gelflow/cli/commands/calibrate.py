@@ -11,7 +11,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_quick, add_seed
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
-from gelflow.policies.calibration.calibrated_scene import SCENE, write_scene
+from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitSettings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
@@ -34,7 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit, print the parameters, and write the report."""
     output = Output(args.json)
-    files = [args.out / "report.json", args.out / "report.html", args.out / SCENE]
+    files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
         if file.exists():
             raise UsageError(f"{file} exists; name a new folder with --out")
