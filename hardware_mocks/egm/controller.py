@@ -152,10 +152,8 @@ class Controller:
             return
         if last is not None:
             cycles = 1 + report.late - self._late_before  # the sender moves on in cycles that this computer skipped
-            step, turn = (
-                math.dist(last.position, reference.position),
-                angle_between(last.quaternion, reference.quaternion),
-            )
+            step = math.dist(last.position, reference.position)
+            turn = angle_between(last.quaternion, reference.quaternion)
             report.largest_step = max(report.largest_step, step / cycles)
             report.largest_turn = max(report.largest_turn, turn / cycles)
         self._reference, self._late_before = reference, report.late

@@ -35,11 +35,12 @@ def write_scene(result: Calibration, folder: Path) -> list[Path]:
         return []
     shipped = find_scene("insertion")
     tables = scene_tables(shipped)
-    for name, value in _changed_parameters(known).items():
+    changed = _changed_parameters(known)
+    for name, value in changed.items():
         _set(tables, name, value)
     tables["model"] = MODEL
     (folder / SCENE).write_text(_HEADING.format(names=", ".join(known)) + toml_text(tables))
-    (folder / MODEL).write_text(_model(shipped.with_name(MODEL), known.get("arm_stiffness")))
+    (folder / MODEL).write_text(_model(shipped.with_name(MODEL), changed))
     return [folder / SCENE, folder / MODEL]
 
 
@@ -64,11 +65,8 @@ def _set(tables: dict[str, Any], parameter: str, value: float) -> None:
             (table["elastic"] if key in _ELASTIC else table)[key] = value
 
 
-def _model(shipped: Path, arm_stiffness: float | None) -> str:
-    """The model of the scene, with the stiffness of the arm's servos."""
-    if arm_stiffness is None:
-        return shipped.read_text()
-    parameters = _changed_parameters({"arm_stiffness": arm_stiffness})
+def _model(shipped: Path, parameters: Mapping[str, float]) -> str:
+    """The model of the scene, with the parameters of the arm's servos."""
     root = ElementTree.fromstring(shipped.read_text())
     for servo in root.iterfind("actuator/position"):
         name = servo.get("name")

@@ -5,7 +5,7 @@ import html
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration,
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
 from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
-from gelflow.sim.tasks.randomization import Fixed
+from gelflow.sim.tasks.randomization import fixed_values
 from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
 
 FORMAT = 1
@@ -65,8 +65,8 @@ def randomization_ranges(result: Calibration) -> dict[str, list[float]]:
 
 
 def _equal_pads(estimate: Estimate) -> bool:
-    row = PAIR_QUANTITIES.get(estimate.parameter.name)
-    return row is not None and estimate.low <= cast(Fixed, row.distribution).value <= estimate.high
+    equal = fixed_values(PAIR_QUANTITIES).get(estimate.parameter.name)
+    return equal is not None and estimate.low <= equal <= estimate.high
 
 
 def _range(estimate: Estimate) -> list[float]:

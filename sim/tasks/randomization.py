@@ -161,6 +161,12 @@ class Randomization:
         ]
 
 
+def fixed_values(quantities: Mapping[str, Quantity]) -> dict[str, float]:
+    """Values of those quantities that are fixed."""
+    found = {name: row.distribution for name, row in quantities.items()}
+    return {name: given.value for name, given in found.items() if isinstance(given, Fixed)}
+
+
 def _distribution(value: Any, present: Distribution) -> Distribution:
     if hasattr(value, "sample"):
         given: Distribution = value

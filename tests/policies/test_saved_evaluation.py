@@ -1,17 +1,16 @@
 """The folder of an evaluation, read again and shown on a page."""
 
 import json
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.view.browser import browser, needs_browser
+from tests.policies.training_page import check_page
+from tests.view.browser import needs_browser
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.policies.reports.saved_evaluation import SavedEvaluation, is_evaluation
-from gelflow.view.training.training_page import TrainingPage
 
 
 @pytest.fixture(scope="module")
@@ -59,17 +58,4 @@ def test_damaged_results_are_refused(tmp_path: Path, results: str) -> None:
 
 @needs_browser
 def test_page_shows_the_evaluation(folder: Path) -> None:
-    ended = threading.Event()
-    with TrainingPage(SavedEvaluation(folder), port=0) as page, browser() as window:
-        loop = threading.Thread(target=lambda: page.run(until=ended.is_set))
-        loop.start()
-        try:
-            window.open(page.url)
-            window.wait(lambda: "some report" in window.text() and "oracle of 8 episodes" in window.text())
-            window.wait(lambda: "success: picture" in window.text())
-            assert window.errors() == []
-            assert window.foreign_requests() == []
-            assert len(np.unique(window.picture().reshape(-1, 3), axis=0)) > 500  # not blank
-        finally:
-            ended.set()
-            loop.join()
+    check_page(SavedEvaluation(folder), texts=("some report", "oracle of 8 episodes"), film="success")

@@ -1,17 +1,16 @@
 """A training that is watched: its curve, episodes of its newest policy, and the page that shows them."""
 
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.policies.training_page import check_page
 from tests.real.runner.harness import untrained_checkpoint
-from tests.view.browser import browser, needs_browser
+from tests.view.browser import needs_browser
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.policies.reports.watched_training import WatchedTraining
-from gelflow.view.training.training_page import TrainingPage
 
 HEADER = "steps,minutes,evaluated_success,success_low,success_high,evaluated_length,evaluated_reward\n"
 
@@ -67,17 +66,4 @@ def test_other_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture
 @needs_browser
 def test_page_shows_curve_results_and_films(folder: Path) -> None:
     untrained_checkpoint(folder)
-    ended = threading.Event()
-    with TrainingPage(WatchedTraining(folder, episodes=8), port=0) as page, browser() as window:
-        loop = threading.Thread(target=lambda: page.run(until=ended.is_set))
-        loop.start()
-        try:
-            window.open(page.url)
-            window.wait(lambda: "some training" in window.text() and "of 8 episodes succeed" in window.text())
-            window.wait(lambda: "failure: picture" in window.text())
-            assert window.errors() == []
-            assert window.foreign_requests() == []
-            assert len(np.unique(window.picture().reshape(-1, 3), axis=0)) > 500  # not blank
-        finally:
-            ended.set()
-            loop.join()
+    check_page(WatchedTraining(folder, episodes=8), texts=("some training", "of 8 episodes succeed"), film="failure")

@@ -22,6 +22,7 @@ from gelflow.policies.episodes import run_episodes
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
 from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, insertion_scene
+from gelflow.sim.tasks.randomization import fixed_values
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS
 from gelflow.task import INSERTION, InsertionTask
@@ -31,7 +32,7 @@ _ENVS = 128
 
 # A lab like that of the mock robot: the pads of the scene, an industrial arm, the noise of image tracking.
 LAB: Mapping[str, float] = {
-    **{name: float(row.distribution.sample(np.random.default_rng(0), 1)[0]) for name, row in NO_SENSOR_EFFECTS.items()},
+    **fixed_values(NO_SENSOR_EFFECTS),
     **NOMINAL_PAD_VALUES,
     "hole_kn": 7e3,
     "hole_mu": 0.8,

@@ -109,21 +109,22 @@ def record_insertions(
             planar[i] = task.corrected(planar[i], policies[i].act(observed))
     if not rows:
         raise UsageError("no attempt in this world has contact")
-    recordings = _recordings(rows, task, inserted, fixed, rng)
-    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
     kept = sorted({row[0] for row in rows})
+    recordings = _recordings(rows, kept, task, inserted, fixed, rng)
+    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
     return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
 
 
 def _recordings(
     rows: Sequence[tuple[int, Array, float, Array]],
+    kept: Sequence[int],
     task: InsertionTask,
     inserted: Mapping[int, Array],
     fixed: Mapping[str, float],
     rng: np.random.Generator,
 ) -> Recordings:
-    """Recordings of attempts: insertion, planar pose, depth and marker vectors of each."""
-    new = {old: k for k, old in enumerate(sorted({row[0] for row in rows}))}
+    """Recordings of attempts: insertion, planar pose, depth and marker vectors of each; `kept` are the insertions."""
+    new = {old: k for k, old in enumerate(kept)}
     return Recordings(
         task,
         np.array([new[row[0]] for row in rows], dtype=np.int64),
