@@ -16,7 +16,9 @@
 PYTHON ?= python3
 TORCH_INDEX ?=
 
-# Python compiles what it imports; compiling all of torch and SymPy beforehand takes longer than the rest.
+# Python compiles what it imports; compiling all of torch and SymPy beforehand takes longer than the rest. The result must
+# be stored: container images often set PYTHONDONTWRITEBYTECODE, and then every process compiles its imports again.
+unexport PYTHONDONTWRITEBYTECODE
 INSTALL := .venv/bin/python -m pip --disable-pip-version-check install -q --no-compile -c constraints.txt
 BUILD := build/editable
 BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
