@@ -48,6 +48,11 @@ class FastGelRenderer:
         self._ink = np.ones(
             (appearance.height + 2 * self._margin, appearance.width + 2 * self._margin), dtype=np.float32
         )
+        self._view = self._ink[
+            self._margin - self._pad : self._margin + appearance.height + self._pad,
+            self._margin - self._pad : self._margin + appearance.width + self._pad,
+        ]
+        self._drawn: NDArray[np.intp] | None = None  # rounded centers of the dots in `_ink`
         # Offsets of the pixels of a sprite in the flattened image.
         steps = np.arange(-self._reach, self._reach + 1)
         self._steps = (steps[:, None] * self._ink.shape[1] + steps).ravel()[used]
@@ -85,12 +90,14 @@ class FastGelRenderer:
     def _draw_dots(self, centers: NDArray[np.float64]) -> NDArray[np.float32]:
         """Brightness factor of the dots at each pixel, shape (height + 2 pad, width + 2 pad)."""
         appearance, margin, pad = self.appearance, self._margin, self._pad
-        self._ink[:] = 1
         flat, stride = self._ink.reshape(-1), self._ink.shape[1]
         # Dots far outside the image are moved to just outside, which keeps their index in the padded image valid.
         limit = np.array([appearance.width, appearance.height]) + self._reach + pad
         centers = np.clip(centers, -self._reach - 1.0 - pad, limit)
         fine = np.round(centers * _PHASES).astype(np.intp)
+        if np.array_equal(fine, self._drawn):
+            return self._view
+        self._drawn, self._ink[:] = fine, 1
         whole, phase = fine // _PHASES, fine % _PHASES
         first = (whole[:, 1] + margin) * stride + whole[:, 0] + margin
         sprite = phase[:, 1] * _PHASES + phase[:, 0]
@@ -98,8 +105,7 @@ class FastGelRenderer:
         for markers in self._classes:
             pixels = first[markers, None] + self._steps
             flat[pixels] = keep(flat[pixels], 1 + self._density[markers, None] * self._sprites[sprite[markers]])
-        first_pixel = margin - pad
-        return self._ink[first_pixel : margin + appearance.height + pad, first_pixel : margin + appearance.width + pad]
+        return self._view
 
 
 def _padded(sources: tuple[Map, Map]) -> tuple[int, tuple[Map, Map]]:

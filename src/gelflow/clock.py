@@ -4,7 +4,7 @@ import contextlib
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -86,16 +86,24 @@ class ScaledClock:
             self._sync.grant(slot, max(until, self.now()))  # robot time never runs backwards
 
     @contextlib.contextmanager
-    def bounded(self, slot: int) -> Iterator[None]:
-        """Robot time advances by at most `MAX_LEAD` in this block.
+    def bounded(self, slot: int) -> Iterator[Callable[[], None]]:
+        """Robot time advances by at most `MAX_LEAD` in this block, and after each call of the yielded function.
 
         For computations that a robot's own computer finishes at once and this computer may not.
         """
-        self.grant(slot, self.now() + MAX_LEAD)
+
+        def renew() -> None:
+            self.grant(slot, self.now() + MAX_LEAD)
+
+        nested = self._sync is not None and math.isfinite(self._sync.limit(slot))
+        renew()
         try:
-            yield
+            yield renew
         finally:
-            self.grant(slot, math.inf)
+            if nested:
+                renew()
+            else:
+                self.grant(slot, math.inf)
 
     def absorb_delay(self) -> None:
         """Continue robot time from where it is held up; only the process of the simulated cell calls this."""

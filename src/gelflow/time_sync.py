@@ -49,6 +49,10 @@ class TimeSync:
         self._words[1 + 2 * slot] = time.monotonic()
         self._words[2 + 2 * slot] = until
 
+    def limit(self, slot: int) -> float:
+        """Robot time [s] up to which `slot` lets it run."""
+        return self._words[2 + 2 * slot]
+
     def now(self, factor: float) -> float:
         """Robot time [s], which runs at most `factor` times as fast as the wall clock."""
         return self._read(factor)[0]

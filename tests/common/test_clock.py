@@ -10,7 +10,7 @@ import pytest
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.time_sync import CONTROLLER, SIMULATED_CELL, TimeSync
+from gelflow.time_sync import CONTROLLER, MAX_LEAD, RUNNER, SIMULATED_CELL, TimeSync
 
 
 @pytest.fixture
@@ -80,6 +80,23 @@ def test_sleep_waits_for_robot_time(synchronized: tuple[ScaledClock, ScaledClock
     other.grant(SIMULATED_CELL, start + 5.0)
     sleeper.join(10.0)
     assert not sleeper.is_alive() and clock.now() >= start + 1.0
+
+
+def test_robot_time_waits_for_a_bounded_block(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
+    clock, other = synchronized
+    with clock.bounded(RUNNER) as renew:
+        start = clock.now()
+        time.sleep(0.02)  # two seconds of robot time
+        assert other.now() <= start + MAX_LEAD
+        with clock.bounded(RUNNER):
+            pass
+        time.sleep(0.02)  # the outer block still holds robot time
+        assert other.now() <= start + 3 * MAX_LEAD  # one for its start, one for its end
+        renew()
+        time.sleep(0.02)
+        assert start + MAX_LEAD < other.now() <= start + 4 * MAX_LEAD
+    time.sleep(0.02)
+    assert other.now() > start + 1.0
 
 
 def test_a_slot_without_grants_is_ignored_after_its_timeout(

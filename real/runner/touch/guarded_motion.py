@@ -123,9 +123,11 @@ class GuardedMotion:
         speed = self.speed_towards(target) if speed is None else speed
         self._motion.go(target, speed=speed, guarded=True)
         progress = self._motion.progress(target)
-        while not self._motion.arrived(within=within):
-            self._motion.wait(0.0)
-            with self._clock.bounded(RUNNER):
+        # A mock robot's time waits for this loop: on a busy computer the arm would travel on before an image is seen.
+        with self._clock.bounded(RUNNER) as renew:
+            while not self._motion.arrived(within=within):
+                renew()
+                self._motion.wait(0.0)
                 reading = self.observer.update()
                 if reading is not None:
                     change = measure(reading.change - zero)
@@ -133,15 +135,13 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                blind = self.observer.blind_time() >= _BLIND_TIME
-                if blind:
+                if self.observer.blind_time() >= _BLIND_TIME:
                     self._motion.hold()
-            if blind:
-                self._wait_until_readable()
-                self._motion.go(target, speed=speed, guarded=True)
-                progress = self._motion.progress(target)
-            progress.check()
-            self._check_deadline(deadline)
+                    self._wait_until_readable()
+                    self._motion.go(target, speed=speed, guarded=True)
+                    progress = self._motion.progress(target)
+                progress.check()
+                self._check_deadline(deadline)
         return None
 
     def rest(self) -> TactileReading | None:

@@ -80,7 +80,8 @@ class TactileObserver:
         """
         images = self._pair(since)
         try:
-            self._results = [self._track(sensor, image) for sensor, image in enumerate(images)]
+            with self._clock.bounded(RUNNER):
+                self._results = [self._track(sensor, image) for sensor, image in enumerate(images)]
         except (PeerError, UsageError) as error:  # UsageError: the grid differs from that of the lab file
             raise MarkersUnreadable(f"no reference frame: {error}") from None
         self._images = list(images)
@@ -138,13 +139,14 @@ class TactileObserver:
         Raises MarkersUnreadable when a pad is not readable for the time limit of images.
         """
         readings: list[TactileReading] = []
-        while len(readings) < _READINGS_AT_REST:
-            reading = self.update_pair(since)
-            if reading is not None:
-                readings.append(reading)
-                since = min(image.stamp for image in reading.images)
-            elif self.blind_time() > self._stale:
-                raise MarkersUnreadable("the markers are not readable at rest; inspect the gels and their light")
+        with self._clock.bounded(RUNNER):
+            while len(readings) < _READINGS_AT_REST:
+                reading = self.update_pair(since)
+                if reading is not None:
+                    readings.append(reading)
+                    since = min(image.stamp for image in reading.images)
+                elif self.blind_time() > self._stale:
+                    raise MarkersUnreadable("the markers are not readable at rest; inspect the gels and their light")
         return readings
 
     def mean_at_rest(self, since: float) -> Array:

@@ -8,7 +8,8 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
-from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, SIZES, make_appearance
+from gelflow.perception.synthetic.appearance import FACTORS, PRESETS, SIZES, GelAppearance, make_appearance
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.synthetic.sequences import FIELDS, GelSequence
 
 # Uniform light without noise, so that the centre of a dot is the centroid of its ink.
@@ -90,6 +91,16 @@ def test_equal_sequences_give_identical_images() -> None:
     assert [frame.jpeg for frame in one] == [frame.jpeg for frame in other]
     assert len({frame.jpeg for frame in one}) == 6, "the noise differs between images, also at rest"
     assert next(iter(GelSequence(make_appearance("hard", seed=6), frames=1))).jpeg != one[0].jpeg
+
+
+def test_an_image_does_not_depend_on_the_images_before_it() -> None:
+    appearance = GelAppearance(seed=3)
+    rest = np.zeros((appearance.grid.rows * appearance.grid.cols, 2))
+    displacements = [rest, rest, rest + 0.3, rest + 0.3, rest]
+    renderer = FastGelRenderer(appearance)
+    for number, displacement in enumerate(displacements):
+        alone = FastGelRenderer(appearance).render(displacement, sequence=number)
+        np.testing.assert_array_equal(renderer.render(displacement, sequence=number), alone)
 
 
 def test_occluded_markers_are_temporarily_not_visible() -> None:
