@@ -52,9 +52,20 @@ class Browser:
         self.driver.execute_script("arguments[0].click()", button)
 
     def picture(self) -> NDArray[np.uint8]:
-        """A screenshot, BGR (height, width, 3)."""
-        png = np.frombuffer(self.driver.get_screenshot_as_png(), dtype=np.uint8)
-        return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR), dtype=np.uint8)
+        """A screenshot, BGR (height, width, 3); Chromium gives up after 10 s when the machine is busy."""
+        from selenium.common.exceptions import TimeoutException
+
+        png = b""
+
+        def taken() -> bool:
+            nonlocal png
+            with contextlib.suppress(TimeoutException):
+                png = self.driver.get_screenshot_as_png()
+            return bool(png)
+
+        self.wait(taken)
+        encoded = np.frombuffer(png, dtype=np.uint8)
+        return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)
 
     def errors(self) -> list[str]:
         """Errors on the console since the last call."""
