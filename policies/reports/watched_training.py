@@ -20,6 +20,11 @@ _ENVS = 32  # parallel environments
 _MAX_FRAMES = 150  # of a film
 
 
+def is_training(folder: Path) -> bool:
+    """Whether the folder is that of `gelflow train`."""
+    return (folder / CONFIGURATION).is_file()
+
+
 class WatchedTraining:
     """The folder of a training run, which may still grow.
 
@@ -33,9 +38,10 @@ class WatchedTraining:
     """
 
     def __init__(self, folder: Path, *, episodes: int = 128, seed: int = 1) -> None:
-        if not (folder / CONFIGURATION).is_file():
+        if not is_training(folder):
             raise UsageError(
-                f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train --out"
+                f"{folder} is not the folder of a training: it has no {CONFIGURATION}; see gelflow train --out and "
+                "gelflow eval --out"
             )
         self.folder, self._episodes, self._seed = folder, episodes, seed
         self._drawn = 0  # time of change of the curve that was drawn [ns]

@@ -15,6 +15,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.view.page import Page
 
@@ -153,3 +154,25 @@ def test_command_serves_a_model_file_until_it_is_interrupted(tmp_path: Path) -> 
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
         assert process.stdout.read() == ""
+
+
+@pytest.mark.parametrize("options", [["--num-envs", "3"], ["--env", "1"], ["--preset", "fast"]])
+def test_options_of_scenes_are_refused_for_folders(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
+) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    assert main(["view", str(tmp_path), *options, "--port", "0"]) == 2
+    error = capsys.readouterr().err
+    assert f"{options[0]} is for scenes" in error and error.count("\n") == 1
+
+
+def test_a_folder_that_is_no_run_does_not_hide_a_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rolling").mkdir()
+    (tmp_path / "other").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "rolling", "--env", "7", "--port", "0"]) == 2
+    assert "env must be below 1" in capsys.readouterr().err  # of the scene
+    assert main(["view", "other", "--port", "0"]) == 2
+    assert "gelflow eval --out" in capsys.readouterr().err

@@ -43,9 +43,12 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"name one scene, or one session or two, got {' '.join(args.shown)}")
     if not sessions and len(args.shown) > 1:
         raise UsageError(f"name one scene, got {' '.join(args.shown)}")
+    folder = "" if sessions else _run_folder(args.shown[0])
     for name, default in _SCENE_ONLY.items():
         if sessions and getattr(args, name) != default:
             raise UsageError(f"--{name.replace('_', '-')} is for scenes, and {sessions[0]} is a session")
+        if folder and getattr(args, name) != default:
+            raise UsageError(f"--{name.replace('_', '-')} is for scenes, and {folder} is a folder")
     if args.replay and len(sessions) != 1:
         raise UsageError("--replay needs one session, a file that ends with .mcap")
     if args.checkpoint is not None and not args.replay:
@@ -55,7 +58,19 @@ def run(args: argparse.Namespace) -> int:
     import_viser()
     if sessions:
         return _view_sessions(args, sessions)
-    return _view_run(args) if Path(args.shown[0]).is_dir() else _view_scene(args)
+    return _view_run(args) if folder else _view_scene(args)
+
+
+def _run_folder(name: str) -> str:
+    """The name if it is that of a folder; "" for a shipped scene beside which lies a folder that is no run."""
+    folder = Path(name)
+    if not name or not folder.is_dir():
+        return ""
+    from gelflow.policies.reports.saved_evaluation import is_evaluation
+    from gelflow.policies.reports.watched_training import is_training
+    from gelflow.sim.scene import scene_names
+
+    return "" if name in scene_names() and not (is_training(folder) or is_evaluation(folder)) else name
 
 
 def _view_run(args: argparse.Namespace) -> int:
