@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.calibration.model.pad_model import PadModel
-from gelflow.policies.calibration.model.parameters import Parameter, parameters
-from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
+from gelflow.policies.calibration.model.reading_model import ReadingModel
+from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.sim.tasks.insertion import NOMINAL
 
@@ -41,10 +40,9 @@ class Problem:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
         self.recordings = recordings
-        self.fitted: tuple[Parameter, ...] = parameters(recordings)
-        self.model = ShearModel(recordings.task, settle=recordings.settle, threads=threads)
-        self._pads = PadModel([pad.positions for pad in self.model.scene.pads])
-        self._scale = 1.0 if recordings.unit == "N" else _displacement_scale(self.model)
+        self.readings = ReadingModel(recordings, threads=threads)
+        self.fitted = self.readings.fitted
+        self._scale = self.readings.scale
         n = len(recordings)
         flow = recordings.flow.reshape(n, -1, 2) / self._scale
         self.data = flow
@@ -66,7 +64,7 @@ class Problem:
 
     def values(self, point: Array) -> dict[str, Array]:
         """Values of the parameters from points (…, unknowns)."""
-        return {p.name: p.value(point[..., i]) for i, p in enumerate(self.fitted)}
+        return self.readings.values(point)
 
     def heights(self, point: Array) -> Array:
         """Start heights (…, n) [m] from points (…, unknowns)."""
@@ -77,10 +75,7 @@ class Problem:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Flow maps (m, markers, 2) [N] of the attempts `rows` (m,), and whether they could be simulated."""
         pose = in_hole(misalignment, self.recordings.planar_pose[rows])
-        shear, ok = self.model.shear(
-            {name: values[name] for name in QUANTITIES}, Descents(pose, z, self.recordings.depth[rows])
-        )
-        return self._pads.read(shear, values), ok
+        return self.readings.read(values, Descents(pose, z, self.recordings.depth[rows]))
 
     def flow(self, point: Array, misalignment: Array) -> Array:
         """Flow maps (n, markers, 2) of all attempts, in the unit of the recordings; zero where a simulation fails."""
@@ -128,38 +123,14 @@ class Problem:
         """Residuals and their exact Jacobian."""
         n, count = len(self.recordings), len(self.fitted)
         pose = in_hole(misalignment[self.recordings.insertion], self.recordings.planar_pose)
-        reading, slopes = self._readings(point, Descents(pose, self.heights(point), self.recordings.depth))
+        descents = Descents(pose, self.heights(point), self.recordings.depth)
+        reading, slopes = self.readings.slopes(point, descents)
         rows = np.arange(n)
         jacobian = np.zeros((n, self.markers * 2, self.size))
         for i in range(count):
             jacobian[:, :, i] = self.whiten(slopes[i], rows)
         jacobian[rows, :, count + rows] = self.whiten(slopes[count], rows)
         return Linearization(self.whiten(reading - self.data, rows), jacobian)
-
-    def reading_slopes(self, point: Array, descents: Descents) -> Array:
-        """Derivatives of readings [N] with respect to the parameters and the start height, (m, markers * 2, count + 1).
-
-        `descents` may be others than the recorded ones.
-        """
-        slopes = self._readings(point, descents)[1]
-        return np.stack([slope.reshape(len(slope), -1) for slope in slopes], -1)
-
-    def _readings(self, point: Array, descents: Descents) -> tuple[Array, list[Array]]:
-        """Readings (m, markers, 2), and their derivatives by each whitened parameter and by the start height."""
-        values = {name: float(value) for name, value in self.values(point).items()}
-        directions = [*QUANTITIES, "z"]
-        shear, slopes = self.model.derivatives({q: values[q] for q in QUANTITIES}, descents, directions)
-        one = {name: np.asarray(value) for name, value in values.items()}
-        of_pads = self._pads.derivatives(shear, values)
-        changes = []
-        for i, parameter in enumerate(self.fitted):
-            name, slope = parameter.name, parameter.slope(float(point[i]))
-            if name in QUANTITIES:
-                changes.append(slope * self._pads.read(slopes[:, directions.index(name)], one))
-            else:
-                changes.append(slope * of_pads[name])
-        changes.append(self.recordings.height_spread * self._pads.read(slopes[:, -1], one))
-        return self._pads.read(shear, one), changes
 
     def cost(self, residuals: Array, point: Array) -> float:
         """Robust negative log posterior."""
@@ -183,12 +154,3 @@ def in_hole(misalignment: Array, planar_pose: Array) -> Array:
     px, py, turn = np.moveaxis(planar_pose, -1, 0)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack([x + cos * px - sin * py, y + sin * px + cos * py, yaw + turn], -1)
-
-
-def _displacement_scale(model: ShearModel) -> float:
-    """Displacement of a marker per force of the scene's gel [mm/N]."""
-    forces = np.zeros((1, model.scene.num_markers, 3))
-    forces[0, 0, 0] = 1.0
-    from gelflow.sim.displacement import marker_displacement
-
-    return float(1e3 * marker_displacement(model.scene, forces, np.float64)[0, 0, 0])

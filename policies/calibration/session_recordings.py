@@ -62,6 +62,21 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     )
 
 
+def nothing_recorded(task: InsertionTask, *, grasp_force: float | None, grasp_height: float | None) -> Recordings:
+    """Recordings of a lab without an attempt, for a plan.
+
+    Parameters
+    ----------
+    grasp_force: commanded [N]; None: any of the randomization
+    grasp_height: of the pad centres above the part's centre [m]; None: any of the randomization
+    """
+    flow = np.zeros((0, task.sensors, task.grid.rows, task.grid.cols, 2))
+    return Recordings(
+        task, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), flow, "mm", (),
+        settle=_SETTLE, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
+    )  # fmt: skip
+
+
 def _task(path: Path, described: dict[str, Any]) -> InsertionTask:
     data = described.get("task")
     if not isinstance(data, dict) or data.get("name") != "insertion":

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.fit import FitResult
+from gelflow.policies.calibration.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.problem import CORRELATED, Problem
+from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
 
@@ -38,13 +39,15 @@ class Suggestion:
 
 def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggestion]:
     """The `count` attempts with the highest information, the best first."""
-    information = np.linalg.inv(result.covariance)
+    known = np.linalg.inv(result.covariance)
     before = np.sqrt(np.diag(result.covariance))
     found = []
     for text, pose, deeper in _CANDIDATES:
         depth = _DEPTH + deeper
         try:
-            after = np.linalg.inv(information + _information(problem, result, pose, depth))
+            descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
+            added = information(problem.readings, result.best.point, descents, problem.noise)[0]
+            after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue
         gain = 0.5 * float(np.linalg.slogdet(result.covariance)[1] - np.linalg.slogdet(after)[1])
@@ -52,13 +55,3 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
         narrowed = {p.name: float(r) for p, r in zip(problem.fitted, ratio, strict=True) if r < 0.9}
         found.append(Suggestion(text, pose, depth, gain, narrowed))
     return sorted(found, key=lambda suggestion: -suggestion.gain)[:count]
-
-
-def _information(problem: Problem, result: FitResult, pose: tuple[float, float, float], depth: float) -> Array:
-    """Fisher information of one attempt about the parameters; its start height is unknown."""
-    descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
-    sigma = float(np.median(problem.sigma))
-    jacobian = problem.reading_slopes(result.best.point, descents)[0] / sigma
-    full = jacobian.T @ jacobian / CORRELATED
-    full[-1, -1] += 1.0
-    return np.asarray(full[:-1, :-1] - np.outer(full[:-1, -1], full[-1, :-1]) / full[-1, -1])

@@ -4,6 +4,7 @@ from .insertion.attempt import Attempt as Attempt
 from .insertion.attempt import Insertion as Insertion
 from .insertion.insertion_runner import InsertionRunner as InsertionRunner
 from .insertion.insertion_runner import Operator as Operator
+from .insertion.planned_motions import PlanPolicy as PlanPolicy
 from .lab import Lab as Lab
 from .lab_file import load_lab as load_lab
 from .lab_file import save_lab as save_lab
@@ -29,6 +30,7 @@ __all__ = [
     "MotionExecutor",
     "Operator",
     "Phase",
+    "PlanPolicy",
     "PreflightItem",
     "RunPlan",
     "Supervisor",

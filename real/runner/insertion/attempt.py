@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gelflow.observation import FlowMap
 from gelflow.real.runner.touch.observer import TactileReading
 
+PLAN_COMPLETE = "plan complete"  # outcome of a part on which all motions of a plan were made
 PlanarPose = tuple[float, float, float]  # of the gripper relative to the taught hole: x, y [m], yaw [rad]
 
 
@@ -53,7 +54,7 @@ class Insertion:
     """The attempts on one part, from grasp to release."""
 
     number: int
-    outcome: str  # inserted, not inserted, part lost, or the error
+    outcome: str  # inserted, not inserted, plan complete, part lost, or the error
     planar_pose: PlanarPose  # of the last attempt
     duration: float  # [s]
     attempts: tuple[Attempt, ...] = field(default=())
@@ -62,3 +63,8 @@ class Insertion:
     def inserted(self) -> bool:
         """Whether the part was inserted."""
         return self.outcome == "inserted"
+
+    @property
+    def successful(self) -> bool:
+        """Whether the part was inserted, or all motions of a plan were made."""
+        return self.inserted or self.outcome == PLAN_COMPLETE

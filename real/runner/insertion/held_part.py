@@ -145,8 +145,8 @@ class HeldPart:
             self._set_rim(found)
         return contact is None
 
-    def descend(self, planar_pose: PlanarPose, observer: TactileObserver) -> Descent:
-        """Descend from the start while `observer`, whose reference was taken there, keeps the readings.
+    def descend(self, planar_pose: PlanarPose, observer: TactileObserver, depth_below: float) -> Descent:
+        """Descend by `depth_below` [m] while `observer`, whose reference was taken at the start, keeps the readings.
 
         Raises PartSlipped when the pads do not show the part's weight at the start, or the part slips by too much.
         """
@@ -162,7 +162,7 @@ class HeldPart:
             return slip.add(depth, reading.shear)
 
         contact = self._guard.move(
-            self._pose(planar_pose, self.start_height - self._task.descent),
+            self._pose(planar_pose, self.start_height - depth_below),
             threshold=self.thresholds.stop,
             measure=along_finger,
             speed=self._lab.descent.speed,

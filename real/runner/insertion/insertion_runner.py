@@ -16,8 +16,9 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.observation import FlowMap
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell
-from gelflow.real.runner.insertion.attempt import Attempt, Insertion, PlanarPose
+from gelflow.real.runner.insertion.attempt import PLAN_COMPLETE, Attempt, Insertion, PlanarPose
 from gelflow.real.runner.insertion.held_part import HeldPart, HoleNotFound, PartSlipped
+from gelflow.real.runner.insertion.planned_motions import PlanPolicy, check_motions
 from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
 from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.supervisor import Supervisor
@@ -42,7 +43,11 @@ class Operator(Protocol):
 
 
 class InsertionRunner:
-    """Inserts parts in a connected cell. The thread of `motion` must be running."""
+    """Inserts parts in a connected cell. The thread of `motion` must be running.
+
+    With a `PlanPolicy` the attempts on each part are the motions of its plan; the part is then handed back. Raises
+    UsageError when one of them exceeds the limits of lab or task.
+    """
 
     def __init__(
         self,
@@ -58,6 +63,8 @@ class InsertionRunner:
         if task.descent > lab.descent.max_depth:
             deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
             raise SafetyError(f"the task descends {deep:g} mm, the lab's max_depth allows {allowed:g} mm")
+        self._motions = policy.motions if isinstance(policy, PlanPolicy) else ()
+        check_motions(self._motions, lab, task)
         self._cell, self._policy, self._task = cell, policy, task
         self._lab, self._clock, self._recorder = lab, cell.clock, cell.recorder
         self._motion, self._operator, self._on_attempt = motion, operator, on_attempt
@@ -68,7 +75,7 @@ class InsertionRunner:
         """Insert one part; returns the result. Raises errors after which continuing is unsafe (stale data, a fault)."""
         start = self._clock.now()
         attempts: list[Attempt] = []
-        self._planar_pose = (0.0, 0.0, 0.0)
+        self._planar_pose = self._motions[0].planar_pose if self._motions else (0.0, 0.0, 0.0)
         self._policy.reset()
         self._recorder.event("insertion", {"number": number})
         try:
@@ -88,9 +95,9 @@ class InsertionRunner:
 
     def _insert_held(self, number: int, part: HeldPart, attempts: list[Attempt]) -> str:
         """Attempts on a held part until it is inserted, then its release; returns the outcome."""
-        outcome = "not inserted"
+        outcome = PLAN_COMPLETE if self._motions else "not inserted"
         try:
-            for index in range(self._task.attempts):
+            for index in range(len(self._motions) or self._task.attempts):
                 attempt = self._attempt(number, index, part)
                 attempts.append(attempt)
                 self._on_attempt(number, attempt)
@@ -203,12 +210,13 @@ class InsertionRunner:
         self._motion.supervisor.phases.enter(Phase.DESCEND)
         self._motion.wait(self._lab.descent.settle)
         observer = self._observer()
-        descent = part.descend(planar_pose, observer)
-        last, frames = descent.last, observer.chosen(self._task.frame_depths)
+        depth = self._motions[index].depth if self._motions else self._task.descent
+        descent = part.descend(planar_pose, observer, depth)
+        last, frames = descent.last, observer.chosen((depth,) if self._motions else self._task.frame_depths)
         contact = last.shear > part.thresholds.contact
         reached = self._task.start_height - last.depth < self._task.success_height
         inserted = False
-        if reached and not contact and not descent.stopped:
+        if reached and not contact and not descent.stopped and not self._motions:
             below = part.lower(planar_pose)
             inserted = below is None
             if below is not None:

@@ -1,28 +1,45 @@
-"""`gelflow calibrate`: fit the simulator to recorded insertions."""
+"""`gelflow calibrate`: fit the simulator to recorded insertions, and plan the attempts to record next."""
 
 import argparse
 import json
+import math
 import os
 from pathlib import Path
 
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_quick, add_seed
+from gelflow.cli.options import add_json, add_out, add_part, add_quick, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.motion_plan import save_motion_plan
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
-from gelflow.policies.calibration.fit import FitSettings
+from gelflow.policies.calibration.fit import FitResult, FitSettings
+from gelflow.policies.calibration.planning import MOTIONS, SCENARIOS, Plan, plan_motions
+from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
-from gelflow.policies.calibration.session_recordings import read_recordings
+from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
+from gelflow.real.runner.lab_file import load_lab
 
 _QUICK = FitSettings(starts=2, points=1, poses=24, steps=1)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("sessions", nargs="+", type=Path, metavar="SESSION", help="recorded sessions (.mcap)")
+    parser.add_argument("sessions", nargs="*", type=Path, metavar="SESSION", help="recorded sessions (.mcap)")
+    parser.add_argument(
+        "--plan",
+        type=Path,
+        metavar="FILE",
+        help="also write the attempts with the most information about what is unknown, for gelflow run insertion "
+        "--plan; without a SESSION nothing is known",
+    )
+    parser.add_argument(
+        "--motions", type=int, default=MOTIONS, metavar="N", help="number of attempts of --plan (default %(default)s)"
+    )
+    parser.add_argument("--lab", type=Path, metavar="FILE", help="lab file whose workspace and grasp --plan keeps to")
+    add_part(parser)
     add_out(
         parser, "new folder for report.html, report.json and scene.toml", default=Path("out/calibration"), folder=True
     )
@@ -32,8 +49,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, print the parameters, and write the report."""
+    """Fit, print the parameters, and write the report; write the plan."""
     output = Output(args.json)
+    _check(args)
+    if not args.sessions:
+        recordings = _lab_recordings(args)
+        output.result({"plan": _write_plan(args, output, recordings, None)})
+        return SUCCESS
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
         if file.exists():
@@ -57,18 +79,86 @@ def run(args: argparse.Namespace) -> int:
         scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
-    if output.json:
-        output.result(report)
-        return SUCCESS
+    if not output.json:
+        _show(output, result)
+        output.text(f"the report is {files[1]}")
+        if scene:
+            output.text(f"the scene with the known values is {scene[0]}")
+    plan = {} if args.plan is None else {"plan": _write_plan(args, output, recordings, result.fit)}
+    output.result(report | plan)
+    return SUCCESS
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raise UsageError for options that contradict each other, before anything is computed."""
+    check_at_least(args, motions=1)
+    if not args.sessions and args.plan is None:
+        raise UsageError("name a recorded session, or a new plan file with --plan")
+    if args.plan is None and args.lab is not None:
+        raise UsageError("--lab gives the limits of --plan; name the plan file, or leave --lab out")
+    if args.sessions and args.part is not None:
+        raise UsageError("a session contains its part; leave --part out")
+    if args.plan is not None and args.plan.exists():
+        raise UsageError(f"{args.plan} exists; name a new file with --plan")
+
+
+def _lab_recordings(args: argparse.Namespace) -> Recordings:
+    """No attempts, with the part of --part and the grasp of --lab."""
+    task = part_task(args.part)
+    if args.lab is None:
+        return nothing_recorded(task, grasp_force=None, grasp_height=None)
+    lab = load_lab(args.lab)
+    height = lab.part.grasp_height - task.part.size[2] / 2
+    return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height)
+
+
+def _write_plan(
+    args: argparse.Namespace, output: Output, recordings: Recordings, fitted: FitResult | None
+) -> list[dict[str, float]]:
+    """Make, write and print a plan; returns its motions as plain data."""
+    workspace = None
+    if args.lab is not None:
+        space = load_lab(args.lab).workspace
+        workspace = (space.x, space.y, math.radians(space.yaw_deg))
+    with progress_bar(count=True) as progress:
+        bar = progress.add_task("planning", total=SCENARIOS)
+        plan = plan_motions(
+            recordings,
+            fitted=fitted,
+            count=args.motions,
+            workspace=workspace,
+            seed=args.seed,
+            progress=lambda done: progress.update(bar, completed=done),
+        )
+    known = "what the sessions leave open" if args.sessions else "a lab of which nothing is known"
+    save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
+    for line in _plan_lines(plan):
+        output.text(line)
+    output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {args.plan}")
+    return [
+        {"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth, "gain": gain}
+        for m, gain in zip(plan.motions, plan.gains, strict=True)
+    ]
+
+
+def _plan_lines(plan: Plan) -> list[str]:
+    """Lines about the motions and what they are expected to determine."""
+    lines = [
+        f"motion {k + 1}: {motion.text}: {gain:.1f} nat"
+        for k, (motion, gain) in enumerate(zip(plan.motions, plan.gains, strict=True))
+    ]
+    narrowed = sorted((after / before, name) for name, (before, after) in plan.widths.items() if after < 0.9 * before)
+    if narrowed:
+        lines.append("expected: " + ", ".join(f"{name} to {100 * ratio:.0f} %" for ratio, name in narrowed))
+    return lines
+
+
+def _show(output: Output, result: Calibration) -> None:
     output.console.print(_table(result))
     for line in error_lines(result):
         output.text(line)
     for line in advice_lines(result):
         output.text(f"record next: {line}")
-    output.text(f"the report is {files[1]}")
-    if scene:
-        output.text(f"the scene with the known values is {scene[0]}")
-    return SUCCESS
 
 
 def _table(result: Calibration) -> Table:

@@ -1,4 +1,4 @@
-"""`gelflow run insertion`: run the insertion policy on the robot of a lab file, or on the mock robot."""
+"""`gelflow run insertion`: run the insertion policy, or a motion plan, on the robot of a lab file or the mock robot."""
 
 import argparse
 import dataclasses
@@ -32,8 +32,12 @@ from gelflow.cli.prompt import read_line
 from gelflow.cli.way_out import way_out
 from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
+from gelflow.motion_plan import load_motion_plan
+from gelflow.protocols import Policy
+from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
+    from gelflow.real.runner.lab import Lab
     from gelflow.real.runner.motion_executor import MotionExecutor
     from gelflow.real.runner.preflight import PreflightItem
     from gelflow.real.runner.run_plan import RunPlan
@@ -46,6 +50,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_part(parser)
     add_checkpoint(parser)
     parser.add_argument("--insertions", type=int, default=1, metavar="N", help="number of parts (default %(default)s)")
+    parser.add_argument(
+        "--plan", type=Path, metavar="FILE", help="make the motions of gelflow calibrate --plan on each part, no policy"
+    )
     add_view(parser)
     parser.add_argument("--dry-run", action="store_true", help="connect, check and read; send no motion")
     add_out(parser, "folder of the recording (default sessions/DATE-TIME)", folder=True)
@@ -53,9 +60,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the insertions and print each attempt. A negative result: a part was not inserted."""
+    """Run the insertions and print each attempt. A negative result: a part not inserted, a plan not completed."""
     from gelflow.cli.live_page import live_page, motion_observer
-    from gelflow.policies.checkpoint import load_policy
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
@@ -65,8 +71,7 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json)
     lab = load_lab(args.lab)
     task = part_task(args.part)
-    checkpoint = checkpoint_for(task, args.checkpoint)
-    policy = load_policy(checkpoint, task=task)
+    policy, checkpoint = _policy(args, task, lab)
     out = args.out or Path("sessions") / datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     session = out / "session.mcap"
     warnings: list[str] = []
@@ -106,10 +111,26 @@ def run(args: argparse.Namespace) -> int:
     output.console.print(insertion_table(results))
     for line in warnings:
         output.text(f"warning: {line}")
-    output.text(f"recorded: {session}; replay it with: gelflow replay {session}")
+    then = f"replay it with: gelflow replay {session}" if args.plan is None else f"then: gelflow calibrate {session}"
+    output.text(f"recorded: {session}; {then}")
     insertions = [insertion_to_json(result) for result in results]
     output.result({"session": session, "insertions": insertions, "warnings": warnings})
-    return SUCCESS if all(result.inserted for result in results) else NEGATIVE_RESULT
+    return SUCCESS if all(result.successful for result in results) else NEGATIVE_RESULT
+
+
+def _policy(args: argparse.Namespace, task: InsertionTask, lab: "Lab") -> tuple[Policy, Path | None]:
+    """The policy of the run and its checkpoint; a plan has none. Raises UsageError."""
+    from gelflow.policies.checkpoint import load_policy
+    from gelflow.real.runner.insertion.planned_motions import PlanPolicy, check_motions
+
+    if args.plan is not None:
+        if args.checkpoint is not None:
+            raise UsageError("--plan replaces the policy of --checkpoint; leave one of them out")
+        motions = load_motion_plan(args.plan)
+        check_motions(motions, lab, task)
+        return PlanPolicy(motions), None
+    checkpoint = checkpoint_for(task, args.checkpoint)
+    return load_policy(checkpoint, task=task), checkpoint
 
 
 def _dry_run(output: Output, plan: "RunPlan") -> int:

@@ -1,0 +1,74 @@
+"""Readings of the pads at the end of descents as a function of whitened parameters, with exact derivatives."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.policies.calibration.model.pad_model import PadModel
+from gelflow.policies.calibration.model.parameters import Parameter, parameters
+from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
+from gelflow.policies.calibration.recordings import Recordings
+
+Array = NDArray[np.float64]
+
+
+class ReadingModel:
+    """`ShearModel`, then `PadModel`, with the parameters that are fitted to recordings.
+
+    Parameters
+    ----------
+    recordings: give task, grasp, unit, settling time and the spread of start heights; they may have no attempt
+    threads: of the simulator
+    """
+
+    def __init__(self, recordings: Recordings, *, threads: int | None = None) -> None:
+        self.fitted: tuple[Parameter, ...] = parameters(recordings)
+        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads)
+        self._pads = PadModel([pad.positions for pad in self.forces.scene.pads])
+        self._height_spread = recordings.height_spread
+        # Unit of the recordings per newton of a reading.
+        self.scale = 1.0 if recordings.unit == "N" else _displacement_scale(self.forces)
+
+    def values(self, point: Array) -> dict[str, Array]:
+        """Values of the parameters from points (…, at least the parameters)."""
+        return {p.name: p.value(point[..., i]) for i, p in enumerate(self.fitted)}
+
+    def read(self, values: Mapping[str, Array], descents: Descents) -> tuple[Array, NDArray[np.bool_]]:
+        """Readings (n, markers, 2) [N] of n descents, and whether they could be simulated; values have shape (n,)."""
+        shear, ok = self.forces.shear({name: values[name] for name in QUANTITIES}, descents)
+        return self._pads.read(shear, values), ok
+
+    def slopes(self, point: Array, descents: Descents) -> tuple[Array, list[Array]]:
+        """Readings (n, markers, 2) [N], and their derivatives by each whitened parameter, then by the start height.
+
+        The start height is in standard deviations. Raises SimulationError when a step fails.
+        """
+        values = {name: float(value) for name, value in self.values(point).items()}
+        directions = [*QUANTITIES, "z"]
+        shear, slopes = self.forces.derivatives({q: values[q] for q in QUANTITIES}, descents, directions)
+        one = {name: np.asarray(value) for name, value in values.items()}
+        of_pads = self._pads.derivatives(shear, values)
+        changes = []
+        for i, parameter in enumerate(self.fitted):
+            name, slope = parameter.name, parameter.slope(float(point[i]))
+            if name in QUANTITIES:
+                changes.append(slope * self._pads.read(slopes[:, directions.index(name)], one))
+            else:
+                changes.append(slope * of_pads[name])
+        changes.append(self._height_spread * self._pads.read(slopes[:, -1], one))
+        return self._pads.read(shear, one), changes
+
+    def jacobian(self, point: Array, descents: Descents) -> Array:
+        """The derivatives of `slopes` as one array (n, markers * 2, parameters + 1)."""
+        slopes = self.slopes(point, descents)[1]
+        return np.stack([slope.reshape(len(slope), -1) for slope in slopes], -1)
+
+
+def _displacement_scale(model: ShearModel) -> float:
+    """Displacement of a marker per force of the scene's gel [mm/N]."""
+    forces = np.zeros((1, model.scene.num_markers, 3))
+    forces[0, 0, 0] = 1.0
+    from gelflow.sim.displacement import marker_displacement
+
+    return float(1e3 * marker_displacement(model.scene, forces, np.float64)[0, 0, 0])

@@ -1,0 +1,149 @@
+"""Plans of attempts with the highest expected information about what a calibration leaves open.
+
+The hole's pose and the parameters are not known when a plan is made. The information of an attempt is therefore
+averaged over scenarios: parameters from the prior, or from a fit with its uncertainty, and misalignments from the task.
+An attempt whose part falls into the hole in a scenario has no information there. All attempts are made on one part, so
+that they share one misalignment.
+"""
+
+import contextlib
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import SimulationError, UsageError
+from gelflow.motion_plan import PlannedMotion
+from gelflow.policies.calibration.fit import FitResult
+from gelflow.policies.calibration.information import information, pose_prior, without_pose
+from gelflow.policies.calibration.model.reading_model import ReadingModel
+from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.problem import in_hole
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.task import InsertionTask
+
+Array = NDArray[np.float64]
+
+SCENARIOS = 4  # over which the information is averaged
+MOTIONS = 5  # of a plan
+USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before anything is recorded [N]
+_OFFSETS = (4e-3, 8e-3)  # of the candidates from the taught hole [m]
+_YAWS = np.radians([-8.0, 0.0, 8.0])
+_STOP_SHEAR = 0.012  # mean shear of a pad at which contact stops a descent [N]: 0.12 mm of a gel of the scene
+_LEVELS = 8  # depths at which the stop is searched
+_SPREAD = 0.7  # of the scenarios' parameters, relative to the prior
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Motions in the order of their information, and what they are expected to determine."""
+
+    motions: tuple[PlannedMotion, ...]
+    gains: tuple[float, ...]  # decrease of the parameters' entropy by each motion, mean of the scenarios [nat]
+    widths: dict[str, tuple[float, float]]  # parameter → width of its interval relative to the prior, before and after
+
+
+def plan_motions(
+    recordings: Recordings,
+    *,
+    fitted: FitResult | None = None,
+    count: int = MOTIONS,
+    workspace: tuple[float, float, float] | None = None,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Plan:
+    """The `count` attempts with the highest expected information.
+
+    Parameters
+    ----------
+    recordings: give task, unit and grasp, and the noise if they have attempts
+    fitted: what is known already; None: the priors
+    workspace: largest |x|, |y| [m], |yaw| [rad] of the gripper about the taught hole; None: that of the task
+    progress: gets the number of finished scenarios of `SCENARIOS`
+
+    Raises UsageError when the workspace leaves no candidate, SimulationError when no scenario can be simulated.
+    """
+    readings = ReadingModel(recordings)
+    task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
+    candidates = _candidates(task, workspace)
+    noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
+    found = []
+    for k in range(SCENARIOS):
+        point = _point(len(readings.fitted), fitted, rng)
+        misalignment = task.draw_misalignment(rng, 1)[0]
+        with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
+            found.append(_scenario(readings, point, in_hole(misalignment, candidates), noise))
+        progress(k + 1)
+    if not found:
+        raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
+    before: Array = np.eye(len(readings.fitted)) if fitted is None else np.asarray(np.linalg.inv(fitted.covariance))
+    chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
+    motions = tuple(PlannedMotion(*map(float, candidates[i]), depth=task.descent) for i in chosen)
+    names = [p.name for p in readings.fitted]
+    widths = (np.sqrt(np.diag(np.linalg.inv(before))), after)
+    return Plan(motions, gains, {name: (float(a), float(b)) for name, a, b in zip(names, *widths, strict=True)})
+
+
+def _candidates(task: InsertionTask, workspace: tuple[float, float, float] | None) -> Array:
+    """Planar poses (n, 3) about the taught hole within the workspace."""
+    limit = np.minimum(task.workspace, task.workspace if workspace is None else workspace)
+    directions = np.arange(8) * np.pi / 4
+    poses = np.array(
+        [(r * np.cos(a), r * np.sin(a), yaw) for r, a, yaw in itertools.product(_OFFSETS, directions, _YAWS)]
+    )
+    inside = poses[(np.abs(poses) <= limit + 1e-12).all(1)]
+    if not len(inside):
+        x, y, yaw = 1e3 * limit[0], 1e3 * limit[1], np.degrees(limit[2])
+        least = 1e3 * min(_OFFSETS)
+        raise UsageError(
+            f"no motion to plan within the workspace of {x:g} mm, {y:g} mm and {yaw:g}°: the motions of a plan are at "
+            f"least {least:g} mm from the taught hole"
+        )
+    return inside
+
+
+def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Array:
+    """Whitened parameters of a scenario."""
+    drawn = rng.normal(size=count)
+    if fitted is None:
+        return _SPREAD * np.clip(drawn, -1.7, 1.7)
+    start = fitted.starts[int(rng.integers(len(fitted.starts)))]
+    return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
+
+
+def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float) -> Array:
+    """Information (n, count + 3, count + 3) of attempts at poses in the hole frame, down to their stops by contact."""
+    n, task = len(poses), readings.forces.task
+    depths = np.linspace(0.4, 1.0, _LEVELS) * task.descent
+    values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
+    descents = Descents(np.repeat(poses, _LEVELS, 0), np.zeros(n * _LEVELS), np.tile(depths, n))
+    reading, _ = readings.read(values, descents)
+    shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
+    shear[:, -1] = np.inf
+    stop = depths[(shear > _STOP_SHEAR).argmax(1)]
+    return information(readings, point, Descents(poses, np.zeros(n), stop), noise)
+
+
+def _greedy(found: Array, before: Array, pose: Array, count: int) -> tuple[list[int], tuple[float, ...], Array]:
+    """Attempts chosen one after the other for the highest mean gain; their gains [nat]; the widths after all of them.
+
+    `found` are the informations (scenarios, candidates, count + 3, count + 3); a pose may be chosen once.
+    """
+    sums = np.zeros_like(found[:, 0])
+    entropy = np.full(len(found), np.linalg.slogdet(before)[1])
+    chosen: list[int] = []
+    gains = []
+    for _ in range(min(count, found.shape[1])):
+        total = np.linalg.slogdet(before + without_pose(sums[:, None] + found, pose))[1]
+        gain = 0.5 * (total - entropy[:, None])
+        mean = gain.mean(0)
+        mean[chosen] = -np.inf
+        best = int(mean.argmax())
+        chosen.append(best)
+        gains.append(float(mean[best]))
+        sums, entropy = sums + found[:, best], total[:, best]
+    variances = np.linalg.inv(before + without_pose(sums, pose))
+    widths = np.sqrt(np.diagonal(variances, axis1=1, axis2=2)).mean(0)
+    return chosen, tuple(gains), widths
