@@ -102,20 +102,22 @@ def calibrate(
     seed: int = 0,
     settings: FitSettings | None = None,
     processes: int = 1,
+    hold_out: bool = True,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Calibration:
-    """Fit the simulator to recordings; the last insertion is held out if there are several.
+    """Fit the simulator to recordings; with `hold_out` the last insertion is held out if there are several.
 
     Raises UsageError without attempts, SimulationError when no start can be simulated.
     """
     insertions = np.unique(recordings.insertion)
-    training = recordings.of(insertions[:-1]) if len(insertions) > 1 else recordings
+    hold_out = hold_out and len(insertions) > 1
+    training = recordings.of(insertions[:-1]) if hold_out else recordings
     result = fit(training, seed=seed, settings=settings, processes=processes, progress=progress)
     problem = Problem(training)
     rng = np.random.default_rng((seed, 0xCA1))
     point = result.best.point[: result.count]
     held_out = None
-    if len(insertions) > 1:
+    if hold_out:
         held_out = _flow_maps(Problem(recordings.of(insertions[-1:])), point, rng)
     return Calibration(
         _estimates(problem.fitted, result),

@@ -16,6 +16,7 @@ from gelflow.errors import SimulationError
 from gelflow.policies.calibration.poses import best_poses, draw_poses
 from gelflow.policies.calibration.problem import MODEL_ERROR, Problem, huber_weights
 from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ class StartResult:
 
     point: Array  # whitened unknowns, see `Problem`
     misalignment: Array  # (insertions, 3)
-    covariance: Array  # of the unknowns, with these poses
+    covariance: Array  # of the unknowns, with unknown poses
     cost: float
     chi: float  # root mean square of the whitened residuals
 
@@ -175,12 +176,8 @@ def _descend(
             point, poses = moved, searched
     line = problem.linearize(point, poses)
     residuals = line.residuals.reshape(-1)
-    jacobian = line.jacobian.reshape(len(residuals), -1)
     chi = float(np.sqrt((huber_weights(residuals) * residuals**2).mean()))
-    information, _ = problem.normal_equations(residuals / max(1.0, chi), jacobian / max(1.0, chi), point)
-    return StartResult(
-        point, poses, np.asarray(np.linalg.inv(information), dtype=float), problem.cost(line.residuals, point), chi
-    )
+    return StartResult(point, poses, covariance(problem, point, poses, chi), problem.cost(line.residuals, point), chi)
 
 
 def levenberg_marquardt(

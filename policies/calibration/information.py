@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import SimulationError
 from gelflow.policies.calibration.model.reading_model import ReadingModel
-from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
 from gelflow.policies.calibration.problem import CORRELATED, DRIFT, MODEL_ERROR
 from gelflow.task import InsertionTask
 
@@ -13,16 +14,19 @@ Array = NDArray[np.float64]
 # Half distance of the poses from whose readings a slope is taken [m, m, rad]. The forces have steps where contact
 # points cross edges of the hole, so that the slope of a smaller distance says nothing about a finite change of pose.
 POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])
+_STEP = 0.2  # of differences in parameters and start heights, in standard deviations of their priors
 
 
 def information(readings: ReadingModel, point: Array, descents: Descents, noise: float) -> Array:
     """Fisher information of each of n descents about the whitened parameters and its pose, (n, count + 3, count + 3).
 
     The pose is in units of `POSE_STEP`; the start height of each descent is unknown. `noise` is the standard deviation
-    of the difference of two readings of a marker [N]. Raises SimulationError when a descent cannot be simulated.
+    of the difference of two readings of a marker [N]. Slopes are differences of simulated readings, which are faster
+    than exact derivatives for many descents. Raises SimulationError when no descent can be simulated.
     """
-    reading, slopes = readings.slopes(point, descents)
-    columns = np.stack([*slopes[:-1], *pose_slopes(readings, point, descents), slopes[-1]], -1)
+    reading, columns, ok = _slopes(readings, point, descents)
+    if not ok.any():
+        raise SimulationError("no descent can be simulated with these parameters")
     sigma = np.sqrt(noise**2 + (MODEL_ERROR**2) * (reading**2).mean((1, 2)) + 1e-12)
     per_pad = columns.reshape(len(sigma), 2, -1, 2, columns.shape[-1])
     shift = 1 - sigma / np.sqrt(sigma**2 + per_pad.shape[2] * DRIFT**2)  # a common shift of a pad is unknown as well
@@ -31,24 +35,46 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
     full = np.einsum("nki,nkj->nij", jacobian, jacobian) / CORRELATED
     full[:, -1, -1] += 1.0
     of_height = full[:, :-1, -1]
-    return np.asarray(full[:, :-1, :-1] - of_height[:, :, None] * of_height[:, None, :] / full[:, -1:, -1:])
+    result = full[:, :-1, :-1] - of_height[:, :, None] * of_height[:, None, :] / full[:, -1:, -1:]
+    return np.where(ok[:, None, None], result, 0.0)
+
+
+def _slopes(readings: ReadingModel, point: Array, descents: Descents) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Readings (n, markers, 2) [N]; their slopes (n, markers, 2, count + 4); and whether all simulations succeeded.
+
+    Slopes are by each whitened parameter, by the pose in units of `POSE_STEP`, and by the start height in standard
+    deviations. Those by parameters of the pads are exact.
+    """
+    n, count = len(descents.depth), len(readings.fitted)
+    simulated = [i for i, p in enumerate(readings.fitted) if p.name in QUANTITIES]
+    # One variation of all descents after the other: none, parameters, height, poses.
+    points = [point[:count] + _STEP * np.eye(count)[i] for i in simulated]
+    points = [point[:count], *points, *([point[:count]] * 7)]
+    shifts = [np.zeros(3)] * (len(simulated) + 2) + [s * row for row in np.diag(POSE_STEP) for s in (1.0, -1.0)]
+    raised = np.zeros(len(points))
+    raised[len(simulated) + 1] = _STEP * readings.height_spread
+    values = {name: np.repeat(value, n) for name, value in readings.values(np.stack(points)).items()}
+    pose = (np.stack(shifts)[:, None] + descents.pose[None]).reshape(-1, 3)
+    z = np.repeat(raised, n) + np.tile(descents.z, len(points))
+    forces = {name: values[name] for name in QUANTITIES}
+    shear, ok = readings.forces.shear(forces, Descents(pose, z, np.tile(descents.depth, len(points))))
+    read = readings.pads.read(shear, values).reshape(len(points), n, *shear.shape[1:])
+    columns = np.zeros((n, *read.shape[2:], count + 4))
+    for k, i in enumerate(simulated):
+        columns[..., i] = (read[1 + k] - read[0]) / _STEP
+    for i, slope in readings.pad_slopes(point, shear[:n]).items():
+        columns[..., i] = slope
+    columns[..., -1] = (read[len(simulated) + 1] - read[0]) / _STEP
+    for axis in range(3):
+        first = len(simulated) + 2 + 2 * axis
+        columns[..., count + axis] = (read[first] - read[first + 1]) / 2
+    return read[0], columns, ok.reshape(len(points), n).all(0)
 
 
 def pose_prior(task: InsertionTask) -> Array:
     """Information about the misalignment of a part before its first attempt, in units of `POSE_STEP`, (3, 3)."""
     spread = np.maximum(np.asarray(task.misalignment), 1e-6) / np.sqrt(3) / POSE_STEP
     return np.diag(1 / spread**2)
-
-
-def pose_slopes(readings: ReadingModel, point: Array, descents: Descents) -> list[Array]:
-    """Changes (n, markers, 2) of the readings [N] per `POSE_STEP` in x, y and yaw of the hole frame."""
-    n, axes = len(descents.depth), len(POSE_STEP)
-    shifts = np.vstack([sign * np.diag(POSE_STEP) for sign in (1.0, -1.0)])
-    pose = (descents.pose[:, None] + shifts[None]).reshape(-1, 3)
-    values = {name: np.full(len(pose), value) for name, value in readings.values(point).items()}
-    moved, _ = readings.read(values, Descents(pose, np.repeat(descents.z, 6), np.repeat(descents.depth, 6)))
-    moved = moved.reshape(n, 2, axes, *moved.shape[1:])
-    return [(moved[:, 0, i] - moved[:, 1, i]) / 2 for i in range(axes)]
 
 
 def without_pose(information: Array, pose: Array) -> Array:

@@ -26,10 +26,10 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
-SCENARIOS = 4  # over which the information is averaged
+SCENARIOS = 12  # over which the information is averaged
 MOTIONS = 5  # of a plan
 USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before anything is recorded [N]
-_OFFSETS = (4e-3, 8e-3)  # of the candidates from the taught hole [m]
+_OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
 _YAWS = np.radians([-8.0, 0.0, 8.0])
 _STOP_SHEAR = 0.012  # mean shear of a pad at which contact stops a descent [N]: 0.12 mm of a gel of the scene
 _LEVELS = 8  # depths at which the stop is searched
@@ -80,7 +80,7 @@ def plan_motions(
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
     before: Array = np.eye(len(readings.fitted)) if fitted is None else np.asarray(np.linalg.inv(fitted.covariance))
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
-    motions = tuple(PlannedMotion(*map(float, candidates[i]), depth=task.descent) for i in chosen)
+    motions = tuple(PlannedMotion(x, y, yaw, task.descent) for x, y, yaw in candidates[chosen].tolist())
     names = [p.name for p in readings.fitted]
     widths = (np.sqrt(np.diag(np.linalg.inv(before))), after)
     return Plan(motions, gains, {name: (float(a), float(b)) for name, a, b in zip(names, *widths, strict=True)})
@@ -93,7 +93,7 @@ def _candidates(task: InsertionTask, workspace: tuple[float, float, float] | Non
     poses = np.array(
         [(r * np.cos(a), r * np.sin(a), yaw) for r, a, yaw in itertools.product(_OFFSETS, directions, _YAWS)]
     )
-    inside = poses[(np.abs(poses) <= limit + 1e-12).all(1)]
+    inside: Array = poses[(np.abs(poses) <= limit + 1e-12).all(1)]
     if not len(inside):
         x, y, yaw = 1e3 * limit[0], 1e3 * limit[1], np.degrees(limit[2])
         least = 1e3 * min(_OFFSETS)

@@ -47,6 +47,16 @@ def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
     return np.asarray(0.5 * ((in_hole(poses, found[None]) / _FREE) ** 2).sum(1))
 
 
+def prior_information(problem: Problem, insertion: int) -> Array:
+    """Information of the prior about the misalignment of an insertion, (3, 3) [1/m, 1/m, 1/rad each]."""
+    found = problem.recordings.inserted.get(insertion)
+    if found is None:
+        spread = np.maximum(np.asarray(problem.recordings.task.misalignment), 1e-9) / np.sqrt(3)
+    else:
+        spread = np.asarray(_FREE)
+    return np.diag(1 / spread**2)
+
+
 def best_poses(
     problem: Problem, point: Array, candidates: list[Array], *, range_of_heights: float = 1.0
 ) -> tuple[list[Array], list[Array], list[Array]]:

@@ -12,7 +12,7 @@ from gelflow.session.reader import SessionReader
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
-_SETTLE = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
+AT_REST = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
 _HEIGHT = 0.3e-3  # standard deviation of a part's height in the gripper, per attempt [m]
 
 
@@ -55,7 +55,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         "mm",
         tuple(row["name"] for row in rows),
         {new[i]: pose for i, pose in inserted.items() if i in new},
-        settle=_SETTLE,
+        settle=AT_REST,
         grasp_force=float(np.mean([force for force, _ in labs])),
         grasp_height=float(np.mean([height for _, height in labs])),
         height_spread=_HEIGHT,
@@ -73,7 +73,7 @@ def nothing_recorded(task: InsertionTask, *, grasp_force: float | None, grasp_he
     flow = np.zeros((0, task.sensors, task.grid.rows, task.grid.cols, 2))
     return Recordings(
         task, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), flow, "mm", (),
-        settle=_SETTLE, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
+        settle=AT_REST, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
     )  # fmt: skip
 
 

@@ -108,6 +108,7 @@ class AttemptResult:
     inserted: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # shape (n,): a simulation step failed
     depth: Array  # [m], shape (n,): of the gripper's target below its start when the descent ended, by contact or not
+    offset: Array  # [m], shape (n,): of the lower face at the start, above the task's start height
 
 
 def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = None, friction: str = "elastic") -> Scene:
@@ -275,7 +276,7 @@ class InsertionAttempts:
         readings = self._readings(dict(zip(steps, shear, strict=True)), chosen, rng)
         stack = np.stack([readings[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
-        return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed, depth)
+        return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed, depth, jitter)
 
     def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
         """The descent of the grippers `rows`, read after `steps`."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.motion_plan import PlannedMotion
 from gelflow.observation import FlowMap
 from gelflow.policies.calibration.model.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
 from gelflow.policies.calibration.problem import in_hole
@@ -47,16 +48,18 @@ class RecordedWorld:
     truth: dict[str, float]
     misalignment: Array  # (insertions, 3), of the recorded insertions
     noise: float  # standard deviation of the difference of two readings [N]
+    heights: Array  # of the attempts' starts above the task's start height [m], (n,)
 
 
-def record_world(seed: int) -> RecordedWorld:
+def record_world(seed: int, *, plan: Sequence[PlannedMotion] = ()) -> RecordedWorld:
     """Insertions with the shipped policy in the world of a seed, which differs from training in all quantities.
 
-    Raises UsageError when the world cannot hold its part, or no attempt has contact.
+    With a `plan` its motions are made on the first part instead. Raises UsageError when the world cannot hold its part,
+    or no attempt has contact.
     """
     rng = np.random.default_rng((seed, 0xCA1))
     drawn = widened(FULL_RANDOMIZATION).sample(rng, 1, friction="elastic")
-    return record_insertions({name: float(value[0]) for name, value in drawn.items()}, rng)
+    return record_insertions({name: float(value[0]) for name, value in drawn.items()}, rng, plan=plan)
 
 
 def record_insertions(
@@ -66,6 +69,7 @@ def record_insertions(
     task: InsertionTask = INSERTION,
     insertions: int = 5,
     attempts: int = 2,
+    plan: Sequence[PlannedMotion] = (),
     **scene: Any,
 ) -> RecordedWorld:
     """Insertions with the shipped policy in a world; the first `attempts` of each are recorded.
@@ -73,6 +77,7 @@ def record_insertions(
     Parameters
     ----------
     fixed: value of every quantity of the randomization
+    plan: motions that are made on the first part instead, all of them recorded
     task: part and hole, and the observations of the policy
     scene: options of `insertion_scene`, such as the friction law
 
@@ -84,11 +89,50 @@ def record_insertions(
     world.draw(rng, misalignment=misalignment)
     all_rows = np.arange(insertions)
     world.sensors.copy(all_rows, world.sensors, np.zeros_like(all_rows))  # the same pads in all insertions
+    if plan:
+        rows, inserted = _planned(world, misalignment, plan, rng), {}
+    else:
+        rows, inserted = _with_policy(world, misalignment, attempts, rng)
+    if not rows:
+        raise UsageError("no attempt in this world has contact")
+    kept = sorted({row[0] for row in rows})
+    recordings = _recordings(rows, kept, task, inserted, fixed, rng)
+    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
+    heights = np.array([row[4] for row in rows])
+    return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]), heights)
+
+
+# Insertion, planar pose, depth [m], marker vectors, and start height above the task's [m] of an attempt.
+_Row = tuple[int, Array, float, Array, float]
+
+
+def _planned(
+    world: InsertionAttempts, misalignment: Array, plan: Sequence[PlannedMotion], rng: np.random.Generator
+) -> list[_Row]:
+    """The motions of a plan on the first part; those that fall into the hole have no contact and are not recorded."""
+    rows = []
+    for motion in plan:
+        planar = np.array(motion.planar_pose)
+        world.pose[0] = in_hole(misalignment[0], planar)
+        result = world.attempt(rng, which=np.arange(world.num_envs) == 0)
+        if result.failed[0]:
+            raise UsageError("this world cannot be simulated")
+        if not result.inserted[0]:
+            flow = _vectors(result.image[0], float(result.divisor[0]), world.task)
+            rows.append((0, planar, float(result.depth[0]), flow, float(result.offset[0])))
+    return rows
+
+
+def _with_policy(
+    world: InsertionAttempts, misalignment: Array, attempts: int, rng: np.random.Generator
+) -> tuple[list[_Row], dict[int, Array]]:
+    """Insertions with the shipped policy: the first `attempts` of each, and the planar poses of inserted parts."""
+    task, insertions = world.task, world.num_envs
     shipped = load_network(default_checkpoint(), task=INSERTION)
     assert isinstance(shipped, FlowMapNetwork)
     policies = [NetworkPolicy(shipped) for _ in range(insertions)]
     planar, active = np.zeros((insertions, 3)), np.ones(insertions, dtype=bool)
-    rows: list[tuple[int, Array, float, Array]] = []
+    rows: list[_Row] = []
     inserted: dict[int, Array] = {}
     for attempt in range(task.attempts):
         if not active.any():
@@ -104,26 +148,21 @@ def record_insertions(
                 continue
             flow = _vectors(result.image[k], float(result.divisor[k]), task)
             if attempt < attempts:
-                rows.append((int(i), planar[i].copy(), float(result.depth[k]), flow))
+                rows.append((int(i), planar[i].copy(), float(result.depth[k]), flow, float(result.offset[k])))
             observed = FlowMap(result.image[k], float(result.divisor[k]), "N", np.zeros((2, 1, 1), bool))
             planar[i] = task.corrected(planar[i], policies[i].act(observed))
-    if not rows:
-        raise UsageError("no attempt in this world has contact")
-    kept = sorted({row[0] for row in rows})
-    recordings = _recordings(rows, kept, task, inserted, fixed, rng)
-    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
-    return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]))
+    return rows, inserted
 
 
 def _recordings(
-    rows: Sequence[tuple[int, Array, float, Array]],
+    rows: Sequence[_Row],
     kept: Sequence[int],
     task: InsertionTask,
     inserted: Mapping[int, Array],
     fixed: Mapping[str, float],
     rng: np.random.Generator,
 ) -> Recordings:
-    """Recordings of attempts: insertion, planar pose, depth and marker vectors of each; `kept` are the insertions."""
+    """Recordings of attempts; `kept` are the insertions."""
     new = {old: k for k, old in enumerate(kept)}
     return Recordings(
         task,

@@ -25,8 +25,8 @@ class ReadingModel:
     def __init__(self, recordings: Recordings, *, threads: int | None = None) -> None:
         self.fitted: tuple[Parameter, ...] = parameters(recordings)
         self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads)
-        self._pads = PadModel([pad.positions for pad in self.forces.scene.pads])
-        self._height_spread = recordings.height_spread
+        self.pads = PadModel([pad.positions for pad in self.forces.scene.pads])
+        self.height_spread = recordings.height_spread
         # Unit of the recordings per newton of a reading.
         self.scale = 1.0 if recordings.unit == "N" else _displacement_scale(self.forces)
 
@@ -37,7 +37,7 @@ class ReadingModel:
     def read(self, values: Mapping[str, Array], descents: Descents) -> tuple[Array, NDArray[np.bool_]]:
         """Readings (n, markers, 2) [N] of n descents, and whether they could be simulated; values have shape (n,)."""
         shear, ok = self.forces.shear({name: values[name] for name in QUANTITIES}, descents)
-        return self._pads.read(shear, values), ok
+        return self.pads.read(shear, values), ok
 
     def slopes(self, point: Array, descents: Descents) -> tuple[Array, list[Array]]:
         """Readings (n, markers, 2) [N], and their derivatives by each whitened parameter, then by the start height.
@@ -48,21 +48,26 @@ class ReadingModel:
         directions = [*QUANTITIES, "z"]
         shear, slopes = self.forces.derivatives({q: values[q] for q in QUANTITIES}, descents, directions)
         one = {name: np.asarray(value) for name, value in values.items()}
-        of_pads = self._pads.derivatives(shear, values)
+        of_pads = self.pad_slopes(point, shear)
         changes = []
         for i, parameter in enumerate(self.fitted):
-            name, slope = parameter.name, parameter.slope(float(point[i]))
-            if name in QUANTITIES:
-                changes.append(slope * self._pads.read(slopes[:, directions.index(name)], one))
-            else:
-                changes.append(slope * of_pads[name])
-        changes.append(self._height_spread * self._pads.read(slopes[:, -1], one))
-        return self._pads.read(shear, one), changes
+            if i in of_pads:
+                changes.append(of_pads[i])
+                continue
+            slope = slopes[:, directions.index(parameter.name)]
+            changes.append(parameter.slope(float(point[i])) * self.pads.read(slope, one))
+        changes.append(self.height_spread * self.pads.read(slopes[:, -1], one))
+        return self.pads.read(shear, one), changes
 
-    def jacobian(self, point: Array, descents: Descents) -> Array:
-        """The derivatives of `slopes` as one array (n, markers * 2, parameters + 1)."""
-        slopes = self.slopes(point, descents)[1]
-        return np.stack([slope.reshape(len(slope), -1) for slope in slopes], -1)
+    def pad_slopes(self, point: Array, shear: Array) -> dict[int, Array]:
+        """Index of each parameter of the pads → derivative of the readings of `shear` (…, markers, 2) by it, whitened."""
+        values = {name: float(value) for name, value in self.values(point).items()}
+        slopes = self.pads.derivatives(shear, values)
+        found = {}
+        for i, parameter in enumerate(self.fitted):
+            if parameter.name in slopes:
+                found[i] = parameter.slope(float(point[i])) * slopes[parameter.name]
+        return found
 
 
 def _displacement_scale(model: ShearModel) -> float:
