@@ -1,6 +1,7 @@
-"""Calibration measured in simulated worlds: `coverage` of its intervals, or the `transfer` matrix of the insertion."""
+"""Calibration in simulated worlds: `coverage` of its intervals, a motion `plan`, or the `transfer` matrix."""
 
 import argparse
+import dataclasses
 import json
 import sys
 import tempfile
@@ -11,8 +12,12 @@ import script
 from rich.table import Table
 
 from gelflow.policies.calibration.experiment.coverage import measure_coverage
+from gelflow.policies.calibration.experiment.planned import measure_plan
 from gelflow.policies.calibration.experiment.transfer import measure_world, worlds
 from gelflow.policies.calibration.fit import FitSettings
+from gelflow.policies.calibration.planning import SCENARIOS, plan_motions
+from gelflow.policies.calibration.session_recordings import nothing_recorded
+from gelflow.task import INSERTION
 
 _QUICK = FitSettings(starts=1, points=1, poses=16, steps=1)
 
@@ -20,9 +25,9 @@ _QUICK = FitSettings(starts=1, points=1, poses=16, steps=1)
 def main() -> int:
     """Measure what the first argument names."""
     chooser = argparse.ArgumentParser(description=__doc__)
-    chooser.add_argument("measure", choices=("coverage", "transfer"), help="each has --help of its own")
+    chooser.add_argument("measure", choices=("coverage", "plan", "transfer"), help="each has --help of its own")
     chosen = chooser.parse_args(sys.argv[1:2])
-    return coverage(sys.argv[2:]) if chosen.measure == "coverage" else transfer(sys.argv[2:])
+    return {"coverage": coverage, "plan": plan, "transfer": transfer}[chosen.measure](sys.argv[2:])
 
 
 def coverage(words: list[str]) -> int:
@@ -43,6 +48,33 @@ def coverage(words: list[str]) -> int:
     keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
     table.add_row(*(str(result[key]) for key in keys))
     script.finish(args, script.header() | result, table)
+    return 0
+
+
+def plan(words: list[str]) -> int:
+    """Compare the intervals of a motion plan with those of unplanned insertions, which make twice as many attempts."""
+    arguments = script.parser(plan.__doc__ or "", out="calibration_plan.json", quick="two worlds")
+    arguments.add_argument("--worlds", type=int, default=40, metavar="N", help="number of worlds (default 40)")
+    arguments.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first world (default 0)")
+    arguments.add_argument(
+        "--fits", type=int, default=0, metavar="N", help="worlds that are calibrated too (default 0)"
+    )
+    args = arguments.parse_args(words)
+    lab = dataclasses.replace(nothing_recorded(INSERTION, grasp_force=None, grasp_height=None), unit="N")
+    with script.progress("scenarios", SCENARIOS) as advance:
+        motions = plan_motions(lab, progress=lambda done: advance(1)).motions
+    count = 2 if args.quick else args.worlds
+    seeds = range(args.first, args.first + count)
+    with script.progress("worlds", count) as advance:
+        result = measure_plan(seeds, motions, fits=args.fits, processes=2, progress=lambda world: advance(1))
+    table = Table("intervals", "worlds", "motions planned", "unplanned", "mean ratio of widths", "same or narrower")
+    for key, name in (("expected", "expected"), ("expected_half", "expected, half"), ("fitted", "calibrated")):
+        if key in result:
+            row, half = result[key], 0.5 if key == "expected_half" else 1.0
+            made = f"{row['motions_planned']:.1f}", f"{half * row['motions_unplanned']:.1f}"
+            table.add_row(name, str(row["worlds"]), *made, f"{row['mean_ratio']:.2f}", str(row["same_or_narrower"]))
+    described = [{"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth} for m in motions]
+    script.finish(args, script.header() | {"plan": described} | result, table)
     return 0
 
 

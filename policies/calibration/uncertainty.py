@@ -16,9 +16,7 @@ from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, hub
 Array = NDArray[np.float64]
 
 _DEVIATIONS = 1.96  # at which the rise of the cost is measured
-_FACTORS = np.array(
-    [1.0, 2.0, 4.0, 8.0, 16.0]
-)  # of a deviation that are tried, the first one that is sufficient is taken
+_FACTORS = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # of a deviation that are tried, until the rise is sufficient
 _LIMIT = 4.0  # whitened parameters and heights stay within, as in the fit
 
 

@@ -60,7 +60,7 @@ class ReadingModel:
         return self.pads.read(shear, one), changes
 
     def pad_slopes(self, point: Array, shear: Array) -> dict[int, Array]:
-        """Index of each parameter of the pads → derivative of the readings of `shear` (…, markers, 2) by it, whitened."""
+        """Index of each parameter of the pads → derivative of the readings of `shear` (…, markers, 2) by it."""
         values = {name: float(value) for name, value in self.values(point).items()}
         slopes = self.pads.derivatives(shear, values)
         found = {}
