@@ -56,9 +56,7 @@ def plan(words: list[str]) -> int:
     arguments = script.parser(plan.__doc__ or "", out="calibration_plan.json", quick="two worlds")
     arguments.add_argument("--worlds", type=int, default=40, metavar="N", help="number of worlds (default 40)")
     arguments.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first world (default 0)")
-    arguments.add_argument(
-        "--fits", type=int, default=0, metavar="N", help="worlds that are calibrated too (default 0)"
-    )
+    arguments.add_argument("--fits", type=int, default=0, metavar="N", help="worlds that are also calibrated (0)")
     args = arguments.parse_args(words)
     lab = dataclasses.replace(nothing_recorded(INSERTION, grasp_force=None, grasp_height=None), unit="N")
     with script.progress("scenarios", SCENARIOS) as advance:

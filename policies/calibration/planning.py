@@ -26,7 +26,7 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
-SCENARIOS = 12  # over which the information is averaged
+SCENARIOS = 12
 MOTIONS = 5  # of a plan
 USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before anything is recorded [N]
 _OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
@@ -51,6 +51,7 @@ def plan_motions(
     fitted: FitResult | None = None,
     count: int = MOTIONS,
     workspace: tuple[float, float, float] | None = None,
+    scenarios: int = SCENARIOS,
     seed: int = 0,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Plan:
@@ -61,7 +62,8 @@ def plan_motions(
     recordings: give task, unit and grasp, and the noise if they have attempts
     fitted: what is known already; None: the priors
     workspace: largest |x|, |y| [m], |yaw| [rad] of the gripper about the taught hole; None: that of the task
-    progress: gets the number of finished scenarios of `SCENARIOS`
+    scenarios: number of scenarios over which the information is averaged
+    progress: gets the number of finished scenarios
 
     Raises UsageError when the workspace leaves no candidate, SimulationError when no scenario can be simulated.
     """
@@ -70,7 +72,7 @@ def plan_motions(
     candidates = _candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
     found = []
-    for k in range(SCENARIOS):
+    for k in range(scenarios):
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part

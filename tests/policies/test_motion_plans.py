@@ -1,0 +1,146 @@
+"""Plans of attempts: files, the information of attempts, and the covariance that plans and intervals rest on."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gelflow.cli.main import main
+from gelflow.errors import UsageError
+from gelflow.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
+from gelflow.policies.calibration.experiment.planned import expected_widths
+from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
+from gelflow.policies.calibration.fit import FitResult, StartResult
+from gelflow.policies.calibration.information import information, pose_prior, without_pose
+from gelflow.policies.calibration.model.reading_model import ReadingModel
+from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.planning import plan_motions
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.session_recordings import nothing_recorded
+from gelflow.policies.calibration.uncertainty import covariance
+from gelflow.task import INSERTION
+
+WORLD = 8
+LAB = nothing_recorded(INSERTION, grasp_force=12.0, grasp_height=0.0)
+NEAR = (4e-3, 4e-3, 0.0)  # a workspace with few candidates
+MOTIONS = (PlannedMotion(3e-3, -2e-3, 0.1, 1.1e-3), PlannedMotion(-6e-3, 0.0, -0.14, 0.9e-3))
+
+
+@pytest.fixture(scope="module")
+def world() -> RecordedWorld:
+    return record_world(WORLD)
+
+
+def test_a_plan_file_has_the_motions_that_were_written(tmp_path: Path) -> None:
+    save_motion_plan(MOTIONS, tmp_path / "plan.toml", title="a test")
+    read = load_motion_plan(tmp_path / "plan.toml")
+    for motion, expected in zip(read, MOTIONS, strict=True):
+        assert (*motion.planar_pose, motion.depth) == pytest.approx((*expected.planar_pose, expected.depth), abs=1e-6)
+    with pytest.raises(UsageError, match="exists; name a new file"):
+        save_motion_plan(MOTIONS, tmp_path / "plan.toml", title="a test")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("format = 2", "motion plan format 2; this gelflow reads format 1"),
+        ("format = 1", "the plan has no motions"),
+        ("format = 1\n[[motions]]\nx = 0.0\ny = 0.0\nyaw = 5\ndepth = 1e-3", "unknown key 'yaw'; did you mean"),
+        ("format = 1\n[[motions]]\nx = 0.0\ny = 0.0\nyaw_deg = 5", "motion 1: depth is missing"),
+    ],
+)
+def test_files_that_are_no_plan_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(UsageError, match=message):
+        load_motion_plan(tmp_path / "plan.toml")
+
+
+def test_attempts_without_contact_have_no_information(world: RecordedWorld) -> None:
+    readings = ReadingModel(world.recordings, threads=1)
+    count = len(readings.fitted)
+    descents = Descents(np.array([[8e-3, 0.0, 0.0], [8e-3, 0.0, 0.0]]), np.zeros(2), np.array([0.9e-3, 0.1e-3]))
+    touching, free = information(readings, np.zeros(count), descents, 1e-4)
+    for matrix in (touching, free):
+        assert np.linalg.eigvalsh(matrix).min() > -1e-8 * np.abs(touching).max()
+    assert np.trace(touching) > 1e3 * np.trace(free)
+    known = without_pose(touching, pose_prior(INSERTION))
+    assert (np.diag(known) <= np.diag(touching[:count, :count]) * (1 + 1e-9)).all()
+
+
+@pytest.mark.slow
+def test_a_plan_has_its_most_informative_motions_first_and_keeps_to_the_workspace() -> None:
+    plan = plan_motions(LAB, count=4, workspace=NEAR, scenarios=2)
+    assert len(set(plan.motions)) == len(plan.motions) == 4
+    assert not any(motion.beyond(NEAR, INSERTION.descent) for motion in plan.motions)
+    assert plan.gains[0] == max(plan.gains) and min(plan.gains) > 0
+    assert all(after <= before for before, after in plan.widths.values())
+    assert plan_motions(LAB, count=1, workspace=NEAR, scenarios=2).motions == plan.motions[:1]
+    with pytest.raises(UsageError, match="no motion to plan within the workspace of 1 mm"):
+        plan_motions(LAB, workspace=(1e-3, 1e-3, 0.0))
+
+
+@pytest.mark.slow
+def test_a_plan_depends_on_what_is_known_already() -> None:
+    count = len(ReadingModel(LAB).fitted)
+    known = StartResult(np.zeros(count), np.zeros((1, 3)), 1e-4 * np.eye(count), 0.0, 1.0)
+    plan = plan_motions(LAB, fitted=FitResult((known,), count), count=2, workspace=NEAR, scenarios=1)
+    unknown = plan_motions(LAB, count=2, workspace=NEAR, scenarios=1)
+    assert plan.gains[0] < 0.5 * unknown.gains[0]
+    assert all(after <= before < 0.1 for before, after in plan.widths.values())
+
+
+def test_planned_attempts_are_made_on_one_part_of_the_same_world(world: RecordedWorld) -> None:
+    planned = record_world(WORLD, plan=[PlannedMotion(9e-3, 0.0, 0.0, 1.1e-3), PlannedMotion(0.0, 9e-3, 0.0, 1.1e-3)])
+    assert planned.truth == world.truth
+    assert planned.recordings.insertion.tolist() == [0, 0] and not planned.recordings.inserted
+    np.testing.assert_allclose(planned.recordings.planar_pose, [[9e-3, 0, 0], [0, 9e-3, 0]])
+    np.testing.assert_array_equal(planned.misalignment, world.misalignment[:1])
+    more, fewer = expected_widths(world), expected_widths(world, attempts=1)
+    assert all(more[name] <= fewer[name] * (1 + 1e-9) for name in more)
+
+
+@pytest.mark.slow
+def test_unknown_poses_widen_the_intervals(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.array([0, 1])), threads=1)
+    point = np.zeros(problem.size)
+    count = len(problem.fitted)
+    point[:count] = [float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted]
+    poses = world.misalignment[:2]
+    line = problem.linearize(point, poses)
+    chi = max(1.0, float(np.sqrt((line.residuals**2).mean())))
+    residuals = line.residuals.reshape(-1)
+    jacobian = line.jacobian.reshape(len(residuals), -1)
+    fixed = np.linalg.inv(problem.normal_equations(residuals / chi, jacobian / chi, point)[0])
+    free = covariance(problem, point, poses, chi)
+    np.testing.assert_allclose(free, free.T)
+    assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
+    assert np.trace(free[:count, :count]) > 1.01 * np.trace(fixed[:count, :count])
+
+
+def test_calibrate_refuses_contradicting_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = tmp_path / "plan.toml"
+    for words, message in (
+        ([], "name a recorded session, or a new plan file with --plan"),
+        (["--lab", "lab.toml", "a.mcap"], "--lab gives the limits of --plan"),
+        (["a.mcap", "--part", "peg"], "a session contains its part"),
+        (["--plan", str(plan), "--motions", "0"], "--motions must be at least 1"),
+    ):
+        assert main(["calibrate", *words]) == 2
+        assert message in capsys.readouterr().err
+    plan.write_text("mine")
+    assert main(["calibrate", "--plan", str(plan)]) == 2
+    assert "exists; name a new file with --plan" in capsys.readouterr().err
+    assert plan.read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_calibrate_writes_a_plan_within_the_workspace_of_the_lab(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = Path(__file__).parents[2] / "real" / "runner" / "lab_example.toml"
+    lab, plan = tmp_path / "lab.toml", tmp_path / "plan.toml"
+    lab.write_text(example.read_text().replace("# x = 0.016 ", "x = 0.004 ").replace("# y = 0.016 ", "y = 0.004 "))
+    assert main(["calibrate", "--plan", str(plan), "--lab", str(lab), "--motions", "2"]) == 0
+    assert "record it with: gelflow run insertion --lab LAB --plan" in capsys.readouterr().out
+    motions = load_motion_plan(plan)
+    assert len(motions) == 2 and not any(m.beyond((4e-3, 4e-3, 0.28), INSERTION.descent) for m in motions)
