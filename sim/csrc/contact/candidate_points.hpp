@@ -21,6 +21,7 @@ void grow(CandidatePoints<T>& c, bool elastic) {
   for (auto* values : {&c.x, &c.y, &c.z, &c.weight}) values->resize(size);
   if (!elastic) return;
   for (auto* values : {&c.anchor_x, &c.anchor_y, &c.anchor_z, &c.has_anchor}) values->resize(size);
+  c.active_packs.resize(size / pack_width<T> + 1);
 }
 
 // Whether the query contains every point that is now within `margin` of the shape: no point has moved farther than the

@@ -8,8 +8,8 @@
 
 namespace gelflow {
 
-// Anchors of all contacts after an accepted step, the last one evaluated in w. `next` and `next_set` may be the arrays
-// that are read.
+// Anchors of all contacts after an accepted step, whose forces were the last ones evaluated in w. `next` and `next_set`:
+// the arrays that are read, or copies of them.
 template <class T>
 void advance_contact_anchors(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
                              const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
@@ -17,9 +17,10 @@ void advance_contact_anchors(const Model& m, const T* params, const T& step_leng
     const Contact& contact = m.contacts[n];
     if (contact.anchor < 0) continue;
     const PointSet& set = m.point_sets[contact.points];
+    if (!advance_anchored<T>(w.candidates[n], set.cloud.size(), next_set + contact.anchor)) continue;
     const PairFrame<T> frame = pair_frame<T>(params, set.mount, m.shapes[contact.shape], w);
-    advance_anchors<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, step_length),
-                       set.cloud.size(), next + contact.anchor, next_set + contact.anchor);
+    const ContactSettings<T> settings = contact_settings<T>(m, contact, params, anchors, anchored, step_length);
+    advance_moved_anchors<T>(frame, w.candidates[n], settings, next + contact.anchor);
   }
 }
 

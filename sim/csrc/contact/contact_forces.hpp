@@ -129,6 +129,7 @@ void subtract_contact_forces(const Model& m, const T* params, const StepStart<T>
     if (!joins_trees) find_candidate_points<T>(frame, set.cloud, settings, cache, w.candidates[n]);
     if ((joins_trees && !w.layout.share_island(contact.first_tree, contact.second_tree)) ||
         !sum_forces<derivatives, T>(frame, w.candidates[n], settings, sums)) {
+      w.candidates[n].active_count = 0;
       if (!is_finite(frame.finiteness_probe())) w.residual[0] = frame.finiteness_probe();
       continue;
     }

@@ -14,8 +14,8 @@ namespace gelflow {
 template <class T>
 struct ContactPack {
   using P = Pack<T>;
-  int first = 0;               // index in the cloud of the first point, if the points are consecutive
-  const int* index = nullptr;  // else the indices of all
+  int first = 0;               // index of the first point in the cloud, or among the candidates
+  const int* index = nullptr;  // indices in the cloud; null where the points are consecutive there
   Mask<P> active;              // the point is in contact
   PointLaw<P> law;             // coefficients, weighted; zero if the point is not active
   Distance<P> at;

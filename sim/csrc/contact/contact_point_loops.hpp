@@ -9,7 +9,7 @@ namespace gelflow {
 
 // Ranges of points that may be in contact, in the order of the cloud; adjacent ones are merged.
 struct CandidateRuns {
-  std::vector<std::pair<int, int>> runs;  // begin, end
+  PointRanges runs;
   int points = 0;
 };
 // The result is stored per thread and overwritten by the next call.
@@ -124,8 +124,7 @@ GELFLOW_INLINE void load_anchors(const ContactSettings<T>& settings, int i, int 
   T anchors[3][width] = {}, has_anchor[width] = {};
   if constexpr (has_fours<T>) {
     if (i + width <= size) {
-      for (int k = 0; k < width; ++k) has_anchor[k] = T(settings.anchored[i + k]);
-      t.has_anchor = load<P>(has_anchor) > P(0.0);
+      t.has_anchor = load<P>(settings.anchored + i) > P(0.0);
       t.anchor = load_vectors<T>(settings.anchors[i].data());  // one that is not set may have any value: it is masked
       return;
     }
@@ -193,33 +192,41 @@ void for_contact_points(const PairFrame<T>& frame, const PointCloud& cloud, cons
                                       f, [](int, int) {});
 }
 
+// Evaluates the pack of candidate points from i on. Returns whether any of them is active; `t` is incomplete otherwise.
+template <bool with_hessian, class T>
+GELFLOW_INLINE bool eval_candidates(const PairFrame<T>& frame, const PairConstants<T>& pair,
+                                    const CandidatePoints<T>& candidates, int i, ContactPack<T>& t) {
+  using P = Pack<T>;
+  const Vec3<P> local{load<P>(&candidates.x[i]), load<P>(&candidates.y[i]), load<P>(&candidates.z[i])};
+  const P weight = load<P>(&candidates.weight[i]);
+  t.x = pair.to_shape_frame(local);
+  t.center = {t.x.x, t.x.y, t.x.z + pair.center_height};
+  distance<with_hessian>(frame.kind, frame.size, frame.grid, t.x, t.at);
+  t.active = t.at.d < P(0.0) && weight > P(0.0);
+  if (!any(t.active)) return false;
+  t.has_anchor = first_lanes<P>(0);
+  if (pair.elastic) {
+    t.anchor = {load<P>(&candidates.anchor_x[i]), load<P>(&candidates.anchor_y[i]), load<P>(&candidates.anchor_z[i])};
+    t.has_anchor = load<P>(&candidates.has_anchor[i]) > P(0.0);
+  }
+  t.first = i;
+  t.index = &candidates.index[i];
+  if (pair.elastic) {
+    eval_contact<true, T>(pair, select(t.active, weight, P(0.0)), t);
+  } else {
+    eval_contact<false, T>(pair, select(t.active, weight, P(0.0)), t);
+  }
+  return true;
+}
+
 // Calls f(pack) for the packs of candidate points with active points.
 template <bool with_hessian, class T, class F>
 GELFLOW_INLINE void for_contact_points(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
                                        const ContactSettings<T>& settings, F&& f) {
-  using P = Pack<T>;
   const PairConstants<T> pair(frame, settings);
   for (int i = 0; i < candidates.count; i += pack_width<T>) {
-    const Vec3<P> local{load<P>(&candidates.x[i]), load<P>(&candidates.y[i]), load<P>(&candidates.z[i])};
-    const P weight = load<P>(&candidates.weight[i]);
     ContactPack<T> t;
-    t.x = pair.to_shape_frame(local);
-    t.center = {t.x.x, t.x.y, t.x.z + pair.center_height};
-    distance<with_hessian>(frame.kind, frame.size, frame.grid, t.x, t.at);
-    t.active = t.at.d < P(0.0) && weight > P(0.0);
-    if (!any(t.active)) continue;
-    t.has_anchor = first_lanes<P>(0);
-    if (pair.elastic) {
-      t.anchor = {load<P>(&candidates.anchor_x[i]), load<P>(&candidates.anchor_y[i]), load<P>(&candidates.anchor_z[i])};
-      t.has_anchor = load<P>(&candidates.has_anchor[i]) > P(0.0);
-    }
-    t.index = &candidates.index[i];
-    if (pair.elastic) {
-      eval_contact<true, T>(pair, select(t.active, weight, P(0.0)), t);
-    } else {
-      eval_contact<false, T>(pair, select(t.active, weight, P(0.0)), t);
-    }
-    f(static_cast<const ContactPack<T>&>(t));
+    if (eval_candidates<with_hessian, T>(frame, pair, candidates, i, t)) f(static_cast<const ContactPack<T>&>(t));
   }
 }
 

@@ -123,15 +123,17 @@ GELFLOW_INLINE void add_force_stiffness(T center_height, ContactSums<T>& sums) {
   }
 }
 
-// Sums over the candidate points. Returns whether any of them is active; `sums` is not written otherwise.
+// Sums over the candidate points. Returns whether any of them is active; `sums` is not written otherwise. Under the
+// elastic law also lists the active packs.
 template <bool derivatives, class T>
-bool sum_forces(const PairFrame<T>& frame, const CandidatePoints<T>& candidates, const ContactSettings<T>& settings,
+bool sum_forces(const PairFrame<T>& frame, CandidatePoints<T>& candidates, const ContactSettings<T>& settings,
                 ContactSums<T>& sums) {
   using P = Pack<T>;
   constexpr int count = derivatives ? ContactSums<T>::count : 6, padded = derivatives ? ContactSums<T>::padded : 8;
   P total[padded];
   for (int i = count; i < padded; ++i) total[i] = P(0.0);
   bool any_active = false;
+  candidates.active_count = 0;
   ForceBuffer<T> buffer;
   const auto flush_buffer = [&]() GELFLOW_LOOP_BODY {
     if (any_active) {
@@ -144,6 +146,11 @@ bool sum_forces(const PairFrame<T>& frame, const CandidatePoints<T>& candidates,
   for_contact_points<derivatives, T>(frame, candidates, settings, [&](const ContactPack<T>& t) GELFLOW_LOOP_BODY {
     PointForce<P> force;
     point_force<derivatives>(t.law, t.at, t.v, t.e, t.has_anchor, force);
+    if (t.law.elastic) {
+      candidates.active_packs[candidates.active_count++] = {
+          t.first, static_cast<std::uint8_t>(bits(t.active)),
+          static_cast<std::uint8_t>(bits(t.active && (force.sliding || !t.has_anchor)))};
+    }
     auto& e = buffer.entry[buffer.count++];
     e.x = t.x;
     e.force = force.force;

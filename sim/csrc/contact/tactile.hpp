@@ -82,19 +82,24 @@ void read_markers(const Model& m, const T* params, const V3<T>* anchors, const s
   tracker.finish();
 }
 
-// Anchors of the markers after an accepted step. Pads that collide share the anchors of their contacts.
+// Anchors of the markers after an accepted step. Pads that collide share the anchors of their contacts. `next` and
+// `next_set`: the arrays that are read, or copies of them.
 template <class T>
 void advance_marker_anchors(const Model& m, const T* params, const T& step_length, const V3<T>* anchors,
                             const std::uint8_t* anchored, Workspace<T>& w, V3<T>* next, std::uint8_t* next_set) {
-  for (const Pad& pad : m.pads) {
+  for (std::size_t p = 0; p < m.pads.size(); ++p) {
+    const Pad& pad = m.pads[p];
     if (pad.anchor < 0 || pad.collides) continue;
     for (std::size_t s = 0; s < pad.shapes.size(); ++s) {
       const PairFrame<T> frame = pair_frame<T>(params, pad.mount, m.shapes[pad.shapes[s]], w);
       const std::size_t slot = pad.anchor + s * pad.cloud.size();
       const ContactSettings<T> settings = contact_settings<T>(pad, s, params, anchors, anchored, step_length);
-      advance_anchors<T>(frame, pad.cloud, settings, next + slot, next_set + slot);
+      PointRanges& ranges = w.anchored_markers[p][s];
+      if (!w.knows_anchored_markers) ranges = {{0, pad.cloud.size()}};
+      advance_anchors<T>(frame, pad.cloud, settings, next + slot, next_set + slot, ranges);
     }
   }
+  w.knows_anchored_markers = true;
 }
 
 // Adds the gradients with respect to the relative pose and twist of a pad and its shape number s, and to the anchors

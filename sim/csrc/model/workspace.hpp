@@ -69,10 +69,22 @@ struct BroadPhaseQuery {
   double margin;  // [m]
 };
 
+// Ranges of the points of a cloud (begin, end), ascending.
+using PointRanges = std::vector<std::pair<int, int>>;
+
+// A pack of candidates with points in contact: from candidate `first` on, a bit per lane.
+struct ActivePack {
+  int first;
+  std::uint8_t active;
+  std::uint8_t moved;  // points whose anchor changes at the end of the step: new or sliding ones
+};
+
 // The points of one cloud that may touch one shape, as structure of arrays (broad_phase.hpp).
 template <class T>
 struct CandidatePoints {
   int count = 0, capacity = 0;
+  int active_count = 0;
+  std::vector<ActivePack> active_packs;                     // of the last evaluation of forces; elastic law
   std::vector<int> index;                                   // in the cloud
   std::vector<T> x, y, z, weight;                           // in the first body's frame
   std::vector<T> anchor_x, anchor_y, anchor_z, has_anchor;  // in the shape's frame; 1 where it is set; elastic law
@@ -156,6 +168,7 @@ struct Workspace {
         jacobian(m.jacobian_columns),
         candidates(m.contacts.size()) {
     impulses.setZero();
+    for (const Pad& pad : m.pads) anchored_markers.emplace_back(pad.shapes.size());
   }
 
   // Kinematics in the world frame; spatial vectors at the world's origin.
@@ -186,6 +199,10 @@ struct Workspace {
 
   ContactJacobian<T> jacobian;                 // of the current pair
   std::vector<CandidatePoints<T>> candidates;  // per contact
+
+  // Per pad and shape: ranges that contain all markers with an anchor, where `knows_anchored_markers`.
+  std::vector<std::vector<PointRanges>> anchored_markers;
+  bool knows_anchored_markers = false;  // the state is that of the last step
 
   // Applies a new layout. Entries of the mass matrix between trees or dofs without a common subtree stay 0 from then on.
   void fit_matrices(const Model& m) {

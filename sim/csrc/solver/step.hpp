@@ -162,6 +162,7 @@ template <class T, class Observer = NoObserver>
 StepReport step(const Model& m, const T* params, const T* u, int polish, const StateView<T>& s, StepMemory<T>& memory,
                 bool same_environment, Observer&& accepted = {}, int parts = 1) {
   memory.cache = same_environment ? CacheState::warm : CacheState::stale;
+  if (!same_environment) memory.work.knows_anchored_markers = false;
   StepReport report;
   const double span = m.step / parts;
   const int full_length = 1 << m.max_halvings;  // lengths in units of the shortest substep
