@@ -169,12 +169,8 @@ def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
 
 def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
     """One step: p and r for the present a and ω, then a and ω by Gauss-Newton with all of them free."""
-    n, position = model.markers, model.position
-    ratio, twist, centre, normal = fit.ratio, fit.twist, fit.centre, fit.normal
-    if normal.any():
-        moved = normal @ position / normal.sum()
-        ratio = ratio + twist * np.array([-(moved[1] - centre[1]), moved[0] - centre[0]])
-        centre = moved
+    n, position, normal = model.markers, model.position, fit.normal
+    ratio, twist, centre = _rigid_motion(fit, position)
     envelope = 1.5 * (model.smoothing @ (0.3 * np.sqrt(normal * normal.max()) + 0.7 * normal))
     envelope *= _REMAINDER * (np.hypot(*ratio) + 1.3 * abs(twist)) + _REMAINDER_FLOOR
     remainder = _remainder(model, data, envelope + 1e-6)
@@ -196,6 +192,22 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
         rigid_covariance=step.covariance,
         wanted=step.wanted,
     )
+
+
+def _rigid_motion(fit: ContactFit, position: Array) -> tuple[Array, float, Array]:
+    """a, ω and c of the rigid motion with the same sums of shear and moment as the whole fit.
+
+    A remainder that carries a part of these sums would keep its part in the next steps: the fit of a contact that
+    begins to slip then ends in a minimum with half of the normal force.
+    """
+    normal = fit.normal
+    if not normal.any():
+        return fit.ratio, fit.twist, fit.centre
+    shear, total = fit.shear(position), float(normal.sum())
+    centre = normal @ position / total
+    x, y = (position - centre).T
+    twist = float(x @ shear[1] - y @ shear[0]) / max(float(normal @ (x**2 + y**2)), 1e-9)
+    return shear.sum(1) / total, twist, centre
 
 
 @dataclass
