@@ -5,6 +5,8 @@ from .calibration import save_calibration as save_calibration
 from .errors import TrackerInitError as TrackerInitError
 from .force.estimator import ForceEstimate as ForceEstimate
 from .force.estimator import ForceEstimator as ForceEstimator
+from .force.slip import SlipEstimate as SlipEstimate
+from .force.slip import SlipEstimator as SlipEstimator
 from .frames import CameraMount as CameraMount
 from .frames import decode_image as decode_image
 from .frames import tactile_frame as tactile_frame
@@ -27,6 +29,8 @@ __all__ = [
     "ImageSource",
     "MarkerTracker",
     "SensorProfile",
+    "SlipEstimate",
+    "SlipEstimator",
     "SourceImage",
     "TrackerConfig",
     "TrackerInitError",

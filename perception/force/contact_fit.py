@@ -13,7 +13,7 @@ first fit of a contact tries several ratios, since the problem has several minim
 last result. Lengths are in pitches and loads in units of Young's modulus times the area of a cell.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ _CORRELATION = 1.0  # length over which r is alike [pitches]
 _LOAD_PRIOR = 0.003 * 16  # weight of differences between neighbouring normal loads, relative to the largest ones
 _STEPS = 6  # of a first fit
 _LARGEST_CHANGE = 0.3  # of a in one step
+_LEFT_OVER = 0.15  # part of the shear in the remainder from which on it is gathered
 
 
 class LayerModel:
@@ -135,6 +136,9 @@ def fit_contact(
         for _ in range(_STEPS):
             fit = _step(model, data, fit)
         return fit
+    gathered = _gathered(start, model.position)
+    if np.hypot(*(gathered.ratio - start.ratio)) > _LEFT_OVER * np.hypot(*gathered.ratio):
+        start = _step(model, data, gathered)
     return _step(model, data, start)
 
 
@@ -169,8 +173,12 @@ def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
 
 def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
     """One step: p and r for the present a and ω, then a and ω by Gauss-Newton with all of them free."""
-    n, position, normal = model.markers, model.position, fit.normal
-    ratio, twist, centre = _rigid_motion(fit, position)
+    n, position = model.markers, model.position
+    ratio, twist, centre, normal = fit.ratio, fit.twist, fit.centre, fit.normal
+    if normal.any():
+        moved = normal @ position / normal.sum()
+        ratio = ratio + twist * np.array([-(moved[1] - centre[1]), moved[0] - centre[0]])
+        centre = moved
     envelope = 1.5 * (model.smoothing @ (0.3 * np.sqrt(normal * normal.max()) + 0.7 * normal))
     envelope *= _REMAINDER * (np.hypot(*ratio) + 1.3 * abs(twist)) + _REMAINDER_FLOOR
     remainder = _remainder(model, data, envelope + 1e-6)
@@ -194,20 +202,20 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
     )
 
 
-def _rigid_motion(fit: ContactFit, position: Array) -> tuple[Array, float, Array]:
-    """a, ω and c of the rigid motion with the same sums of shear and moment as the whole fit.
+def _gathered(fit: ContactFit, position: Array) -> ContactFit:
+    """The fit with all of its shear and moment in the rigid motion.
 
-    A remainder that carries a part of these sums would keep its part in the next steps: the fit of a contact that
-    begins to slip then ends in a minimum with half of the normal force.
+    A remainder that carries a part of these sums would keep it in the next steps: in a contact that begins to slip the
+    normal force would decrease by up to a half.
     """
     normal = fit.normal
     if not normal.any():
-        return fit.ratio, fit.twist, fit.centre
+        return fit
     shear, total = fit.shear(position), float(normal.sum())
     centre = normal @ position / total
     x, y = (position - centre).T
     twist = float(x @ shear[1] - y @ shear[0]) / max(float(normal @ (x**2 + y**2)), 1e-9)
-    return shear.sum(1) / total, twist, centre
+    return replace(fit, ratio=shear.sum(1) / total, twist=twist, centre=centre)
 
 
 @dataclass

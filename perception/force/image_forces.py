@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator
+from gelflow.perception.force.slip import SlipEstimate, SlipEstimator
 
 _NOISE_PX = 0.05  # of a tracked displacement along one axis
 
@@ -22,12 +23,15 @@ class GridScale:
 
 
 class ImageForces:
-    """Forces from tracked images of one camera."""
+    """Forces and slip from tracked images of one camera."""
 
     def __init__(self, gel: ElasticGel, rows: int, cols: int, scale: GridScale) -> None:
         """Raises UsageError for a grid without forces, see `ForceEstimator`."""
         noise = _NOISE_PX / scale.pixels_per_mm * 1e-3
-        self._estimator = ForceEstimator(gel, Grid(rows, cols, scale.pitch_mm), noise=noise)
+        grid = Grid(rows, cols, scale.pitch_mm)
+        self._estimator = ForceEstimator(gel, grid, noise=noise)
+        self._slip = SlipEstimator(grid, friction=gel.friction or None, friction_deviation=gel.friction_deviation)
+        self.slip: SlipEstimate | None = None  # in the last image; None where the forces are not known
 
     def estimate(
         self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_], stamp: float
@@ -36,7 +40,9 @@ class ImageForces:
 
         None if fewer than half of the markers are valid.
         """
-        estimate = self._estimator.estimate(displacement_mm[:, ::-1] * 1e-3, valid, stamp)
+        displacement = displacement_mm[:, ::-1] * 1e-3
+        estimate = self._estimator.estimate(displacement, valid, stamp)
+        self.slip = self._slip.estimate(estimate, displacement, valid, stamp)
         return None if estimate is None else _exchanged_axes(estimate)
 
 
@@ -54,6 +60,19 @@ def force_record(estimate: ForceEstimate) -> dict[str, Any]:
         "centre_mm": None if centre is None else 1e3 * centre,
         "contact_area_mm2": 1e6 * estimate.contact_area,
         "unexplained": estimate.unexplained,
+    }
+
+
+def slip_record(slip: SlipEstimate) -> dict[str, Any]:
+    """The slip as plain data."""
+    return {
+        "stick_share": slip.stick_share,
+        "stick_share_deviation": slip.stick_share_deviation,
+        "gross_slip": slip.gross,
+        "gross_slip_since": slip.since,
+        "gross_slip_confidence": slip.confidence,
+        "friction": slip.friction,
+        "friction_observed": slip.friction_observed,
     }
 
 

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 # Measured on balls, rounded discs, cylinders and edges, see docs/guide/sensing/slip.md.
 _EXPONENT, _EXPONENT_DEVIATION = .57, 0.1  # β
-_RATIO_BIAS, _RATIO_DEVIATION = 1.025, 0.03  # of the estimated shear / normal force of a contact that slips in part
+_RATIO_BIAS, _RATIO_DEVIATION = 1.04, 0.03  # of the estimated shear / normal force of a contact that slips in part
 _LOAD_NOISE = .14  # of T: smaller changes are noise, not a motion backwards
 _SMALLEST_DEVIATION = 0.03  # of the share that sticks
 # Logistic regression of gross slip on: 1, slide, share of the drag in the motion, drag [pitches] and, if known, T.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.force.estimator import ForceEstimate
+from gelflow.perception.force.slip import SlipEstimate
 
 SUFFIX = ".forces.csv"
 
@@ -17,8 +18,10 @@ _COLUMNS = (
     *("shear_right_n", "shear_down_n", "normal_n", "moment_n_mm"),
     *("shear_right_sd_n", "shear_down_sd_n", "normal_sd_n", "moment_sd_n_mm"),
     *("centre_right_mm", "centre_down_mm", "contact_area_mm2", "unexplained"),
+    *("stick_share", "stick_share_sd", "gross_slip", "gross_slip_confidence", "friction"),
 )
 _FORCE = (80, 220, 255)
+_GROSS_SLIP = (60, 60, 255)
 _EDGE = (0, 0, 0)
 
 
@@ -33,7 +36,9 @@ class ForceTable:
         self._writer = csv.writer(self._file)
         self._writer.writerow(_COLUMNS)
 
-    def add(self, number: int, name: str, stamp: float, force: ForceEstimate | None) -> None:
+    def add(
+        self, number: int, name: str, stamp: float, force: ForceEstimate | None, slip: SlipEstimate | None = None
+    ) -> None:
         """Write the row of one image."""
         first = [number, name, f"{stamp:.6f}"]
         if force is None:
@@ -46,11 +51,30 @@ class ForceTable:
                 *(*centre, 1e6 * force.contact_area, force.unexplained),
             ]
             cells = [value if isinstance(value, str) else f"{value:.5f}" for value in values]
-            self._writer.writerow([*first, int(force.contact), *cells])
+            self._writer.writerow([*first, int(force.contact), *cells, *_slip_cells(slip)])
         self._file.flush()
 
     def close(self) -> None:
         self._file.close()
+
+
+def _slip_cells(slip: SlipEstimate | None) -> list[str]:
+    if slip is None:
+        return [""] * 5
+    numbers = (slip.stick_share, slip.stick_share_deviation, slip.confidence, slip.friction)
+    share, deviation, confidence, friction = ("" if value is None else f"{value:.4f}" for value in numbers)
+    return [share, deviation, str(int(slip.gross)), confidence, friction]
+
+
+def slip_text(slip: SlipEstimate | None) -> str:
+    """The slip of a contact in a few words; empty without a contact."""
+    if slip is None or (slip.stick_share is None and not slip.gross and slip.confidence == 1.0):
+        return ""
+    if slip.gross:
+        return f"gross slip ({100 * slip.confidence:.0f} %)"
+    if slip.stick_share is None or slip.stick_share_deviation is None:
+        return "no gross slip, friction unknown"
+    return f"sticks {100 * slip.stick_share:.0f} +- {100 * slip.stick_share_deviation:.0f} %"
 
 
 def force_text(force: ForceEstimate | None) -> str:
@@ -66,25 +90,31 @@ def force_text(force: ForceEstimate | None) -> str:
     )
 
 
-def draw_force(picture: NDArray[np.uint8], force: ForceEstimate | None, position: NDArray[np.float64]) -> None:
+def draw_force(
+    picture: NDArray[np.uint8],
+    force: ForceEstimate | None,
+    slip: SlipEstimate | None,
+    position: NDArray[np.float64],
+) -> None:
     """Draw the forces into an overlay: circles for the normal force of cells, an arrow for the total shear.
 
     `position` are the markers in the picture [px], shape (markers, 2). The area of a circle is proportional to the
-    force, relative to the largest one; the arrow starts at the centre of pressure and has one pitch of length per
+    force, relative to the largest one, and their colour changes in gross slip; the arrow starts at the centre of pressure and has one pitch of length per
     tenth of the ratio of shear to normal force.
     """
-    _caption(picture, force_text(force))
+    _caption(picture, ", ".join(filter(None, (force_text(force), slip_text(slip)))))
     if force is None or not force.contact:
         return
+    colour = _GROSS_SLIP if slip is not None and slip.gross else _FORCE
     pitch = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     share = np.sqrt(force.normal_field / force.normal_field.max())
     for place, radius in zip(position, 0.5 * pitch * share, strict=True):
         if radius > 0.05 * pitch:
-            cv2.circle(picture, _rounded(place), max(1, round(radius)), _FORCE, 1, cv2.LINE_AA)
+            cv2.circle(picture, _rounded(place), max(1, round(radius)), colour, 1, cv2.LINE_AA)
     centre = force.normal_field @ position / force.normal_field.sum()
     tip = centre + 10 * pitch * force.shear / max(force.normal, 1e-9)
-    for colour, thickness in ((_EDGE, 5), (_FORCE, 2)):
-        cv2.arrowedLine(picture, _rounded(centre), _rounded(tip), colour, thickness, cv2.LINE_AA, 0, 0.15)
+    for stroke, thickness in ((_EDGE, 5), (colour, 2)):
+        cv2.arrowedLine(picture, _rounded(centre), _rounded(tip), stroke, thickness, cv2.LINE_AA, 0, 0.15)
 
 
 def _caption(picture: NDArray[np.uint8], text: str) -> None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gelflow.perception.force.estimator import ForceEstimate
 from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.mount_check import VisiblePart
+from gelflow.perception.output.slip_summary import SlipSummary
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.tracker import TrackingResult
 
@@ -28,6 +29,7 @@ class TrackingSummary:
     first: TrackingResult | None = None
     pixels_per_mm: float | None = None  # uniform scale, where it is known and there is no calibration
     largest_normal: ForceEstimate | None = None  # the forces of the image with the largest normal force
+    slip: SlipSummary = field(default_factory=SlipSummary)
     visible: list[VisiblePart] = field(default_factory=list)  # possible visible parts of a partly visible grid
     _valid: list[float] = field(default_factory=list)  # share of each image
     _inferred: list[float] = field(default_factory=list)
@@ -47,6 +49,7 @@ class TrackingSummary:
         if len(self._newest) == 3:
             noise = _noise(self._newest[0] - 2 * self._newest[1] + self._newest[2], tracked.position)
             self._noise += [] if noise is None else [noise]
+        self.slip.add(step)
         force, largest = step.force, self.largest_normal
         if force is not None and (largest is None or force.normal > largest.normal):
             self.largest_normal = force
@@ -93,6 +96,7 @@ class TrackingSummary:
             "largest_displacement_mm": self.largest_mm,
             "largest_displacement_at": self.largest_at,
             "force": None if self.largest_normal is None else force_record(self.largest_normal),
+            "slip": self.slip.to_json() if self.largest_normal is not None else None,
             "seconds_per_image": self.frame_seconds(),
             "seconds_first_image": self.seconds[0],
         }

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.force.estimator import ForceEstimate
-from gelflow.perception.force.image_forces import force_record
+from gelflow.perception.force.image_forces import force_record, slip_record
+from gelflow.perception.force.slip import SlipEstimate
 from gelflow.perception.output.forces import SUFFIX, ForceTable, draw_force
 from gelflow.perception.overlay import draw_overlay
 from gelflow.perception.sources import SourceImage
@@ -44,6 +45,7 @@ class TrackedImage:
     position_mm: Floats | None = None  # on the gel [mm], shape (markers, 2); None without a calibration
     displacement_mm: Floats | None = None  # [mm], shape (markers, 2); None without a calibration
     force: ForceEstimate | None = None  # in the axes of the image; None without a gel, or if it is not known
+    slip: SlipEstimate | None = None  # None where the force is
 
 
 class TrackWriter(Protocol):
@@ -97,7 +99,7 @@ class ForceWriter:
         self._table = ForceTable(path)
 
     def add(self, step: TrackedImage) -> None:
-        self._table.add(step.number, step.frame.name, step.frame.stamp, step.force)
+        self._table.add(step.number, step.frame.name, step.frame.stamp, step.force, step.slip)
 
     def close(self) -> None:
         self._table.close()
@@ -132,7 +134,8 @@ class McapWriter:
             values["displacement_mm"] = step.displacement_mm
         self._recorder.markers(self._sensor, stamp, values)
         if step.force is not None:
-            self._recorder.force(self._sensor, stamp, force_record(step.force))
+            slip = {} if step.slip is None else slip_record(step.slip)
+            self._recorder.force(self._sensor, stamp, force_record(step.force) | slip)
         if step.number % _SYNC_PERIOD == _SYNC_PERIOD - 1:
             self._recorder.attempt_end()
 
@@ -200,7 +203,7 @@ class OverlayWriter:
         picture = draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
         if self._forces:
             enlarged = picture.shape[0] / step.frame.image.shape[0]
-            draw_force(picture, step.force, (step.tracked.position + 0.5) * enlarged - 0.5)
+            draw_force(picture, step.force, step.slip, (step.tracked.position + 0.5) * enlarged - 0.5)
         return picture
 
 

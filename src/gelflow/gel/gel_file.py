@@ -20,6 +20,8 @@ class ElasticGel:
     youngs_modulus_deviation: float = 0.0  # standard deviation, relative to the modulus
     creep: float = 0.0  # part of the deformation that follows the force with a lag, see `creep`
     creep_time: float = 0.1  # time constant of this lag [s]
+    friction: float = 0.0  # coefficient between gel and objects; 0: not known
+    friction_deviation: float = 0.0  # standard deviation, relative to the coefficient
 
     def __post_init__(self) -> None:
         if not 0 < self.youngs_modulus < math.inf:
@@ -32,6 +34,11 @@ class ElasticGel:
             raise UsageError(
                 "youngs_modulus_deviation is relative to the modulus, at least 0 and below 1, got "
                 f"{self.youngs_modulus_deviation:g}"
+            )
+        if not 0 <= self.friction < math.inf or not 0 <= self.friction_deviation < 1:
+            raise UsageError(
+                "friction must be at least 0 (0: not known), and friction_deviation at least 0 and below 1, got "
+                f"{self.friction:g} and {self.friction_deviation:g}"
             )
         if not 0 <= self.creep < 1 or not 0 < self.creep_time < math.inf:
             raise UsageError(

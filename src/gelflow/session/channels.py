@@ -19,6 +19,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from gelflow.session.records import SENSORS
 
 NUMBER = {"type": ["number", "string"]}  # a string only for "NaN", "Infinity" and "-Infinity"
+NUMBER_OR_NULL = {"type": ["number", "string", "null"]}
 INTEGER = {"type": "integer"}
 TEXT = {"type": "string"}
 FLAG = {"type": "boolean"}
@@ -102,6 +103,13 @@ JSON: dict[str, JsonChannel] = {
                 "centre_mm": {"type": ["array", "null"], "items": NUMBER},
                 "contact_area_mm2": NUMBER,
                 "unexplained": NUMBER,
+                "stick_share": NUMBER_OR_NULL,
+                "stick_share_deviation": NUMBER_OR_NULL,
+                "gross_slip": FLAG,
+                "gross_slip_since": NUMBER_OR_NULL,
+                "gross_slip_confidence": NUMBER,
+                "friction": NUMBER_OR_NULL,
+                "friction_observed": FLAG,
             },
             ("stamp", "contact", "shear", "shear_deviation", "normal", "normal_deviation"),
         )

@@ -148,7 +148,8 @@ def _track(
                 writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
-                step = replace(step, force=forces.estimate(step.displacement_mm, tracked.valid, frame.stamp))
+                force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
+                step = replace(step, force=force, slip=forces.slip)
             for writer in writers:
                 writer.add(step)
             summary.add(step, seconds)
@@ -287,6 +288,7 @@ def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall
         table.add_row("largest motion", f"{largest:.2f} px, {largest / spacing:.2f} of the spacing{mm} ({where})")
     if summary.largest_normal is not None:
         table.add_row("largest force", force_text(summary.largest_normal))
+        table.add_row("slip", summary.slip.text())
     usual, first = values["seconds_per_image"], values["seconds_first_image"]
     speed = f"{1 / usual:.0f} a second tracked ({1e3 * usual:.2f} ms each, the first {1e3 * first:.0f} ms)"
     table.add_row("speed", f"{speed}, {summary.images / wall:.0f} a second with reading and writing")
