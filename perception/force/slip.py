@@ -28,9 +28,9 @@ from gelflow.perception.force.partial_slip import PartialSlip
 Array = NDArray[np.float64]
 
 # Measured on balls, rounded discs, cylinders and edges, see docs/guide/sensing/slip.md.
-_EXPONENT, _EXPONENT_DEVIATION = .57, 0.1  # β
+_EXPONENT, _EXPONENT_DEVIATION = 0.57, 0.1  # β
 _RATIO_BIAS, _RATIO_DEVIATION = 1.04, 0.03  # of the estimated shear / normal force of a contact that slips in part
-_LOAD_NOISE = .14  # of T: smaller changes are noise, not a motion backwards
+_LOAD_NOISE = 0.14  # of T: smaller changes are noise, not a motion backwards
 _SMALLEST_DEVIATION = 0.03  # of the share that sticks
 # Logistic regression of gross slip on: 1, slide, share of the drag in the motion, drag [pitches] and, if known, T.
 _WITH_LOAD, _GROSS_WITH_LOAD = (-21.1, 36.0, -1.3, -43.9, 20.0), 0.6

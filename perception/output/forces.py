@@ -99,8 +99,8 @@ def draw_force(
     """Draw the forces into an overlay: circles for the normal force of cells, an arrow for the total shear.
 
     `position` are the markers in the picture [px], shape (markers, 2). The area of a circle is proportional to the
-    force, relative to the largest one, and their colour changes in gross slip; the arrow starts at the centre of pressure and has one pitch of length per
-    tenth of the ratio of shear to normal force.
+    force, relative to the largest one; the arrow starts at the centre of pressure and has one pitch of length per
+    tenth of the ratio of shear to normal force. Both are red in gross slip.
     """
     _caption(picture, ", ".join(filter(None, (force_text(force), slip_text(slip)))))
     if force is None or not force.contact:

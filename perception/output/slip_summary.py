@@ -57,5 +57,7 @@ class SlipSummary:
         if self.friction is None:
             return f"{gross}; friction unknown: no share that sticks, state it in the gel file"
         source = "observed in gross slip" if self.observed else "of the gel file"
-        share = f"; at least {100 * self.smallest_share:.0f} % stick otherwise" if self.smallest_share is not None else ""
+        share = (
+            f"; at least {100 * self.smallest_share:.0f} % stick otherwise" if self.smallest_share is not None else ""
+        )
         return f"{gross}{share} (friction {self.friction:.2f}, {source})"

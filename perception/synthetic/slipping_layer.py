@@ -11,7 +11,6 @@ sticks where |q| < μ p. The gap is that of the moved object over the moved surf
 material when the object slips.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -157,9 +156,7 @@ class SlippingLayer:
         for _ in range(60):
             chosen = np.flatnonzero(active)
             ones = np.ones(chosen.size)
-            solved = np.linalg.solve(
-                self._normal[np.ix_(chosen, chosen)], np.stack([ones, -level[chosen]], axis=1)
-            )
+            solved = np.linalg.solve(self._normal[np.ix_(chosen, chosen)], np.stack([ones, -level[chosen]], axis=1))
             depth = (motion.normal - solved[:, 1].sum()) / solved[:, 0].sum()
             pressure = np.zeros(n)
             pressure[chosen] = depth * solved[:, 0] + solved[:, 1]

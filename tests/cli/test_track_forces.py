@@ -5,13 +5,16 @@ import json
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from gelflow.cli.main import main
 from gelflow.gel.gel_file import ElasticGel
+from gelflow.perception.benchmark.slip import SlippingContact, contact_states
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.appearance import make_appearance
 from gelflow.perception.synthetic.pressed_layer import Press, PressedGel, PressedLayer
+from gelflow.perception.synthetic.slipping_layer import RigidObject
 from gelflow.session.reader import SessionReader
 
 GEL = "format = 1\n[gel]\nyoungs_modulus = 1.5e5\npoisson_ratio = 0.48\nthickness = 0.003\n"
@@ -58,6 +61,46 @@ def test_forces_are_written_everywhere(
         recorded = [record.value for record in session.records(["/left/force"])]
     assert [value["contact"] for value in recorded] == [False, False, True, True, True, True]
     assert recorded[-1]["normal"] == pytest.approx(float(rows[-1]["normal_n"]), abs=1e-4)
+    assert cv2.imread(str(files[2])) is not None
+
+
+@pytest.fixture(scope="module")
+def slipping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball that is pressed and pulled until it slips, at 25 images a second."""
+    folder = tmp_path_factory.mktemp("slipping")
+    (folder / "known.toml").write_text(GEL + "friction = 0.4\n")
+    (folder / "unknown.toml").write_text(GEL)
+    (folder / "images").mkdir()
+    gel = ElasticGel(1.5e5, 0.48, 3e-3)
+    ball = RigidObject("ball", 0.0, 8.0)
+    pull = SlippingContact(ball, "pull", 0.4, (0.0, 0.0), 1.0, (5.0, 0.0), 0.0, 1.0)
+    renderer = AccurateGelRenderer(LOOK)
+    displacements = [state.displacement_mm for state in contact_states(pull, gel, LOOK.grid, 25.0)]
+    for number, displacement in enumerate([np.zeros((130, 2)), *displacements]):
+        (folder / "images" / f"{number:03}.jpg").write_bytes(renderer.render(displacement, number=number).jpeg)
+    return folder
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_slip_is_written_everywhere(
+    known: bool, slipping: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / name for name in ("a.forces.csv", "a.mcap", "a.png")]
+    outputs = [text for file in files for text in ("--out", str(file))]
+    gel = slipping / ("known.toml" if known else "unknown.toml")
+    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(gel)]
+    assert main(["track", str(slipping / "images"), *scale, *outputs]) == 0
+    assert "gross slip, first at" in capsys.readouterr().out
+    with files[0].open(newline="") as text:
+        rows = list(csv.DictReader(text))
+    assert rows[-1]["gross_slip"] == "1" and float(rows[-1]["stick_share"]) == 0.0
+    assert float(rows[-1]["friction"]) == pytest.approx(0.4, rel=0.1)
+    pressed = rows[6]
+    assert pressed["gross_slip"] == "0" and (pressed["stick_share"] != "") == known
+    with SessionReader(files[1]) as session:
+        recorded = [record.value for record in session.records(["/left/force"])]
+    assert [value["gross_slip"] for value in recorded] == [row["gross_slip"] == "1" for row in rows]
+    assert recorded[-1]["friction_observed"] is not known
     assert cv2.imread(str(files[2])) is not None
 
 

@@ -112,7 +112,7 @@ def test_share_of_rising_and_falling_loads() -> None:
 
 
 def test_the_model_of_a_ball_agrees_with_cattaneo_and_mindlin() -> None:
-    """On a thick layer a ball that is pulled sticks on (1 - Q / (μ P))^(2/3) of its contact, and shear obeys Coulomb."""
+    """A pulled ball on a thick layer sticks on (1 - Q / (μ P))^(2/3) of its contact, and Q never exceeds μ P."""
     half_space = ElasticGel(1.5e5, 0.5, 0.2)
     layer = SlippingLayer(half_space, GRID, 0.4, BALL, ObjectMotion((0.0, 0.0), 0.0, 0.0))
     layer.step(ObjectMotion((0.0, 0.0), 0.0, 1.0))
