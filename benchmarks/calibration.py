@@ -15,7 +15,7 @@ from gelflow.policies.calibration.experiment.coverage import measure_coverage
 from gelflow.policies.calibration.experiment.planned import measure_plan
 from gelflow.policies.calibration.experiment.transfer import measure_world, worlds
 from gelflow.policies.calibration.fit import FitSettings
-from gelflow.policies.calibration.planning import SCENARIOS, plan_motions
+from gelflow.policies.calibration.planning.motions import SCENARIOS, plan_motions
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.task import INSERTION
 

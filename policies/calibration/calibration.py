@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
 from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
+from gelflow.policies.calibration.planning.suggestions import Suggestion, suggest
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.policies.calibration.suggestions import Suggestion, suggest
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ the cost has risen as a normal distribution predicts (a likelihood-ratio interva
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.policies.calibration.information import POSE_STEP
+from gelflow.policies.calibration.planning.information import POSE_STEP
 from gelflow.policies.calibration.poses import prior_cost, prior_information
 from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, huber_weights
 
@@ -76,7 +76,7 @@ def _costs(problem: Problem, points: Array, poses: Array, scale: float) -> Array
     residuals = _residuals(problem, points, poses) / scale
     fit = huber(residuals).sum((1, 2)) / CORRELATED
     of_poses = sum(prior_cost(problem, i, poses[:, i]) for i in range(poses.shape[1]))
-    return np.nan_to_num(fit + 0.5 * (points**2).sum(1) + of_poses, nan=np.inf)
+    return np.asarray(np.nan_to_num(fit + 0.5 * (points**2).sum(1) + of_poses, nan=np.inf))
 
 
 def _factors(problem: Problem, point: Array, poses: Array, axes: Array, scale: float) -> Array:

@@ -7,17 +7,17 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
 from gelflow.policies.calibration.experiment.planned import expected_widths
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitResult, StartResult
-from gelflow.policies.calibration.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning import plan_motions
+from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
+from gelflow.policies.calibration.planning.motions import plan_motions
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.policies.calibration.uncertainty import covariance
+from gelflow.session.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
 from gelflow.task import INSERTION
 
 WORLD = 8

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import GelflowError
-from gelflow.motion_plan import PlannedMotion
 from gelflow.policies.calibration.calibration import calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings
-from gelflow.policies.calibration.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.session_recordings import AT_REST
+from gelflow.session.motion_plan import PlannedMotion
 
 Array = NDArray[np.float64]
 

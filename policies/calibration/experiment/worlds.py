@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.motion_plan import PlannedMotion
 from gelflow.observation import FlowMap
 from gelflow.policies.calibration.model.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_network
 from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
+from gelflow.session.motion_plan import PlannedMotion
 from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Randomization, Uniform
 from gelflow.task import INSERTION, InsertionTask
@@ -89,8 +89,9 @@ def record_insertions(
     world.draw(rng, misalignment=misalignment)
     all_rows = np.arange(insertions)
     world.sensors.copy(all_rows, world.sensors, np.zeros_like(all_rows))  # the same pads in all insertions
+    inserted: dict[int, Array] = {}
     if plan:
-        rows, inserted = _planned(world, misalignment, plan, rng), {}
+        rows = _planned(world, misalignment, plan, rng)
     else:
         rows, inserted = _with_policy(world, misalignment, attempts, rng)
     if not rows:

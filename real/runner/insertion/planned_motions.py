@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.motion_plan import PlannedMotion
 from gelflow.observation import FlowMap
 from gelflow.real.runner.lab import Lab
+from gelflow.session.motion_plan import PlannedMotion
 from gelflow.task import InsertionTask
 
 

@@ -10,11 +10,11 @@ from tests.real.runner.harness import plan_for
 
 from gelflow.cli.main import main
 from gelflow.hardware_mocks.robot import MockRobot
-from gelflow.motion_plan import PlannedMotion, save_motion_plan
 from gelflow.observation import FlowMap
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.real.runner import PlanPolicy
 from gelflow.real.runner.run_plan import run_insertions
+from gelflow.session.motion_plan import PlannedMotion, save_motion_plan
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
 

@@ -12,15 +12,15 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_part, add_quick, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
-from gelflow.motion_plan import save_motion_plan
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitResult, FitSettings
-from gelflow.policies.calibration.planning import MOTIONS, SCENARIOS, Plan, plan_motions
+from gelflow.policies.calibration.planning.motions import MOTIONS, SCENARIOS, Plan, plan_motions
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
 from gelflow.real.runner.lab_file import load_lab
+from gelflow.session.motion_plan import save_motion_plan
 
 _QUICK = FitSettings(starts=2, points=1, poses=24, steps=1)
 

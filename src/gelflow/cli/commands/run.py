@@ -32,8 +32,8 @@ from gelflow.cli.prompt import read_line
 from gelflow.cli.way_out import way_out
 from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
-from gelflow.motion_plan import load_motion_plan
 from gelflow.protocols import Policy
+from gelflow.session.motion_plan import load_motion_plan
 from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:

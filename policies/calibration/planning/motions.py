@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.motion_plan import PlannedMotion
 from gelflow.policies.calibration.fit import FitResult
-from gelflow.policies.calibration.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
+from gelflow.session.motion_plan import PlannedMotion
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]

@@ -68,7 +68,7 @@ def _slopes(readings: ReadingModel, point: Array, descents: Descents) -> tuple[A
     for axis in range(3):
         first = len(simulated) + 2 + 2 * axis
         columns[..., count + axis] = (read[first] - read[first + 1]) / 2
-    return read[0], columns, ok.reshape(len(points), n).all(0)
+    return read[0], columns, np.asarray(ok.reshape(len(points), n).all(0))
 
 
 def pose_prior(task: InsertionTask) -> Array:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.fit import FitResult
-from gelflow.policies.calibration.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.model.shear_model import Descents
+from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
