@@ -304,8 +304,11 @@ class _Loop:
             self._udp.sendto(message, (self._config.host, self._config.port))
 
     def _wait_until(self, due: float) -> None:
-        """Wait for the next cycle; robot time waits for late cycles and for the plant's answer."""
-        while True:
+        """Wait for the next cycle; robot time waits for late cycles and for the plant's answer.
+
+        Without the parent, whose answer may never come, it returns at once.
+        """
+        while not self._parent.closed:
             self._clock.grant(CONTROLLER, MAX_LEAD + (due if self._asked is None else self._asked))
             left = due - self._clock.now()
             if left <= 0:

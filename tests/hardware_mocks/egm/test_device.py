@@ -5,9 +5,12 @@ import math
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -212,6 +215,51 @@ def test_calls_on_a_stopped_mock_raise_usage_error(bench: Bench) -> None:
         bench.mock.motors(False)
     bench.mock.start()
     bench.receive()
+
+
+_ROBOT_PROCESS = """
+import sys, time
+import numpy as np
+from gelflow.clock import ScaledClock
+from gelflow.hardware_mocks.egm.controller import MockEgmConfig
+from gelflow.hardware_mocks.egm.device import MockEgmArm
+from gelflow.hardware_mocks.plant import KinematicArm
+from gelflow.time_sync import TimeSync
+
+TimeSync.create(sys.argv[1])
+clock = ScaledClock(1.0, sys.argv[1])
+plant = KinematicArm(clock, position=np.array([0.40, 0.0, 0.30]), quaternion=np.array([0.0, 0.0, 1.0, 0.0]), lag=0.004)
+arm = MockEgmArm(plant, clock=clock, config=MockEgmConfig(port=int(sys.argv[2])))
+arm.start()
+print(arm.pid, flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_controller_ends_when_the_mock_robot_is_killed_before_it_answers(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        words = [sys.executable, "-c", _ROBOT_PROCESS, str(tmp_path / "time_sync"), str(receiver.getsockname()[1])]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as robot:
+            assert robot.stdout is not None
+            controller = int(robot.stdout.readline())
+            robot.send_signal(
+                signal.SIGSTOP
+            )  # a request of the controller is not answered, and robot time stands still
+            time.sleep(0.3)
+            robot.kill()
+    end = time.monotonic() + 60.0
+    while _is_running(controller):
+        assert time.monotonic() < end, "the controller runs without its parent"
+        time.sleep(0.05)
+
+
+def _is_running(pid: int) -> bool:
+    """Whether a process exists and is not a zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
 
 
 def test_killed_controller_is_detected(bench: Bench) -> None:
