@@ -81,7 +81,10 @@ class SlipEstimator:
         self._stated = friction
         self._friction, self._deviation = friction, friction_deviation
         self._stated_deviation = friction_deviation
-        self._forget_contact()
+        self._history: deque[_Moment] = deque()
+        self._certain: list[float] = []  # ratios of forces in a certain gross slip
+        self._since: float | None = None
+        self._slip = PartialSlip(_EXPONENT, _LOAD_NOISE)
 
     def reset(self) -> None:
         """Forget the images before, and a friction coefficient that they showed."""
@@ -143,7 +146,8 @@ class SlipEstimator:
         """Probability of gross slip, and that from which on it is stated."""
         slide, drag, growth = self._motion(shear)
         cues = [1.0, min(max(slide, -0.05), 0.15), drag / (max(slide, 0.0) + drag + 0.02), min(drag, 0.06)]
-        factors, limit = _MOTION_ONLY, _GROSS_BY_MOTION
+        factors: tuple[float, ...] = _MOTION_ONLY
+        limit = _GROSS_BY_MOTION
         if self._friction is None and (size < _SMALLEST_FRICTION or growth > _LARGEST_GROWTH):
             return 0.0, limit
         if self._friction is not None and not self._observed():
@@ -189,9 +193,8 @@ class SlipEstimator:
         return self._stated is None and self._friction is not None
 
     def _forget_contact(self) -> None:
-        self._history: deque[_Moment] = deque()
-        self._certain: list[float] = []
-        self._since: float | None = None
+        self._history.clear()
+        self._certain, self._since = [], None
         self._slip = PartialSlip(_EXPONENT, _LOAD_NOISE)
 
 
