@@ -1,4 +1,4 @@
-"""Accuracy of forces from rendered images of gels under five shapes: a table on the terminal."""
+"""Accuracy of forces, or of slip, from rendered images of gels under several shapes: a table on the terminal."""
 
 import argparse
 import sys
@@ -10,11 +10,14 @@ from rich.table import Table
 
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.perception.benchmark.forces import measure_forces
+from gelflow.perception.benchmark.slip import measure_slip
 from gelflow.perception.synthetic.pressed_layer import SHAPES
+from gelflow.perception.synthetic.slipping_layer import INDENTERS
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Forces from rendered images of gels under five shapes.")
+    parser = argparse.ArgumentParser(description="Forces or slip from rendered images of gels under several shapes.")
+    parser.add_argument("quantity", nargs="?", choices=("forces", "slip"), default="forces", help="(%(default)s)")
     parser.add_argument("--contacts", type=int, default=10, help="of each shape (%(default)s)")
     parser.add_argument("--image-class", default="typical", help="as in gelflow bench tracking (%(default)s)")
     parser.add_argument("--width", type=int, default=640, help="of the images [px] (%(default)s)")
@@ -22,8 +25,19 @@ def main() -> int:
     parser.add_argument("--poisson-ratio", type=float, default=0.48, help="(%(default)s)")
     parser.add_argument("--thickness", type=float, default=3e-3, help="[m] (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="(%(default)s)")
+    slip = parser.add_argument_group("slip only")
+    slip.add_argument("--objects", nargs="+", default=INDENTERS, choices=INDENTERS, help="default: all")
+    slip.add_argument("--rate", type=float, default=60.0, help="of the images [Hz] (%(default)s)")
+    slip.add_argument("--friction-unknown", action="store_true", help="do not state the friction coefficient")
+    slip.add_argument("--friction-error", type=float, default=0.0, help="of the stated one, relative (%(default)s)")
     args = parser.parse_args()
     gel = ElasticGel(args.youngs_modulus, args.poisson_ratio, args.thickness)
+    table = _slip(gel, args) if args.quantity == "slip" else _forces(gel, args)
+    Console(width=140 if args.quantity == "slip" else None).print(table)
+    return 0
+
+
+def _forces(gel: ElasticGel, args: argparse.Namespace) -> Table:
     table = Table(title="errors, 95th percentile, and share of images within the bound")
     for column in ("shape", "shear [N]", "<5 % or .05 N", "normal [N]", "<10 % or .1 N", "moment [N mm]", "<10 %"):
         table.add_column(column, justify="right")
@@ -45,8 +59,41 @@ def main() -> int:
             f"{100 * covered:.0f} %",
             f"{1e3 * np.median(errors.seconds):.1f}",
         )
-    Console().print(table)
-    return 0
+    return table
+
+
+def _slip(gel: ElasticGel, args: argparse.Namespace) -> Table:
+    table = Table(title="share that sticks in points, gross slip, false alarms")
+    for column in ("object", "within 10", "95 %", "error < 2 sd", "found in 40 ms", "false", "false, > 10 % sticks"):
+        table.add_column(column, justify="right")
+    for column in ("friction 5/50/95 %", "ms"):
+        table.add_column(column, justify="right")
+    for name in args.objects:
+        errors = measure_slip(
+            name,
+            args.contacts,
+            gel,
+            image_class=args.image_class,
+            width=args.width,
+            rate=args.rate,
+            friction_known=not args.friction_unknown,
+            friction_error=args.friction_error,
+            seed=args.seed,
+        )
+        missed = np.abs(errors.share[:, 1] - errors.share[:, 0])
+        friction = errors.friction[np.isfinite(errors.friction)]
+        table.add_row(
+            name,
+            f"{100 * errors.share_within(0.1):.0f} %" if missed.size else "",
+            f"{100 * np.percentile(missed, 95):.0f}" if missed.size else "",
+            f"{100 * np.mean(missed < 2 * errors.share[:, 2]):.0f} %" if missed.size else "",
+            f"{int((errors.delays <= 0.0401).sum())} of {len(errors.delays)}",
+            f"{100 * errors.alarms[:, 0].mean():.2f} %",
+            f"{100 * errors.alarms[:, 1].mean():.2f} %",
+            "/".join(f"{value:.2f}" for value in np.percentile(friction, (5, 50, 95))) if friction.size else "",
+            f"{1e3 * np.median(errors.seconds):.2f}",
+        )
+    return table
 
 
 if __name__ == "__main__":

@@ -152,7 +152,7 @@ class SlippingLayer:
         cos, sin = np.cos(motion.rotation), np.sin(motion.rotation)
         height = self.shape.height(arm @ np.array([[cos, -sin], [sin, cos]]))
         level = height + self._coupling.T @ shear  # depth that the object reaches, below its lowest point
-        active = start > 0 if start.any() else level < np.sort(level)[: max(4, n // 8)][-1]
+        active = start > 0 if start.any() else level <= np.sort(level)[max(4, n // 8) - 1]
         for _ in range(60):
             chosen = np.flatnonzero(active)
             ones = np.ones(chosen.size)
