@@ -95,7 +95,7 @@ class FastGelRenderer:
         limit = np.array([appearance.width, appearance.height]) + self._reach + pad
         centers = np.clip(centers, -self._reach - 1.0 - pad, limit)
         fine = np.round(centers * _PHASES).astype(np.intp)
-        if np.array_equal(fine, self._drawn):
+        if self._drawn is not None and np.array_equal(fine, self._drawn):
             return self._view
         self._drawn, self._ink[:] = fine, 1
         whole, phase = fine // _PHASES, fine % _PHASES
