@@ -13,9 +13,10 @@ GELFLOW_INLINE T scaled_weight(const PairFrame<T>& f, const PointCloud& cloud, i
   return f.scaled && !cloud.areas.empty() ? T(weight + f.area_growth.dot(cloud.areas[i].template cast<T>())) : weight;
 }
 
+// Memory for more candidates, at first for all points of a small cloud: many small contacts then share cache lines.
 template <class T>
-void grow(CandidatePoints<T>& c, bool elastic) {
-  c.capacity = std::max(64, 2 * c.capacity);
+void grow(CandidatePoints<T>& c, const PointCloud& cloud, bool elastic) {
+  c.capacity = std::max(std::min(64, cloud.size()), 2 * c.capacity);
   const std::size_t size = static_cast<std::size_t>(c.capacity) + PointCloud::padding;
   c.index.resize(size);
   for (auto* values : {&c.x, &c.y, &c.z, &c.weight}) values->resize(size);
@@ -56,7 +57,7 @@ GELFLOW_INLINE int select_candidates(const PairFrame<T>& f, const PointCloud& cl
                                      bool brute_force, CandidatePoints<T>& c) {
   int count = 0;
   const auto add = [&](int i, const T& x, const T& y, const T& z) {
-    if (count == c.capacity) grow(c, elastic);
+    if (count == c.capacity) grow(c, cloud, elastic);
     c.index[count] = i;
     c.x[count] = x;
     c.y[count] = y;
@@ -113,7 +114,7 @@ void find_candidate_points(const PairFrame<T>& f, const PointCloud& cloud, const
   }
   c.query = {f.rotation, f.offset, margin};
   const bool elastic = settings.law == FrictionLaw::elastic;
-  if (c.capacity == 0) grow(c, elastic);
+  if (c.capacity == 0) grow(c, cloud, elastic);
   if constexpr (std::is_floating_point_v<T>) {
     if (!brute_force && (cache == CacheState::stale || !covers(c.neighbor_query, f, cloud, margin))) {
       find_neighbors<T>(f, cloud, settings.rolling_radius, margin, c);
