@@ -30,6 +30,11 @@ class BodyDef:
     def inertia(self) -> Floats: ...  # (6,)
     @inertia.setter
     def inertia(self, value: ArrayLike) -> None: ...
+    gravcomp: float  # share of the weight that a force at com + gravcomp_pos balances
+    @property
+    def gravcomp_pos(self) -> Floats: ...  # (3,), in the body frame [m]
+    @gravcomp_pos.setter
+    def gravcomp_pos(self, value: ArrayLike) -> None: ...
     def __init__(
         self,
         *,
@@ -40,6 +45,8 @@ class BodyDef:
         mass: float,
         com: ArrayLike = ...,
         inertia: ArrayLike,
+        gravcomp: float = 0.0,
+        gravcomp_pos: ArrayLike = ...,
     ) -> None: ...
 
 class JointDef:

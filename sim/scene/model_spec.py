@@ -77,6 +77,8 @@ def _body(body: BodyDef) -> _core.BodyDef:
         mass=body.mass,
         com=body.com,
         inertia=body.inertia,
+        gravcomp=body.gravcomp,
+        gravcomp_pos=body.gravcomp_pos,
     )
 
 

@@ -35,7 +35,7 @@ class Energy:
     """Mechanical energy [J] by kind, each of shape (N,), without the energy of servos and motors."""
 
     kinetic: Array
-    gravity: Array  # zero at the origin of the world
+    gravity: Array  # of weights and gravity compensation; zero at the origin of the world
     contact: Array  # ½ k_n d² of all contact points; markers that do not collide store none
     friction: Array  # ½ k_s |s|² of all contact points
     springs: Array  # of joint springs
@@ -137,7 +137,12 @@ def _gravity(sim: Simulator) -> Array:
     for n, name in enumerate(sim.model.body_names):
         com = np.stack([sim.param(f"{name}.com.{axis}") for axis in "xyz"], axis=1)
         position = poses[:, n, :3] + [rotate(turn, c) for turn, c in zip(poses[:, n, 3:], com, strict=True)]
-        result -= sim.param(f"{name}.mass") * (position * gravity).sum(1)
+        mass = sim.param(f"{name}.mass")
+        result -= mass * (position * gravity).sum(1)
+        if f"{name}.gravcomp" in sim.model.param_names:
+            offset = np.stack([sim.param(f"{name}.gravcomp.{axis}") for axis in "xyz"], axis=1)
+            position += [rotate(turn, r) for turn, r in zip(poses[:, n, 3:], offset, strict=True)]
+            result += sim.param(f"{name}.gravcomp") * mass * (position * gravity).sum(1)
     return result
 
 

@@ -28,6 +28,7 @@ struct BodyDef {
   double mass = 0;                          // [kg]
   V3<double> com = V3<double>::Zero();      // centre of mass in the body frame [m]
   V6<double> inertia = V6<double>::Zero();  // about the centre of mass: xx, yy, zz, xy, xz, yz [kg m²]
+  GravityCompensationParams<double> compensation{0, V3<double>::Zero()};
 };
 
 struct JointDef {

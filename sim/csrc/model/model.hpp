@@ -40,9 +40,10 @@ struct Body {
   M3<double> rotation;  // the same as a matrix
   int joint_begin, joint_end;
   ParamBlock<BodyParams> params;
-  std::vector<int> dofs;          // all dofs that move this body, root first
-  bool translation_only = false;  // all of them are slides
-  bool is_free = false;           // it has a free joint and no child
+  ParamBlock<GravityCompensationParams> compensation;  // of bodies in Model::compensated_bodies
+  std::vector<int> dofs;                               // all dofs that move this body, root first
+  bool translation_only = false;                       // all of them are slides
+  bool is_free = false;                                // it has a free joint and no child
 };
 
 struct Joint {
@@ -210,6 +211,7 @@ struct Model : SolverOptions {
   std::vector<Tendon> tendons;
   std::vector<Coupling> couplings;   // whose leaders follow no other joint
   std::vector<int> prescribed_dofs;  // whose velocity no force changes
+  std::vector<int> compensated_bodies;
   std::vector<PolynomialCoupling> polynomial_couplings;
   std::vector<LoopClosure> loop_closures;
   std::vector<Actuator> actuators;

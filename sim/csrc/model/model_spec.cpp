@@ -81,6 +81,12 @@ int ModelSpec::add_body(const BodyDef& def) {
   const V6<double>& i = def.inertia;
   body.params = add_params("body", def.name,
                            BodyParams<double>{def.mass, def.com, i[0], i[1], i[2], i[3], i[4], i[5], def.pose.pos});
+  check_finite(owner, "gravcomp_pos", def.compensation.pos);
+  if (!std::isfinite(def.compensation.factor)) reject(owner + ": gravcomp must be finite");
+  if (def.compensation.factor != 0) {
+    body.compensation = add_params("body", def.name, def.compensation);
+    model_.compensated_bodies.push_back(count(model_.bodies));
+  }
   model_.bodies.push_back(body);
   definitions_.bodies.push_back(def);
   return count(model_.bodies) - 1;

@@ -40,6 +40,14 @@ struct BodyParams {
   }
 };
 
+// Gravity compensation of a body: the force −factor · mass · gravity at the point com + pos.
+template <class T>
+struct GravityCompensationParams {
+  static constexpr std::array names{"gravcomp", "gravcomp.x", "gravcomp.y", "gravcomp.z"};
+  T factor;
+  V3<T> pos;  // from the centre of mass, in the body frame [m]
+};
+
 template <class T>
 struct JointParams {
   static constexpr std::array names{"damping", "armature",        "stiffness",     "springref",   "lower",

@@ -62,15 +62,24 @@ std::optional<py::array> optional_array(const std::optional<Vectors>& vectors) {
 void bind_body(py::module_& module) {
   py::class_<BodyDef> type(module, "BodyDef");
   type.def(py::init([](const std::string& name, int parent, const V3<double>& pos, const V4<double>& quat, double mass,
-                       const V3<double>& com,
-                       const V6<double>& inertia) { return BodyDef{name, parent, {pos, quat}, mass, com, inertia}; }),
+                       const V3<double>& com, const V6<double>& inertia, double gravcomp,
+                       const V3<double>& gravcomp_pos) {
+             return BodyDef{name, parent, {pos, quat}, mass, com, inertia, {gravcomp, gravcomp_pos}};
+           }),
            py::kw_only(), py::arg("name"), py::arg("parent") = world, py::arg("pos") = origin,
-           py::arg("quat") = identity, py::arg("mass"), py::arg("com") = origin, py::arg("inertia"))
+           py::arg("quat") = identity, py::arg("mass"), py::arg("com") = origin, py::arg("inertia"),
+           py::arg("gravcomp") = 0., py::arg("gravcomp_pos") = origin)
       .def_readwrite("name", &BodyDef::name)
       .def_readwrite("parent", &BodyDef::parent)
       .def_readwrite("mass", &BodyDef::mass)
       .def_readwrite("com", &BodyDef::com)
-      .def_readwrite("inertia", &BodyDef::inertia);
+      .def_readwrite("inertia", &BodyDef::inertia)
+      .def_property(
+          "gravcomp", [](const BodyDef& d) { return d.compensation.factor; },
+          [](BodyDef& d, double x) { d.compensation.factor = x; })
+      .def_property(
+          "gravcomp_pos", [](const BodyDef& d) { return d.compensation.pos; },
+          [](BodyDef& d, const V3<double>& x) { d.compensation.pos = x; });
   bind_pose(type);
 }
 

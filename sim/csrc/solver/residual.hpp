@@ -5,6 +5,7 @@
 // with h the step length; `beta_h` is β h.
 #pragma once
 
+#include "dynamics/gravity_compensation.hpp"
 #include "dynamics/inverse_dynamics.hpp"
 #include "solver/islands.hpp"
 #include "solver/joint_forces.hpp"
@@ -50,6 +51,7 @@ void evaluate(const Model& m, const T* params, const StepStart<T>& start, const 
   if (add_impulses) {
     for (int k = 0; k < m.nv; ++k) w.impulses[k] = beta_h * w.mass.in_tree(k, k) * (m.angular[k] ? T(98.1) : T(9.81));
   }
+  if (!m.compensated_bodies.empty()) subtract_gravity_compensation<derivatives, T>(m, params, start, w);
   subtract_joint_forces<derivatives, T>(m, params, beta_h, w.q.data(), v, start.u, start.continuation, add_impulses, w);
   subtract_polynomial_couplings<derivatives, T>(m, params, beta_h, w.q.data(), v, add_impulses, w);
   subtract_contact_forces<derivatives, T>(m, params, start, cache, add_impulses, w);

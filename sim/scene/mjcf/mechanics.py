@@ -4,7 +4,7 @@ MuJoCo parses and compiles the file (defaults, meshes, inertia); it never steps.
 the body that they are fixed to, including their mass, geometries and sites.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,8 @@ class BodyDef:
     mass: float  # [kg]
     com: Array  # centre of mass in the body frame [m], shape (3,)
     inertia: Array  # about the centre of mass in body axes [kg m²]: xx, yy, zz, xy, xz, yz
+    gravcomp: float = 0.0  # share of the weight that a force at com + gravcomp_pos balances
+    gravcomp_pos: Array = field(default_factory=lambda: np.zeros(3))  # in the body frame [m], shape (3,)
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def read_mechanics(path: Path) -> Mechanics:
         for i, (name, b) in enumerate(zip(element_names(model, "site", model.nsite), model.site_bodyid, strict=True))
     }
     return Mechanics(
-        bodies=_bodies(model, moving_body, poses),
+        bodies=_bodies(model, moving_body, poses, path.name),
         joints=_joints(model, moving_body, actuators, tendons, compiled.mocap),
         geoms=_geoms(model, moving_body, poses),
         frames=frames,
@@ -177,7 +179,7 @@ def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:
     return moving_body, poses
 
 
-def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tuple[BodyDef, ...]:
+def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose], location: str) -> tuple[BodyDef, ...]:
     bodies = []
     body_names = element_names(model, "body", model.nbody)
     for root in np.flatnonzero(model.body_jntnum > 0):
@@ -194,8 +196,27 @@ def _bodies(model: Any, moving_body: NDArray[np.int64], poses: list[Pose]) -> tu
         parent = model.body_parentid[root]
         pose = poses[parent] @ Pose(model.body_pos[root].copy(), model.body_quat[root].copy())
         packed = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-        bodies.append(BodyDef(body_names[root], int(moving_body[parent]), pose, mass, com, packed))
+        centers = np.array([frame.position for frame in frames])
+        owner = f"{location}: body {body_names[root]!r}"
+        compensation = _gravity_compensation(model.body_gravcomp[members], masses, centers, com, owner)
+        bodies.append(BodyDef(body_names[root], int(moving_body[parent]), pose, mass, com, packed, *compensation))
     return tuple(bodies)
+
+
+def _gravity_compensation(factors: Array, masses: Array, centers: Array, com: Array, owner: str) -> tuple[float, Array]:
+    """Share of the weight that is balanced, and the point of the force relative to the centre of mass `com`.
+
+    `factors`, `masses` (members,) and `centers` (members, 3): of the bodies that are fixed to each other.
+    """
+    balanced = factors * masses
+    total = float(balanced.sum())
+    if not balanced.any():
+        return 0.0, np.zeros(3)
+    if abs(total) <= 1e-9 * float(np.abs(balanced).sum()):
+        raise UsageError(f"{owner}: gravcomp of the bodies fixed to it adds up to 0; give them equal gravcomp")
+    if len(set(factors[masses > 0])) == 1:
+        return float(factors[masses > 0][0]), np.zeros(3)
+    return total / float(masses.sum()), balanced @ (centers - com) / total
 
 
 def _joints(

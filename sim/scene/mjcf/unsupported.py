@@ -111,8 +111,6 @@ def _elements(model: Any) -> Iterator[Unsupported]:
     for b, body in enumerate(bodies):
         if model.body_plugin[b] >= 0:
             yield f"plugin of body {body!r}", "remove it"
-        if model.body_gravcomp[b] != 0:
-            yield f"gravcomp of body {body!r}", "remove it, or disable gravity for the whole model"
 
 
 def _equality(model: Any, e: int) -> str:
@@ -150,6 +148,8 @@ def _joints(model: Any) -> Iterator[Unsupported]:
             yield f"polynomial stiffness of joint {joint!r}", "give one coefficient"
         if model.jnt_dofadr[j] in polynomial_damping:
             yield f"polynomial damping of joint {joint!r}", "give one coefficient"
+        if model.jnt_actgravcomp[j] and model.jnt_actfrclimited[j]:
+            yield f"actuatorgravcomp of joint {joint!r} with an actuatorfrcrange", "remove one of them"
         if model.jnt_actfrclimited[j] and driven[j] > 1:
             yield f"actuatorfrcrange of joint {joint!r} with {driven[j]} actuators", "give each actuator a forcerange"
 

@@ -85,10 +85,6 @@ UNSUPPORTED = [
         ),
         f"actuator 'servo' with a plugin is not supported: {SERVO}",
     ),
-    (
-        ('<body name="arm">', '<body name="arm" gravcomp="1">'),
-        "gravcomp of body 'arm' is not supported: remove it, or disable gravity for the whole model",
-    ),
     (option('density="1"/>'), "option density is not supported: remove it; fluid forces are not simulated"),
     (option('viscosity="1"/>'), "option viscosity is not supported: remove it; fluid forces are not simulated"),
     (option('wind="1 0 0"/>'), "option wind is not supported: remove it; fluid forces are not simulated"),
