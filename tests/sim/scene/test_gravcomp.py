@@ -130,7 +130,7 @@ def check_gradients(sim: Simulator, u: Array, rng: np.random.Generator) -> None:
 
 
 def test_energy_of_a_swinging_arm(tmp_path: Path) -> None:
-    """What the force stores counts: the energy of an undamped arm changes by the error of the integrator alone."""
+    """The potential energy includes the force: the total energy changes by the error of the integrator alone."""
     spec = load(tmp_path).model_spec()
     spec.step = 2e-4
     sim, gauge = Simulator(_core.Model(spec)), EnergyGauge(load(tmp_path))
