@@ -126,7 +126,8 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
     thickness = None
     if normal and shear and abs(normal.value - shear.value) > 2 * math.hypot(normal.deviation, shear.deviation):
         thickness = gel.thickness * shear.value / normal.value
-        deviation = max(deviation, abs(normal.value / shear.value - 1) / 2)
+        # Both factors depend on the thickness, so their mean may be wrong by as much as they differ.
+        deviation = max(deviation, abs(normal.value / shear.value - 1))
     pressed = samples.normal > 0.2 * samples.normal.max()
     return GelFit(
         gel=replace(
@@ -195,7 +196,10 @@ def _lag(samples: ForceSamples) -> tuple[float, float, float | None]:
     creep, deviation = float(best.x[0]), float(np.sqrt(covariance[0, 0]))
     if count * math.log(plain / left) - 2 * math.log(len(estimated)) < _LAG_EVIDENCE or creep < 2 * deviation:
         return none
-    return creep, math.exp(best.x[1]), deviation
+    # During a shorter contact a lag looks like a factor, for example that of a wrong thickness.
+    time = math.exp(best.x[1])
+    longest = max(float(samples.stamp[part][-1] - samples.stamp[part][0]) for part in contacts)
+    return (creep, time, deviation) if time < longest else none
 
 
 def _contacts(samples: ForceSamples) -> list[slice]:

@@ -1,1 +1,1 @@
-"""What to record next: information of attempts, suggestions, and plans."""
+"""Choice of the attempts to record next: their information, suggestions, and plans."""

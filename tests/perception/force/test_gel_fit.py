@@ -86,6 +86,8 @@ def test_a_wrong_thickness_shows(layer: PressedLayer, tmp_path: Path) -> None:
     assert fit.thickness is not None
     assert fit.thickness < 4e-3
     assert fit.gel.youngs_modulus_deviation > 0.1
+    assert fit.creep_deviation is None  # the gel has none: a lag that is longer than the contacts is not measured
+    assert abs(fit.gel.youngs_modulus / TRUE.youngs_modulus - 1) < 2 * fit.gel.youngs_modulus_deviation
 
 
 @pytest.mark.parametrize(
