@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
 CORRELATED = 9.0  # neighbouring markers that share this error: their residuals count as one
 DRIFT = 1e-3  # standard deviation of a common shift of all markers of a pad [N]
+POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])  # over which slopes by x, y [m] and yaw [rad] are taken
 _HUBER = 3.0  # residuals beyond this many standard deviations count linearly
 
 

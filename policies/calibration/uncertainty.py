@@ -9,9 +9,8 @@ the cost has risen as a normal distribution predicts (a likelihood-ratio interva
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.policies.calibration.planning.information import POSE_STEP
 from gelflow.policies.calibration.poses import prior_cost, prior_information
-from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, huber_weights
+from gelflow.policies.calibration.problem import CORRELATED, POSE_STEP, Problem, huber, huber_weights
 
 Array = NDArray[np.float64]
 

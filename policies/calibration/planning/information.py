@@ -6,14 +6,13 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
-from gelflow.policies.calibration.problem import CORRELATED, DRIFT, MODEL_ERROR
+from gelflow.policies.calibration.problem import CORRELATED, DRIFT, MODEL_ERROR, POSE_STEP
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
 # Half distance of the poses from whose readings a slope is taken [m, m, rad]. The forces have steps where contact
 # points cross edges of the hole, so that the slope of a smaller distance says nothing about a finite change of pose.
-POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])
 _STEP = 0.2  # of differences in parameters and start heights, in standard deviations of their priors
 
 
