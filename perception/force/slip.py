@@ -2,7 +2,7 @@
 
 Two cues are independent of each other:
 
-- **Load.** With the friction coefficient μ, T = |shear| / (μ normal force) tells how close a contact is to gross slip;
+- **Load.** With the friction coefficient μ, T = |shear| / (μ normal force) shows how close a contact is to gross slip;
   a moment about the normal enters as in an elliptic limit surface (Howe and Cutkosky 1996). Before, the contact slips
   from its edge inwards. In an elastic layer the part of the area that sticks is nearly (1 − T)^β, with β from 0.5 for
   flat objects with rounded edges to 0.7 for balls (a ball on a half space: 2/3, Cattaneo 1938, Mindlin 1949). For

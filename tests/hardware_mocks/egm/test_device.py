@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ABBRobotEGM import EGM
+from tests.common.processes import is_running
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, UsageError
@@ -243,23 +244,14 @@ def test_the_controller_ends_when_the_mock_robot_is_killed_before_it_answers(tmp
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as robot:
             assert robot.stdout is not None
             controller = int(robot.stdout.readline())
-            robot.send_signal(
-                signal.SIGSTOP
-            )  # a request of the controller is not answered, and robot time stands still
+            # The controller gets no answer from a stopped process, and robot time stands still.
+            robot.send_signal(signal.SIGSTOP)
             time.sleep(0.3)
             robot.kill()
     end = time.monotonic() + 60.0
-    while _is_running(controller):
+    while is_running(controller):
         assert time.monotonic() < end, "the controller runs without its parent"
         time.sleep(0.05)
-
-
-def _is_running(pid: int) -> bool:
-    """Whether a process exists and is not a zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def test_killed_controller_is_detected(bench: Bench) -> None:

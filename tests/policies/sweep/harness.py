@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from tests.common.processes import is_running
 from tests.policies.sweep.fake_training import STEPS
 
 from gelflow.errors import UsageError
@@ -76,14 +77,6 @@ def wait_until(condition: Callable[[], bool]) -> None:
     """Wait for a condition; a test that waits for ever is ended by pytest's time limit."""
     while not condition():
         time.sleep(0.02)
-
-
-def is_running(process: int) -> bool:
-    """Whether a process exists and is not a zombie."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 @contextlib.contextmanager

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.common.processes import is_running
 from tests.policies.sweep.harness import (
     LINUX,
     TWO_SEEDS,
     assert_resumed,
     held,
     is_held,
-    is_running,
     kill,
     make_runs,
     steps,

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.common.processes import is_running
 from tests.policies.sweep.harness import (
     LINUX,
     assert_resumed,
     held,
-    is_running,
     kill,
     make_runs,
     signal_worker,

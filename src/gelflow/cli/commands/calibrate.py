@@ -130,7 +130,7 @@ def _write_plan(
             seed=args.seed,
             progress=lambda done: progress.update(bar, completed=done),
         )
-    known = "what the sessions leave open" if args.sessions else "a lab of which nothing is known"
+    known = "what the sessions leave open" if args.sessions else "an unknown lab"
     save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
     for line in _plan_lines(plan):
         output.text(line)
