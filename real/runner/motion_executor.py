@@ -98,6 +98,8 @@ class MotionExecutor:
             self._fail(error)
         with contextlib.suppress(GelflowError):
             self._log()
+            timing = self._arm.timing
+            self._recorder.event("arm timing", timing._asdict() | {"missed": timing.missed})
 
     # Called from the runner's thread
 

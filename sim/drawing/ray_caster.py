@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.figures import BLUE, GREEN, ORANGE, PURPLE, VERMILION
+from gelflow.figures import BLUE, GREEN, ORANGE, PURPLE, SKY_BLUE
 from gelflow.sim.drawing.camera import Camera
 from gelflow.sim.drawing.scene_drawing import SceneDrawing
 from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
 
 Array = NDArray[np.float64]
 
-_COLORS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE)
+_COLORS = (BLUE, ORANGE, GREEN, SKY_BLUE, PURPLE)  # without that of the contact forces, VERMILION
 _WORLD_COLOR, _PLANE_COLOR, _BACKGROUND = (176, 176, 176), (232, 232, 228), (250, 250, 250)
 _LIGHT = np.array([-0.35, -0.45, 0.85])  # direction to the light, in axes of the camera's azimuth
 _AMBIENT, _HEADLIGHT, _DIFFUSE = 0.42, 0.2, 0.42  # shares of the brightness

@@ -151,7 +151,7 @@ class InsertionRunner:
         observer = self._observer()
         before = observer.at_rest(self._clock.now())
         latency = self._cell.latency
-        with latency.grasp():
+        with latency.grasp(self._clock):
             try:
                 self._cell.gripper.grasp(
                     width=lab.gripper.part_width, speed=lab.gripper.speed, force=lab.gripper.grasp_force

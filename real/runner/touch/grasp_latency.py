@@ -6,11 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
 from gelflow.perception.frames import decode_image
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig
 from gelflow.protocols import CameraImage, GripperState
 from gelflow.real.camera.latency import LatencyEstimate, combine_latencies, estimate_latency
+from gelflow.time_sync import RUNNER
 
 _AROUND = 0.4  # before and after the rise of the force, in which images are tracked [s]
 _RISEN = 0.1  # of the largest force, above which it has risen
@@ -81,14 +83,19 @@ class LatencyMonitor:
             signals.force.append((state.stamp, state.force))
 
     @contextmanager
-    def grasp(self) -> Iterator[None]:
-        """Collect the signals of a grasp: the context starts before the fingers close and ends with the part held."""
+    def grasp(self, clock: ScaledClock) -> Iterator[None]:
+        """Collect the signals of a grasp: the context starts before the fingers close and ends with the part held.
+
+        Then estimate the latencies from some fifty images, for which the time of a mock robot waits.
+        """
         self._signals = signals = GraspSignals()
         try:
             yield
         finally:
             self._signals = None
-        for known, estimate in zip(self.estimates, signals.latencies(self._trackers), strict=True):
+        with clock.bounded(RUNNER):
+            latencies = signals.latencies(self._trackers)
+        for known, estimate in zip(self.estimates, latencies, strict=True):
             known += [] if estimate is None else [estimate]
 
     @property

@@ -14,8 +14,8 @@ from gelflow.real.runner import lab
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
-# Limits that are wider still, since they measure the computer and not the robot: a shared computer may not run a process,
-# or not finish a write, for some tenths of a second.
+# Limits that are wider still, since they measure the computer and not the robot: a process may not run, or a write may
+# take, for some tenths of a second.
 _DISK = 4  # of the delay of a recording
 _POSE = 2  # of the age of a pose, which ages while the driver's process does not run
 
@@ -114,7 +114,7 @@ def _write_calibration(robot: "MockRobot", finger: int) -> Path:
 
 
 def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0, pose: float = 1.0) -> lab.LimitsSettings:
-    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; two of them `disk` and `pose` times that."""
+    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; `disk` and `pose` multiply two."""
     return lab.LimitsSettings(
         stale_pose=0.020 * scale * pose + jitter,
         stale_frame=0.250 * scale + jitter,

@@ -54,6 +54,7 @@ def test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run(
     # The recording is complete and contains the reason.
     recorded = dict(events(plan.session))
     assert expected.lower() in recorded["stopped"]["reason"].lower()
+    assert recorded["arm timing"]["cycles"] > 100 and 0 <= recorded["arm timing"]["missed"] < 1
 
 
 def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobot, tmp_path: Path) -> None:
