@@ -27,6 +27,7 @@ from gelflow.session.records import from_plain, to_plain
 
 FORMAT = 1
 
+_SPACINGS = 0.01, 1000  # of markers [mm]
 _MIN_MARKERS = 16  # fewer markers do not determine a lens
 _MAX_RESIDUAL = 0.1  # root mean square residual of a gel at rest / marker spacing
 _MAX_SCALE_ERROR = 0.025  # relative, of lengths on the gel
@@ -35,6 +36,7 @@ _EVIDENCE = 10.0  # decrease of the Bayesian information criterion that justifie
 _MAX_OFF_CENTER = 0.5  # largest distance of the lens centre from the image centre [half diagonals]
 _MAX_EVALUATIONS = 20  # of a fit; a well-determined fit needs less than ten
 _NEWTON_STEPS = 12  # of the inverse distortion; it converges earlier
+_READING = 1.0  # standard deviation of a point that is read in an image, along one axis [px]
 _MIN_INLIERS = 0.9  # fraction of inliers among the visible markers
 _EXACT = 1e-3  # [px]: residuals below do not discriminate models
 
@@ -163,8 +165,8 @@ def fit_calibration(
     The Bayesian information criterion selects the lens model. Raises UsageError for an invalid spacing, PeerError when
     too few markers are visible or the residuals are too large.
     """
-    if not 0.01 <= spacing_mm <= 1000:
-        raise UsageError(f"the marker spacing must be within 0.01 to 1000 mm, got {spacing_mm}")
+    if not _SPACINGS[0] <= spacing_mm <= _SPACINGS[1]:
+        raise UsageError(f"the marker spacing must be within {_SPACINGS[0]} to {_SPACINGS[1]} mm, got {spacing_mm}")
     if visible.sum() < _MIN_MARKERS:
         raise PeerError(
             f"{visible.sum()} markers are visible, at least {_MIN_MARKERS} are required: show more of the gel"
@@ -184,6 +186,34 @@ def fit_calibration(
         if gain > _EVIDENCE and _is_one_to_one(fit):
             best = fit
     return _checked(best, rest, visible, inliers)
+
+
+def scale_by_ruler(fit: Calibration, points: Floats, length_mm: float) -> Calibration:
+    """The calibration whose scale is such that two image points (2, 2) [px] are `length_mm` apart on the gel.
+
+    `scale_error` includes the error of reading the points, one pixel each. Raises UsageError for points outside the
+    image or too close to each other, and for an invalid length or spacing.
+    """
+    if not (np.isfinite(points).all() and (points >= 0).all() and (points <= [fit.width - 1, fit.height - 1]).all()):
+        raise UsageError(f"the points of the ruler must be in the image of {fit.width} × {fit.height} px")
+    if not 0 < length_mm < np.inf:
+        raise UsageError(f"the length on the ruler must be above 0 mm, got {length_mm:g}")
+    pixels = float(np.linalg.norm(points[1] - points[0]))
+    reading = np.sqrt(2) * _READING / max(pixels, 1e-9)
+    error = float(np.hypot(fit.scale_error or 0.0, reading))
+    if error > _MAX_SCALE_ERROR:
+        raise UsageError(
+            f"the points of the ruler are {pixels:.0f} px apart, and reading them makes the scale uncertain by "
+            f"{100 * error:.1f} %, limit {100 * _MAX_SCALE_ERROR:g} %: choose points further apart"
+        )
+    (first, last) = fit.to_mm(points)
+    factor = length_mm / float(np.linalg.norm(last - first))
+    spacing = factor * fit.spacing_mm
+    if not _SPACINGS[0] <= spacing <= _SPACINGS[1]:
+        raise UsageError(f"by the ruler, markers are {spacing:g} mm apart: check its points [px] and length [mm]")
+    x, y, w = fit.matrix
+    matrix = (tuple(factor * value for value in x), tuple(factor * value for value in y), w)
+    return replace(fit, spacing_mm=spacing, matrix=matrix, scale_error=error)
 
 
 def _checked(fit: Calibration, rest: Floats, visible: NDArray[np.bool_], inliers: NDArray[np.bool_]) -> Calibration:

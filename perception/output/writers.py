@@ -200,11 +200,16 @@ class OverlayWriter:
             self._video.write(picture)
 
     def _draw(self, step: TrackedImage) -> NDArray[np.uint8]:
-        picture = draw_overlay(step.frame.image, step.tracked, magnify=self._magnify)
-        if self._forces:
-            enlarged = picture.shape[0] / step.frame.image.shape[0]
-            draw_force(picture, step.force, step.slip, (step.tracked.position + 0.5) * enlarged - 0.5)
-        return picture
+        return overlay(step, magnify=self._magnify, forces=self._forces)
+
+
+def overlay(step: TrackedImage, *, magnify: float, forces: bool) -> NDArray[np.uint8]:
+    """The image (B G R), enlarged, with its markers and displacements, and with the forces if there is a gel."""
+    picture = draw_overlay(step.frame.image, step.tracked, magnify=magnify)
+    if forces:
+        enlarged = picture.shape[0] / step.frame.image.shape[0]
+        draw_force(picture, step.force, step.slip, (step.tracked.position + 0.5) * enlarged - 0.5)
+    return picture
 
 
 def _png(image: NDArray[np.uint8]) -> bytes:

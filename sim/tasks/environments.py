@@ -4,7 +4,8 @@ An episode is one part. `reset` samples the part and makes a first attempt; each
 the action and makes another attempt. A part that is inserted by the first attempt is sampled again.
 
 Action: correction (x, y, yaw) in ±1, scaled by the task, in the gripper's frame; the pose is limited to the workspace.
-Observation: normalized flow map of the attempt, float32, shape (frames * sensors * 2, rows, cols), in ±1.
+Observation: normalized flow map of the attempt, float32, shape (frames * sensors * 2, rows, cols), in ±1; for
+comparisons shear forces in parts of 30 mN, or zeros (`observation` of the task).
 Reward: `InsertionTask.reward` of the pose after the correction.
 Terminated: the part is inserted. Truncated: all attempts of the task (including the first) are used, or the simulation
 failed (`info["failed"]`).
@@ -31,6 +32,7 @@ from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, InsertionTask
 
+_FORCE_RANGE = 0.03  # shear force of a marker that is 1 in the observation "forces" [N]
 _RESET_OPTIONS = {"misalignment": "x, y, yaw of the gripper [m, m, rad]"}
 
 
@@ -126,7 +128,9 @@ class Insertion(AttemptTask):
         image = result.image
         if self._noise is not None:
             image = self._noise.apply(image, self._part_noise[active], rng)
-        self.observation[active] = image
+        if self.description.observation == "forces":
+            image = np.clip(image * (result.divisor / _FORCE_RANGE)[:, None, None, None], -1, 1)
+        self.observation[active] = 0 if self.description.observation == "nothing" else image
         for name in ("divisor", "height", "inserted", "failed"):
             self.info[name][active] = getattr(result, name)
         self.info["pose"][active] = self.attempts.pose[active]

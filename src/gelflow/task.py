@@ -21,6 +21,8 @@ from gelflow.part import CUBOID, Part
 _START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
 _SUCCESS_BELOW_RIM = 0.3e-3  # [m]
 
+OBSERVATIONS = ("flow map", "forces", "nothing")
+
 _POLICY_GRID = Grid(rows=13, cols=10, pitch=1.5, center=(2.0, 0.0))
 
 
@@ -84,12 +86,21 @@ class InsertionTask(TaskDescription):
     workspace: tuple[float, float, float] = (15e-3, 15e-3, np.pi / 12)  # largest |x|, |y|, |yaw| of the gripper
     misalignment: tuple[float, float, float] = (6e-3, 6e-3, np.pi / 18)  # at the start: uniform within ± these
     part: Part = CUBOID
+    # Shown to a policy, as an image of the same shape: the flow map, which robots measure too; for comparisons in
+    # simulation "forces", the shear forces in parts of 30 mN, or "nothing".
+    observation: str = "flow map"
+
+    def __post_init__(self) -> None:
+        if self.observation not in OBSERVATIONS:
+            raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data; the cuboid is omitted, so that its description is that of checkpoints without a part."""
+        """As plain data, without cuboid and flow map, so that it is that of checkpoints of earlier versions."""
         values = super().to_json()
         del values["part"]
-        return values if self.part == CUBOID else {**values, "part": self.part.to_json()}
+        observation = values.pop("observation")
+        changed = {} if observation == OBSERVATIONS[0] else {"observation": observation}
+        return {**values, **changed, **({} if self.part == CUBOID else {"part": self.part.to_json()})}
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Self:

@@ -22,6 +22,7 @@ from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import TrackingResult
 from gelflow.session.reader import SessionReader
 from gelflow.session.recovery import recover
+from gelflow.view.tracking.tracking_page import TrackingPage
 
 MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
 LOOK = GelAppearance(grid=Grid(rows=8, cols=6, pitch=2.2), width=240, height=320, noise=0.5)
@@ -202,3 +203,29 @@ def test_jitter_is_the_noise_without_the_motion() -> None:
         tracked = TrackingResult(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
         summary.add(TrackedImage(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
     assert summary.jitter() == pytest.approx(0.03, rel=0.2)
+
+
+def test_a_ruler_replaces_the_spacing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "rest.png"), FastGelRenderer(LOOK).render(field(0)))
+    length = 200 / LOOK.pixels_per_mm  # [mm]
+    words = ["calibrate-camera", str(tmp_path / "rest.png"), "--out", str(tmp_path / "fit.json")]
+    assert main([*words, "--ruler", "20", "160", "220", "160", f"{length}"]) == 0
+    assert "by the ruler" in capsys.readouterr().out
+    assert load_calibration(tmp_path / "fit.json").spacing_mm == pytest.approx(LOOK.grid.pitch, rel=2e-3)
+    assert main([*words[:2], "--out", str(tmp_path / "other.json")]) == 2
+    assert "give --ruler" in capsys.readouterr().err
+
+
+def test_a_new_zero_from_the_page_is_the_new_state_of_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = FastGelRenderer(LOOK)
+    for number in range(6):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), renderer.render(field(number)))
+    asked = iter([False, False, True, False, False])
+    monkeypatch.setattr(TrackingPage, "take_zero_request", lambda page: next(asked))
+    table = tmp_path / "table.csv"
+    words = ["track", str(tmp_path), "--rate", "200", "--pixels-per-mm", str(LOOK.pixels_per_mm)]
+    assert main([*words, "--show", "--port", "0", "--out", str(table)]) == 0
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    moved = np.array([float(row["dy_mm"]) for row in rows]).reshape(6, 48).mean(1)
+    np.testing.assert_allclose(moved, [0, 0.05, 0.1, 0, 0.05, 0.1], atol=5e-3)

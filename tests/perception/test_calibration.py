@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import Calibration, fit_calibration, load_calibration, save_calibration
+from gelflow.perception.calibration import (
+    Calibration,
+    fit_calibration,
+    load_calibration,
+    save_calibration,
+    scale_by_ruler,
+)
 from gelflow.perception.synthetic.appearance import make_appearance
 from gelflow.perception.synthetic.sequences import GelSequence
 from gelflow.perception.tracker import MarkerTracker
@@ -133,6 +139,38 @@ def test_a_deformed_gel_and_too_few_markers_are_rejected() -> None:
         fitted(rest, np.arange(len(MARKERS)) < 10)
     with pytest.raises(UsageError, match="spacing"):
         fit_calibration(rest, ALL, rows=ROWS, cols=COLS, spacing_mm=0.0, size=SIZE)
+
+
+def test_a_ruler_gives_the_spacing_behind_perspective_and_lens() -> None:
+    view: dict[str, Any] = {"barrel": 0.08, "keystone": 0.1, "center": (159.5, 119.5)}
+    rng = np.random.default_rng(3)
+    rest = camera(MARKERS, **view) + rng.normal(0, 0.02, MARKERS.shape)
+    unscaled = fit_calibration(rest, ALL, rows=ROWS, cols=COLS, spacing_mm=1.0, size=SIZE)
+    errors = []
+    for _ in range(100):
+        turn = rng.uniform(0, 2 * np.pi)
+        ends = rng.uniform(-1.5, 1.5, 2) + np.outer([-4.5, 4.5], [np.cos(turn), np.sin(turn)])  # 9 mm apart
+        read = camera(ends, **view) + rng.normal(0, 1.0, (2, 2))
+        scaled = scale_by_ruler(unscaled, read, 9.0)
+        errors.append(scaled.spacing_mm / SPACING - 1)
+        assert scaled.scale_error is not None and 0.008 < scaled.scale_error < 0.013
+    assert 0.5 < float(np.std(errors)) / 0.0105 < 1.5 and abs(np.mean(errors)) < 0.003
+    np.testing.assert_allclose(scaled.to_mm(rest), fitted(rest).to_mm(rest) * (1 + errors[-1]), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("points", "length", "message"),
+    [
+        ([[10, 10], [40, 10]], 2.0, "reading them makes the scale uncertain by 4.7 %.*further apart"),
+        ([[10, 10], [400, 10]], 20.0, "must be in the image of 320 × 240 px"),
+        ([[10, np.nan], [200, 10]], 20.0, "must be in the image"),
+        ([[10, 10], [300, 10]], -1.0, "above 0 mm, got -1"),
+        ([[10, 10], [300, 10]], 1e9, "check its points"),
+    ],
+)
+def test_a_ruler_that_gives_no_scale_is_refused(points: list[list[float]], length: float, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        scale_by_ruler(fitted(camera(MARKERS, barrel=0, keystone=0, center=(159.5, 119.5))), np.array(points), length)
 
 
 def rms_length_error(calibration: Calibration, view: dict[str, Any]) -> float:

@@ -95,6 +95,9 @@ def test_a_checkpoint_of_another_task_is_rejected_with_the_differing_fields(stor
     line = str(error_info.value)
     assert "attempts 15 (here 7)" in line and "frame_depths [0.0011] (here [0.001])" in line
     assert "workspace" not in line and "\n" not in line
+    assert "observation" not in INSERTION.to_json()  # as in checkpoints of earlier versions
+    with pytest.raises(UsageError, match="observation"):
+        load_policy(stored, task=dataclasses.replace(INSERTION, observation="forces"))
 
 
 def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:

@@ -186,3 +186,18 @@ def test_misalignment_is_sampled_from_the_range_of_the_task() -> None:
     limit = np.array(INSERTION.misalignment)
     assert (np.abs(drawn) <= limit).all()
     np.testing.assert_allclose(np.abs(drawn).max(0), limit, rtol=0.02)
+
+
+def test_observations_for_comparisons_show_forces_or_nothing() -> None:
+    images, divisors = {}, {}
+    for observation in ("flow map", "forces", "nothing"):
+        envs = vector(8, task=dataclasses.replace(INSERTION, observation=observation))
+        images[observation], info = envs.reset(seed=0)
+        divisors[observation] = info["divisor"]
+        assert images[observation] in envs.observation_space
+    force = images["flow map"] * divisors["flow map"][:, None, None, None]  # [N]
+    np.testing.assert_allclose(images["forces"], np.clip(force / 0.03, -1, 1), atol=1e-6)
+    assert not images["nothing"].any()
+    np.testing.assert_array_equal(divisors["forces"], divisors["flow map"])
+    with pytest.raises(UsageError, match="observation must be one of flow map, forces, nothing, got 'sound'"):
+        dataclasses.replace(INSERTION, observation="sound")

@@ -12,7 +12,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_profile
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration
+from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration, scale_by_ruler
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid_detection.grid import find_extent
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
@@ -31,8 +31,16 @@ Floats = NDArray[np.float64]
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("source", help="image of the gel at rest, or a folder, video, session or camera (first image)")
-    parser.add_argument(
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument(
         "--spacing-mm", type=float, metavar="MM", help="distance of neighbouring markers (default: of the profile)"
+    )
+    length.add_argument(
+        "--ruler",
+        type=float,
+        nargs=5,
+        metavar=("X1", "Y1", "X2", "Y2", "MM"),
+        help="instead: two points in images of this camera [px], and their distance on the gel, such as on a ruler",
     )
     add_profile(parser)
     parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
@@ -61,8 +69,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
     profile = load_sensor_profile(args.profile)
     spacing = args.spacing_mm or profile.markers.pitch_mm
-    if not spacing:
-        raise UsageError("--spacing-mm is missing: the distance of neighbouring markers; measure it on the gel")
+    if not spacing and args.ruler is None:
+        raise UsageError(
+            "--spacing-mm is missing: the distance of neighbouring markers; measure it on the gel, or give --ruler"
+        )
     if args.rows is None and args.cols is None and profile.markers.rows:
         args.rows, args.cols = profile.markers.rows, profile.markers.cols
     image = _first_image(image_source(args.source, sensor=args.sensor, profile=profile))
@@ -70,7 +80,11 @@ def run(args: argparse.Namespace) -> int:
         tracker, first, part = _start(image, args)
     rest, measured = tracker.rest, first.valid
     size = (image.shape[1], image.shape[0])
-    fit = fit_calibration(rest, measured, rows=first.rows, cols=first.cols, spacing_mm=spacing, size=size)
+    fit = fit_calibration(
+        rest, measured, rows=first.rows, cols=first.cols, spacing_mm=1.0 if args.ruler else spacing, size=size
+    )
+    if args.ruler:
+        fit = scale_by_ruler(fit, np.reshape(args.ruler[:4], (2, 2)), args.ruler[4])
     fit = replace(fit, skipped=part.skipped) if part else fit
     save_calibration(fit, args.out)
     draw_calibration(image, rest, measured, fit, picture)
@@ -90,12 +104,14 @@ def run(args: argparse.Namespace) -> int:
                 "pixels_per_mm": scale,
                 "residual_px": fit.residual_px,
                 "largest_residual_px": fit.largest_px,
+                "spacing_mm": fit.spacing_mm,
                 "scale_error": fit.scale_error,
                 "smooth_share": fit.smooth_share,
             }
         )
     else:
-        output.console.print(_table(fit, measured, rejected, written=f"{args.out}, and the picture {picture}"))
+        written = f"{args.out}, and the picture {picture}"
+        output.console.print(_table(fit, measured, rejected, ruler=args.ruler is not None, written=written))
     return SUCCESS
 
 
@@ -161,7 +177,7 @@ def _rejected(fit: Calibration, rest: Floats, measured: NDArray[np.bool_]) -> in
     return int((distance > fit.largest_px * (1 + 1e-9)).sum())
 
 
-def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, written: str) -> Table:
+def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, ruler: bool, written: str) -> Table:
     along, down = fit.pixels_per_mm()
     lens = ", ".join(f"k{i} {k:+.3f}" for i, k in enumerate(fit.radial, start=1)) or "no measurable distortion"
     offset = np.subtract(fit.center, ((fit.width - 1) / 2, (fit.height - 1) / 2))
@@ -175,14 +191,15 @@ def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, writ
     if any(fit.skipped):
         lines = VisiblePart.of_calibration(fit).lines
         table.add_row("visible", f"{lines_text(lines, *fit.printed_grid)} of the printed grid, counted in the image")
+    if ruler:
+        table.add_row("spacing", f"{fit.spacing_mm:.3f} mm between neighbouring markers, by the ruler")
     table.add_row("scale", f"{along:.2f} px/mm along rows, {down:.2f} along columns (centre)")
     table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid")
     table.add_row("lens", lens)
     residuals = (fit.residual_px, 1e3 * fit.residual_px / along, fit.largest_px)
     table.add_row("residual", "{:.3f} px = {:.1f} µm root mean square, {:.2f} px at most".format(*residuals))
-    table.add_row(
-        "uncertainty", f"{100 * (fit.scale_error or 0.0):.1f} % of a length, from the unevenness of the print"
-    )
+    reason = "the unevenness of the print" + (", and the reading of the ruler" if ruler else "")
+    table.add_row("uncertainty", f"{100 * (fit.scale_error or 0.0):.1f} % of a length, from {reason}")
     spacings = fit.residual_px / (fit.spacing_mm * min(along, down))
     if spacings > _UNEVEN and (fit.smooth_share or 0.0) > _SMOOTH:
         table.add_row("", "the deviations change slowly over the image: check that nothing touches the gel")

@@ -3,16 +3,18 @@
 import argparse
 import itertools
 import time
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_profile, check_at_least
+from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
@@ -29,6 +31,9 @@ from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profil
 from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
+
+if TYPE_CHECKING:
+    from gelflow.view.tracking.tracking_page import TrackingPage
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -76,6 +81,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--magnify", type=float, default=3.0, metavar="X", help="length of the overlay's arrows (%(default)s times)"
     )
+    parser.add_argument(
+        "--show", action="store_true", help="show markers and forces in the browser, with a key for a new zero"
+    )
+    add_page_address(parser, of=" of --show")
     add_json(parser)
 
 
@@ -91,7 +100,8 @@ def run(args: argparse.Namespace) -> int:
     args.gel = _gel(args.gel, profile)
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
-        _track(source, calibration, summary, args)
+        with _page(args, output, live=source.live) as page:
+            _track(source, calibration, summary, args, page)
     except KeyboardInterrupt:
         if not source.live or not summary.images:
             raise
@@ -118,11 +128,28 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(f"{file}: the folder {file.parent} does not exist")
 
 
+@contextmanager
+def _page(args: argparse.Namespace, output: Output, *, live: bool) -> "Iterator[TrackingPage | None]":
+    """The page of `--show`, or None without it."""
+    if not args.show:
+        yield None
+        return
+    from gelflow.view.tracking.tracking_page import TrackingPage  # deferred: optional
+
+    page = TrackingPage(
+        args.source, magnify=args.magnify, forces=args.gel is not None, paced=not live, host=args.host, port=args.port
+    )
+    with closing(page):
+        output.text(f"open {page.url} in a browser; Ctrl-C ends")
+        yield page
+
+
 def _track(
     source: ImageSource,
     calibration: Calibration | None,
     summary: TrackingSummary,
     args: argparse.Namespace,
+    page: "TrackingPage | None",
 ) -> None:
     total = source.count()
     if args.images is not None:
@@ -146,6 +173,10 @@ def _track(
                 # Files are created after the first image: a failed start leaves no empty files.
                 forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
                 writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
+                writers += [] if page is None else [page]
+            elif page is not None and page.take_zero_request() and (started := _zeroed(tracker, tracked, frame, page)):
+                tracker, tracked = started
+                forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
                 force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
@@ -180,6 +211,20 @@ def _start(
     if calibration is not None:
         check_calibrated_scale(calibration, first)
     return tracker, first, parts
+
+
+def _zeroed(
+    tracker: MarkerTracker, tracked: TrackingResult, frame: SourceImage, page: "TrackingPage"
+) -> tuple[MarkerTracker, TrackingResult] | None:
+    """A tracker for which the present image is the state of rest; None if it does not show the same grid clearly."""
+    fresh = MarkerTracker(tracker.config)
+    try:
+        first = fresh.start(frame.image)
+    except TrackerInitError:
+        first = None
+    same = first is not None and (first.rows, first.cols) == (tracked.rows, tracked.cols)
+    page.zeroed(done=same)
+    return (fresh, first) if first is not None and same else None
 
 
 def _scale(first: TrackingResult, source: ImageSource, args: argparse.Namespace) -> float | None:

@@ -1,0 +1,150 @@
+"""Trains the insertion under each shear law and preset, or with each observation, and evaluates under all of them.
+
+    python -m benchmarks.training.insertion_matrix settings
+    python -m benchmarks.training.insertion_matrix observations
+
+Every training has the same number of attempts. Results are stored in --folder as they are found: a second call with the
+same folder computes what is missing. Writes a record and a picture.
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from gelflow.figures import save
+from gelflow.measurement.machine import processor, versions
+from gelflow.policies.checkpoint import load_network
+from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.recipes import training_run
+from gelflow.sim.tasks.environments import Insertion
+from gelflow.task import INSERTION
+
+ROOT = Path(__file__).parents[2]
+EVALUATION_SEED = 7_000_003  # far from the seeds of trainings and their validations
+ENVS = 128
+
+
+class Row(NamedTuple):
+    """A setting in which policies are trained, or evaluated."""
+
+    name: str
+    options: Mapping[str, Any]  # of the environments
+
+
+def settings(presets: tuple[str, ...]) -> list[Row]:
+    """Each shear law with each preset; "scene" stands for the values of the scene file."""
+    return [
+        Row(f"{law}, {preset}", {"friction": law, "preset": None if preset == "scene" else preset})
+        for law in ("elastic", "viscous")
+        for preset in presets
+    ]
+
+
+def observations() -> list[Row]:
+    """Each observation of the last frame, and of five frames where they differ."""
+    five = tuple(depth * 1e-4 for depth in (3, 5, 7, 9, 11))
+    rows = []
+    for observation in ("flow map", "forces", "nothing"):
+        for frames in (INSERTION.frame_depths, five) if observation != "nothing" else (INSERTION.frame_depths,):
+            task = dataclasses.replace(INSERTION, observation=observation, frame_depths=frames)
+            rows.append(Row(f"{observation}, {len(frames)} frame{'s' * (len(frames) > 1)}", {"task": task}))
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("matrix", choices=("settings", "observations"))
+    parser.add_argument("--attempts", type=int, default=100_000, help="of each training (%(default)s)")
+    parser.add_argument("--episodes", type=int, default=512, help="of each evaluation (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="(%(default)s)")
+    parser.add_argument("--folder", type=Path, help="of the trainings (default runs/insertion_MATRIX)")
+    parser.add_argument("--out", type=Path, help="record (default benchmarks/results/insertion_MATRIX.json)")
+    parser.add_argument("--picture", type=Path, help="default docs/pictures/insertion_MATRIX.png")
+    args = parser.parse_args()
+    name = f"insertion_{args.matrix}"
+    folder = args.folder or Path("runs") / name
+    if args.matrix == "settings":
+        trained, evaluated = (
+            settings(("fast", "scene", "balanced")),
+            settings(("fast", "scene", "balanced", "accurate")),
+        )
+    else:
+        trained = [row._replace(options={**row.options, "preset": "fast"}) for row in observations()]
+        evaluated = []  # each under its own observation, with the values of the scene file
+    cells: dict[str, dict[str, Any]] = {}
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("", total=len(trained))
+        for row in trained:
+            progress.update(bar, description=row.name)
+            columns = evaluated or [Row("its own observation", {**row.options, "preset": None})]
+            cells[row.name] = train_and_evaluate(row, columns, folder, args)
+            progress.advance(bar)
+    record = {
+        "format": 1, "attempts": args.attempts, "episodes": args.episodes, "seed": args.seed,
+        "processor": processor(), "versions": versions(), "success": cells,
+    }  # fmt: skip
+    out = args.out or ROOT / "benchmarks" / "results" / f"{name}.json"
+    out.write_text(json.dumps(record, indent=1) + "\n")
+    draw(cells, args.picture or ROOT / "docs" / "pictures" / f"{name}.png")
+    columns = list(next(iter(cells.values())))
+    table = Table("trained", *columns, title="inserted [%]")
+    for trained_name, values in cells.items():
+        table.add_row(trained_name, *(f"{100 * values[column]['success']:.1f}" for column in columns))
+    Console(width=120).print(table)
+
+
+def train_and_evaluate(row: Row, columns: list[Row], folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    """Success and corrections of the policy that is trained in `row`, by the names of the columns."""
+    place = folder / "".join(letter if letter.isalnum() else "_" for letter in row.name)
+    options = {name: value for name, value in row.options.items() if value is not None}
+    run = training_run("insertion", place, seed=args.seed, steps=args.attempts, envs=256, options=options)
+    if not run.is_finished():
+        run.train()
+    stored = place / "evaluations.json"
+    known = json.loads(stored.read_text()) if stored.exists() else {}
+    for column in columns:
+        if known.get(column.name, {}).get("episodes") == args.episodes:
+            continue
+        batch = Insertion(ENVS, **column.options)
+        actor = load_network(run.checkpoint, task=batch.description).batch_policy(ENVS)
+        result = evaluate_task("policy", actor, batch, episodes=args.episodes, seed=EVALUATION_SEED + args.seed)
+        known[column.name] = {
+            "episodes": args.episodes, "success": result.success, "success_95": list(result.confidence_interval()),
+            "corrections": result.length,
+        }  # fmt: skip
+        stored.write_text(json.dumps(known, indent=1) + "\n")
+    return {column.name: known[column.name] for column in columns}
+
+
+def draw(cells: Mapping[str, Mapping[str, Any]], path: Path) -> None:
+    """Draw the success of every cell as a number and as a colour, one colour map from the worst cell to 100 %."""
+    from matplotlib.figure import Figure
+
+    columns = list(next(iter(cells.values())))
+    success = [[100 * values[column]["success"] for column in columns] for values in cells.values()]
+    worst = min(min(row) for row in success)
+    figure = Figure(figsize=(2.6 + 0.95 * len(columns), 1.6 + 0.55 * len(cells)), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(success, cmap="cividis", vmin=worst, vmax=100, aspect="auto")
+    for i, row in enumerate(success):
+        for j, value in enumerate(row):
+            dark = value < (worst + 100) / 2
+            axes.text(j, i, f"{value:.1f}", ha="center", va="center", color="white" if dark else "black")
+    axes.set_yticks(range(len(cells)), list(cells))
+    axes.set_xticks(range(len(columns)), [column.replace(", ", "\n") for column in columns])
+    axes.xaxis.tick_top()
+    axes.xaxis.set_label_position("top")
+    axes.set(ylabel="trained under", xlabel="evaluated under")
+    figure.colorbar(image, label="inserted [%]")
+    save(figure, path)
+
+
+if __name__ == "__main__":
+    main()

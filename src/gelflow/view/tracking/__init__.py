@@ -1,0 +1,1 @@
+"""The page of `gelflow track --show`: markers and forces while images arrive."""
