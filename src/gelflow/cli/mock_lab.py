@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from gelflow.gel.gel_file import save_gel
 from gelflow.perception.calibration import fit_calibration, save_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import MOCK_TIME_SCALE
@@ -14,8 +15,8 @@ from gelflow.real.runner import lab
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
-# Limits that are wider still, since they measure the computer and not the robot: a shared computer may not run a process,
-# or not finish a write, for some tenths of a second.
+# Limits that are wider still, since they measure the computer and not the robot: a shared computer may not run a
+# process, or not finish a write, for some tenths of a second.
 _DISK = 4  # of the delay of a recording
 _POSE = 2  # of the age of a pose, which ages while the driver's process does not run
 
@@ -76,6 +77,7 @@ def _camera(robot: "MockRobot", finger: int) -> lab.CameraSettings:
         center_mm=grid.center,
         rotation_deg=robot.config.rotations[finger],
         mirrored=True,
+        gel=_write_gel(robot, finger),
         **scale,
         **visible,
     )
@@ -113,8 +115,19 @@ def _write_calibration(robot: "MockRobot", finger: int) -> Path:
     return path
 
 
+def _write_gel(robot: "MockRobot", finger: int) -> str:
+    """The path of a new file with the true gel of a pad; empty for a world without a gel file."""
+    gel = robot.config.cell.world.true_gel(finger)
+    if gel is None:
+        return ""
+    path = robot.folder / f"gel_{finger}.toml"
+    path.unlink(missing_ok=True)
+    save_gel(gel, path)
+    return str(path)
+
+
 def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0, pose: float = 1.0) -> lab.LimitsSettings:
-    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; two of them `disk` and `pose` times that."""
+    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; two also times `disk` and `pose`."""
     return lab.LimitsSettings(
         stale_pose=0.020 * scale * pose + jitter,
         stale_frame=0.250 * scale + jitter,
