@@ -178,7 +178,7 @@ def _scale(mount: CameraMount) -> GridScale:
 
 
 def _request(tracked: _Tracked, mount: CameraMount) -> dict[str, Any]:
-    """What the helper needs of an image: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2)."""
+    """A request: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2), and validity."""
     displacement = tracked.result.position - tracked.rest.position
     moved = mount.displacement_mm(replace(tracked.result, displacement=displacement))
     valid = tracked.result.valid & tracked.rest.valid
