@@ -213,7 +213,8 @@ class SimulatedCell:
     def displacements(self) -> Array:
         """Displacement of the printed markers on both pads [mm], shape (2, markers, 2)."""
         with self._lock:
-            moved = 1e3 * self._sim.displacement()[0]
+            forces = self._layer_forces() if self.config.world.gels.file else None
+            moved = 1e3 * self._sim.displacement(forces)[0]
             compliance = self._physics.gel_compliance
         pads = zip(self._weights, self._pads, compliance, strict=True)
         return np.stack([weights @ (soft * moved[pad, :2]) for weights, pad, soft in pads])
@@ -259,6 +260,18 @@ class SimulatedCell:
             self._physics.apply(replace(world, gels=gels, friction=friction))
 
     # Internal; the caller holds the lock
+
+    def _layer_forces(self) -> Array:
+        """Forces on the cells of elastic gels, whose sums are the forces of the pads, (1, markers, 3) [N].
+
+        Markers and contact points sample the part differently; the difference of the sums is spread like the pressure.
+        """
+        forces = np.array(self._sim.tactile())
+        for pad, total in zip(self._pads, self._pad_forces(), strict=True):
+            pressure = forces[0, pad, 2]
+            if pressure.sum() > 0:
+                forces[0, pad] += np.outer(pressure / pressure.sum(), total - forces[0, pad].sum(axis=0))
+        return forces
 
     def _pad_forces(self) -> list[list[float]]:
         """See `truth`."""

@@ -20,6 +20,7 @@ from gelflow.part import CUBOID
 from gelflow.part import Part as TrainedPart
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.lens import Lens
+from gelflow.sim.scene.gel import MAX_LAYER_MARKERS
 from gelflow.sim.tasks.parts import part_geometry
 from gelflow.toml_tables import TomlTable, read_toml
 
@@ -271,6 +272,8 @@ def load_world(path: Path, part: TrainedPart = CUBOID) -> World:
     world = dataclasses.replace(world, gels=dataclasses.replace(world.gels, file=file))
     try:
         _ = world.sensor_effects
+        if (count := world.markers.rows * world.markers.cols) > MAX_LAYER_MARKERS:
+            raise UsageError(f"a gel file supports at most {MAX_LAYER_MARKERS} markers, got {count}")
     except UsageError as error:
         raise UsageError(f"{path}, gels: {error}") from None
     return world

@@ -1,16 +1,19 @@
 """A world with a gel file: the markers move with an elastic layer that carries the forces of the pads."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.hardware_mocks.simulated_cell.harness import grasped
 
+from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, save_gel
-from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
-from gelflow.hardware_mocks.simulated_cell.world import Gels, SensorEffects, World, load_world
+from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig, preset_config
+from gelflow.hardware_mocks.simulated_cell.world import Gels, SensorEffects, World, load_world, training_world
 from gelflow.perception.force.estimator import ForceEstimate, ForceEstimator
+from gelflow.sim.tasks.parts import load_part
 
 GEL = ElasticGel(3e5, 0.48, 3e-3)
 WEIGHT = 0.063 * 9.8  # of the part [N]
@@ -45,6 +48,20 @@ def test_forces_of_the_markers_are_those_of_the_pads(world: World) -> None:
         assert force.normal == pytest.approx(true[finger, 2], rel=0.1)
 
 
+def test_a_part_that_covers_a_strip_of_the_pads_is_measured_too(world: World) -> None:
+    task = load_part("peg")
+    made = dataclasses.replace(training_world(task.part), gels=world.gels)
+    cell = SimulatedCell(ScaledClock(), preset_config(None, seed=3, world=made, task=task))
+    cell.advance(100)
+    cell.command_gripper(width=task.part.grasp_width - 3e-3, speed=0.1, force=12.0)
+    cell.advance(300)
+    for finger, (x, _, normal) in enumerate(cell.truth()["pad_forces"]):
+        force = estimated(cell, finger)
+        assert normal == pytest.approx(12.0, rel=0.05)
+        assert force.normal == pytest.approx(normal, rel=0.1)
+        assert force.shear[0] == pytest.approx(x, abs=0.05)
+
+
 def test_a_gel_file_is_relative_to_the_world_file(tmp_path: Path) -> None:
     save_gel(ElasticGel(3e5, 0.48, 3e-3, creep=0.2, creep_time=0.3, friction=0.4), tmp_path / "gel.toml")
     path = tmp_path / "world.toml"
@@ -60,6 +77,7 @@ def test_a_gel_file_is_relative_to_the_world_file(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ('[gels]\nfile = "none.toml"', "gels: no such file"),
+        ('[gels]\nfile = "creep.toml"\n[markers]\nrows = 40\ncols = 30', "at most 1000 markers, got 1200"),
         ('[gels]\nfile = "creep.toml"\n[sensor]\ncreep = 0.1', "creep is in [sensor] and in the gel file"),
     ],
 )
