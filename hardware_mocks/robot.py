@@ -151,7 +151,7 @@ class _Gel:
         self._renderer = FastGelRenderer(appearance, lens=lens)
         self._printed = config.print_error(finger)
         world = config.cell.world
-        self._effects = DeviatingGel(world.sensor, world.markers.grid.positions(), finger)
+        self._effects = DeviatingGel(world.sensor_effects, world.markers.grid.positions(), finger)
         self._count = 0
 
     def __call__(self) -> bytes:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
-from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics
+from gelflow.geometry import Pose, conjugate, rotate, yaw_quaternion
+from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics, pad_overrides
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
 from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside
 from gelflow.hardware_mocks.simulated_cell.progress import Progress, ProgressMonitor
-from gelflow.hardware_mocks.simulated_cell.world import Friction, Gels, World, training_world
+from gelflow.hardware_mocks.simulated_cell.world import Friction, World, training_world
 from gelflow.observation import Grid, resampling_weights
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -108,7 +108,8 @@ class SimulatedCell:
             raise UsageError("the hole of this part is a mesh, whose clearance a world cannot change")
         # The walls of a box's hole are moved by `CellPhysics`.
         with_hole = config.task.part if part.shape == "box" else part
-        scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides={"step": config.step})
+        overrides = {"step": config.step, **pad_overrides(config.world)}
+        scene = load_scene("insertion", preset=config.preset, friction="elastic", overrides=overrides)
         scene = with_part(scene, with_hole)
         self._sim = sim = Simulator(scene, threads=1)
         self._physics = CellPhysics(sim, config.world, self._geometry.hole)
@@ -212,7 +213,8 @@ class SimulatedCell:
     def displacements(self) -> Array:
         """Displacement of the printed markers on both pads [mm], shape (2, markers, 2)."""
         with self._lock:
-            moved = 1e3 * self._sim.displacement()[0]
+            forces = self._layer_forces() if self.config.world.gels.file else None
+            moved = 1e3 * self._sim.displacement(forces)[0]
             compliance = self._physics.gel_compliance
         pads = zip(self._weights, self._pads, compliance, strict=True)
         return np.stack([weights @ (soft * moved[pad, :2]) for weights, pad, soft in pads])
@@ -225,7 +227,11 @@ class SimulatedCell:
             self._next_seed = seed
 
     def truth(self) -> dict[str, Any]:
-        """Ground truth as plain data: the parts, robot time and its delay [s], position of tool and fingers [m]."""
+        """Ground truth as plain data: the parts, robot time and its delay [s], position of tool and fingers [m].
+
+        `pad_forces` are the forces of the part on the left and the right pad [N]: to the tip of the finger, across it
+        and into the pad.
+        """
         with self._lock:
             if self._current is not None:
                 self._measure(self._current)
@@ -236,6 +242,7 @@ class SimulatedCell:
                 "tool": self._tool.position.tolist(),
                 "width": self._gripper.width(),
                 "waited": self._clock.delay,
+                "pad_forces": self._pad_forces(),
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
@@ -247,12 +254,35 @@ class SimulatedCell:
     def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
         """Multiply the stiffness of both gels and the friction of the pads by these factors of the world's values."""
         world = self.config.world
-        gels = Gels(world.gels.left * gel_stiffness, world.gels.right * gel_stiffness)
+        gels = replace(world.gels, left=world.gels.left * gel_stiffness, right=world.gels.right * gel_stiffness)
         friction = Friction(world.friction.pads * pad_friction, world.friction.hole, world.friction.floor)
         with self._lock:
             self._physics.apply(replace(world, gels=gels, friction=friction))
 
     # Internal; the caller holds the lock
+
+    def _layer_forces(self) -> Array:
+        """Forces on the cells of elastic gels, whose sums are the forces of the pads, (1, markers, 3) [N].
+
+        Markers and contact points sample the part differently; the difference of the sums is spread like the pressure.
+        """
+        forces = np.array(self._sim.tactile())
+        for pad, total in zip(self._pads, self._pad_forces(), strict=True):
+            pressure = forces[0, pad, 2]
+            if pressure.sum() > 0:
+                forces[0, pad] += np.outer(pressure / pressure.sum(), total - forces[0, pad].sum(axis=0))
+        return forces
+
+    def _pad_forces(self) -> list[list[float]]:
+        """See `truth`."""
+        wrenches, poses, names = self._sim.wrenches()[0], self._sim.site_poses()[0], self._sim.model.contact_names
+        sites = [site.name for site in self._sim.scene.sites]
+        forces = []
+        for pad in ("pad_left", "pad_right"):
+            total = wrenches[[name.startswith(pad) for name in names], 3:].sum(axis=0)
+            x, y, z = rotate(conjugate(poses[sites.index(pad), 3:]), total)
+            forces.append([float(x), float(y), -float(z)])  # z of the site points out of the pad
+        return forces
 
     def _gripper_height(self) -> float:
         gripper = self._taught_to_base @ (self._tool @ self.config.tool)

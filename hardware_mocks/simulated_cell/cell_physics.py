@@ -1,5 +1,7 @@
 """Applies a world to the parameters of the insertion scene; may be applied again while the simulation runs."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,23 @@ from gelflow.sim.tasks.parts import Outline, Rectangle
 _SIDES = ("left", "right")
 _STIFFNESSES = ("kn", "ks", "kt", "kd")  # contact parameters that are proportional to the stiffness of a surface
 _WALLS = {"wall_left": ("x", -1), "wall_right": ("x", 1), "wall_front": ("y", -1), "wall_back": ("y", 1)}
+_PAD_FACES = 2  # of the contact points of a pad, one of which touches the part
 _INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+def pad_overrides(world: World) -> dict[str, Any]:
+    """Overrides of the scene for a world with a gel file: the layer, with the printed markers as its cells."""
+    gel = world.gels.layer()
+    if gel is None:
+        return {}
+    printed = world.markers
+    return {
+        "pads.*.rows": printed.rows,
+        "pads.*.cols": printed.cols,
+        "pads.*.pitch": 1e-3 * printed.pitch_mm,
+        "pads.*.center": [1e-3 * c for c in printed.center_mm],
+        "pads.*.gel": {name: getattr(gel, name) for name in ("youngs_modulus", "poisson_ratio", "thickness")},
+    }
 
 
 class CellPhysics:
@@ -29,8 +47,11 @@ class CellPhysics:
         """Set all parameters for `world`."""
         self.world = world
         for side, stiffness in zip(_SIDES, (world.gels.left, world.gels.right), strict=True):
-            for surface in (f"pad_{side}", side):
-                self._scale_contact(surface, stiffness, world.friction.pads)
+            self._scale_contact(f"pad_{side}", stiffness, world.friction.pads)
+            if world.gels.file:
+                self._share_contact(side, world.friction.pads)
+            else:
+                self._scale_contact(side, stiffness, world.friction.pads)
         self.gel_compliance = 1 / np.array([world.gels.left, world.gels.right])
         if isinstance(self._hole, Rectangle):
             opening = dict(zip("xy", self._hole.half, strict=True))
@@ -50,6 +71,18 @@ class CellPhysics:
         for key in _STIFFNESSES:
             self._scale(f"{contact}.{key}", stiffness)
         self._set(f"{contact}.mu", friction)
+
+    def _share_contact(self, side: str, friction: float) -> None:
+        """Give the markers of a pad the stiffness of its contact, so that their forces add up to those of the contact.
+
+        The markers of the scene measure with a stiffness of their own, and policies see normalized flow maps only.
+        """
+        scene = self._sim.scene
+        points = next(len(points.points) for points in scene.points if points.name == f"pad_{side}") / _PAD_FACES
+        markers = next(len(pad.positions) for pad in scene.pads if pad.name == side)
+        for key in _STIFFNESSES:
+            self._set(f"{side}.{key}", float(self._sim.param(f"pad_{side}.{key}")[0]) * points / markers)
+        self._set(f"{side}.mu", friction)
 
     def _servo(self, name: str, stiffness: float, force: float) -> None:
         for key, value in (("kp", stiffness), ("kd", stiffness / 200), ("force_lower", -force), ("force_upper", force)):

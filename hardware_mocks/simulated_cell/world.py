@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import UsageError
+from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.observation import Grid
 from gelflow.part import CUBOID
 from gelflow.part import Part as TrainedPart
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.lens import Lens
+from gelflow.sim.scene.gel import MAX_LAYER_MARKERS
 from gelflow.sim.tasks.parts import part_geometry
 from gelflow.toml_tables import TomlTable, read_toml
 
@@ -47,13 +49,18 @@ class Friction:
 
 @dataclass(frozen=True)
 class Gels:
-    """Stiffness of each gel relative to that of the scene: 5 moves the markers a fifth as far under equal force."""
+    """Stiffness of each gel relative to that of the scene or of the file: 5 moves the markers a fifth as far."""
 
     left: float = 1.0
     right: float = 1.0
+    file: str = ""  # gel file of both pads, relative to the world file: an elastic layer; empty: springs of the scene
 
     def __post_init__(self) -> None:
         _check(self, {"left": (1e-3, 2500), "right": (1e-3, 2500)})
+
+    def layer(self) -> ElasticGel | None:
+        """The gel of the file; None without one. Raises UsageError when the file cannot be read."""
+        return load_gel(Path(self.file)) if self.file else None
 
 
 @dataclass(frozen=True)
@@ -215,6 +222,36 @@ class World:
         """Views of the left and of the right camera."""
         return self.left_camera, self.right_camera
 
+    @property
+    def sensor_effects(self) -> SensorEffects:
+        """The deviations of the sensors, with the creep of the gel file.
+
+        Raises UsageError when the file cannot be read, and when it and `sensor` both have a creep.
+        """
+        gel = self.gels.layer()
+        if gel is None or not gel.creep:
+            return self.sensor
+        if self.sensor.creep:
+            raise UsageError(f"creep is in [sensor] and in the gel file {self.gels.file}: give one of them")
+        return dataclasses.replace(self.sensor, creep=gel.creep, creep_time=gel.creep_time)
+
+    def true_gel(self, finger: int) -> ElasticGel | None:
+        """The gel of a pad with its true values, friction included; None for the springs of the scene."""
+        gel = self.gels.layer()
+        if gel is None:
+            return None
+        stiffness = (self.gels.left, self.gels.right)[finger]
+        effects = self.sensor_effects
+        return dataclasses.replace(
+            gel,
+            youngs_modulus=gel.youngs_modulus * stiffness,
+            youngs_modulus_deviation=0.0,
+            creep=effects.creep,
+            creep_time=effects.creep_time,
+            friction=self.friction.pads,
+            friction_deviation=0.0,
+        )
+
 
 def training_world(part: TrainedPart) -> World:
     """The world in which policies for `part` are trained."""
@@ -226,9 +263,20 @@ def training_world(part: TrainedPart) -> World:
 def load_world(path: Path, part: TrainedPart = CUBOID) -> World:
     """Read a world from TOML; without a value, hole and mass are those of `part`.
 
-    Raises UsageError on unknown keys and values out of range, naming the known ones.
+    Raises UsageError on unknown keys and values out of range, naming the known ones, and on a wrong gel file.
     """
-    return world_from_tables(read_toml(path), str(path), part)
+    world = world_from_tables(read_toml(path), str(path), part)
+    if not world.gels.file:
+        return world
+    file = str((path.parent / world.gels.file).resolve())
+    world = dataclasses.replace(world, gels=dataclasses.replace(world.gels, file=file))
+    try:
+        _ = world.sensor_effects
+        if (count := world.markers.rows * world.markers.cols) > MAX_LAYER_MARKERS:
+            raise UsageError(f"a gel file supports at most {MAX_LAYER_MARKERS} markers, got {count}")
+    except UsageError as error:
+        raise UsageError(f"{path}, gels: {error}") from None
+    return world
 
 
 def world_from_tables(tables: dict[str, Any], location: str, part: TrainedPart = CUBOID) -> World:

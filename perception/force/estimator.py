@@ -25,6 +25,12 @@ _PRESSED = 0.1  # cells with this share of the largest normal load count as cont
 _SHEAR_ERROR, _NORMAL_ERROR, _MOMENT_ERROR = 0.015, 0.06, 0.06
 
 
+def check_force_grid(rows: int, cols: int) -> None:
+    """Raise UsageError for a grid of markers that is too large or too small for forces."""
+    if rows < 3 or cols < 3 or rows * cols > MAX_MARKERS:
+        raise UsageError(f"forces need a grid of at least 3 × 3 and at most {MAX_MARKERS} markers, got {rows} × {cols}")
+
+
 @dataclass(frozen=True)
 class ForceEstimate:
     """Forces of an object on the gel, in the axes of the displacements; the normal force is positive in compression.
@@ -59,10 +65,7 @@ class ForceEstimator:
 
         Raises UsageError for a grid that is too large or too small, or a noise that is not above 0.
         """
-        if grid.rows < 3 or grid.cols < 3 or grid.rows * grid.cols > MAX_MARKERS:
-            raise UsageError(
-                f"forces need a grid of at least 3 × 3 and at most {MAX_MARKERS} markers, got {grid.rows} × {grid.cols}"
-            )
+        check_force_grid(grid.rows, grid.cols)
         if not 0 < noise < math.inf:
             raise UsageError(f"noise must be above 0 m, got {noise:g}")
         self.gel, self.grid = gel, grid

@@ -33,6 +33,12 @@ class ImageForces:
         self._slip = SlipEstimator(grid, friction=gel.friction or None, friction_deviation=gel.friction_deviation)
         self.slip: SlipEstimate | None = None  # in the last image; None where the forces are not known
 
+    def reset(self) -> None:
+        """Forget the images before, and an observed friction."""
+        self._estimator.reset()
+        self._slip.reset()
+        self.slip = None
+
     def estimate(
         self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_], stamp: float
     ) -> ForceEstimate | None:
@@ -46,8 +52,8 @@ class ImageForces:
         return None if estimate is None else _exchanged_axes(estimate)
 
 
-def force_record(estimate: ForceEstimate) -> dict[str, Any]:
-    """The totals as plain data: forces [N], moments [N m], lengths [mm]."""
+def force_record(estimate: ForceEstimate, slip: SlipEstimate | None = None) -> dict[str, Any]:
+    """Totals and slip as plain data, as in `gelflow.Force` of sessions: forces [N], moments [N m], lengths [mm]."""
     centre = estimate.centre_of_pressure
     return {
         "contact": estimate.contact,
@@ -60,6 +66,7 @@ def force_record(estimate: ForceEstimate) -> dict[str, Any]:
         "centre_mm": None if centre is None else 1e3 * centre,
         "contact_area_mm2": 1e6 * estimate.contact_area,
         "unexplained": estimate.unexplained,
+        **({} if slip is None else slip_record(slip)),
     }
 
 

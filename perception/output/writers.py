@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.perception.force.estimator import ForceEstimate
-from gelflow.perception.force.image_forces import force_record, slip_record
+from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.force.slip import SlipEstimate
 from gelflow.perception.output.forces import SUFFIX, ForceTable, draw_force
 from gelflow.perception.overlay import draw_overlay
@@ -134,8 +134,7 @@ class McapWriter:
             values["displacement_mm"] = step.displacement_mm
         self._recorder.markers(self._sensor, stamp, values)
         if step.force is not None:
-            slip = {} if step.slip is None else slip_record(step.slip)
-            self._recorder.force(self._sensor, stamp, force_record(step.force) | slip)
+            self._recorder.force(self._sensor, stamp, force_record(step.force, step.slip))
         if step.number % _SYNC_PERIOD == _SYNC_PERIOD - 1:
             self._recorder.attempt_end()
 

@@ -8,6 +8,7 @@ import math
 import os
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, cast
 from urllib.parse import urlsplit
 
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
+from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.calibration import load_calibration
+from gelflow.perception.force.estimator import check_force_grid
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range
 from gelflow.real.web_services.client import WebServicesClient
@@ -102,6 +105,7 @@ class CameraSettings:
     center_mm: tuple[float, float] = (0.0, 0.0)  # centre of the marker grid on the pad, x towards the fingertip [mm]
     rotation_deg: int = 0  # of the image, clockwise; at 0 the fingertip is at the bottom [°]: 0, 90, 180 or 270
     mirrored: bool = True  # the camera views the gel from behind
+    gel: str = ""  # file of gelflow calibrate-gel, relative to the lab file or absolute; empty: no forces
     latency: float = 0.0  # constant time from the exposure to the reception of an image [s], 0 to 0.2
     # First and last row and column that the image shows, from 1; [0, 0]: those of the calibration, without one all.
     visible_rows: tuple[int, int] = (0, 0)
@@ -134,6 +138,17 @@ class CameraSettings:
             visible_rows=self.visible_rows if any(self.visible_rows) else None,
             visible_cols=self.visible_cols if any(self.visible_cols) else None,
         )
+
+    @property
+    def elastic_gel(self) -> ElasticGel | None:
+        """The gel of the pad; None without one.
+
+        Raises UsageError when its file cannot be read, or when forces cannot be estimated on the grid of markers.
+        """
+        if not self.gel:
+            return None
+        check_force_grid(*self.mount.image_grid)
+        return load_gel(Path(self.gel))
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,19 @@ def load_lab(path: str | Path) -> Lab:
     table = TomlTable(read_toml(path), str(path))
     if (version := table.integer("format")) != FORMAT:
         raise UsageError(f"{path}: lab file format {version}; this gelflow reads format {FORMAT}")
-    return _with_calibrations(table.as_dataclass(Lab, renamed=_RENAMED_KEYS), path)
+    return _with_files(table.as_dataclass(Lab, renamed=_RENAMED_KEYS), path)
 
 
-def _with_calibrations(lab: Lab, path: Path) -> Lab:
-    """`lab` with absolute paths of the camera calibrations; reads each of them once, so that errors show early."""
+def _with_files(lab: Lab, path: Path) -> Lab:
+    """`lab` with absolute paths of calibrations and gels; reads each of them once, so that errors show early."""
     cameras = {}
     for name in ("left", "right"):
         camera = getattr(lab.cameras, name)
-        if camera.calibration:
-            camera = dataclasses.replace(camera, calibration=str((path.parent / camera.calibration).resolve()))
+        files = {key: getattr(camera, key) for key in ("calibration", "gel")}
+        absolute = {key: str((path.parent / file).resolve()) for key, file in files.items() if file}
+        camera = dataclasses.replace(camera, **absolute)
         try:
-            _ = camera.mount
+            _ = camera.mount, camera.elastic_gel
         except UsageError as error:
             raise UsageError(f"{path}, cameras.{name}: {error}") from None
         cameras[name] = camera

@@ -21,6 +21,7 @@ from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.preflight import PreflightItem, run_preflight
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.observer import TactileObserver
+from gelflow.real.runner.touch.pad_forces import pad_forces
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import describe_session
 from gelflow.task import InsertionTask
@@ -71,7 +72,11 @@ class DryRun:
 def run_insertions(plan: RunPlan) -> list[Insertion]:
     """Run and record the insertions of a plan. Raises the first error after which continuing is unsafe."""
     results = []
-    with _recording(plan, dry_run=False) as recorder, open_cell(plan.lab, recorder) as cell:
+    with (
+        _recording(plan, dry_run=False) as recorder,
+        pad_forces(plan.lab, recorder) as forces,
+        open_cell(plan.lab, recorder) as cell,
+    ):
         supervisor, motion = create_motion(cell)
         plan.on_motion(motion)
         supervisor.phases.enter(Phase.PREFLIGHT)
@@ -79,7 +84,13 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
         operator = WaitingOperator(motion, plan.lab.part.load_wait) if plan.operator is None else plan.operator(motion)
         with motion:
             runner = InsertionRunner(
-                cell, plan.policy, task=plan.task, motion=motion, operator=operator, on_attempt=plan.on_attempt
+                cell,
+                plan.policy,
+                task=plan.task,
+                motion=motion,
+                operator=operator,
+                forces=forces,
+                on_attempt=plan.on_attempt,
             )
             for number in range(plan.insertions):
                 plan.before_insertion(number)
@@ -87,6 +98,8 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
                 plan.on_insertion(results[-1])
         for line in cell.latency.warnings():
             plan.on_warning(line)
+        if forces is not None and forces.problem:
+            plan.on_warning(forces.problem)
     return results
 
 
@@ -137,6 +150,7 @@ def _recording(plan: RunPlan, *, dry_run: bool) -> Iterator[SessionRecorder]:
         task=plan.task,
         trackers=[mount.tracker_config() for mount in mounts],
         mounts=mounts,
+        gels=[plan.lab.cameras.left.elastic_gel, plan.lab.cameras.right.elastic_gel],
         checkpoint=plan.checkpoint,
         lab=plan.lab,
         clock_factor=plan.lab.clock_factor,

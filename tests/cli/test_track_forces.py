@@ -7,15 +7,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.common.manual_clock import ManualClock
 
 from gelflow.cli.main import main
-from gelflow.gel.gel_file import ElasticGel
+from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.benchmark.slip import SlippingContact, contact_states
+from gelflow.perception.frames import CameraMount
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
 from gelflow.perception.synthetic.appearance import make_appearance
 from gelflow.perception.synthetic.pressed_layer import Press, PressedGel, PressedLayer
 from gelflow.perception.synthetic.slipping_layer import RigidObject
+from gelflow.protocols import CameraImage
 from gelflow.session.reader import SessionReader
+from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import describe_session
+from gelflow.task import INSERTION
 
 GEL = "format = 1\n[gel]\nyoungs_modulus = 1.5e5\npoisson_ratio = 0.48\nthickness = 0.003\n"
 LOOK = make_appearance("clean", width=640, height=480)
@@ -144,3 +150,48 @@ def test_forces_without_scale_or_gel_are_refused(
     assert main(["track", str(images / "images"), *arguments]) == 2
     assert named in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["gel.toml"]
+
+
+@pytest.fixture(scope="module")
+def session(images: Path) -> Path:
+    """A recorded run with those images of the left pad; its lab has a gel for this pad."""
+    path = images / "session.mcap"
+    clock = ManualClock(50.0)
+    mount = CameraMount(13, 10, 1.5, pixels_per_mm=LOOK.pixels_per_mm)
+    with SessionRecorder(path, clock) as recorder:
+        gels = [load_gel(images / "gel.toml"), None]
+        trackers = [mount.tracker_config()] * 2
+        recorder.metadata(describe_session(task=INSERTION, trackers=trackers, mounts=[mount] * 2, gels=gels))
+        for number in range(6):
+            clock.time += 0.1
+            for sensor in range(2):
+                data = (images / "images" / f"{number}.jpg").read_bytes()
+                recorder.image(sensor, CameraImage(data, clock.time, number))
+    return path
+
+
+def test_gel_and_scale_of_a_recorded_lab_are_used(
+    session: Path, images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.forces.csv"
+    assert main(["track", str(session), "--out", str(out), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["gel"] == "of the left pad in the session's lab, 150000 Pa, 3 mm thick"
+    assert summary["force"]["normal"] == pytest.approx(pressed.normal, rel=0.1)
+    assert out.exists()
+    (images / "stiff.toml").write_text(GEL.replace("1.5e5", "3e5"))
+    assert main(["track", str(session), "--gel", str(images / "stiff.toml"), "--pixels-per-mm", "20", "--json"]) == 0
+    explicit = json.loads(capsys.readouterr().out)
+    assert explicit["gel"] == str(images / "stiff.toml")
+    assert explicit["force"]["normal"] > 1.5 * summary["force"]["normal"]
+    assert main(["track", str(session), "--sensor", "right", "--json"]) == 0
+    without = json.loads(capsys.readouterr().out)
+    assert without["gel"] is None and without["force"] is None
+
+
+def test_a_stated_gel_of_a_session_needs_no_scale(
+    session: Path, images: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["track", str(session), "--gel", str(images / "gel.toml")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "gel.toml" in printed and "largest force" in printed

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from gelflow.observation import FlowMap
 from gelflow.real.runner.touch.observer import TactileReading
+from gelflow.real.runner.touch.pad_forces import ForceRecord
+from gelflow.session.records import SENSORS
 
 PLAN_COMPLETE = "plan complete"  # outcome of a part on which all motions of a plan were made
 PlanarPose = tuple[float, float, float]  # of the gripper relative to the taught hole: x, y [m], yaw [rad]
@@ -31,6 +33,12 @@ class Attempt:
     correction: NDArray[np.float64] | None = None  # dx, dy [m], dyaw [rad] in the gripper's frame
     reference: TactileReading | None = None
     last: TactileReading | None = None  # the newest reading of the descent
+    force: tuple[ForceRecord | None, ...] = ()  # on each pad at the end, where it has a gel and is readable
+
+    @property
+    def pad_forces(self) -> dict[str, ForceRecord]:
+        """The known forces at the end, by pad: left, right."""
+        return {side: force for side, force in zip(SENSORS, self.force, strict=False) if force is not None}
 
     def summary(self, insertion: int) -> dict[str, Any]:
         """The result as plain data, for the recording."""
@@ -46,6 +54,7 @@ class Attempt:
             "slipped": self.slipped,
             "height_offset": self.height_offset,
             "duration": self.duration,
+            **({"force": self.pad_forces} if self.pad_forces else {}),
         }
 
 

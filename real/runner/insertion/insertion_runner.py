@@ -24,6 +24,7 @@ from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.grasp_check import GraspCheck, TouchImplausible, check_grasp
 from gelflow.real.runner.touch.observer import MarkersUnreadable, TactileObserver, TactileReading
+from gelflow.real.runner.touch.pad_forces import ForceRecord, PadForces
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
@@ -57,6 +58,7 @@ class InsertionRunner:
         task: InsertionTask,
         motion: MotionExecutor,
         operator: Operator,
+        forces: PadForces | None = None,
         on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None,
     ) -> None:
         lab = cell.lab
@@ -68,6 +70,7 @@ class InsertionRunner:
         self._cell, self._policy, self._task = cell, policy, task
         self._lab, self._clock, self._recorder = lab, cell.clock, cell.recorder
         self._motion, self._operator, self._on_attempt = motion, operator, on_attempt
+        self._forces = forces
         self._planar_pose: PlanarPose = (0.0, 0.0, 0.0)
         self.mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
 
@@ -150,6 +153,8 @@ class InsertionRunner:
         self._motion.wait(0.0)
         observer = self._observer()
         before = observer.at_rest(self._clock.now())
+        if self._forces is not None:
+            self._forces.set_rest(observer.resting_pads)  # the fingers are open
         latency = self._cell.latency
         with latency.grasp(self._clock):
             try:
@@ -174,7 +179,13 @@ class InsertionRunner:
         """
         limits, failures = self._lab.limits, 0
         while True:
-            observer = TactileObserver(self._cell.cameras, self.mounts, clock=self._clock, stale=limits.stale_frame)
+            observer = TactileObserver(
+                self._cell.cameras,
+                self.mounts,
+                clock=self._clock,
+                stale=limits.stale_frame,
+                on_result=None if self._forces is None else self._forces.add,
+            )
             try:
                 observer.start(self._clock.now())
                 return observer
@@ -229,10 +240,17 @@ class InsertionRunner:
         result = Attempt(
             index, planar_pose, last.depth, last.shear, contact, descent.stopped, inserted,
             self._clock.now() - begun, descent.slipped, part.height_offset,
-            observation, correction, observer.reference, last,
+            observation, correction, observer.reference, last, self._force_of(observer),
         )  # fmt: skip
         self._recorder.attempt_end(result.summary(number))
         return result
+
+    def _force_of(self, observer: TactileObserver) -> tuple[ForceRecord | None, ...]:
+        """The forces in the newest images, at the end of an attempt and after its decision."""
+        if self._forces is None:
+            return ()
+        observer.pass_on()
+        return self._forces.of(observer.newest_images)
 
     def _record_decision(
         self,

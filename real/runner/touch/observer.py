@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from gelflow.observation import FlowMap, TactileFrame, flow_map
 from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
 from gelflow.protocols import Camera, CameraImage
+from gelflow.real.runner.touch.pad_forces import RestingPad
 from gelflow.task import InsertionTask
 from gelflow.time_sync import MAX_LEAD, RUNNER
 
@@ -54,11 +55,18 @@ class TactileReading:
 class TactileObserver:
     """Observes both pads relative to a reference, with new trackers; a pair of images is the reference.
 
-    `stale` is the largest age of an image [s, robot time].
+    `stale` is the largest age of an image [s, robot time]. `on_result` receives the newest readable result of each
+    sensor, with its image, after the decision that it leads to: see `pass_on`.
     """
 
     def __init__(
-        self, cameras: Sequence[Camera], mounts: Sequence[CameraMount], *, clock: ScaledClock, stale: float
+        self,
+        cameras: Sequence[Camera],
+        mounts: Sequence[CameraMount],
+        *,
+        clock: ScaledClock,
+        stale: float,
+        on_result: Callable[[int, CameraImage, TrackingResult], None] | None = None,
     ) -> None:
         self._cameras, self._mounts, self._clock, self._stale = cameras, mounts, clock, stale
         self._trackers = [MarkerTracker(mount.tracker_config()) for mount in mounts]
@@ -66,6 +74,8 @@ class TactileObserver:
         self._images: list[CameraImage] = []
         self._results: list[TrackingResult] = []
         self._readable: list[bool] = []
+        self._on_result = on_result
+        self._not_passed_on: list[int] = []  # sensors whose newest result is readable and was not passed on
         self._readable_stamps: list[float] = []  # of the newest readable image of each sensor [s]
         self._intervals: deque[float] = deque(maxlen=_PERIODS)
         self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order
@@ -105,6 +115,7 @@ class TactileObserver:
         PeerTimeout when a camera has sent no new image within the time limit.
         """
         assert self.reference is not None, "call start() first"
+        self.pass_on()
         new = self._wait_for_images()
         for sensor, image in new:
             last = self._images[sensor]
@@ -118,12 +129,23 @@ class TactileObserver:
                 self._readable[sensor] = False
             if self._readable[sensor]:
                 self._readable_stamps[sensor] = image.stamp
+                self._not_passed_on.append(sensor)
             else:
                 self.unreadable += 1
         if not new or not all(self._readable):
             return None
         frame = self._frame()
         return TactileReading(frame, tuple(self._images), 0.0, mean_change(frame, self.reference.frame))
+
+    def pass_on(self) -> None:
+        """Call `on_result` for the results of the last update.
+
+        `update` does so before it waits for the next image; a caller that ends its observation calls this itself.
+        """
+        if self._on_result is not None:
+            for sensor in self._not_passed_on:
+                self._on_result(sensor, self._images[sensor], self._results[sensor])
+        self._not_passed_on = []
 
     def update_pair(self, since: float) -> TactileReading | None:
         """Track until the newest image of each pad was received after the robot time `since` [s]; see `update`."""
@@ -166,6 +188,17 @@ class TactileObserver:
     def image_period(self) -> float:
         """Largest recent interval between two images of a camera [s]; `stale` before any is known."""
         return max(self._intervals, default=self._stale)
+
+    @property
+    def newest_images(self) -> tuple[CameraImage, ...]:
+        """The newest image of each sensor, readable or not."""
+        return tuple(self._images)
+
+    @property
+    def resting_pads(self) -> list[RestingPad]:
+        """The markers of each pad in the reference, where they are measured now too."""
+        pairs = zip(self._trackers, self._results, strict=True)
+        return [RestingPad(tracker.rest, result.valid) for tracker, result in pairs]
 
     def reference_change(self, earlier: "TactileObserver") -> Array:
         """Mean change of each pad from the reference of `earlier` to this one [mm], shape (sensors, 2).

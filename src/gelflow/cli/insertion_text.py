@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
 ATTEMPT_HEADER = "  part  try   x [mm]   y [mm]  yaw [°]  depth [mm]  shear [mm]"
 
+_FORCE_KEYS = ("normal", "normal_deviation", "shear", "shear_deviation")  # of the recorded forces [N]
+
 
 def attempt_line(number: int, attempt: "Attempt") -> str:
     """One line for an attempt of part `number`, below `ATTEMPT_HEADER`."""
@@ -53,14 +55,17 @@ def insertion_to_json(result: "Insertion") -> dict[str, Any]:
         "inserted": result.inserted,
         "outcome": result.outcome,
         "seconds": result.duration,
-        "attempts": [
-            {
-                "pose": attempt.planar_pose,
-                "depth": attempt.depth,
-                "shear_mm": attempt.shear,
-                "outcome": attempt_outcome(attempt),
-                "correction": attempt.correction,
-            }
-            for attempt in result.attempts
-        ],
+        "attempts": [_attempt_to_json(attempt) for attempt in result.attempts],
     }
+
+
+def _attempt_to_json(attempt: "Attempt") -> dict[str, Any]:
+    values = {
+        "pose": attempt.planar_pose,
+        "depth": attempt.depth,
+        "shear_mm": attempt.shear,
+        "outcome": attempt_outcome(attempt),
+        "correction": attempt.correction,
+    }
+    forces = {side: {key: force[key] for key in _FORCE_KEYS} for side, force in attempt.pad_forces.items()}
+    return values | ({"force": forces} if forces else {})

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from gelflow.gel.gel_file import save_gel
 from gelflow.perception.calibration import fit_calibration, save_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import MOCK_TIME_SCALE
@@ -76,6 +77,7 @@ def _camera(robot: "MockRobot", finger: int) -> lab.CameraSettings:
         center_mm=grid.center,
         rotation_deg=robot.config.rotations[finger],
         mirrored=True,
+        gel=_write_gel(robot, finger),
         **scale,
         **visible,
     )
@@ -111,6 +113,17 @@ def _write_calibration(robot: "MockRobot", finger: int) -> Path:
     path.unlink(missing_ok=True)
     save_calibration(fit, path)
     return path
+
+
+def _write_gel(robot: "MockRobot", finger: int) -> str:
+    """The path of a new file with the true gel of a pad; empty for a world without a gel file."""
+    gel = robot.config.cell.world.true_gel(finger)
+    if gel is None:
+        return ""
+    path = robot.folder / f"gel_{finger}.toml"
+    path.unlink(missing_ok=True)
+    save_gel(gel, path)
+    return str(path)
 
 
 def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0, pose: float = 1.0) -> lab.LimitsSettings:

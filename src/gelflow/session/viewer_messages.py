@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gelflow.session.records import to_plain
 
 ERRORS = ("stopped", "arm stopped", "part lost")
-WARNINGS = ("pad not readable", "reference repeated", "weight not shown", "camera latency")
+WARNINGS = ("pad not readable", "reference repeated", "weight not shown", "camera latency", "forces ended")
 
 
 def flow_image(flow: NDArray[np.float32], nanoseconds: int) -> RawImage:

@@ -9,6 +9,7 @@ import pytest
 
 import gelflow.real
 from gelflow.errors import UsageError
+from gelflow.gel.gel_file import ElasticGel, save_gel
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.calibration import Calibration, save_calibration
 from gelflow.real.limits import LAB_RANGES
@@ -214,6 +215,27 @@ def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: s
     assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
     path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
     assert "lab.toml, cameras.left: the calibration is for 18 rows of 14" in refused(tmp_path, path.read_text())
+
+
+def test_gel_path_is_relative_to_the_lab_file(tmp_path: Path, example: str) -> None:
+    save_gel(ElasticGel(1.5e5, 0.48, 3e-3), tmp_path / "left_gel.toml")
+    path = tmp_path / "lab.toml"
+    path.write_text(example.replace('# gel = ""', 'gel = "left_gel.toml"', 1), encoding="utf-8")
+    lab = load_lab(path)
+    assert lab.cameras.left.gel == str(tmp_path / "left_gel.toml")
+    assert lab.cameras.left.elastic_gel == ElasticGel(1.5e5, 0.48, 3e-3)
+    assert lab.cameras.right.elastic_gel is None
+
+
+def test_wrong_gel_is_refused_in_one_line(tmp_path: Path, example: str) -> None:
+    text = example.replace('# gel = ""', 'gel = "left_gel.toml"', 1)
+    assert "lab.toml, cameras.left: no such file" in refused(tmp_path, text)
+    (tmp_path / "left_gel.toml").write_text("format = 1\n[gel]\nyoungs_modulus = -1.0\n")
+    assert "left_gel.toml, gel: poisson_ratio is missing" in refused(tmp_path, text)
+    (tmp_path / "left_gel.toml").unlink()
+    save_gel(ElasticGel(1.5e5, 0.48, 3e-3), tmp_path / "left_gel.toml")
+    fine = text.replace("rows = 18\ncols = 14", "rows = 40\ncols = 30", 1)
+    assert "cameras.left: forces need a grid of" in refused(tmp_path, fine)
 
 
 def test_visible_lines_are_read_and_checked(tmp_path: Path, example: str) -> None:

@@ -135,6 +135,38 @@ def test_pictures_show_displacements_and_the_present(session: RecordedSession) -
     assert decision_picture(Comparison(decision, decision.observation, decision.action), INSERTION.grid).std() > 5
 
 
+def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) -> None:
+    clock = ManualClock(100.0)
+    with SessionRecorder(tmp_path / "forces.mcap", clock) as recorder:
+        recorder.event("insertion", {"number": 0})
+        for number in range(20):
+            clock.time = 100.0 + 0.1 * number
+            force = {
+                "contact": number >= 5, "normal": 0.5 * number, "normal_deviation": 0.25,
+                "shear": [0.3, 0.4], "shear_deviation": [0.1, 0.1],
+                "stick_share": 0.8, "stick_share_deviation": 0.1, "gross_slip": number >= 15,
+            }  # fmt: skip
+            recorder.force(1, clock.time, force)
+        clock.time = 105.0
+        recorder.event("insertion ended", {"number": 0})
+    with RecordedSession(tmp_path / "forces.mcap") as session:
+        texts = [moment_text(session.at(time), session) for time in (100.05, 101.05, 101.85, 104.0)]
+        assert "right pad: no contact" in texts[0] and "left pad" not in texts[0]
+        assert "right pad: normal 5.00 ± 0.25 N, shear 0.50 N, sticks 80 ± 10 %" in texts[1]
+        assert "**gross slip**" in texts[2]
+        assert "right pad" not in texts[3]  # the last force is old
+        curves = Curves(session.start, session.end)
+        for _ in read_curves(session, curves):
+            pass
+        assert not curves.normal[0].samples and not curves.force.samples
+        np.testing.assert_allclose(curves.normal[1].ordered()[1], 0.5 * np.arange(20))
+        assert len(curves.gross_slip.samples) == 5
+        line = TimeLine(curves, [], origin=session.start).with_present(100.0)
+        assert (
+            line != TimeLine(Curves(session.start, session.end), [], origin=session.start).with_present(100.0)
+        ).any()
+
+
 def test_links_of_the_arm_follow_each_other() -> None:
     rng = np.random.default_rng(0)
     for joints in (list(HOME), *rng.uniform(-1, 1, (5, 6)).tolist()):

@@ -5,7 +5,7 @@ import itertools
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.calibration import Calibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces
+from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
 from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
 from gelflow.perception.output.forces import SUFFIX, force_text
@@ -62,7 +63,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--gel",
         metavar="FILE",
-        help="gel file (TOML), or guess: that of the profile; adds forces in newtons, needs a scale or calibration",
+        help="gel file (TOML), or guess: that of the profile; adds forces in newtons, needs a scale or calibration "
+        "(default: the gel and the scale in the lab of a recorded session)",
     )
     parser.add_argument(
         "--out",
@@ -97,7 +99,12 @@ def run(args: argparse.Namespace) -> int:
         args.rows, args.cols = profile.markers.rows, profile.markers.cols
     source = image_source(args.source, sensor=args.sensor, rate=args.rate, profile=profile)
     calibration = load_calibration(args.calibration) if args.calibration else None
-    args.gel = _gel(args.gel, profile)
+    pad = recorded_pad(source.text, args.sensor) if source.kind == "session" else None
+    gel = _gel(args, profile, pad)
+    if gel is not None and pad is not None and calibration is None and args.pixels_per_mm is None:
+        calibration, args.pixels_per_mm = pad.mount.calibration, pad.mount.pixels_per_mm
+    args.gel = None if gel is None else gel.gel
+    _check_outputs(args)
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
         with _page(args, output, live=source.live) as page:
@@ -108,7 +115,8 @@ def run(args: argparse.Namespace) -> int:
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
         if summary.images:
-            _show(output, summary, source.skipped, time.perf_counter() - begin, args.out)
+            seconds, name = time.perf_counter() - begin, None if gel is None else gel.text
+            _show(output, summary, source.skipped, seconds, args.out, name)
     return SUCCESS
 
 
@@ -118,6 +126,9 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
     for file in args.out:
         check_suffix(file)
         if file.name.endswith(SUFFIX) and args.gel is None:
@@ -169,7 +180,7 @@ def _track(
                     tracked = tracker.track(frame.image)
             seconds = time.perf_counter() - begin
             if number == 0:
-                summary.pixels_per_mm = _scale(tracked, source, args)
+                summary.pixels_per_mm = _scale(tracked, source, calibration, args)
                 # Files are created after the first image: a failed start leaves no empty files.
                 forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
                 writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
@@ -227,22 +238,37 @@ def _zeroed(
     return (fresh, first) if first is not None and same else None
 
 
-def _scale(first: TrackingResult, source: ImageSource, args: argparse.Namespace) -> float | None:
+def _scale(
+    first: TrackingResult, source: ImageSource, calibration: Calibration | None, args: argparse.Namespace
+) -> float | None:
     """The uniform scale [px/mm] where there is no calibration; None if it is not known."""
-    if args.calibration is not None or args.pixels_per_mm is not None:
+    if calibration is not None or args.pixels_per_mm is not None:
         scale: float | None = args.pixels_per_mm
         return scale
     pitch = source.profile.markers.pitch_mm
     return first.spacing / pitch if pitch else None
 
 
-def _gel(name: str | None, profile: SensorProfile) -> ElasticGel | None:
-    """The gel of a file, or the first guess of the profile."""
-    if name == "guess":
+@dataclass(frozen=True)
+class _Gel:
+    """The gel of the forces, and its origin in words."""
+
+    gel: ElasticGel
+    text: str
+
+
+def _gel(args: argparse.Namespace, profile: SensorProfile, pad: RecordedPad | None) -> _Gel | None:
+    """The gel of a file, the first guess of the profile, or that of a recorded pad; None without any."""
+    if args.gel == "guess":
         if profile.gel is None:
             raise UsageError(f"the profile {profile.title!r} has no guess of the gel: give a gel file")
-        return profile.gel
-    return load_gel(Path(name)) if name else None
+        return _Gel(profile.gel, f"guess of the profile {profile.title}")
+    if args.gel:
+        return _Gel(load_gel(Path(args.gel)), str(args.gel))
+    if pad is None or pad.gel is None:
+        return None
+    values = f"{pad.gel.youngs_modulus:g} Pa, {1e3 * pad.gel.thickness:g} mm thick"
+    return _Gel(pad.gel, f"of the {args.sensor} pad in the session's lab, {values}")
 
 
 def _forces(
@@ -295,8 +321,10 @@ def _tracked_image(
     return TrackedImage(number, frame, tracked)
 
 
-def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall: float, files: list[Path]) -> None:
-    """Print the summary; `wall` is the duration of the run [s]."""
+def _show(
+    output: Output, summary: TrackingSummary, skipped: SkippedImages, wall: float, files: list[Path], gel: str | None
+) -> None:
+    """Print the summary; `wall` is the duration of the run [s], `gel` names the gel of the forces."""
     values = summary.to_json()
     if output.json:
         not_tracked = {
@@ -304,7 +332,7 @@ def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall
             "first_unreadable": skipped.first or None,
             "dropped_images": skipped.dropped,
         }
-        output.result(values | not_tracked | {"seconds": wall, "files": files})
+        output.result(values | not_tracked | {"gel": gel, "seconds": wall, "files": files})
         return
     markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
     table = Table(show_header=False)
@@ -331,6 +359,8 @@ def _show(output: Output, summary: TrackingSummary, skipped: SkippedImages, wall
         mm = f", {largest_mm:.3f} mm" if largest_mm is not None else ""
         where = values["largest_displacement_at"]
         table.add_row("largest motion", f"{largest:.2f} px, {largest / spacing:.2f} of the spacing{mm} ({where})")
+    if gel is not None:
+        table.add_row("gel", gel)
     if summary.largest_normal is not None:
         table.add_row("largest force", force_text(summary.largest_normal))
         table.add_row("slip", summary.slip.text())

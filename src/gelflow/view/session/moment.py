@@ -36,6 +36,7 @@ class Moment:
     attempt: int | None = None  # of this insertion
     decision: Decision | None = None  # the last one before
     checks: Sequence[Mapping[str, Any]] = ()  # of the run: name, ok, text
+    forces: tuple[Mapping[str, Any] | None, ...] = (None, None)  # on each pad, as in `gelflow.Force`
 
     @property
     def part_held(self) -> bool:

@@ -1,9 +1,12 @@
 """A moment of a session in words."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from gelflow.geometry import Pose
 from gelflow.session.decision_replay import Comparison
+from gelflow.session.records import SENSORS
 from gelflow.view.session.marks import correction_text
 from gelflow.view.session.moment import Moment
 from gelflow.view.session.recorded_session import RecordedSession
@@ -21,6 +24,11 @@ def moment_text(moment: Moment, session: RecordedSession, *, comparison: Compari
         lines.append(arm_text(session.cell.gripper(moment.flange), session.cell.part_height(moment.flange)))
     if moment.gripper is not None:
         lines.append(gripper_text(moment))
+    lines += [
+        f"{sensor} pad: {force_text(force)}"
+        for sensor, force in zip(SENSORS, moment.forces, strict=False)
+        if force is not None
+    ]
     if any(pad is not None and pad.tracked is not None for pad in moment.pads):
         reference = session.reference_time(moment.time) - session.start
         lines.append(f"markers: displacement since {reference:.2f} s, lines 5 times as long")
@@ -48,6 +56,19 @@ def gripper_text(moment: Moment) -> str:
     gripper = moment.gripper or {}
     text = f"grip: {1e3 * float(gripper['width']):.2f} mm, {float(gripper['force']):.1f} N, {gripper['grasp']}"
     return text + (f", **fault: {gripper['fault']}**" if gripper.get("fault") else "")
+
+
+def force_text(force: Mapping[str, Any]) -> str:
+    """Normal force, shear force and slip of a pad in words; `force` is a record of `gelflow.Force`."""
+    if not force["contact"]:
+        return "no contact"
+    text = (
+        f"normal {force['normal']:.2f} ± {force['normal_deviation']:.2f} N, shear {math.hypot(*force['shear']):.2f} N"
+    )
+    if force.get("gross_slip"):
+        return f"{text}, **gross slip**"
+    share, deviation = force.get("stick_share"), force.get("stick_share_deviation")
+    return text if share is None or deviation is None else f"{text}, sticks {100 * share:.0f} ± {100 * deviation:.0f} %"
 
 
 def comparison_text(comparison: Comparison) -> str:

@@ -18,6 +18,7 @@ from gelflow.view.session.marker_reader import MarkerReader
 from gelflow.view.session.marks import Mark, descents, marks, phases
 from gelflow.view.session.moment import Moment
 
+_FORCE_AGE = 0.5  # of a force that is shown [s]
 _STORY = ("/event", "/attempt", "/decision")
 
 
@@ -154,4 +155,10 @@ class RecordedSession:
             attempt=attempt.attempt if attempt else None,
             decision=decision,
             checks=tuple(checks.value["checks"]) if checks is not None else (),
+            forces=tuple(self._force(sensor, time) for sensor in SENSORS),
         )
+
+    def _force(self, sensor: str, time: float) -> Mapping[str, Any] | None:
+        """The force on a pad at a time [s]; None where it was not estimated, for example while nothing was held."""
+        record = self.index.latest(f"/{sensor}/force", time)
+        return record.value if record is not None and time - record.time < _FORCE_AGE else None

@@ -47,8 +47,7 @@ class TimeLine:
         _draw(axes[2], curves.shear, [BLUE, VERMILION], origin)
         axes[2].set_ylabel("shear\n[mm]", fontsize=7)
         axes[2].legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7)
-        _draw(axes[3], [curves.force], ["black"], origin)
-        axes[3].set_ylabel("grip\n[N]", fontsize=7)
+        _draw_forces(axes[3], curves, origin)
         axes[3].set_xlabel("time since the start of the recording [s]", fontsize=7)
         figure.align_ylabels(axes)
         self._picture: Image = rasterize(figure)
@@ -69,6 +68,19 @@ def _draw(axis: Any, curves: Sequence[Curve], colors: Sequence[str], origin: flo
     for curve, color, style in zip(curves, colors, ("-", "--"), strict=False):
         times, values = curve.ordered()
         axis.plot(times - origin, values, style, color=color, linewidth=1.1, label=curve.label)
+
+
+def _draw_forces(axis: Any, curves: Curves, origin: float) -> None:
+    """The force of the gripper, and where they are recorded, the normal forces of the pads."""
+    _draw(axis, [curves.force], ["black"], origin)
+    axis.set_ylabel("grip\n[N]", fontsize=7)
+    if not any(curve.samples for curve in curves.normal):
+        return
+    _draw(axis, curves.normal, [BLUE, VERMILION], origin)
+    if curves.gross_slip.samples:
+        times, values = curves.gross_slip.ordered()
+        axis.plot(times - origin, values, "x", color=PURPLE, markersize=3, label=curves.gross_slip.label)
+    axis.legend(loc="upper left", fontsize=6, ncols=4, framealpha=0.7)
 
 
 def _shade(axis: Any, marks: Sequence[Mark], origin: float) -> None:
