@@ -59,7 +59,8 @@ def test_part_is_inserted_and_the_run_is_recorded(robot: MockRobot, tmp_path: Pa
     assert lab["gripper"]["grasp_force"] == plan.lab.gripper.grasp_force
     report = robot.arm.report
     assert report.first_error < 1e-4  # the first reference was the feedback
-    assert report.largest_step < 5e-3 * 0.004 * 1.5  # no cycle moved faster than the lab allows
+    # No cycle moved faster than the lab allows; a hold returns the reference to the arm with up to this speed.
+    assert report.largest_step <= plan.lab.arm.max_speed * 0.004 * (1 + 1e-9)
     assert not robot.gripper.fast_stopped  # the disconnect was announced
 
     # Every motion with a held part has a phase in which the pads are observed.
