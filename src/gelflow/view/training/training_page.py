@@ -17,6 +17,8 @@ _LOOK = 2.0  # between two looks at the folder [s]
 _LAST_FRAME = 1.5  # of a film [s]
 _SLOWEST, _FASTEST = 1.0, 20.0  # pictures of a film per second
 _PANEL_WIDTH = 620  # [px]
+_CONTROLS = 0.14  # height of the controls above a film, in heights of the view
+_BLANK = 250  # grey of the space around a film
 
 
 class Episodes(Protocol):
@@ -77,6 +79,7 @@ class TrainingPage:
         self._caption = gui.add_markdown("Films show episodes of the policy.")
         self._episodes: Episodes | None = None
         self._frame, self._due = 0, 0.0
+        self._problem = ""  # the reason why no new episodes are shown
         self._ending = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
         self._watcher.start()
@@ -108,7 +111,9 @@ class TrainingPage:
         if episodes is None or not film or now < self._due:
             return
         number = self._frame % len(film)
-        self._page.scene.set_background_image(film[number], format="jpeg", jpeg_quality=85)
+        for client in self._page.server.get_clients().values():
+            picture = below_controls(film[number], client.camera.aspect)
+            client.scene.set_background_image(picture, format="jpeg", jpeg_quality=85)
         self._caption.content = f"{self._choice.value}: picture {number + 1} of {len(film)}"
         self._frame = number + 1
         rate = min(max(episodes.frames_per_second, _SLOWEST), _FASTEST)
@@ -121,7 +126,8 @@ class TrainingPage:
                 self._show_curve()
                 self._show_episodes(self._training.evaluate(self._show_state))
             except (GelflowError, OSError) as error:
-                self._show_state(f"**{error}**")
+                self._problem = f"**{error}**"
+                self._show_state(self._problem)
             self._ending.wait(_LOOK)
 
     def _show_state(self, text: str) -> None:
@@ -131,12 +137,12 @@ class TrainingPage:
         picture = self._training.curve()
         if picture is not None:
             self._curve.image, self._curve.visible = picture, True
-            self._show_state("")
+            self._show_state(self._problem)
 
     def _show_episodes(self, episodes: Episodes | None) -> None:
         if episodes is None:
             return
-        self._episodes = episodes
+        self._episodes, self._problem = episodes, ""
         self._show_state("")
         self._result.content = episodes.text
         if episodes.failures is not None:
@@ -146,3 +152,17 @@ class TrainingPage:
         self._choice.options = names or ("none yet",)
         self._choice.value = chosen
         self._restart()
+
+
+def below_controls(picture: Image, aspect: float) -> Image:
+    """The picture with blank space above it for the controls, in the shape (width / height) of a browser's view.
+
+    The view stretches a background image to its own shape.
+    """
+    height, width = picture.shape[:2]
+    rows = round(max(height / (1 - _CONTROLS), width / aspect))
+    columns = max(round(rows * aspect), width)
+    framed = np.full((rows, columns, 3), _BLANK, dtype=np.uint8)
+    left = (columns - width) // 2
+    framed[rows - height :, left : left + width] = picture
+    return framed
