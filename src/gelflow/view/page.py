@@ -1,6 +1,7 @@
 """A page in the browser: viser's server on one port, behind the rules of `gelflow.view.access`."""
 
 import contextlib
+import errno
 import socket
 import threading
 from collections.abc import Iterator
@@ -67,6 +68,10 @@ def _listen(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
     except (OSError, UnicodeError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            raise UsageError(
+                f"port {port} of {host} is in use; choose another with --port, or 0 for a free one"
+            ) from None
         reason = getattr(error, "strerror", None) or error
         raise UsageError(
             f"cannot serve a page on {host} port {port}: {reason}; choose another --port or --host"
