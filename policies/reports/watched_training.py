@@ -1,7 +1,9 @@
 """A training that is watched while it runs: its curves, and episodes of its newest policy."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +16,10 @@ from gelflow.policies.reports.failures import failure_figure, failure_ranges, wo
 from gelflow.policies.reports.shown_episodes import Image, ShownEpisodes
 from gelflow.policies.training.progress_curve import figure_of
 from gelflow.policies.training.run import CONFIGURATION, PROGRESS, STATE
+from gelflow.sim.tasks.parts import load_part
 from gelflow.sim.tasks.task_batch import TaskBatch
 
+_PART = "--part"  # option of the command of a training
 _ENVS = 32  # parallel environments
 _MAX_FRAMES = 150  # of a film
 
@@ -77,9 +81,9 @@ class WatchedTraining:
         if checkpoint.digest == self._evaluated:
             return None
         self._evaluated = checkpoint.digest
+        progress("evaluating the newest policy")
         batch = self._batch(checkpoint)
         network = load_network(path, task=batch.description)
-        progress("evaluating the newest policy")
         count = batch.num_envs
         episodes = run_episodes(network.batch_policy(count), batch, episodes=self._episodes, seed=self._seed)
         ranges = failure_ranges(episodes)
@@ -114,4 +118,22 @@ class WatchedTraining:
         recipe = recipe_for(str(checkpoint.task["name"]), training.get("recipe", DEFAULT))
         options = dict(training.get("options", {}))
         kind = type(recipe.make_task(1, **options).description)
-        return recipe.make_task(_ENVS, **{**options, "task": kind.from_json(dict(checkpoint.task))})
+        task = _with_meshes(kind.from_json(dict(checkpoint.task)), training.get("command", ()))
+        return recipe.make_task(_ENVS, **{**options, "task": task})
+
+
+def _with_meshes(task: Any, command: Sequence[str]) -> Any:
+    """The task with the meshes of its part, which its description does not contain, from the part file of the command.
+
+    Raises UsageError when the part file is missing, or describes another part.
+    """
+    if _PART not in command[:-1]:
+        return task
+    name = command[command.index(_PART) + 1]
+    try:
+        found = load_part(name)
+    except UsageError as error:
+        raise UsageError(f"{error}; start gelflow view in the folder where the training was started") from None
+    if found.to_json()["part"] != task.to_json()["part"]:
+        raise UsageError(f"part {name} has changed since the training was started, so no episodes are shown")
+    return dataclasses.replace(task, part=found.part)

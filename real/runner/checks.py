@@ -68,7 +68,9 @@ class DataChecks:
         """The state of every check, also of those behind one that fails, and of the bounds of the last target."""
         found = [_state(check) for check in self.table]
         latched = self._supervisor.latched
-        found.append(CheckState("motion", not latched, f"stopped: {latched}" if latched else "allowed"))
+        found.append(
+            CheckState("motion", not latched, f"stopped: {latched.removeprefix('stopped: ')}" if latched else "allowed")
+        )
         return found + [CheckState(f"target: {b.name}", b.ok, b.text) for b in self._supervisor.last_bounds]
 
     def _camera_check(self, sensor: str, camera: Camera) -> Check:

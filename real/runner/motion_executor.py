@@ -18,6 +18,7 @@ from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.checks import DataChecks
 from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.phases import with_advice
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.session.recorder import SessionRecorder
@@ -244,7 +245,7 @@ class MotionExecutor:
 
     def _check_requested_stop(self) -> None:
         if self._requested_stop:
-            raise SafetyError(f"stopped: {self._requested_stop}; inspect the robot, then start a new run")
+            raise SafetyError(with_advice(f"stopped: {self._requested_stop}"))
 
     def watch_part(self) -> None:
         """Hold when the gripper shows that the part is no longer held as it was grasped."""

@@ -8,6 +8,13 @@ from types import MappingProxyType
 
 from gelflow.errors import SafetyError
 
+_ADVICE = "; inspect the robot, then start a new run"
+
+
+def with_advice(text: str) -> str:
+    """The reason of a stop, followed once by what to do after it."""
+    return text.removesuffix(_ADVICE) + _ADVICE
+
 
 class Phase(StrEnum):
     """Phases of a run."""
@@ -107,7 +114,7 @@ class PhaseMachine:
             if phase == present:
                 return
             if present == Phase.LATCHED:
-                raise SafetyError(f"motion is latched: {self.latched}; inspect the robot, then start a new run")
+                raise SafetyError(with_advice(f"motion is latched: {self.latched}"))
             allowed = phase in PHASES[present].following or phase == Phase.LATCHED
             if not allowed and not (phase == Phase.HOLD and present in HOLDABLE):
                 raise SafetyError(f"phase {phase} may not follow phase {present}; start a new run")

@@ -15,7 +15,7 @@ from gelflow.errors import SafetyError
 from gelflow.geometry import Pose, angle_between
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
-from gelflow.real.runner.phases import Phase, PhaseMachine
+from gelflow.real.runner.phases import Phase, PhaseMachine, with_advice
 
 _TOLERANCE = 1e-6  # rounding at a bound
 
@@ -44,7 +44,7 @@ class Supervisor:
         reason = not_ready_reason(state)
         if reason:
             self.latch(reason)
-            raise SafetyError(f"the arm stopped: {reason}; inspect the robot, then start a new run")
+            raise SafetyError(with_advice(f"the arm stopped: {reason.removeprefix('stopped: ')}"))
 
     def check(self, target: Pose, previous: Pose, *, speed: float, turn_speed: float) -> Pose:
         """Check a target of the gripper frame; returns the tool pose to send to the controller.
@@ -59,7 +59,7 @@ class Supervisor:
         fast, and always after a latch. The arm's driver checks joint ranges, because it knows the controller's tool.
         """
         if self.latched:
-            raise SafetyError(f"motion is latched: {self.latched}; inspect the robot, then start a new run")
+            raise SafetyError(with_advice(f"motion is latched: {self.latched}"))
         self._check_numbers(target)
         self.last_bounds = bounds = self._bounds(target, previous, speed, turn_speed)
         for bound in bounds:
@@ -119,9 +119,14 @@ class TargetBound:
         return self.low - _TOLERANCE <= self.value <= self.high + _TOLERANCE
 
     @property
+    def _shown(self) -> str:
+        """The value to 0.001 of its unit, so that rounding errors are 0."""
+        return f"{round(self.value, 3) + 0.0:g}"
+
+    @property
     def text(self) -> str:
         """Value and range in words."""
-        return f"{self.value:.4g} {self.unit}, allowed {self.low:g} to {self.high:g} {self.unit}"
+        return f"{self._shown} {self.unit}, allowed {self.low:g} to {self.high:g} {self.unit}"
 
     @property
     def refusal(self) -> str:

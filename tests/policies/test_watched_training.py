@@ -11,6 +11,7 @@ from tests.view.browser import needs_browser
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.policies.reports.watched_training import WatchedTraining
+from gelflow.view.page import below_controls
 
 HEADER = "steps,minutes,evaluated_success,success_low,success_high,evaluated_length,evaluated_reward\n"
 
@@ -53,6 +54,14 @@ def test_newest_policy_is_evaluated_once(folder: Path) -> None:
     for film in episodes.films.values():
         assert len(film) >= 2 and film[0].shape == film[-1].shape
     assert training.evaluate() is None
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.37, 3.0])
+def test_films_keep_their_shape_in_every_window(aspect: float) -> None:
+    film = np.zeros((48, 64, 3), dtype=np.uint8)
+    shown = below_controls(film, aspect)
+    assert shown.shape[1] / shown.shape[0] == pytest.approx(aspect, rel=0.03)
+    assert (shown == 0).sum() == film.size and (shown[-48:] == 0).sum() == film.size
 
 
 def test_other_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,8 +26,8 @@ def draw_comparisons(comparisons: Sequence[Comparison], grid: Grid, path: str | 
     save(comparison_figure(comparisons, grid), path, make_folder=False)
 
 
-def comparison_figure(comparisons: Sequence[Comparison], grid: Grid) -> Any:
-    """The figure of `draw_comparisons`."""
+def comparison_figure(comparisons: Sequence[Comparison], grid: Grid, *, font_size: float = 8) -> Any:
+    """The figure of `draw_comparisons`; `font_size` is in points."""
     from matplotlib.figure import Figure  # deferred: slow to import
 
     shown = list(comparisons[:MAX_DECISIONS])
@@ -35,15 +35,15 @@ def comparison_figure(comparisons: Sequence[Comparison], grid: Grid) -> Any:
     figure = Figure(figsize=(2.1 * columns + 2.2, 2.6 * len(shown)), layout="constrained")
     axes = figure.subplots(len(shown), columns, squeeze=False)
     for line, comparison in zip(axes, shown, strict=True):
-        _draw_row(line, comparison, grid)
+        _draw_row(line, comparison, grid, font_size)
     notes = "flow maps at the frames of a decision, longest arrow = 1; fingertip down"
     if any(_texts(comparison)[1] or _flow_differs(comparison) for comparison in shown):
         notes += "\nblue: recorded; red: recomputed, where it differs visibly"
-    figure.supxlabel(notes, fontsize=8)
+    figure.supxlabel(notes, fontsize=font_size)
     return figure
 
 
-def _draw_row(line: Any, comparison: Comparison, grid: Grid) -> None:
+def _draw_row(line: Any, comparison: Comparison, grid: Grid, font_size: float) -> None:
     decision = comparison.recorded
     columns, sensors = len(line), len(decision.tracked)
     recorded = decision.flow.reshape(columns, 2, -1)
@@ -52,12 +52,14 @@ def _draw_row(line: Any, comparison: Comparison, grid: Grid) -> None:
         draw_flow_map(axis, grid, recorded[column])
         if recomputed is not None:
             add_arrows(axis, grid, recomputed[column], color=VERMILION, width=0.004)
-        axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=8)
-    line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=8)
+        axis.set_title(f"{SENSORS[column % sensors]} pad", fontsize=font_size)
+    line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=font_size)
     first, second = _texts(comparison)
     for text, color, height, alignment in ((first, BLUE, 0.52, "bottom"), (second, VERMILION, 0.48, "top")):
         place = {"transform": line[-1].transAxes, "va": alignment if second else "center"}
-        line[-1].text(1.06, height if second else 0.5, text, color=color if second else "black", fontsize=8, **place)
+        line[-1].text(
+            1.06, height if second else 0.5, text, color=color if second else "black", fontsize=font_size, **place
+        )
 
 
 def _texts(comparison: Comparison) -> tuple[str, str]:

@@ -1,16 +1,22 @@
 """A page in the browser: viser's server on one port, behind the rules of `gelflow.view.access`."""
 
 import contextlib
+import errno
 import socket
 import threading
 from collections.abc import Iterator
 from typing import Any
 from unittest import mock
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gelflow.errors import UsageError
 from gelflow.view.access import Access, guarded, is_loopback
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
+_CONTROLS = 0.14  # height of the controls above a picture, in heights of the view
+_BLANK = 250  # grey of the space around a picture
 _starting = threading.Lock()
 
 
@@ -52,12 +58,32 @@ class Page:
         """Whether a browser shows the page."""
         return bool(self.server.get_clients())
 
+    def show_picture(self, picture: NDArray[np.uint8]) -> None:
+        """Show a picture, RGB (height, width, 3), in the view of every browser, below its controls."""
+        for client in self.server.get_clients().values():
+            framed = below_controls(picture, client.camera.aspect)
+            client.scene.set_background_image(framed, format="jpeg", jpeg_quality=85)
+
     def close(self) -> None:
         """Stop serving; further calls have no effect."""
         server, self.server = self.server, None
         if server is not None:
             with _starting, _quiet():
                 server.stop()
+
+
+def below_controls(picture: NDArray[np.uint8], aspect: float) -> NDArray[np.uint8]:
+    """The picture with blank space above it for the controls, in the shape (width / height) of a browser's view.
+
+    The view stretches a background image to its own shape.
+    """
+    height, width = picture.shape[:2]
+    rows = round(max(height / (1 - _CONTROLS), width / aspect))
+    columns = max(round(rows * aspect), width)
+    framed = np.full((rows, columns, 3), _BLANK, dtype=np.uint8)
+    left = (columns - width) // 2
+    framed[rows - height :, left : left + width] = picture
+    return framed
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -67,6 +93,10 @@ def _listen(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((host, port), family=family)
     except (OSError, UnicodeError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            raise UsageError(
+                f"port {port} of {host} is in use; choose another with --port, or 0 for a free one"
+            ) from None
         reason = getattr(error, "strerror", None) or error
         raise UsageError(
             f"cannot serve a page on {host} port {port}: {reason}; choose another --port or --host"

@@ -31,8 +31,9 @@ PANEL_SIZE = (260, 340)  # of a pad [px]
 _LONGEST_FORCE = 0.16  # arrow of the largest contact force, in distances of the camera
 _LONGEST_SHEAR = 0.04  # the same of the shear force of a marker
 _SHEAR_COLOR = (20, 20, 20)
+_GAMMA = 2.2  # of sRGB, about
 _MAX_SHEAR_ARROWS = 800  # per pad
-_OPACITY, _OPACITY_WORLD = 0.7, 0.4  # arrows of forces start at faces and often lie inside of a body
+_OPACITY, _OPACITY_WORLD = 0.5, 0.4  # arrows of forces start at faces and often lie inside of a body
 _LABELS = 8  # of the largest contact forces
 _LABEL_INTERVAL = 0.3  # [s]
 _PANELS_PER_ROW = 2
@@ -78,7 +79,7 @@ class SceneView:
         distance = self._camera.distance
         arrows = np.zeros((1, 2, 3))
         self._arrows = page.scene.add_arrows(
-            f"{root}/contact forces", arrows, FORCE_COLOR, shaft_radius=0.003 * distance,
+            f"{root}/contact forces", arrows, _linear(FORCE_COLOR), shaft_radius=0.003 * distance,
             head_radius=0.008 * distance, head_length=0.02 * distance, visible=False,
         )  # fmt: skip
         self._labels: dict[str, Any] = {}  # by contact, so that their texts change little
@@ -105,6 +106,8 @@ class SceneView:
 
     def legend(self) -> str:
         """Scales of the forces in words, as Markdown."""
+        if not self._scene.contacts and not self._pads:
+            return "The scene has no contacts, so bodies pass through each other; a TOML file lists contacts."
         lines = [f"Contact force, orange arrow: {quantity(self.scales.contact, 'N')} is the longest."]
         if self._pads:
             lines.append(
@@ -234,3 +237,9 @@ class SceneView:
 
 def _geometry_key(drawing: SceneDrawing) -> tuple[bytes, ...]:
     return tuple(part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position))
+
+
+def _linear(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """A colour in linear light: viser takes the colours of arrows as such, unlike all others."""
+    red, green, blue = (round(255 * (c / 255) ** _GAMMA) for c in color)
+    return red, green, blue

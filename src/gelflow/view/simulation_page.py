@@ -138,7 +138,10 @@ class SimulationPage:
                 self._panels = gui.add_image(self._view.panels(scene_drawing(self._sim, self.env)), format="png")
         with gui.add_folder("Forces"):
             self._legend = gui.add_markdown(self._view.legend())
-            for name, label in (("contacts", "contact forces"), ("labels", "labels"), ("markers", "pad markers")):
+            choices = [("contacts", "contact forces"), ("labels", "labels")]
+            if self._scene.pads:
+                choices.append(("markers", "pad markers"))
+            for name, label in choices:
                 box = gui.add_checkbox(label, initial_value=True)
                 box.on_update(lambda event, name=name: self._post(setattr, self._view.shown, name, event.target.value))
             gui.add_button("Choose scales anew").on_click(lambda _: self._post(self._view.reset_scales))

@@ -12,7 +12,8 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
-from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
+from gelflow.real.runner.phases import with_advice
+from gelflow.real.runner.supervisor import Supervisor, TargetBound, not_ready_reason
 
 LAB: Lab = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
 
@@ -72,6 +73,7 @@ def test_bounds_of_the_last_target_are_known_also_when_it_is_refused() -> None:
     supervisor.check(gripper(x=0.003), gripper(), speed=0.01, turn_speed=0.1)
     assert all(bound.ok for bound in supervisor.last_bounds)
     assert supervisor.last_bounds[0].text == "3 mm, allowed -16 to 16 mm"
+    assert TargetBound("turn", 1.4e-14, 0.0, 35.0, "°").text == "0 °, allowed 0 to 35 °"
     with pytest.raises(SafetyError):
         supervisor.check(gripper(y=0.02, height=0.07), gripper(), speed=0.01, turn_speed=0.1)
     assert [bound.name for bound in supervisor.last_bounds if not bound.ok] == ["y", "height"]
@@ -106,3 +108,8 @@ def test_arm_states_that_forbid_motion(values: dict[str, object], reason: str) -
         assert supervisor.latched
     else:
         supervisor.watch(state)
+
+
+def test_the_advice_after_a_stop_is_given_once() -> None:
+    text = "stopped: a button; inspect the robot, then start a new run"
+    assert with_advice(text) == with_advice("stopped: a button") == text

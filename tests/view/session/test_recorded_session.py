@@ -53,6 +53,13 @@ def test_marks_are_the_attempts_decisions_and_warnings(session: RecordedSession)
     assert session.marks[2].text == "decision: x +1.00 mm, y -2.00 mm, yaw +2.9°"
 
 
+def test_first_view_has_both_images_and_the_arm(session: RecordedSession) -> None:
+    moment = session.at(session.first_view, markers=False)
+    assert all(pad is not None for pad in moment.pads) and moment.joints is not None
+    before = session.at(session.first_view - 1e-3, markers=False)
+    assert before.joints is None or any(pad is None for pad in before.pads)
+
+
 @pytest.mark.parametrize(("seconds", "shear"), [(4.95, 0.0), (5.0, SHEAR), (6.8, SHEAR), (7.5, 0.0), (1.0, 0.0)])
 def test_markers_are_relative_to_the_start_of_the_attempt(
     session: RecordedSession, seconds: float, shear: float

@@ -81,7 +81,8 @@ def run(args: argparse.Namespace) -> int:
     )
     evaluations = [] if args.quick else _in_simulation(output, policy, task, preset=args.preset)
     session = args.out / "session.mcap"
-    output.text(f"pictures of what the policy saw: {args.out}/insertion-*.png")
+    if first.insertions:
+        output.text(f"pictures of what the policy saw: {args.out}/insertion-*.png")
     output.text(f"the session is {session}; recompute its decisions with:")
     output.text(f"  gelflow replay {session}")
     output.result(_to_json(session, results, evaluations))

@@ -57,6 +57,8 @@ class LiveView:
         """Show the last state, then end the page."""
         if error is not None:
             self._ended = str(error) or type(error).__name__
+        elif self._requested:
+            self._ended = self._requested
         self._ending = True
         self._send({"ended": self._ended})
         self._helper.stop(limit=_END_LIMIT)

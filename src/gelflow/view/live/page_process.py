@@ -19,6 +19,8 @@ from gelflow.view.session.session_page import SessionPage
 
 _TICK = 0.04  # [s]
 _NICENESS = 5  # of the thread that draws: the run comes first
+# viser has no setting for the size of a button; the stop button is the only red one.
+_LARGE_BUTTON = '<style>button[style*="-red-"] {height: 7rem; font-size: 1.6rem; font-weight: 700}</style>'
 _LAST_STATE = 0.5  # time for browsers to receive the last state [s]
 
 
@@ -29,6 +31,7 @@ class LivePage:
         self._page, self._messages = page, messages
         self._stop = page.gui.add_button("STOP THE ARM", color="red", hint="in addition to the robot's own stop")
         self._stop.on_click(self._request_stop)
+        page.gui.add_html(_LARGE_BUTTON)
         self._state = page.gui.add_markdown("waiting for the recording of the run")
         self._path: Path | None = None
         self._session: RecordedSession | None = None

@@ -18,6 +18,7 @@ _PALM = (0.146, 0.05, 0.072)  # housing of the gripper [m]
 _FINGER_SIZE = (0.012, 0.024)  # thickness and width of a finger [m]
 _PAD_SIZE = (0.003, 0.020, 0.026)  # of a gel pad [m]
 _BELOW_PAD = 0.014  # length of a finger below the centre of its pad [m]
+_ASIDE = 0.22  # of the centre of the view from that of the robot [m]
 _WALL = 0.006  # thickness of the walls that stand for the hole [m]
 
 
@@ -77,7 +78,8 @@ class RobotView:
             # In the frame after joint k: its x axis carries a, the axis of joint k (tilted by the twist) carries d.
             axis = np.array([0.0, np.sin(twist), np.cos(twist)])
             elbow = np.array([-a, 0.0, 0.0])
-            for name, start, end in (("d", elbow - d * axis, elbow), ("a", elbow, np.zeros(3))):
+            foot = _LINK_RADII[0] if k == 1 else 0.0  # the first capsule ends within the base
+            for name, start, end in (("d", elbow - (d - foot) * axis, elbow), ("a", elbow, np.zeros(3))):
                 if np.linalg.norm(end - start) > 1e-6:
                     self._capsule(f"arm/{k}/{name}", start, end, radius)
 
@@ -152,5 +154,8 @@ class RobotView:
             target = target + self._cell.hole.position * (0.6, 0.5, 0.0)
         initial = self._page.server.initial_camera
         initial.up = (0.0, 0.0, 1.0)
-        initial.position, initial.look_at = target + np.array([0.65, -0.85, 0.3]), target
+        away = np.array([0.65, -0.85, 0.3])
+        right = np.array([-away[1], away[0], 0.0]) / np.hypot(away[0], away[1])
+        target = target + _ASIDE * right  # the controls cover the right side of the view
+        initial.position, initial.look_at = target + away, target
         initial.near = 0.01

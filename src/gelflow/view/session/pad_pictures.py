@@ -21,6 +21,7 @@ _GAP, _TITLE = 6, 24  # [px]
 _BACKGROUND, _INK, _PROBLEM = (255, 255, 255), (40, 40, 40), (0, 94, 213)  # B G R
 _MEASURED, _INFERRED, _EDGE = (255, 255, 255), (0, 165, 255), (0, 0, 0)
 _LOST = 4  # half the size of the cross at a marker that is not measured [px]
+_FONT_SIZE = 11  # of the flow maps [pt], because the page shows them smaller
 _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
@@ -76,4 +77,4 @@ def _titled(picture: Image, text: str, color: tuple[int, int, int]) -> Image:
 
 def decision_picture(comparison: Comparison, grid: Grid) -> Image:
     """The flow maps and the correction of a decision, and those of its replay where they differ, RGB."""
-    return rasterize(comparison_figure([comparison], grid))
+    return rasterize(comparison_figure([comparison], grid, font_size=_FONT_SIZE))

@@ -74,6 +74,13 @@ class RecordedSession:
         return self.index.end
 
     @property
+    def first_view(self) -> float:
+        """The first time at which both images and the arm are known, as far as they are recorded, robot time [s]."""
+        topics = {*(f"/{sensor}/image" for sensor in SENSORS), "/arm/joints"} & set(self.index.topics())
+        found = [self.index.first(topic, self.start) for topic in topics]
+        return max((record.time for record in found if record is not None), default=self.start)
+
+    @property
     def growing(self) -> bool:
         """Whether the session is still being recorded."""
         return self._live is not None and not self._live.finished

@@ -17,7 +17,7 @@ _SPEEDS = ("0.1 ×", "0.25 ×", "1 ×", "4 ×", "16 ×")
 _RANGES = ("whole recording", "this attempt", "10 s")
 _START = "start"
 _FROM_START = "starts of the recordings"
-_PANEL_WIDTH = 560  # [px]
+_PANEL_WIDTHS = (560, 440)  # of one session, and of each of two [px]
 _SLIDER_STEP = 0.01  # [s]
 _FOLLOW_PERIOD = 0.2  # between two pictures of a growing session [s]
 _FOLLOW_SHARE = 0.25  # of a core that these pictures take at most
@@ -51,6 +51,7 @@ class SessionPage:
     ) -> None:
         if not 1 <= len(sessions) <= 2:
             raise UsageError(f"a page shows one session or two, got {len(sessions)}")
+        self._count = len(sessions)
         self._events = PageEvents()
         self._post = self._events.post
         self._own_page = page is None
@@ -69,6 +70,7 @@ class SessionPage:
         self._names = [f"{s.reader.path.parent.name}/{s.name}" if same else s.name for s in sessions]
         self._duration = max(session.end - session.start for session in sessions)
         self._range = (0.0, self._duration)
+        self._first_view = sessions[0].first_view - sessions[0].start
         self._live = any(session.growing for session in sessions)
         self._following = self._live  # the end of a session that is being recorded
         self._folder = self._page.gui.add_folder("Time")
@@ -83,7 +85,7 @@ class SessionPage:
         with self._folder:
             self._add_choices()
         self._show_range(_RANGES[0])
-        self._go(0.0)
+        self._go(self._first_view)
 
     def __enter__(self) -> "SessionPage":
         return self
@@ -158,7 +160,7 @@ class SessionPage:
             panel.dock_left()
         else:
             panel.dock_right()
-        panel.set_width(_PANEL_WIDTH)
+        panel.set_width(_PANEL_WIDTHS[self._count - 1])
         return SessionPanel(
             self._page, panel, session, decision_panel=folder,
             comparisons=comparisons if number == 0 else None, number=number,
@@ -213,7 +215,7 @@ class SessionPage:
 
     def _go_to_mark(self, name: str) -> None:
         self._following = False
-        self._go(self._marks.get(name, 0.0))
+        self._go(self._marks.get(name, self._first_view))
 
     def _follow(self) -> None:
         self._following = self._behind = True

@@ -23,6 +23,7 @@ from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
 _DECISION_PICTURES = 32  # that are kept
 _GROWTH = 1.0  # period in which curves of a growing session are extended [s]
 _GROWTH_SAMPLES = 4  # in a second of robot time
+_MOST_SAMPLES = 40  # in a period; on a busy machine the curves are coarser instead of late
 _DRAWING_SHARE = 4  # pause after drawing, in durations of drawing
 _REDRAW = 5  # rounds of samples between two pictures of the curves
 
@@ -162,9 +163,8 @@ class SessionPanel:
         while self.session.growing and not ended.wait(_GROWTH):
             added = Curves(curves.end, self.session.end)
             if added.end - added.start > _GROWTH / 2:
-                for _ in read_curves(
-                    self.session, added, samples=round(_GROWTH_SAMPLES * (added.end - added.start)) + 1
-                ):
+                samples = min(round(_GROWTH_SAMPLES * (added.end - added.start)), _MOST_SAMPLES) + 1
+                for _ in read_curves(self.session, added, samples=samples):
                     pass
                 curves.add(added)
             begun = perf_counter()

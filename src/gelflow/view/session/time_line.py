@@ -12,6 +12,7 @@ from gelflow.view.session.marks import Mark
 
 Image = NDArray[np.uint8]
 WIDTH, HEIGHT = 640, 380  # [px]
+_LEGEND_ROOM = 0.35  # above the curves of shear, in heights of the curves
 _PRESENT = np.array((0, 0, 0), dtype=np.uint8)
 _SPANS = {"inserted": (GREEN, ""), "not inserted": (ORANGE, "//")}  # colour and hatch of attempts
 _POINTS = {  # colour, symbol and name of marks without a duration
@@ -46,7 +47,9 @@ class TimeLine:
         axes[1].set_ylabel("height\n[mm]", fontsize=7)
         _draw(axes[2], curves.shear, [BLUE, VERMILION], origin)
         axes[2].set_ylabel("shear\n[mm]", fontsize=7)
-        axes[2].legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7)
+        low, high = axes[2].get_ylim()
+        axes[2].set_ylim(low, high + _LEGEND_ROOM * (high - low))
+        axes[2].legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7, borderpad=0.2, borderaxespad=0.2)
         _draw_forces(axes[3], curves, origin)
         axes[3].set_xlabel("time since the start of the recording [s]", fontsize=7)
         figure.align_ylabels(axes)

@@ -101,7 +101,7 @@ class TrackingPage:
         if begun < self._next or not self._page.watched():
             return
         picture = overlay(step, magnify=self._magnify, forces=self._forces)
-        self._page.scene.set_background_image(picture[..., ::-1], format="jpeg", jpeg_quality=80)
+        self._page.show_picture(picture[..., ::-1])
         if begun >= self._next_curve:
             self._show_curve()
             self._text.content = self._words(step)

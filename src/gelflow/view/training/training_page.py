@@ -77,6 +77,7 @@ class TrainingPage:
         self._caption = gui.add_markdown("Films show episodes of the policy.")
         self._episodes: Episodes | None = None
         self._frame, self._due = 0, 0.0
+        self._problem = ""  # the reason why no new episodes are shown
         self._ending = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="training", daemon=True)
         self._watcher.start()
@@ -108,7 +109,7 @@ class TrainingPage:
         if episodes is None or not film or now < self._due:
             return
         number = self._frame % len(film)
-        self._page.scene.set_background_image(film[number], format="jpeg", jpeg_quality=85)
+        self._page.show_picture(film[number])
         self._caption.content = f"{self._choice.value}: picture {number + 1} of {len(film)}"
         self._frame = number + 1
         rate = min(max(episodes.frames_per_second, _SLOWEST), _FASTEST)
@@ -121,7 +122,8 @@ class TrainingPage:
                 self._show_curve()
                 self._show_episodes(self._training.evaluate(self._show_state))
             except (GelflowError, OSError) as error:
-                self._show_state(f"**{error}**")
+                self._problem = f"**{error}**"
+                self._show_state(self._problem)
             self._ending.wait(_LOOK)
 
     def _show_state(self, text: str) -> None:
@@ -131,12 +133,12 @@ class TrainingPage:
         picture = self._training.curve()
         if picture is not None:
             self._curve.image, self._curve.visible = picture, True
-            self._show_state("")
+            self._show_state(self._problem)
 
     def _show_episodes(self, episodes: Episodes | None) -> None:
         if episodes is None:
             return
-        self._episodes = episodes
+        self._episodes, self._problem = episodes, ""
         self._show_state("")
         self._result.content = episodes.text
         if episodes.failures is not None:
