@@ -24,7 +24,7 @@ from gelflow.session import SessionReader
 
 
 class Run(NamedTuple):
-    """What is compared of a run."""
+    """Numbers of a run that are compared."""
 
     corrections: NDArray[np.float64]  # of all decisions: x, y [m], yaw [rad]
     cycles: int  # of EGM
