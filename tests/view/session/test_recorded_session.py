@@ -206,6 +206,17 @@ def test_what_a_session_lacks_is_stated_and_the_rest_is_shown(tmp_path: Path) ->
         assert [mark.kind for mark in session.marks] == ["stop"]
 
 
+def test_a_recording_of_track_starts_with_its_first_image(tmp_path: Path) -> None:
+    clock = ManualClock(0.0)  # its description has no time
+    with SessionRecorder(tmp_path / "tracked.mcap", clock) as recorder:
+        recorder.metadata({"format": 1, "source": "images"})
+        for clock.time in (500.0, 502.0):
+            recorder.image(0, CameraImage(b"\xff\xd8no picture\xff\xd9", clock.time, int(clock.time)))
+    with RecordedSession(tmp_path / "tracked.mcap") as session:
+        assert (session.start, session.end, session.first_view) == (500.0, 502.0, 500.0)
+        assert session.cell is None and session.notes == []
+
+
 def test_files_that_are_no_sessions_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello")
     with pytest.raises(UsageError, match="not an MCAP file"):

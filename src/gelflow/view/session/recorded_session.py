@@ -50,6 +50,8 @@ class RecordedSession:
             raise
         self.name = self.reader.path.name
         self.start = self.index.start  # robot time [s]
+        if "task" not in self.description:  # of `gelflow track`, whose description has no time
+            self.start = min((record.time for record in self._first_images()), default=self.start)
         self.marks: list[Mark] = []
         self.decisions: list[Record] = []
         self._story: list[Record] = []
@@ -76,9 +78,15 @@ class RecordedSession:
     @property
     def first_view(self) -> float:
         """The first time at which both images and the arm are known, as far as they are recorded, robot time [s]."""
-        topics = {*(f"/{sensor}/image" for sensor in SENSORS), "/arm/joints"} & set(self.index.topics())
-        found = [self.index.first(topic, self.start) for topic in topics]
-        return max((record.time for record in found if record is not None), default=self.start)
+        arm = self.index.first("/arm/joints", self.start) if "/arm/joints" in self.index.topics() else None
+        found = [*self._first_images(), *([] if arm is None else [arm])]
+        return max((record.time for record in found), default=self.start)
+
+    def _first_images(self) -> list[Record]:
+        """The first image of each pad that has one."""
+        topics = [f"/{sensor}/image" for sensor in SENSORS if f"/{sensor}/image" in self.index.topics()]
+        found = [self.index.first(topic, self.index.start) for topic in topics]
+        return [record for record in found if record is not None]
 
     @property
     def growing(self) -> bool:
@@ -119,7 +127,7 @@ class RecordedSession:
 
     def _cell(self) -> CellGeometry | None:
         """The geometry of the cell; None where the description lacks it."""
-        if not self.description:
+        if "task" not in self.description:
             return None
         try:
             return CellGeometry.of(self.description)
