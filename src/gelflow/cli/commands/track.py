@@ -104,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
     if gel is not None and pad is not None and calibration is None and args.pixels_per_mm is None:
         calibration, args.pixels_per_mm = pad.mount.calibration, pad.mount.pixels_per_mm
     args.gel = None if gel is None else gel.gel
-    _check_outputs(args)
+    for file in args.out:
+        if file.name.endswith(SUFFIX) and args.gel is None:
+            raise UsageError(f"--out {file} needs the gel: give --gel FILE")
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
         with _page(args, output, live=source.live) as page:
@@ -126,13 +128,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
-
-
-def _check_outputs(args: argparse.Namespace) -> None:
     for file in args.out:
         check_suffix(file)
-        if file.name.endswith(SUFFIX) and args.gel is None:
-            raise UsageError(f"--out {file} needs the gel: give --gel FILE")
         if file.exists():
             raise UsageError(f"{file} exists; name a new file")
         if not file.parent.is_dir():
