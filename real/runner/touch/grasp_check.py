@@ -2,7 +2,8 @@
 
 The weight of the grasped part pulls the markers of both pads towards the fingertips. A camera whose image shows no such
 change, or a change in another direction, is not a sense of touch: it repeats an old image, belongs to another finger or
-is mounted as the lab file does not say. The size of the change is a force known to both pads. A threshold below it is
+is mounted as the lab file does not say. Fingers that close on a part without parallel sides also shear the pads
+sideways, with opposite forces on the part; as the axes y of the pads are opposite too, this is the mean of both y. The size of the change is a force known to both pads. A threshold below it is
 exceeded before a held part can slip: contact from below first takes the weight off the pads.
 """
 
@@ -75,6 +76,7 @@ def check_grasp(
     if not settings.weight_check:
         return GraspCheck(weight, noise, nominal)
     least = _NOISE_FACTOR * noise
+    balanced = float(weight[:, 1].mean())  # by the grip, not by the weight
     for side, (x, y) in zip(_SIDES, weight, strict=False):
         size = float(np.hypot(x, y))
         if size < least:
@@ -82,8 +84,8 @@ def check_grasp(
                 f"{side} camera: the pad shows no weight of the grasped part ({size:.4f} mm of mean shear, noise "
                 f"{noise:.4f} mm); check that this camera is live, on its finger, and that nothing supports the part"
             )
-        angle = float(np.degrees(np.arctan2(y, x)))
-        if abs(angle) > _LARGEST_ANGLE:
+        if x < least or abs(np.degrees(np.arctan2(y - balanced, x))) > _LARGEST_ANGLE:
+            angle = float(np.degrees(np.arctan2(y, x)))
             raise TouchImplausible(
                 f"{side} camera: the weight of the grasped part points {angle:+.0f}° away from the fingertip; "
                 f"check rotation_deg, mirrored and the gripper's orientation in the lab file"

@@ -53,11 +53,20 @@ def test_softer_gels_and_heavier_parts_do_not_raise_the_thresholds() -> None:
         ([[-0.056, 0.0], [0.056, 0.0]], "left camera: .* points [+-]180° away"),
         ([[0.056, 0.0], [0.0, 0.056]], "right camera: .* points [+]90° away"),
         ([[0.0, 0.0], [0.0, 0.0]], "left camera: the pad shows no weight"),
+        ([[0.0, 0.056], [0.0, 0.056]], "left camera: .* points [+](89|90|91)° away"),
+        ([[0.0, 0.056], [0.0, -0.056]], "left camera: .* points [+](89|90|91)° away"),
+        ([[0.056, -0.07], [-0.056, -0.07]], "right camera: .* away"),
     ],
 )
 def test_pad_that_does_not_show_the_weight_is_refused(weight: list[list[float]], named: str) -> None:
     with pytest.raises(TouchImplausible, match=named):
         check_grasp(FREE, readings(weight, seed=1), DescentSettings())
+
+
+def test_sideways_shear_by_the_grip_itself_is_accepted() -> None:
+    """A plug without parallel sides: the pads are sheared sideways, with opposite forces on the part."""
+    check = check_grasp(FREE, readings([[0.055, -0.065], [0.05, -0.039]], seed=1), DescentSettings())
+    assert check.thresholds.contact == pytest.approx(0.7 * 0.05, rel=0.1)
 
 
 def test_weight_below_the_noise_is_refused() -> None:
