@@ -156,7 +156,10 @@ def test_frozen_gripper_repeats_its_state_while_it_moves() -> None:
         gripper.begin_fault(2, "freeze", "both", {})
         home = PREAMBLE + struct.pack("<BHB", 0x20, 1, 1)
         os.write(client.descriptor, home + struct.pack("<H", checksum(home)))
-        assert packets(client.read(0.5)) > 20
+        received, end = b"", time.monotonic() + 30
+        while packets(received) <= 20 and time.monotonic() < end:
+            received += client.read(0.1)
+        assert packets(received) > 20
         gripper.end_fault(2)
         client.read(0.05)
         assert packets(client.read(0.3)) == 0
