@@ -14,19 +14,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from benchmarks import script
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from gelflow.figures import save
-from gelflow.measurement.machine import processor, versions
 from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import training_run
+from gelflow.policies.reproduction.trials import folder_name
 from gelflow.sim.tasks.environments import Insertion
 from gelflow.task import INSERTION
 
-ROOT = Path(__file__).parents[2]
 EVALUATION_SEED = 7_000_003  # far from the seeds of trainings and their validations
 ENVS = 128
 
@@ -86,13 +86,9 @@ def main() -> None:
             columns = evaluated or [Row("its own observation", {**row.options, "preset": None})]
             cells[row.name] = train_and_evaluate(row, columns, folder, args)
             progress.advance(bar)
-    record = {
-        "format": 1, "attempts": args.attempts, "episodes": args.episodes, "seed": args.seed,
-        "processor": processor(), "versions": versions(), "success": cells,
-    }  # fmt: skip
-    out = args.out or ROOT / "benchmarks" / "results" / f"{name}.json"
-    out.write_text(json.dumps(record, indent=1) + "\n")
-    draw(cells, args.picture or ROOT / "docs" / "pictures" / f"{name}.png")
+    settings_of_run = {"attempts": args.attempts, "episodes": args.episodes, "seed": args.seed}
+    script.save(args.out or script.RESULTS / f"{name}.json", script.header() | settings_of_run | {"success": cells})
+    draw(cells, args.picture or script.PICTURES / f"{name}.png")
     columns = list(next(iter(cells.values())))
     table = Table("trained", *columns, title="inserted [%]")
     for trained_name, values in cells.items():
@@ -102,7 +98,7 @@ def main() -> None:
 
 def train_and_evaluate(row: Row, columns: list[Row], folder: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Success and corrections of the policy that is trained in `row`, by the names of the columns."""
-    place = folder / "".join(letter if letter.isalnum() else "_" for letter in row.name)
+    place = folder / folder_name(row.name)
     options = {name: value for name, value in row.options.items() if value is not None}
     run = training_run("insertion", place, seed=args.seed, steps=args.attempts, envs=256, options=options)
     if not run.is_finished():

@@ -12,7 +12,7 @@ from gelflow.sim.tasks.parts import Outline, Rectangle
 _SIDES = ("left", "right")
 _STIFFNESSES = ("kn", "ks", "kt", "kd")  # contact parameters that are proportional to the stiffness of a surface
 _WALLS = {"wall_left": ("x", -1), "wall_right": ("x", 1), "wall_front": ("y", -1), "wall_back": ("y", 1)}
-_PAD_FACES = 2  # of the contact points of a pad, one of which touches the part
+_PAD_FACES = 2  # faces of a pad with contact points; the part touches one of them
 _INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 
 

@@ -184,7 +184,8 @@ def _track(
                 writers += [] if page is None else [page]
             elif page is not None and page.take_zero_request() and (started := _zeroed(tracker, tracked, frame, page)):
                 tracker, tracked = started
-                forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
+                if forces is not None:
+                    forces.reset()
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
                 force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
