@@ -16,7 +16,7 @@ from tests.view.browser import browser
 
 import gelflow.sim as gs
 import gelflow.view
-from gelflow.sim.benchmark.step_times import holding_controls
+from gelflow.sim.scene.start_controls import holding_controls
 
 
 def main() -> None:

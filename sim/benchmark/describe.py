@@ -11,11 +11,11 @@ import numpy as np
 
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.accuracy_hints import accuracy_hints
-from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.loader import scene_tables
 from gelflow.sim.scene.mjcf.mechanics import WORLD, JointDef, Mechanics, read_mechanics
 from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
+from gelflow.sim.scene.start_controls import holding_controls
 from gelflow.sim.simulator import Simulator
 
 

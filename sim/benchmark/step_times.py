@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor
 from gelflow.sim.scene import Scene
+from gelflow.sim.scene.start_controls import holding_controls
 from gelflow.sim.simulator import Simulator
 
 Array = NDArray[np.float64]
@@ -55,13 +56,6 @@ class StepTimes:
     halved_steps: int  # timed steps that were split into substeps
     parts: tuple[Part, ...]  # their sum is the whole step
     reading: float | None  # one evaluation of all tactile forces, not part of a step; None without pads
-
-
-def holding_controls(scene: Scene) -> Array:
-    """Controls that hold position servos at the start of the scene; others are 0. Shape (nu,)."""
-    lengths = [a.gear * sum(c * scene.q0[j.q_start] for j, c in scene.driven_joints(a)) for a in scene.actuators]
-    servo = [a.kind == "position" for a in scene.actuators]
-    return np.where(servo, lengths, 0.0)
 
 
 def with_duplicates(scene: Scene) -> list[tuple[str, Simulator]]:

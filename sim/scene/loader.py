@@ -111,6 +111,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
         sites=tuple(SiteDef(name, body, pose) for name, (body, pose) in mechanics.sites.items()),
         geoms=mechanics.geoms,
         q0=mechanics.q0,
+        keyframe_controls=mechanics.keyframe_controls,
         not_modelled=(*mechanics.not_modelled, *unused_geoms, *unused_points),
         presets=presets,
     )

@@ -46,6 +46,7 @@ class Scene:
     joints: tuple[JointDef, ...]
     limits: tuple[JointLimit, ...]  # one per joint
     q0: Array  # initial positions, shape (nq,)
+    keyframe_controls: Array | None = None  # of the keyframe that gives q0, shape (nu,); None: it has none
     integrator: str = DEFAULT_INTEGRATOR  # or "bdf1"
     tolerance: float = DEFAULT_TOLERANCE  # of Newton's method, see docs/reference/physics.md
     precision: Precision = "double"  # default precision of a `Simulator` of this scene

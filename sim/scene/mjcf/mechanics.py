@@ -116,6 +116,7 @@ class Mechanics:
     actuators: tuple[ActuatorDef, ...]
     gravity: Array  # [m/s²], shape (3,)
     q0: Array  # initial positions, shape (nq,)
+    keyframe_controls: Array | None  # of the keyframe that gives q0, shape (nu,); None: it has none
     step: float  # time step of the file, MuJoCo's 0.002 if it has none [s]
     not_modelled: tuple[str, ...]  # elements without effect, with the reason
 
@@ -159,6 +160,7 @@ def read_mechanics(path: Path) -> Mechanics:
         actuators=actuators,
         gravity=model.opt.gravity.copy(),
         q0=compiled.q0,
+        keyframe_controls=compiled.controls,
         step=float(model.opt.timestep),
         not_modelled=not_modelled(model),
     )

@@ -22,6 +22,7 @@ class CompiledModel:
     model: Any  # mujoco.MjModel
     urdf: bool
     q0: NDArray[np.float64]  # initial positions: the keyframe "start", else "home", else those of the file
+    controls: NDArray[np.float64] | None  # of that keyframe; None where it sets none, which for MuJoCo are zeros
     mocap: tuple[str, ...]  # names of the mocap bodies
 
 
@@ -63,8 +64,9 @@ def _compiled(spec: Any, *, urdf: bool) -> CompiledModel:
     model = spec.compile()
     keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in ("start", "home"))
     key = next((k for k in keys if k >= 0), None)
+    controls = None if key is None or not model.key_ctrl[key].any() else np.array(model.key_ctrl[key])
     if model.nmocap == 0:
-        return CompiledModel(model, urdf, np.array(model.qpos0 if key is None else model.key_qpos[key]), ())
+        return CompiledModel(model, urdf, np.array(model.qpos0 if key is None else model.key_qpos[key]), controls, ())
     names = element_names(model, "body", model.nbody)
     mocap = [body for body in spec.bodies if body.mocap]
     for keyframe in list(spec.keys):  # which have no positions of the new joints
@@ -84,7 +86,7 @@ def _compiled(spec: Any, *, urdf: bool) -> CompiledModel:
             q0[place] = [*model.key_mpos[key].reshape(-1, 3)[which], *model.key_mquat[key].reshape(-1, 4)[which]]
             other[place] = False
         q0[other] = model.key_qpos[key]
-    return CompiledModel(free, urdf, q0, tuple(names[body.id] for body in mocap))
+    return CompiledModel(free, urdf, q0, controls, tuple(names[body.id] for body in mocap))
 
 
 def element_names(model: Any, kind: str, count: int) -> list[str]:

@@ -3,6 +3,7 @@ from .outline import Outline as Outline
 from .outline import Rectangle as Rectangle
 from .part_file import load_part as load_part
 from .part_file import part_names as part_names
+from .part_file import shipped_mesh as shipped_mesh
 from .part_scene import with_part as with_part
 from .registry import part_geometry as part_geometry
 
@@ -13,5 +14,6 @@ __all__ = [
     "load_part",
     "part_geometry",
     "part_names",
+    "shipped_mesh",
     "with_part",
 ]

@@ -5,12 +5,15 @@ from dataclasses import replace
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gelflow.errors import UsageError
 from gelflow.part import CUBOID, SHAPES, Part
 from gelflow.task import INSERTION, InsertionTask, insertion_task
 from gelflow.toml_tables import TomlTable, read_toml, suggestion
+
+if TYPE_CHECKING:
+    from gelflow.sim.scene.geometry.mesh import TriangleMesh
 
 FORMAT = 1
 
@@ -24,6 +27,19 @@ _OUTLINE_HOLE, _MESH_HOLE = ("clearance", "depth"), ("file", "scale", "depth")
 def part_names() -> tuple[str, ...]:
     """Names of the parts that are part of gelflow."""
     return tuple(sorted(Path(file.name).stem for file in _folder().iterdir() if file.name.endswith(".toml")))
+
+
+def shipped_mesh(part: Part) -> "TriangleMesh | None":
+    """The mesh of a part of gelflow in the frame of the part [m], also where `mesh_file` is unknown, as in a session.
+
+    None for other parts: their descriptions hold only the digest of the mesh file.
+    """
+    from gelflow.sim.tasks.parts import mesh_file, mesh_part
+
+    for file in Path(str(_folder())).glob("*.obj"):
+        if part.mesh == mesh_file.file_digest(file):
+            return mesh_part.MeshPart(replace(part, mesh_file=str(file))).mesh
+    return None
 
 
 def load_part(part: str | Path) -> InsertionTask:

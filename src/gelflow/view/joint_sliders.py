@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.scene import Scene
+from gelflow.sim.scene.start_controls import start_controls
 from gelflow.sim.simulator import Simulator
 
 _SLIDE_RANGE = 0.1  # [m] to both sides of the start, of joints without a range
@@ -89,7 +89,7 @@ def _rotation(quaternion: Any) -> Rotation:
 def control_ranges(scene: Scene) -> list[tuple[float, float, float]]:
     """Start, lower and upper end of the slider of each control."""
     ranges = []
-    for actuator, start in zip(scene.actuators, holding_controls(scene).tolist(), strict=True):
+    for actuator, start in zip(scene.actuators, start_controls(scene).tolist(), strict=True):
         low, high = actuator.ctrl_range
         reach = _FREE_MOTOR
         if actuator.kind == "position":

@@ -9,10 +9,10 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.sim import arguments
 from gelflow.sim.benchmark.describe import Description, describe
-from gelflow.sim.benchmark.step_times import holding_controls
 from gelflow.sim.drawing.scene_drawing import SceneDrawing, scene_drawing
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.mjcf.mechanics import WORLD
+from gelflow.sim.scene.start_controls import start_controls
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.view.body_text import body_text
 from gelflow.view.joint_sliders import Sliders, control_ranges, coordinates, read_coordinate, write_coordinate
@@ -24,6 +24,9 @@ MAX_RATE = 20.0  # of the pictures on the page [1/s]
 MAX_SHARE = 0.2  # of the time of the caller that the page takes
 _IDLE_RATE = 1.0  # while no browser is open [1/s]
 _TICK = 0.02  # [s] of the loop of `run`
+_MARKERS_OBSERVE = (
+    "Markers only observe, with a stiffness of their own: the sum over a pad differs from the contact force."
+)
 _SPEEDS = ("0.01 ×", "0.1 ×", "0.25 ×", "1 ×", "4 ×")
 _FEW_SLIDERS = 12
 
@@ -61,9 +64,9 @@ class SimulationPage:
         self._steps = 0  # taken by `run`
         self.playing = False
         self._speed = 1.0
-        self._u = np.tile(holding_controls(self._scene), (sim.num_envs, 1))
+        self._u = np.tile(start_controls(self._scene), (sim.num_envs, 1))
         self._description: Description | None = None
-        start = drawing if not isinstance(self._scene, Scene) else scene_drawing(Simulator(self._scene))
+        start = drawing if not isinstance(self._scene, Scene) else _start_drawing(self._scene)
         self._page = Page(host=host, port=port)
         self.url = self._page.url
         self._view = SceneView(self._page, self._scene, start, clicked=lambda body: self._post(self._describe, body))
@@ -136,6 +139,7 @@ class SimulationPage:
         if self._scene.pads:
             with gui.add_folder("Pads"):
                 self._panels = gui.add_image(self._view.panels(scene_drawing(self._sim, self.env)), format="png")
+                gui.add_markdown(_MARKERS_OBSERVE)
         with gui.add_folder("Forces"):
             self._legend = gui.add_markdown(self._view.legend())
             choices = [("contacts", "contact forces"), ("labels", "labels")]
@@ -181,7 +185,8 @@ class SimulationPage:
     def _reset(self) -> None:
         self._set_playing(False)
         self._sim.reset()
-        self._u[:] = holding_controls(self._scene)
+        self._sim.q[:] = self._scene.q0
+        self._u[:] = start_controls(self._scene)
         self._steps = 0
         self._view.reset_scales()
         if self._scene.actuators:
@@ -216,6 +221,13 @@ class SimulationPage:
         taken = f", {self._steps} steps, {self._steps * self._scene.step:.3f} s" if self._joints is not None else ""
         state = "" if not failed else f"; **stopped: {STATUS_MESSAGES[failed]}**"
         return f"**{self._scene.name}**, environment {self.env} of {self._sim.num_envs}{taken}{state}"
+
+
+def _start_drawing(scene: Scene) -> SceneDrawing:
+    """The scene at its start."""
+    sim = Simulator(scene)
+    sim.q[:] = scene.q0
+    return scene_drawing(sim)
 
 
 def open(sim: Simulator, *, env: int = 0, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> SimulationPage:

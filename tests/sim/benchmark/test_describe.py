@@ -11,8 +11,9 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
-from gelflow.sim.benchmark.step_times import holding_controls, measure, with_duplicates
+from gelflow.sim.benchmark.step_times import measure, with_duplicates
 from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
+from gelflow.sim.scene.start_controls import holding_controls
 from gelflow.sim.simulator import Simulator
 
 MODEL = """

@@ -130,7 +130,9 @@ def test_pictures_show_displacements_and_the_present(session: RecordedSession) -
     rest, contact = (pads_picture(session.at(session.start + t).pads) for t in (4.0, 6.0))
     assert rest.shape == contact.shape
     assert (np.abs(rest.astype(int) - contact).max(-1) > 60).mean() > 0.01
-    line = TimeLine(Curves(session.start, session.end), session.marks, origin=session.start)
+    line = TimeLine(
+        Curves(session.start, session.end), session.marks, origin=session.start, topics=session.index.topics()
+    )
     early, late = (line.with_present(session.start + t) for t in (1.0, 9.0))
     assert early.shape == (HEIGHT, WIDTH, 3)
     column = [int(np.flatnonzero((a != b).any(axis=(0, 2)))[0]) for a, b in ((early, late), (late, early))]
@@ -140,6 +142,20 @@ def test_pictures_show_displacements_and_the_present(session: RecordedSession) -
     assert width / WIDTH == pytest.approx(8.0 / 11.9 * 0.88, abs=0.02)  # 0.88 of the picture are the axes
     decision = session.decisions[0].value
     assert decision_picture(Comparison(decision, decision.observation, decision.action), INSERTION.grid).std() > 5
+
+
+def test_time_line_has_axes_for_what_was_recorded() -> None:
+    curves = Curves(0.0, 10.0)
+    pictures = {
+        topics: TimeLine(curves, [], origin=0.0, topics=topics).with_present(5.0)
+        for topics in [(), ("/left/force",), ("/arm/pose",), ("/arm/pose", "/gripper/state")]
+    }
+    # Rows of black pixels in most of a column are the frames of axes: two for each of the curves and the events.
+    frames = {
+        topics: int((picture[:, 100:600] == 0).all(-1).mean(1).__gt__(0.9).sum())
+        for topics, picture in pictures.items()
+    }
+    assert list(frames.values()) == [4, 6, 6, 8]
 
 
 def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) -> None:
@@ -168,10 +184,11 @@ def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) ->
         assert not curves.normal[0].samples and not curves.force.samples
         np.testing.assert_allclose(curves.normal[1].ordered()[1], 0.5 * np.arange(20))
         assert len(curves.gross_slip.samples) == 5
-        line = TimeLine(curves, [], origin=session.start).with_present(100.0)
-        assert (
-            line != TimeLine(Curves(session.start, session.end), [], origin=session.start).with_present(100.0)
-        ).any()
+        drawn, empty = (
+            TimeLine(shown, [], origin=session.start, topics=session.index.topics()).with_present(100.0)
+            for shown in (curves, Curves(session.start, session.end))
+        )
+        assert (drawn != empty).any()
 
 
 def test_links_of_the_arm_follow_each_other() -> None:

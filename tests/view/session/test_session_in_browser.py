@@ -107,7 +107,7 @@ def test_two_sessions_side_by_side_can_be_aligned_at_an_attempt(paths: list[Path
             window.wait(lambda: "first.mcap" in window.text() and "second.mcap" in window.text())
             window.wait(lambda: window.text().count("0.00 s of 11.9 s") == 2)
             page._post(page._align, "insertion 0, attempt 1")
-            page._post(page._go, 8.5)
+            page.go(8.5)
             window.wait(lambda: "8.50 s of" in window.text() and "9.00 s of" in window.text())
             assert window.text().count("insertion 0, attempt 1") >= 2
             assert window.errors() == []

@@ -7,6 +7,7 @@ import numpy as np
 
 from gelflow.geometry import Pose
 from gelflow.real.kinematics import DH, link_frames
+from gelflow.sim.tasks.parts import shipped_mesh
 from gelflow.view.page import Page
 from gelflow.view.robot.cell_geometry import CellGeometry
 
@@ -91,9 +92,12 @@ class RobotView:
         shape = library.creation.capsule(radius=radius, height=length, count=(16, 16))
         shape.apply_transform(library.geometry.align_vectors([0.0, 0.0, 1.0], (end - start) / length))
         shape.apply_translation((start + end) / 2)
+        self._mesh(name, np.asarray(shape.vertices), np.asarray(shape.faces), _ARM, smooth=True)
+
+    def _mesh(self, name: str, vertices: Any, faces: Any, color: Color, smooth: bool = False) -> None:
         self._page.scene.add_mesh_simple(
-            f"{self._root}/{name}", np.asarray(shape.vertices), np.asarray(shape.faces), color=_ARM,
-            opacity=self._opacity, side="double",
+            f"{self._root}/{name}", vertices, faces, color=color, opacity=self._opacity, side="double",
+            flat_shading=not smooth,
         )  # fmt: skip
 
     def _palm_height(self) -> float:
@@ -116,7 +120,10 @@ class RobotView:
         node = self._page.scene.add_frame(f"{self._root}/gripper/part", show_axes=False, visible=False)
         part = self._cell.task.part
         height = part.size[2] / 2 - self._cell.grasp_height
-        if part.shape == "cylinder":
+        mesh = shipped_mesh(part)
+        if mesh is not None:
+            self._mesh("gripper/part/body", mesh.vertices + np.array([0.0, 0.0, height]), mesh.faces, _PART)
+        elif part.shape == "cylinder":
             self._cylinder("gripper/part/body", part.size[0] / 2, part.size[2], (0.0, 0.0, height), _PART)
         else:
             self._box("gripper/part/body", part.size, (0.0, 0.0, height), _PART)

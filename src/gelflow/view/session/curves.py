@@ -15,8 +15,8 @@ from gelflow.view.session.recorded_session import RecordedSession
 Array = NDArray[np.float64]
 SAMPLES = 500  # of a curve in the shown time
 _PER_ROUND = 10  # samples between two yields
-_TOPICS = ("/arm/pose", "/gripper/state")
-_FORCES = tuple(f"/{sensor}/force" for sensor in SENSORS)
+ARM, GRIPPER = "/arm/pose", "/gripper/state"  # topics
+FORCES = tuple(f"/{sensor}/force" for sensor in SENSORS)
 
 
 @dataclass
@@ -61,7 +61,7 @@ class Curves:
 def read_curves(session: RecordedSession, curves: Curves, *, samples: int = SAMPLES) -> Iterator[None]:
     """Add the samples of a session to `curves`; yields after some of them, first evenly spread over the time."""
     markers = session.marker_reader()
-    records = session.index.spread([*_TOPICS, *_FORCES], curves.start, curves.end, samples)
+    records = session.index.spread([ARM, GRIPPER, *FORCES], curves.start, curves.end, samples)
     times = np.linspace(curves.start, curves.end, samples + 1)[1:]
     order = list(refining_order(samples))
     for number in range(samples):
@@ -80,9 +80,9 @@ def _add_record(session: RecordedSession, curves: Curves, record: Record) -> Non
     if isinstance(record.value, Pose):
         height = record.value.position[2] if session.cell is None else session.cell.part_height(record.value)
         curves.height.samples.append((record.time, 1e3 * float(height)))
-    elif record.topic in _FORCES:
+    elif record.topic in FORCES:
         normal = record.time, float(record.value["normal"])
-        curves.normal[_FORCES.index(record.topic)].samples.append(normal)
+        curves.normal[FORCES.index(record.topic)].samples.append(normal)
         if record.value.get("gross_slip"):
             curves.gross_slip.samples.append(normal)
     else:

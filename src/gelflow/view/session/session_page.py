@@ -108,6 +108,10 @@ class SessionPage:
         if self._decision_folder is not None:
             self._decision_folder.remove()
 
+    def go(self, seconds: float) -> None:
+        """Go to a time since the start of the first recording [s]; from any thread, while `run` shows the page."""
+        self._post(self._go_to, seconds)
+
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
         """Show what the page asks for, until `until()` is true or Ctrl-C."""
         while not until():
@@ -214,8 +218,11 @@ class SessionPage:
             self._post(self._go_to_mark, event.target.value)
 
     def _go_to_mark(self, name: str) -> None:
+        self._go_to(self._marks.get(name, self._first_view))
+
+    def _go_to(self, seconds: float) -> None:
         self._following = False
-        self._go(self._marks.get(name, self._first_view))
+        self._go(seconds)
 
     def _follow(self) -> None:
         self._following = self._behind = True

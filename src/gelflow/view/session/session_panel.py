@@ -160,9 +160,11 @@ class SessionPanel:
             if number % _REDRAW == 0:
                 self._draw(curves)
         self._draw(curves)
-        while self.session.growing and not ended.wait(_GROWTH):
+        growing = self.session.growing
+        while growing and not ended.wait(_GROWTH):
+            growing = self.session.growing  # the end of the recording is drawn too
             added = Curves(curves.end, self.session.end)
-            if added.end - added.start > _GROWTH / 2:
+            if added.end - added.start > (_GROWTH / 2 if growing else 0.0):
                 samples = min(round(_GROWTH_SAMPLES * (added.end - added.start)), _MOST_SAMPLES) + 1
                 for _ in read_curves(self.session, added, samples=samples):
                     pass
@@ -172,7 +174,7 @@ class SessionPanel:
             ended.wait(_DRAWING_SHARE * (perf_counter() - begun))
 
     def _draw(self, curves: Curves) -> None:
-        self._time_line = TimeLine(curves, self.marks, origin=self.session.start)
+        self._time_line = TimeLine(curves, self.marks, origin=self.session.start, topics=self.session.index.topics())
 
     def _comparison(self, decision: Decision | None) -> Comparison | None:
         return None if decision is None else self._comparisons.get((decision.insertion, decision.attempt))

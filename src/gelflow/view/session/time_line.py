@@ -1,17 +1,17 @@
 """The picture of a session's time line: curves, attempts and events over time, and the present as a line."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.figures import BLUE, GREEN, ORANGE, PURPLE, VERMILION, rasterize
-from gelflow.view.session.curves import Curve, Curves
+from gelflow.view.session.curves import ARM, FORCES, GRIPPER, Curve, Curves
 from gelflow.view.session.marks import Mark
 
 Image = NDArray[np.uint8]
-WIDTH, HEIGHT = 640, 380  # [px]
+WIDTH, HEIGHT = 640, 310  # [px]
 _LEGEND_ROOM = 0.35  # above the curves of shear, in heights of the curves
 _PRESENT = np.array((0, 0, 0), dtype=np.uint8)
 _SPANS = {"inserted": (GREEN, ""), "not inserted": (ORANGE, "//")}  # colour and hatch of attempts
@@ -24,37 +24,42 @@ _POINTS = {  # colour, symbol and name of marks without a duration
 
 
 class TimeLine:
-    """The time line of curves and marks; `with_present` draws the present into it."""
+    """The time line of curves and marks; `with_present` draws the present into it.
 
-    def __init__(self, curves: Curves, marks: Sequence[Mark], *, origin: float) -> None:
+    Parameters
+    ----------
+    curves, marks: to draw
+    origin: robot time that is 0 on the axis [s]
+    topics: of the session; curves whose topics are missing get no axis
+    """
+
+    def __init__(self, curves: Curves, marks: Sequence[Mark], *, origin: float, topics: Collection[str]) -> None:
         from matplotlib.figure import Figure  # deferred: slow to import
 
         figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
-        figure.subplots_adjust(left=0.105, right=0.985, top=0.935, bottom=0.12, hspace=0.18)
-        axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.55, 1, 1, 1))
+        figure.subplots_adjust(left=0.105, right=0.985, top=0.92, bottom=0.14, hspace=0.18)
+        rows = [
+            *([_draw_height] if ARM in topics else []),
+            _draw_shear,
+            *([_draw_forces] if {GRIPPER, *FORCES} & set(topics) else []),
+        ]
+        events, *axes = figure.subplots(1 + len(rows), 1, sharex=True, height_ratios=(0.55, *(1 for _ in rows)))
         self._start, self._end = curves.start, curves.end
-        axes[0].set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
+        events.set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
         inside = [mark for mark in marks if mark.end >= curves.start and mark.time <= curves.end]
-        _draw_marks(axes[0], inside, origin)
-        handles, labels = axes[0].get_legend_handles_labels()
+        _draw_marks(events, inside, origin)
+        handles, labels = events.get_legend_handles_labels()
         if labels:
             figure.legend(handles, labels, loc="upper right", fontsize=7, ncols=len(labels), frameon=False, borderpad=0)
-        for axis in axes[1:]:
+        for draw, axis in zip(rows, axes, strict=True):
             _shade(axis, inside, origin)
             axis.grid(alpha=0.3)
             axis.tick_params(labelsize=7)
-        _draw(axes[1], [curves.height], ["black"], origin)
-        axes[1].set_ylabel("height\n[mm]", fontsize=7)
-        _draw(axes[2], curves.shear, [BLUE, VERMILION], origin)
-        axes[2].set_ylabel("shear\n[mm]", fontsize=7)
-        low, high = axes[2].get_ylim()
-        axes[2].set_ylim(low, high + _LEGEND_ROOM * (high - low))
-        axes[2].legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7, borderpad=0.2, borderaxespad=0.2)
-        _draw_forces(axes[3], curves, origin)
-        axes[3].set_xlabel("time since the start of the recording [s]", fontsize=7)
-        figure.align_ylabels(axes)
+            draw(axis, curves, origin)
+        axes[-1].set_xlabel("time since the start of the recording [s]", fontsize=7)
+        figure.align_ylabels([events, *axes])
         self._picture: Image = rasterize(figure)
-        box = axes[1].get_window_extent()
+        box = axes[0].get_window_extent()
         self._left, self._right = float(box.x0), float(box.x1)
 
     def with_present(self, time: float) -> Image:
@@ -71,6 +76,19 @@ def _draw(axis: Any, curves: Sequence[Curve], colors: Sequence[str], origin: flo
     for curve, color, style in zip(curves, colors, ("-", "--"), strict=False):
         times, values = curve.ordered()
         axis.plot(times - origin, values, style, color=color, linewidth=1.1, label=curve.label)
+
+
+def _draw_height(axis: Any, curves: Curves, origin: float) -> None:
+    _draw(axis, [curves.height], ["black"], origin)
+    axis.set_ylabel("height\n[mm]", fontsize=7)
+
+
+def _draw_shear(axis: Any, curves: Curves, origin: float) -> None:
+    _draw(axis, curves.shear, [BLUE, VERMILION], origin)
+    axis.set_ylabel("shear\n[mm]", fontsize=7)
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + _LEGEND_ROOM * (high - low))
+    axis.legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7, borderpad=0.2, borderaxespad=0.2)
 
 
 def _draw_forces(axis: Any, curves: Curves, origin: float) -> None:

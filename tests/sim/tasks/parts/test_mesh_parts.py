@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
+from gelflow.part import CUBOID, Part
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.parts import load_part, part_geometry, with_part
+from gelflow.sim.tasks.parts import load_part, part_geometry, shipped_mesh, with_part
 from gelflow.sim.tasks.parts.mesh_part import MeshPart, found_symmetry, grasped_sides
 from gelflow.sim.tasks.parts.mesh_picture import picture
 from gelflow.sim.tasks.parts.shipped_meshes import connector, hexagon, obj_text, prism
@@ -32,6 +33,16 @@ def written(tmp_path: Path, mesh: TriangleMesh, text: str = PART) -> Path:
     (tmp_path / "part.obj").write_text(obj_text(mesh))
     (tmp_path / "part.toml").write_text(text)
     return tmp_path / "part.toml"
+
+
+def test_mesh_of_a_shipped_part_is_found_by_its_digest() -> None:
+    described = Part.from_json(load_part("connector").part.to_json())
+    assert not described.mesh_file
+    mesh = shipped_mesh(described)
+    assert mesh is not None
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(described.size)
+    assert shipped_mesh(dataclasses.replace(described, mesh="0" * 64)) is None
+    assert shipped_mesh(CUBOID) is None
 
 
 def test_the_meshes_that_come_along_are_those_of_the_script() -> None:

@@ -28,8 +28,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--controls",
         type=Path,
         metavar="FILE",
-        help="controls of each step, one row per step: .npy, or .csv without a header (default: position servos hold "
-        "the start, other controls are 0)",
+        help="controls of each step, one row per step: .npy, or .csv without a header (default: those of the "
+        "model's keyframe; without them position servos hold the start, others are 0)",
     )
     parser.add_argument(
         "--seconds",
@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
     scene = load_scene(args.scene, preset=args.preset)
     sim = Simulator(scene)
+    sim.q[:] = sim.scene.q0
     controls = _controls(scene, args.controls)
     frames = _frames(args, len(controls) if args.controls else 0, scene.step, film=suffix in VIDEO_CODECS)
     drawings = record_rollout(sim, controls, frames)
@@ -82,11 +83,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _controls(scene: "Scene", file: Path | None) -> NDArray[np.float64]:
-    """Controls (steps, nu) of a file, or those that hold the start in one row. Raises UsageError for a wrong file."""
+    """Controls (steps, nu) of a file, or those of the start in one row. Raises UsageError for a wrong file."""
     if file is None:
-        from gelflow.sim.benchmark.step_times import holding_controls
+        from gelflow.sim.scene.start_controls import start_controls
 
-        return holding_controls(scene)[None]
+        return start_controls(scene)[None]
     try:
         read = np.load(file, allow_pickle=False) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=2)
         controls = np.asarray(read, dtype=np.float64)
