@@ -12,7 +12,7 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.helper_process import HelperProcess
 
 _START_LIMIT = 60.0  # for the page to be served [s, wall]
-_END_LIMIT = 3.0  # for the page to show the last state [s, wall]
+_END_LIMIT = 4.0  # for the page to show the last state [s, wall]
 
 
 class LiveView:

@@ -21,7 +21,7 @@ _TICK = 0.04  # [s]
 _NICENESS = 5  # of the thread that draws: the run comes first
 # viser has no setting for the size of a button; the stop button is the only red one.
 _LARGE_BUTTON = '<style>button[style*="-red-"] {height: 7rem; font-size: 1.6rem; font-weight: 700}</style>'
-_LAST_STATE = 2.0  # time to draw the end of the recording and for browsers to receive it [s]
+_LAST_STATE = 0.5  # time for browsers to receive the last state [s]
 
 
 class LivePage:
@@ -71,18 +71,12 @@ class LivePage:
         if "ended" in message:
             self._stop.disabled = True
             self._state.content = f"**the run has ended: {message['ended']}**{self._how_to_look_again()}"
-            self._show_end()
+            if self._shown is not None:
+                self._shown.show_end()
+            time.sleep(_LAST_STATE)
 
     def _how_to_look_again(self) -> str:
         return "" if self._path is None else f"  \nlook at it again: `gelflow view {self._path}`"
-
-    def _show_end(self) -> None:
-        """Show the end of the recording."""
-        end = time.monotonic() + _LAST_STATE
-        while time.monotonic() < end:
-            if self._shown is not None:
-                self._shown.update()
-            time.sleep(_TICK)
 
     def _open(self, path: Path) -> None:
         """Show a recording once its first records are written."""

@@ -132,6 +132,12 @@ class SessionPage:
         for panel in self._panels:
             panel.refresh()
 
+    def show_end(self) -> None:
+        """Show the end of a recording that has grown until now."""
+        self.update()
+        for panel in self._panels:
+            panel.show_end()
+
     def _grow(self) -> None:
         """Add what has been recorded; show its end when it is followed."""
         if not self._live:

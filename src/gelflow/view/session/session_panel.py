@@ -12,7 +12,7 @@ from gelflow.session.decision_replay import Comparison
 from gelflow.session.records import Decision
 from gelflow.view.page import Page
 from gelflow.view.robot.robot_view import RobotView
-from gelflow.view.session.curves import Curves, read_curves
+from gelflow.view.session.curves import SAMPLES, Curves, read_curves
 from gelflow.view.session.marks import Mark
 from gelflow.view.session.moment import Moment
 from gelflow.view.session.moment_text import checks_text, moment_text
@@ -22,8 +22,7 @@ from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
 
 _DECISION_PICTURES = 32  # that are kept
 _GROWTH = 1.0  # period in which curves of a growing session are extended [s]
-_GROWTH_SAMPLES = 4  # in a second of robot time
-_MOST_SAMPLES = 40  # in a period; on a busy machine the curves are coarser instead of late
+_GROWTH_SAMPLES = 4  # of the curves of a growing session, in a second of robot time
 _DRAWING_SHARE = 4  # pause after drawing, in durations of drawing
 _REDRAW = 5  # rounds of samples between two pictures of the curves
 
@@ -77,6 +76,7 @@ class SessionPanel:
         self._time_line: TimeLine | None = None
         self._drawn: TimeLine | None = None
         self._time = session.start
+        self._curves = Curves(session.start, session.end)
         self._reading = threading.Event()
         self._reader: threading.Thread | None = None
 
@@ -88,7 +88,7 @@ class SessionPanel:
     def show_range(self, start: float, end: float) -> None:
         """Read and draw the curves from `start` to `end` [s] in the background."""
         self.close()
-        curves = Curves(max(start, self.session.start), min(end, self.session.end))
+        self._curves = curves = Curves(max(start, self.session.start), min(end, self.session.end))
         self._reading = threading.Event()
         self._reader = threading.Thread(target=self._read, args=(curves, self._reading), name="curves", daemon=True)
         self._reader.start()
@@ -124,6 +124,13 @@ class SessionPanel:
                 self._pictures.popitem(last=False)
         self._decision_image.image = self._pictures[key]
 
+    def show_end(self) -> None:
+        """Show the end of a recording that has grown, with the curves as far as they are read."""
+        self.close()
+        self._curves.end = self.session.end
+        self._draw(self._curves)
+        self.refresh()
+
     def close(self) -> None:
         """End the reading in the background."""
         self._reading.set()
@@ -154,20 +161,21 @@ class SessionPanel:
 
     def _read(self, curves: Curves, ended: threading.Event) -> None:
         """In a thread: read the curves, and draw them from time to time; of a growing session also what is added."""
-        for number, _ in enumerate(read_curves(self.session, curves)):
+        samples = _growth_samples(curves) if self.session.growing else SAMPLES
+        for number, _ in enumerate(read_curves(self.session, curves, samples=samples)):
             if ended.is_set():
                 return
             if number % _REDRAW == 0:
                 self._draw(curves)
         self._draw(curves)
-        growing = self.session.growing
-        while growing and not ended.wait(_GROWTH):
-            growing = self.session.growing  # the end of the recording is drawn too
+        while self.session.growing and not ended.wait(_GROWTH):
+            begun = perf_counter()
             added = Curves(curves.end, self.session.end)
-            if added.end - added.start > (_GROWTH / 2 if growing else 0.0):
-                samples = min(round(_GROWTH_SAMPLES * (added.end - added.start)), _MOST_SAMPLES) + 1
-                for _ in read_curves(self.session, added, samples=samples):
-                    pass
+            if added.end > added.start:
+                # On a busy machine the curves are coarser instead of late: the first samples are spread evenly too.
+                for _ in read_curves(self.session, added, samples=_growth_samples(added)):
+                    if ended.is_set() or perf_counter() - begun > _GROWTH:
+                        break
                 curves.add(added)
             begun = perf_counter()
             self._draw(curves)
@@ -191,3 +199,8 @@ class SessionPanel:
                     text = f"insertion {key[0]}, attempt {key[1]} could not be replayed"
                 found.append(Mark(record.time, record.time, "difference", text, *key))
         return found
+
+
+def _growth_samples(curves: Curves) -> int:
+    """Samples of the curves of a growing session."""
+    return min(round(_GROWTH_SAMPLES * (curves.end - curves.start)) + 1, SAMPLES)
