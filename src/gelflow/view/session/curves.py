@@ -41,7 +41,8 @@ class Curves:
     height: Curve = field(default_factory=lambda: Curve("height of the part [mm]"))
     shear: tuple[Curve, ...] = field(
         default_factory=lambda: tuple(Curve(f"{sensor} pad") for sensor in SENSORS)
-    )  # [mm]
+    )  # [mm], or length of the displacements [px], see `MarkerReader.shear`
+    shear_in_millimetres: bool = True
     force: Curve = field(default_factory=lambda: Curve("gripper"))  # [N]
     normal: tuple[Curve, ...] = field(
         default_factory=lambda: tuple(Curve(f"{sensor} pad") for sensor in SENSORS)
@@ -61,6 +62,7 @@ class Curves:
 def read_curves(session: RecordedSession, curves: Curves, *, samples: int = SAMPLES) -> Iterator[None]:
     """Add the samples of a session to `curves`; yields after some of them, first evenly spread over the time."""
     markers = session.marker_reader()
+    curves.shear_in_millimetres = markers.in_millimetres
     records = session.index.spread([ARM, GRIPPER, *FORCES], curves.start, curves.end, samples)
     times = np.linspace(curves.start, curves.end, samples + 1)[1:]
     order = list(refining_order(samples))

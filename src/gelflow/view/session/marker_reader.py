@@ -67,11 +67,22 @@ class MarkerReader:
         """Whether the trackers have started, which takes 0.1 s for each pad."""
         return all(sensor in self._trackers for sensor in range(len(self._configs)))
 
+    @property
+    def in_millimetres(self) -> bool:
+        """Whether `shear` has the unit mm; otherwise the recording does not say how the cameras are mounted."""
+        return bool(self._mounts)
+
     def shear(self, sensor: int, time: float) -> float:
-        """Mean shear of a pad along its finger since the reference [mm]; NaN where the markers are not readable."""
+        """Mean shear of a pad along its finger since the reference [mm]; NaN where the markers are not readable.
+
+        Where the mount of the camera is not known, the mean length of the displacements [px].
+        """
         pad = self.pad(sensor, time)
-        if pad is None or pad.tracked is None or sensor >= len(self._mounts):
+        if pad is None or pad.tracked is None:
             return float("nan")
+        if sensor >= len(self._mounts):
+            lengths = np.linalg.norm(pad.tracked.displacement[pad.tracked.valid], axis=-1)
+            return float(lengths.mean()) if len(lengths) else float("nan")
         frame = tactile_frame([pad.tracked], [self._mounts[sensor]], pad.stamp)
         along = frame.shear[0, frame.valid[0], 0]
         return float(along.mean()) if len(along) and frame.unit == "mm" else float("nan")

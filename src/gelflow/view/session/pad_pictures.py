@@ -26,8 +26,9 @@ _SHIFT = 4  # fractional bits of OpenCV's drawing coordinates
 
 
 def pads_picture(pads: Sequence[PadImage | None], *, markers: bool = True) -> Image:
-    """The newest images of all pads side by side, RGB; with `markers` also their grid and displacements."""
-    pictures = [_pad_picture(pad, name, markers) for pad, name in zip(pads, SENSORS, strict=False)]
+    """The newest images of all pads that have one side by side, RGB; with `markers` also grid and displacements."""
+    shown = [(pad, name) for pad, name in zip(pads, SENSORS, strict=False) if pad is not None or not any(pads)]
+    pictures = [_pad_picture(pad, name, markers) for pad, name in shown]
     gap = np.full((pictures[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
     row = [piece for picture in pictures for piece in (picture, gap)][:-1]
     return np.ascontiguousarray(np.hstack(row)[..., ::-1])

@@ -43,7 +43,7 @@ class TimeLine:
             _draw_shear,
             *([_draw_forces] if {GRIPPER, *FORCES} & set(topics) else []),
         ]
-        events, *axes = figure.subplots(1 + len(rows), 1, sharex=True, height_ratios=(0.55, *(1 for _ in rows)))
+        events, *axes = figure.subplots(1 + len(rows), 1, sharex=True, height_ratios=(0.18 * len(rows), *(1 for _ in rows)))
         self._start, self._end = curves.start, curves.end
         events.set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
         inside = [mark for mark in marks if mark.end >= curves.start and mark.time <= curves.end]
@@ -85,7 +85,7 @@ def _draw_height(axis: Any, curves: Curves, origin: float) -> None:
 
 def _draw_shear(axis: Any, curves: Curves, origin: float) -> None:
     _draw(axis, curves.shear, [BLUE, VERMILION], origin)
-    axis.set_ylabel("shear\n[mm]", fontsize=7)
+    axis.set_ylabel("shear\n[mm]" if curves.shear_in_millimetres else "markers\n[px]", fontsize=7)
     low, high = axis.get_ylim()
     axis.set_ylim(low, high + _LEGEND_ROOM * (high - low))
     axis.legend(loc="upper left", fontsize=6, ncols=2, framealpha=0.7, borderpad=0.2, borderaxespad=0.2)
