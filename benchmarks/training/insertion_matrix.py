@@ -1,6 +1,7 @@
-"""Trains the insertion under each shear law and preset, or with each observation, and evaluates under all of them.
+"""Trains the insertion under each shear law and preset, randomization, or observation, and evaluates under all of them.
 
     python -m benchmarks.training.insertion_matrix settings
+    python -m benchmarks.training.insertion_matrix randomizations
     python -m benchmarks.training.insertion_matrix observations
 
 Every training has the same number of attempts. Results are stored in --folder as they are found: a second call with the
@@ -25,6 +26,7 @@ from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import training_run
 from gelflow.policies.reproduction.trials import folder_name
 from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.insertion import RANDOMIZATIONS
 from gelflow.task import INSERTION
 
 EVALUATION_SEED = 7_000_003  # far from the seeds of trainings and their validations
@@ -47,6 +49,11 @@ def settings(presets: tuple[str, ...]) -> list[Row]:
     ]
 
 
+def randomizations() -> list[Row]:
+    """Each table of physical parameters; the nominal one has a single value of each."""
+    return [Row(name, {"randomization": name}) for name in RANDOMIZATIONS]
+
+
 def observations() -> list[Row]:
     """Each observation of the last frame, and of five frames where they differ."""
     five = tuple(depth * 1e-4 for depth in (3, 5, 7, 9, 11))
@@ -58,9 +65,14 @@ def observations() -> list[Row]:
     return rows
 
 
+def fast(rows: list[Row]) -> list[Row]:
+    """`rows` with the preset "fast"."""
+    return [row._replace(options={**row.options, "preset": "fast"}) for row in rows]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("matrix", choices=("settings", "observations"))
+    parser.add_argument("matrix", choices=("settings", "randomizations", "observations"))
     parser.add_argument("--attempts", type=int, default=100_000, help="of each training (%(default)s)")
     parser.add_argument("--episodes", type=int, default=512, help="of each evaluation (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="(%(default)s)")
@@ -75,8 +87,10 @@ def main() -> None:
             settings(("fast", "scene", "balanced")),
             settings(("fast", "scene", "balanced", "accurate")),
         )
+    elif args.matrix == "randomizations":
+        trained, evaluated = fast(randomizations()), randomizations()
     else:
-        trained = [row._replace(options={**row.options, "preset": "fast"}) for row in observations()]
+        trained = fast(observations())
         evaluated = []  # each under its own observation, with the values of the scene file
     cells: dict[str, dict[str, Any]] = {}
     with Progress(console=Console(stderr=True), transient=True) as progress:

@@ -1,0 +1,145 @@
+"""Inserts parts with the mock robot in worlds that differ from training: through protocols, camera images and tracker.
+
+    python benchmarks/mock_worlds.py --parts 10
+    python benchmarks/mock_worlds.py --worlds "as in training" --parts 100 --out 100_parts.json
+    python benchmarks/mock_worlds.py --worlds "as in training" --part hexagon --parts 20 --out hexagon.json
+
+The policy is that of the part. A world is changed by the file of `gelflow mock --world`; the lab file holds what a user
+of that cell would know. The same command continues a run that was killed.
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import script
+from rich.table import Table
+
+from gelflow.cli.mock_process import mock_robot, true_state
+from gelflow.cli.options import checkpoint_for, part_task
+from gelflow.errors import GelflowError
+from gelflow.policies.checkpoint import load_policy
+from gelflow.real.runner.insertion.attempt import Insertion
+from gelflow.real.runner.lab_file import load_lab
+from gelflow.real.runner.run_plan import RunPlan, run_insertions
+from gelflow.toml_tables import toml_text
+
+TRAINING = "as in training"
+_SOFT_GELS = {"left": 0.5, "right": 0.5}
+
+WORLDS: Mapping[str, Mapping[str, Any]] = {
+    TRAINING: {},
+    "cameras tilted by 8°": {"cameras": {"tilt_deg": [8.0, 0.0]}},
+    "lens with 6 % distortion": {"cameras": {"barrel": 0.06}},
+    "half the light": {"cameras": {"light": 60.0}},
+    "twice the light": {"cameras": {"light": 220.0}},
+    "pale dots": {"cameras": {"contrast": 0.3}},
+    "out of focus": {"cameras": {"blur_px": 2.5}},
+    "noisy cameras, 4 grey levels": {"cameras": {"noise": 4.0}},
+    "15 images per second": {"cameras": {"rate": 15.0}},
+    "grid of 9 × 7 markers": {"markers": {"rows": 9, "cols": 7, "pitch_mm": 2.8}},
+    "uneven print, 0.1 mm": {"markers": {"jitter_mm": 0.1}},
+    "5 % of the markers missing": {"markers": {"missing": 0.05}},
+    "hole taught 3 mm aside, 5° turned": {"taught_error": {"x": 0.003, "yaw_deg": 5.0}},
+    "hole taught 1 mm too high": {"taught_error": {"z": 0.001}},
+    "hole taught 1 mm too low": {"taught_error": {"z": -0.001}},
+    "gels five times as stiff": {"gels": {"left": 5.0, "right": 5.0}},
+    "gels a fifth as stiff": {"gels": {"left": 0.2, "right": 0.2}},
+    "low friction": {"friction": {"pads": 0.5, "hole": 0.3}},
+    "creep, crosstalk, unequal gains": {"sensor": {"creep": 0.3, "crosstalk": 0.2, "gain_spread": 0.1}},
+    "soft arm, 10 N/mm": {"arm": {"stiffness": 1e4}},
+    "all of these": {
+        "cameras": {"tilt_deg": [4.0, 0.0], "barrel": 0.03, "light": 90.0, "contrast": 0.45, "noise": 2.5},
+        "markers": {"jitter_mm": 0.05, "missing": 0.02},
+        "taught_error": {"x": 0.001, "yaw_deg": 2.0, "z": 0.0005},
+        "gels": _SOFT_GELS,
+        "friction": {"pads": 0.8, "hole": 0.5},
+        "sensor": {"creep": 0.3, "crosstalk": 0.2, "gain_spread": 0.1},
+        "arm": {"stiffness": 1e4},
+    },
+}
+
+
+def main() -> int:
+    parser = script.parser(__doc__ or "", out="mock_worlds.json", quick="one part in each of two worlds", seed=0)
+    parser.add_argument("--parts", type=int, default=10, metavar="N", help="in each world (default 10)")
+    parser.add_argument(
+        "--worlds", nargs="+", choices=WORLDS, default=list(WORLDS), metavar="NAME", help="default: all"
+    )
+    parser.add_argument("--part", help="part to insert (default: the cuboid)")
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="policy (default: that of the part)")
+    parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
+    args = parser.parse_args()
+    names, parts = (args.worlds[:2], 1) if args.quick else (args.worlds, args.parts)
+    unfinished = args.out.with_suffix(".part")
+    rows: dict[str, Any] = json.loads(unfinished.read_text()) if unfinished.is_file() else {}
+    with script.progress("worlds", len(names)) as advance:
+        for name in names:
+            if name not in rows:
+                rows[name] = inserted(WORLDS[name], parts, args)
+                script.save(unfinished, rows)
+            advance(1)
+    table = Table("world", "inserted", "robot and truth agree", "corrections", "ended by")
+    for name, row in rows.items():
+        length = "" if row["corrections"] is None else f"{row['corrections']:.2f}"
+        table.add_row(name, f"{row['inserted']} of {row['parts']}", str(row["agree"]), length, row["error"])
+    settings = {"part": args.part or "cuboid", "parts": parts, "seed": args.seed}
+    script.finish(args, script.header() | settings | {"worlds": rows}, table)
+    unfinished.unlink(missing_ok=True)
+    return 0
+
+
+def inserted(world: Mapping[str, Any], parts: int, args: Any) -> dict[str, Any]:
+    """Counts of one world: parts that are inserted in truth, and those of which the robot says the same."""
+    task = part_task(args.part)
+    checkpoint = checkpoint_for(task, args.checkpoint)
+    rows: list[dict[str, Any]] = []
+    error, begun = "", time.monotonic()
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / "world.toml"
+        file.write_text(toml_text({"format": 1, **world}), encoding="utf-8")
+        with mock_robot(factor=args.factor, seed=args.seed, world=file, part=args.part) as (lab_file, truth_url):
+
+            def seen(result: Insertion) -> None:
+                truth = true_state(truth_url)["parts"][result.number]
+                rows.append(
+                    {
+                        "robot": result.inserted,
+                        "truth": bool(truth["inserted"]),
+                        "attempts": len(result.attempts),
+                        "outcome": result.outcome,
+                        "misalignment": truth["misalignment"],
+                    }
+                )
+
+            plan = RunPlan(
+                lab=load_lab(lab_file),
+                policy=load_policy(checkpoint, task=task),
+                task=task,
+                session=Path(name) / "session.mcap",
+                checkpoint=checkpoint,
+                insertions=parts,
+                on_insertion=seen,
+            )
+            try:
+                run_insertions(plan)
+            except GelflowError as stop:
+                error = str(stop)
+    tries = [row["attempts"] - 1 for row in rows if row["truth"]]
+    return {
+        "world": world,
+        "parts": parts,
+        "inserted": sum(row["truth"] for row in rows),
+        "agree": sum(row["robot"] == row["truth"] for row in rows),
+        "corrections": sum(tries) / len(tries) if tries else None,
+        "error": error,
+        "minutes": round((time.monotonic() - begun) / 60, 2),
+        "insertions": rows,
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(script.run(main))
