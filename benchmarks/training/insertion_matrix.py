@@ -25,8 +25,8 @@ from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import training_run
 from gelflow.policies.reproduction.trials import folder_name
-from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.insertion import RANDOMIZATIONS
+from gelflow.sim.tasks.registry import make_task
 from gelflow.task import INSERTION
 
 EVALUATION_SEED = 7_000_003  # far from the seeds of trainings and their validations
@@ -122,7 +122,7 @@ def train_and_evaluate(row: Row, columns: list[Row], folder: Path, args: argpars
     for column in columns:
         if known.get(column.name, {}).get("episodes") == args.episodes:
             continue
-        batch = Insertion(ENVS, **column.options)
+        batch = make_task("insertion", ENVS, **column.options)
         actor = load_network(run.checkpoint, task=batch.description).batch_policy(ENVS)
         result = evaluate_task("policy", actor, batch, episodes=args.episodes, seed=EVALUATION_SEED + args.seed)
         known[column.name] = {
