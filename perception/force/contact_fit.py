@@ -35,7 +35,8 @@ _CORRELATION = 1.0  # length over which r is alike [pitches]
 _LOAD_PRIOR = 0.003 * 16  # weight of differences between neighbouring normal loads, relative to the largest ones
 _STEPS = 6  # of a first fit
 _LARGEST_CHANGE = 0.3  # of a in one step
-_LEFT_OVER = 0.15  # part of the shear in the remainder from which on it is gathered
+_CONVERGED = 0.05  # change of the ratios of shear to normal load, below which no further step follows
+_RIGID_PRIOR = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
 
 
 class LayerModel:
@@ -153,9 +154,8 @@ def fit_contact(
             fit = _step(model, data, fit)
         return fit
     gathered = _gathered(start, model.position)
-    if np.hypot(*(gathered.ratio - start.ratio)) > _LEFT_OVER * np.hypot(*gathered.ratio):
-        start = _step(model, data, gathered)
-    return _step(model, data, start)
+    fit = _step(model, data, gathered)
+    return fit if _ratio_change(gathered, fit, model.position) < _CONVERGED else _step(model, data, fit)
 
 
 def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
@@ -221,7 +221,7 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
 def _gathered(fit: ContactFit, position: Array) -> ContactFit:
     """The fit with all of its shear and moment in the rigid motion.
 
-    A remainder that carries a part of these sums would keep it in the next steps: in a contact that begins to slip the
+    A remainder that carries a part of these sums would keep it in the next step: in a contact that begins to slip the
     normal force would decrease by up to a half.
     """
     normal = fit.normal
@@ -232,6 +232,14 @@ def _gathered(fit: ContactFit, position: Array) -> ContactFit:
     x, y = (position - centre).T
     twist = float(x @ shear[1] - y @ shear[0]) / max(float(normal @ (x**2 + y**2)), 1e-9)
     return replace(fit, ratio=shear.sum(1) / total, twist=twist, centre=centre)
+
+
+def _ratio_change(before: ContactFit, after: ContactFit, position: Array) -> float:
+    """Change of the ratios of shear to normal load in a step, rms over the normal load before it."""
+    squares = ((position - before.centre) ** 2).sum(1)
+    square_radius = float(before.normal @ squares) / max(float(before.normal.sum()), 1e-30)
+    change = after.ratio - before.ratio
+    return float(np.sqrt(change @ change + square_radius * (after.twist - before.twist) ** 2))
 
 
 @dataclass
@@ -259,9 +267,8 @@ def _gauss_newton(data: _Data, cells: _Cells, loads: _Loads, field: Array, offse
     shear[0, :, 0] = shear[1, :, 1] = loads.normal
     shear[0, :, 2], shear[1, :, 2] = -arm[1] * loads.normal, arm[0] * loads.normal
     shear = shear.reshape(2 * m, 3)
-    response = weight * (cells.gram.reshape(3 * m, 3 * m)[:, : 2 * m] @ shear)  # (3m, 3)
+    response = weight * (shear.T @ cells.gram.reshape(3 * m, 3 * m)[: 2 * m]).T  # (3m, 3)
     gradient, wanted = _gradient(data, cells, loads, field)
-    prior = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
 
     # Sums of the loads, as functions of (a, ω), p and r: shear x, y, normal, moment about the centre of pressure.
     both = np.zeros((3, m, 7))
@@ -271,7 +278,7 @@ def _gauss_newton(data: _Data, cells: _Cells, loads: _Loads, field: Array, offse
     of_rest = _lower(cells.factor, both[:2, :k].reshape(2 * k, 7))
     of_normal = both[2] + ratio[0][:, None] * both[0] + ratio[1][:, None] * both[1] - loads.cross.T @ of_rest
     of_rigid = shear.T @ both[:2].reshape(2 * m, 7) - of_rest[:, :3].T @ of_rest
-    of_rigid[:, :3] += np.diag(prior)
+    of_rigid[np.arange(3), np.arange(3)] += _RIGID_PRIOR
     covariance = of_rest[:, 3:].T @ of_rest[:, 3:]
     change_per_rigid = np.zeros((m, 3))
     if positive.size:
@@ -280,7 +287,7 @@ def _gauss_newton(data: _Data, cells: _Cells, loads: _Loads, field: Array, offse
         of_rigid -= of_normal[:, :3].T @ solved
         covariance += of_normal[:, 3:].T @ solved[:, 3:]
         change_per_rigid[positive] = -solved[:, :3]
-    slope = gradient @ shear - prior * rigid
+    slope = gradient @ shear - _RIGID_PRIOR * rigid
     unknown = solve_positive_definite(of_rigid[:, :3], np.column_stack([slope, of_rigid[:, 3:]]))
     covariance += of_rigid[:, 3:].T @ unknown[:, 1:]
     step = unknown[:, 0] * min(1.0, _LARGEST_CHANGE / max(float(np.hypot(*unknown[:2, 0])), 1e-30))
