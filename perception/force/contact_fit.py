@@ -263,10 +263,9 @@ def _gauss_newton(data: _Data, cells: _Cells, loads: _Loads, field: Array, offse
     positive = np.flatnonzero(loads.normal)
     arm = offset[cells.index].T
     ratio = field[:, cells.index]
-    shear = np.zeros((2, m, 3))  # loads per unit of a and ω
-    shear[0, :, 0] = shear[1, :, 1] = loads.normal
-    shear[0, :, 2], shear[1, :, 2] = -arm[1] * loads.normal, arm[0] * loads.normal
-    shear = shear.reshape(2 * m, 3)
+    shear = np.zeros((2 * m, 3))  # loads per unit of a and ω
+    shear[:m, 0] = shear[m:, 1] = loads.normal
+    shear[:m, 2], shear[m:, 2] = -arm[1] * loads.normal, arm[0] * loads.normal
     response = weight * (shear.T @ cells.gram.reshape(3 * m, 3 * m)[: 2 * m]).T  # (3m, 3)
     gradient, wanted = _gradient(data, cells, loads, field)
 

@@ -26,7 +26,7 @@ def solve_nonnegative(hessian: Array, linear: Array, start: NDArray[np.bool_]) -
         if indices.size:
             x[indices] = solve_positive_definite(hessian[indices[:, None], indices], linear[indices])
         wrong = np.where(positive, x < 0, hessian @ x - linear < -tolerance)
-        count = np.count_nonzero(wrong)
+        count = int(np.count_nonzero(wrong))
         if count == 0:
             break
         if count < fewest:
