@@ -41,7 +41,7 @@ def _forces(gel: ElasticGel, args: argparse.Namespace) -> Table:
     table = Table(title="errors, 95th percentile, and share of images within the bound")
     for column in ("shape", "shear [N]", "<5 % or .05 N", "normal [N]", "<10 % or .1 N", "moment [N mm]", "<10 %"):
         table.add_column(column, justify="right")
-    for column in ("error < 2 sd", "ms"):
+    for column in ("error < 2 sd", "CPU ms"):
         table.add_column(column, justify="right")
     for shape in SHAPES:
         errors = measure_forces(

@@ -35,7 +35,8 @@ _CORRELATION = 1.0  # length over which r is alike [pitches]
 _LOAD_PRIOR = 0.003 * 16  # weight of differences between neighbouring normal loads, relative to the largest ones
 _STEPS = 6  # of a first fit
 _LARGEST_CHANGE = 0.3  # of a in one step
-_LEFT_OVER = 0.15  # part of the shear in the remainder from which on it is gathered
+_CONVERGED = 0.05  # change of the ratios of shear to normal load, below which no further step follows
+_RIGID_PRIOR = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
 
 
 class LayerModel:
@@ -54,15 +55,27 @@ class LayerModel:
         self.smoothing = self.correlation / self.correlation.sum(1).max()
         neighbours = (np.abs(distance - 1) < 0.1).astype(float)
         self.roughness = np.diag(neighbours.sum(1) + 0.01) - neighbours
-        self._gram: tuple[bytes, Array] = (b"", np.empty(0))
+        self._gram_of_all = self.compliance.T @ self.compliance
+        self._gram: tuple[bytes, Array] = (np.ones(n, bool).tobytes(), self._gram_of_all)
+        self._precision: tuple[bytes, Array] = (b"", np.empty(0))
 
     def gram(self, valid: NDArray[np.bool_]) -> Array:
         """The product of the compliance of valid markers with itself, shape (3n, 3n)."""
         key = valid.tobytes()
         if self._gram[0] != key:
-            rows = self.compliance[np.concatenate([valid, valid])]
-            self._gram = (key, rows.T @ rows)
+            rows = self.compliance[np.concatenate([~valid, ~valid])]
+            self._gram = (key, self._gram_of_all - rows.T @ rows)
         return self._gram[1]
+
+    def precision(self, cells: Indices) -> Array:
+        """Inverse of the correlation of the remainder at `cells`; only the triangle above the diagonal is set."""
+        key = cells.tobytes()
+        if self._precision[0] != key:
+            correlation = self.correlation.take(cells, 0).take(cells, 1)
+            correlation[np.diag_indices(cells.size)] += 0.01
+            inverse, _ = lapack.dpotri(_cholesky(correlation), lower=1, overwrite_c=1)
+            self._precision = (key, inverse.T)
+        return self._precision[1]
 
 
 @dataclass
@@ -97,24 +110,28 @@ class _Data:
 
 
 @dataclass
-class _Remainder:
-    """The equations of r, from its prior and one image."""
+class _Cells:
+    """The cells that may bear loads, and the equations of their loads.
 
-    cells: Indices  # of r in x and y, as indices of the 3n loads
-    factor: Array  # lower Cholesky factor of the matrix
+    A remainder is possible at the first cells only; p can be positive at all of them.
+    """
+
+    index: Indices  # (m,)
+    gram: Array  # (3, m, 3, m)
+    projected: Array  # (3, m)
+    remainder: int  # number of cells with a remainder, k
+    factor: Array  # lower Cholesky factor of the equations of r, (2k, 2k)
 
 
 @dataclass
 class _Loads:
     """p and r for given ratios, and the equations that remain for p without r."""
 
-    field: Array  # the given ratios of shear to p, (2, n)
-    candidates: Indices  # cells that may be pressed, (m,)
-    normal: Array  # p of the candidates, (m,)
-    remainder: Array  # r at its cells
+    normal: Array  # p, (m,)
+    remainder: Array  # r, (2k,)
     cost: float
     matrix: Array  # of p, (m, m)
-    cross: Array  # between r and p, solved with the factor of r, (cells, m)
+    cross: Array  # between r and p, solved with the factor of r, (2k, m)
 
 
 def fit_contact(
@@ -137,9 +154,8 @@ def fit_contact(
             fit = _step(model, data, fit)
         return fit
     gathered = _gathered(start, model.position)
-    if np.hypot(*(gathered.ratio - start.ratio)) > _LEFT_OVER * np.hypot(*gathered.ratio):
-        start = _step(model, data, gathered)
-    return _step(model, data, start)
+    fit = _step(model, data, gathered)
+    return fit if _ratio_change(gathered, fit, model.position) < _CONVERGED else _step(model, data, fit)
 
 
 def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
@@ -154,14 +170,14 @@ def _first_fit(model: LayerModel, data: _Data) -> ContactFit:
     lengths = np.hypot(*shear)
     cells = max(float(lengths.sum() ** 2 / max((lengths**2).sum(), 1e-30)), 20.0)
     envelope = np.full(n, 1.5 * _REMAINDER * size / cells + _REMAINDER_FLOOR * _SMALLEST_LOAD)
-    remainder = _remainder(model, data, envelope)
+    everywhere = _cells(model, data, envelope, np.ones(n, bool))
     weights = model.smoothing @ lengths
     centre = weights @ model.position / max(float(weights.sum()), 1e-30)
     best: tuple[float, float, Array] | None = None
     for ratio in _RATIOS if size > _REMAINDER_FLOOR else _RATIOS[:1]:
         scale = max(size / max(ratio, 0.05) / cells, _SMALLEST_LOAD)
         field = np.outer(ratio * direction, np.ones(n))
-        loads = _loads(model, data, remainder, field, scale, np.zeros(n), np.arange(n))
+        loads = _loads(model, data, everywhere, field, scale, np.zeros(n, bool))
         if best is None or loads.cost < best[0]:
             best = loads.cost, ratio, loads.normal
     assert best is not None
@@ -181,21 +197,21 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
         centre = moved
     envelope = 1.5 * (model.smoothing @ (0.3 * np.sqrt(normal * normal.max()) + 0.7 * normal))
     envelope *= _REMAINDER * (np.hypot(*ratio) + 1.3 * abs(twist)) + _REMAINDER_FLOOR
-    remainder = _remainder(model, data, envelope + 1e-6)
+    cells = _cells(model, data, envelope + 1e-6, fit.wanted | (normal > 0))
     offset = position - centre
     field = np.stack([ratio[0] - twist * offset[:, 1], ratio[1] + twist * offset[:, 0]])
-    candidates = np.flatnonzero(fit.wanted | (normal > 0) | (envelope > 0.05 * envelope.max()))
-    loads = _loads(model, data, remainder, field, _load_scale(normal), normal, candidates)
-    step = _gauss_newton(data, remainder, loads, offset, np.array([*ratio, twist]))
-    moved_normal, spread = np.zeros(n), np.zeros(2 * n)
-    moved_normal[candidates] = np.maximum(loads.normal + step.normal, 0.0)
-    spread[remainder.cells] = loads.remainder + step.remainder
+    pressed = normal[cells.index] > 0
+    loads = _loads(model, data, cells, field[:, cells.index], _load_scale(normal), pressed)
+    step = _gauss_newton(data, cells, loads, field, offset, np.array([*ratio, twist]))
+    moved_normal, spread = np.zeros(n), np.zeros((2, n))
+    moved_normal[cells.index] = np.maximum(loads.normal + step.normal, 0.0)
+    spread[:, cells.index[: cells.remainder]] = (loads.remainder + step.remainder).reshape(2, -1)
     return ContactFit(
         ratio=ratio + step.rigid[:2],
         twist=float(twist + step.rigid[2]),
         centre=centre,
         normal=moved_normal,
-        remainder=spread.reshape(2, n),
+        remainder=spread,
         cost=loads.cost,
         rigid_covariance=step.covariance,
         wanted=step.wanted,
@@ -205,7 +221,7 @@ def _step(model: LayerModel, data: _Data, fit: ContactFit) -> ContactFit:
 def _gathered(fit: ContactFit, position: Array) -> ContactFit:
     """The fit with all of its shear and moment in the rigid motion.
 
-    A remainder that carries a part of these sums would keep it in the next steps: in a contact that begins to slip the
+    A remainder that carries a part of these sums would keep it in the next step: in a contact that begins to slip the
     normal force would decrease by up to a half.
     """
     normal = fit.normal
@@ -218,114 +234,135 @@ def _gathered(fit: ContactFit, position: Array) -> ContactFit:
     return replace(fit, ratio=shear.sum(1) / total, twist=twist, centre=centre)
 
 
+def _ratio_change(before: ContactFit, after: ContactFit, position: Array) -> float:
+    """Change of the ratios of shear to normal load in a step, rms over the normal load before it."""
+    squares = ((position - before.centre) ** 2).sum(1)
+    square_radius = float(before.normal @ squares) / max(float(before.normal.sum()), 1e-30)
+    change = after.ratio - before.ratio
+    return float(np.sqrt(change @ change + square_radius * (after.twist - before.twist) ** 2))
+
+
 @dataclass
 class _Step:
     """Changes of (a, ω), p and r in a step with all of them free."""
 
     rigid: Array  # (3,)
-    normal: Array  # of the candidates
-    remainder: Array  # at its cells
+    normal: Array  # (m,)
+    remainder: Array  # (2k,)
     covariance: Array  # of the sums of the loads, see `ContactFit`
     wanted: NDArray[np.bool_]
 
 
-def _gauss_newton(data: _Data, remainder: _Remainder, loads: _Loads, offset: Array, rigid: Array) -> _Step:
+def _gauss_newton(data: _Data, cells: _Cells, loads: _Loads, field: Array, offset: Array, rigid: Array) -> _Step:
     """One step of Gauss-Newton: r is eliminated first, then p.
 
-    `rigid` is (a, ω), `offset` the positions relative to the centre of pressure.
+    `field` (2, n) are the ratios of shear to p, `rigid` is (a, ω), `offset` the positions relative to the centre of
+    pressure.
     """
-    n, field, cells = len(offset), loads.field, remainder.cells
-    x, y, z = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+    m, k, weight = cells.index.size, cells.remainder, data.weight
     positive = np.flatnonzero(loads.normal)
-    pressed = loads.candidates[positive]
-    cross = loads.cross[:, positive]
-    normal = np.zeros(n)
-    normal[loads.candidates] = loads.normal
-    shear_xy = np.zeros((3, 2 * n))  # loads per unit of a and ω
-    shear_xy[0, x] = shear_xy[1, y] = normal
-    shear_xy[2, x], shear_xy[2, y] = -offset[:, 1] * normal, offset[:, 0] * normal
-    response = data.weight * (data.gram[:, : 2 * n] @ shear_xy.T)  # (3n, 3)
-    total = np.concatenate([(field * normal).ravel(), normal])
-    total[cells] += loads.remainder
-    gradient = data.weight * (data.projected - data.gram @ total)
-    prior = np.array([_RATIO_DEVIATION, _RATIO_DEVIATION, _TWIST_DEVIATION]) ** -2.0
+    arm = offset[cells.index].T
+    ratio = field[:, cells.index]
+    shear = np.zeros((2 * m, 3))  # loads per unit of a and ω
+    shear[:m, 0] = shear[m:, 1] = loads.normal
+    shear[:m, 2], shear[m:, 2] = -arm[1] * loads.normal, arm[0] * loads.normal
+    response = weight * (shear.T @ cells.gram.reshape(3 * m, 3 * m)[: 2 * m]).T  # (3m, 3)
+    gradient, wanted = _gradient(data, cells, loads, field)
 
     # Sums of the loads, as functions of (a, ω), p and r: shear x, y, normal, moment about the centre of pressure.
-    sums = np.zeros((3 * n, 4))
-    sums[x, 0] = sums[y, 1] = sums[z, 2] = 1.0
-    sums[x, 3], sums[y, 3] = -offset[:, 1], offset[:, 0]
-    both = np.column_stack([response, sums])
-    of_rest = _lower(remainder.factor, both[cells])
-    of_normal = both[z] + field[0][:, None] * both[x] + field[1][:, None] * both[y]
-    of_normal = of_normal[pressed] - cross.T @ of_rest
-    of_rigid = np.column_stack([shear_xy @ response[: 2 * n] + np.diag(prior), shear_xy @ sums[: 2 * n]])
-    of_rigid -= of_rest[:, :3].T @ of_rest
+    both = np.zeros((3, m, 7))
+    both[..., :3] = response.reshape(3, m, 3)
+    both[0, :, 3] = both[1, :, 4] = both[2, :, 5] = 1.0
+    both[0, :, 6], both[1, :, 6] = -arm[1], arm[0]
+    of_rest = _lower(cells.factor, both[:2, :k].reshape(2 * k, 7))
+    of_normal = both[2] + ratio[0][:, None] * both[0] + ratio[1][:, None] * both[1] - loads.cross.T @ of_rest
+    of_rigid = shear.T @ both[:2].reshape(2 * m, 7) - of_rest[:, :3].T @ of_rest
+    of_rigid[np.arange(3), np.arange(3)] += _RIGID_PRIOR
     covariance = of_rest[:, 3:].T @ of_rest[:, 3:]
-    solved = np.zeros((0, 7))
-    if pressed.size:
-        solved = solve_positive_definite(loads.matrix[np.ix_(positive, positive)], of_normal)
+    change_per_rigid = np.zeros((m, 3))
+    if positive.size:
+        of_normal = of_normal[positive]
+        solved = solve_positive_definite(loads.matrix[positive[:, None], positive], of_normal)
         of_rigid -= of_normal[:, :3].T @ solved
-        covariance = covariance + of_normal[:, 3:].T @ solved[:, 3:]
-    slope = shear_xy @ gradient[: 2 * n] - prior * rigid
+        covariance += of_normal[:, 3:].T @ solved[:, 3:]
+        change_per_rigid[positive] = -solved[:, :3]
+    slope = gradient @ shear - _RIGID_PRIOR * rigid
     unknown = solve_positive_definite(of_rigid[:, :3], np.column_stack([slope, of_rigid[:, 3:]]))
-    covariance = covariance + of_rigid[:, 3:].T @ unknown[:, 1:]
+    covariance += of_rigid[:, 3:].T @ unknown[:, 1:]
     step = unknown[:, 0] * min(1.0, _LARGEST_CHANGE / max(float(np.hypot(*unknown[:2, 0])), 1e-30))
-    change = np.zeros(len(loads.normal))
-    change[positive] = -solved[:, :3] @ step
-    rest = -_upper(remainder.factor, of_rest[:, :3] @ step + loads.cross @ change)
-    outside = np.ones(n, bool)
-    outside[loads.candidates] = False
-    wanted = gradient[z] + field[0] * gradient[x] + field[1] * gradient[y] > 0
-    return _Step(step, change, rest, covariance, wanted & outside)
+    change = change_per_rigid @ step
+    rest = -_upper(cells.factor, of_rest[:, :3] @ step + loads.cross @ change)
+    return _Step(step, change, rest, covariance, wanted)
 
 
-def _remainder(model: LayerModel, data: _Data, envelope: Array) -> _Remainder:
-    """The prior of a remainder with standard deviation `envelope` (n,), zero where that is small."""
+def _gradient(data: _Data, cells: _Cells, loads: _Loads, field: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """The gradient of the shear loads of the cells, shape (2m,), and the other cells that p would improve, (n,)."""
+    index, k = cells.index, cells.remainder
+    total = np.zeros((3, field.shape[1]))
+    total[:2, index] = field[:, index] * loads.normal
+    total[:2, index[:k]] += loads.remainder.reshape(2, k)
+    total[2, index] = loads.normal
+    gradient = data.weight * (data.projected - data.gram @ total.ravel()).reshape(total.shape)
+    wanted = gradient[2] + field[0] * gradient[0] + field[1] * gradient[1] > 0
+    wanted[index] = False
+    return gradient[:2, index].ravel(), wanted
+
+
+def _cells(model: LayerModel, data: _Data, envelope: Array, pressed: NDArray[np.bool_]) -> _Cells:
+    """The cells where the remainder has a standard deviation `envelope` (n,) that is not small, and those `pressed`."""
     n = model.markers
-    cells = np.flatnonzero(envelope > 0.05 * envelope.max())
-    covariance = model.correlation[np.ix_(cells, cells)] * np.outer(envelope[cells], envelope[cells])
-    covariance[np.diag_indices(cells.size)] *= 1.01
-    precision = np.linalg.inv(covariance)
-    both = np.concatenate([cells, n + cells])
-    matrix = data.weight * data.gram[np.ix_(both, both)]
-    matrix[: cells.size, : cells.size] += precision
-    matrix[cells.size :, cells.size :] += precision
-    factor, info = lapack.dpotrf(matrix, lower=1)
-    if info != 0:
-        raise LinAlgError("the equations of the remainder are not positive definite")
-    return _Remainder(both, factor)
+    has_remainder = envelope > 0.05 * envelope.max()
+    inner = np.flatnonzero(has_remainder)
+    index = np.concatenate([inner, np.flatnonzero(pressed & ~has_remainder)])
+    m, k = index.size, inner.size
+    gram = data.gram
+    if k < n:
+        loads = np.concatenate([index, n + index, 2 * n + index])
+        gram = gram.take(loads, 0).take(loads, 1)
+    gram = gram.reshape(3, m, 3, m)
+    inverse = 1 / envelope[inner]
+    precision = model.precision(inner) * (inverse[:, None] * inverse)
+    matrix = data.weight * gram[:2, :k, :2, :k]
+    matrix[0, :, 0] += precision
+    matrix[1, :, 1] += precision
+    factor = _cholesky(matrix.reshape(2 * k, 2 * k))
+    return _Cells(index, gram, data.projected.reshape(3, n)[:, index], k, factor)
 
 
 def _loads(
-    model: LayerModel,
-    data: _Data,
-    remainder: _Remainder,
-    field: Array,
-    scale: float,
-    normal: Array,
-    candidates: Indices,
+    model: LayerModel, data: _Data, cells: _Cells, field: Array, scale: float, pressed: NDArray[np.bool_]
 ) -> _Loads:
-    """p and r for the given ratios `field` (2, n), with p = 0 outside of `candidates`.
+    """p and r for the given ratios `field` (2, m) of shear to p.
 
-    `scale` is that of p, and `normal` (n,) a similar solution.
+    `scale` is that of p, and `pressed` (m,) the cells with p > 0 in a similar solution.
     """
-    n, gram, weight = model.markers, data.gram, data.weight
-    along, across = field[:, candidates]
-    x, y, z = candidates, n + candidates, 2 * n + candidates
-    rows = gram[z] + along[:, None] * gram[x] + across[:, None] * gram[y]
-    own = rows[:, z] + rows[:, x] * along + rows[:, y] * across
-    linear = data.projected[z] + along * data.projected[x] + across * data.projected[y]
+    m, k, weight = cells.index.size, cells.remainder, data.weight
+    along, across = field
+    gram, projected = cells.gram, cells.projected
+    rows = gram[2] + along[:, None, None] * gram[0] + across[:, None, None] * gram[1]  # (m, 3, m)
+    own = rows[:, 2] + rows[:, 0] * along + rows[:, 1] * across
+    linear = projected[2] + along * projected[0] + across * projected[1]
     # Solved with the factor of r, so that products of two columns are what r explains.
-    columns = np.vstack([rows[:, remainder.cells], data.projected[remainder.cells]])
-    solved = weight * _lower(remainder.factor, columns.T)
-    cross, right = solved[:, :-1], solved[:, -1]
-    prior = _LOAD_PRIOR / scale**2 * model.roughness[np.ix_(candidates, candidates)]
+    columns = np.empty((m + 1, 2, k))
+    columns[:m], columns[m] = rows[:, :2, :k], projected[:2, :k]
+    columns *= weight
+    solved = _lower(cells.factor, columns.reshape(m + 1, 2 * k).T)
+    cross, right = solved[:, :m], solved[:, m]
+    prior = _LOAD_PRIOR / scale**2 * model.roughness.take(cells.index, 0).take(cells.index, 1)
     matrix = weight * own + prior - cross.T @ cross
     linear = weight * linear - cross.T @ right
-    loads = solve_nonnegative(matrix, linear, normal[candidates] > 0)
-    rest = _upper(remainder.factor, right - cross @ loads)
+    loads = solve_nonnegative(matrix, linear, pressed)
+    rest = _upper(cells.factor, right - cross @ loads)
     cost = weight * data.square - float(right @ right) - float(linear @ loads)
-    return _Loads(field, candidates, loads, rest, cost, matrix, cross)
+    return _Loads(loads, rest, cost, matrix, cross)
+
+
+def _cholesky(matrix: Array) -> Array:
+    """Lower Cholesky factor of `matrix`, of which the triangle above the diagonal is read and which is overwritten."""
+    factor, info = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
+    if info != 0:
+        raise LinAlgError("the equations of the remainder are not positive definite")
+    return np.asarray(factor)
 
 
 def _lower(factor: Array, right: Array) -> Array:

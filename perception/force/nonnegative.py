@@ -18,16 +18,15 @@ def solve_nonnegative(hessian: Array, linear: Array, start: NDArray[np.bool_]) -
     that of a similar problem. `hessian` must be positive definite.
     """
     positive = start.copy()
-    x, fewest, exchanges = np.zeros(len(linear)), len(linear) + 1, _FULL_EXCHANGES
+    fewest, exchanges = len(linear) + 1, _FULL_EXCHANGES
     tolerance = 1e-9 * float(np.abs(linear).max(initial=0.0))
     for _ in range(_MAX_ITERATIONS):
-        x[:] = 0.0
-        indices = np.flatnonzero(positive)
+        x = np.zeros(len(linear))
+        indices = positive.nonzero()[0]
         if indices.size:
-            x[indices] = solve_positive_definite(hessian[np.ix_(indices, indices)], linear[indices])
-        slope = hessian[:, indices] @ x[indices] - linear
-        wrong = np.where(positive, x < 0, slope < -tolerance)
-        count = int(wrong.sum())
+            x[indices] = solve_positive_definite(hessian[indices[:, None], indices], linear[indices])
+        wrong = np.where(positive, x < 0, hessian @ x - linear < -tolerance)
+        count = int(np.count_nonzero(wrong))
         if count == 0:
             break
         if count < fewest:
@@ -42,7 +41,7 @@ def solve_nonnegative(hessian: Array, linear: Array, start: NDArray[np.bool_]) -
 
 def solve_positive_definite(matrix: Array, right: Array) -> Array:
     """Solution of a symmetric positive definite system. Raises LinAlgError for another matrix."""
-    _, solution, info = lapack.dposv(matrix, right, lower=1)
+    _, solution, info = lapack.dposv(matrix.T, right, lower=1)
     if info != 0:
         raise LinAlgError("the matrix is not positive definite")
     return np.asarray(solution).reshape(right.shape)

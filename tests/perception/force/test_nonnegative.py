@@ -16,6 +16,15 @@ def test_solution_is_that_of_an_independent_solver(seed: int) -> None:
     np.testing.assert_allclose(found, nnls(matrix, right)[0], atol=1e-9)
 
 
+def test_solution_does_not_depend_on_the_first_set() -> None:
+    rng = np.random.default_rng(1)
+    matrix, right = rng.normal(size=(60, 40)), rng.normal(size=60)
+    hessian, linear = matrix.T @ matrix, matrix.T @ right
+    cold = solve_nonnegative(hessian, linear, np.zeros(40, bool))
+    for start in (cold > 0, cold == 0, np.ones(40, bool)):
+        np.testing.assert_allclose(solve_nonnegative(hessian, linear, start), cold, atol=1e-12)
+
+
 def test_an_ill_conditioned_problem_is_solved_too() -> None:
     distance = np.abs(np.arange(50)[:, None] - np.arange(50))
     matrix = np.exp(-((distance / 3.0) ** 2)) + 1e-6 * np.eye(50)
