@@ -1,4 +1,4 @@
-"""What the fit keeps between images does not change its result."""
+"""The fit of contact forces keeps matrices between images: they give the result of a fit that starts anew."""
 
 import numpy as np
 import pytest

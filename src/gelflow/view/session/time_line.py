@@ -43,7 +43,9 @@ class TimeLine:
             _draw_shear,
             *([_draw_forces] if {GRIPPER, *FORCES} & set(topics) else []),
         ]
-        events, *axes = figure.subplots(1 + len(rows), 1, sharex=True, height_ratios=(0.18 * len(rows), *(1 for _ in rows)))
+        events, *axes = figure.subplots(
+            1 + len(rows), 1, sharex=True, height_ratios=(0.18 * len(rows), *(1 for _ in rows))
+        )
         self._start, self._end = curves.start, curves.end
         events.set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
         inside = [mark for mark in marks if mark.end >= curves.start and mark.time <= curves.end]

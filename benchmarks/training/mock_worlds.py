@@ -1,8 +1,8 @@
 """Inserts parts with the mock robot in worlds that differ from training: through protocols, camera images and tracker.
 
-    python benchmarks/mock_worlds.py --parts 10
-    python benchmarks/mock_worlds.py --worlds "as in training" --parts 100 --out 100_parts.json
-    python benchmarks/mock_worlds.py --worlds "as in training" --part hexagon --parts 20 --out hexagon.json
+    python -m benchmarks.training.mock_worlds --parts 10
+    python -m benchmarks.training.mock_worlds --worlds "as in training" --parts 100 --out 100_parts.json
+    python -m benchmarks.training.mock_worlds --worlds "as in training" --part hexagon --parts 20 --out hexagon.json
 
 The policy is that of the part. A world is changed by the file of `gelflow mock --world`; the lab file holds what a user
 of that cell would know. The same command continues a run that was killed.
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import script
+from benchmarks import script
 from rich.table import Table
 
 from gelflow.cli.mock_process import mock_robot, true_state
