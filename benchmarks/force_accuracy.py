@@ -24,6 +24,7 @@ def main() -> int:
     parser.add_argument("--youngs-modulus", type=float, default=1.5e5, help="[Pa] (%(default)s)")
     parser.add_argument("--poisson-ratio", type=float, default=0.48, help="(%(default)s)")
     parser.add_argument("--thickness", type=float, default=3e-3, help="[m] (%(default)s)")
+    parser.add_argument("--markers", type=int, default=130, help="of the gels, for forces (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="(%(default)s)")
     slip = parser.add_argument_group("slip only")
     slip.add_argument("--objects", nargs="+", default=INDENTERS, choices=INDENTERS, help="default: all")
@@ -45,7 +46,13 @@ def _forces(gel: ElasticGel, args: argparse.Namespace) -> Table:
         table.add_column(column, justify="right")
     for shape in SHAPES:
         errors = measure_forces(
-            shape, args.contacts, gel, image_class=args.image_class, width=args.width, seed=args.seed
+            shape,
+            args.contacts,
+            gel,
+            image_class=args.image_class,
+            markers=args.markers,
+            width=args.width,
+            seed=args.seed,
         )
         covered = np.mean(np.stack([e[:, 1] < 2 * e[:, 2] for e in (errors.shear, errors.normal, errors.moment)]))
         table.add_row(

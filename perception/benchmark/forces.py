@@ -35,18 +35,25 @@ class ForceErrors:
 
 
 def measure_forces(
-    shape: Shape, contacts: int, gel: ElasticGel, *, image_class: str = "typical", width: int = 640, seed: int = 0
+    shape: Shape,
+    contacts: int,
+    gel: ElasticGel,
+    *,
+    image_class: str = "typical",
+    markers: int = 130,
+    width: int = 640,
+    seed: int = 0,
 ) -> ForceErrors:
-    """Press `contacts` random objects on gels with 130 markers, render, track and estimate.
+    """Press `contacts` random objects on gels, render, track and estimate.
 
-    `width` is that of the images [px], 4 : 3.
+    `width` is that of the images [px], 4 : 3. Raises UsageError for a number of `markers` that no class of images has.
     """
     rng = np.random.default_rng((SHAPES.index(shape), seed))
     rows: list[tuple[tuple[float, ...], ...]] = []
     seconds: list[float] = []
     for number in range(contacts):
         appearance = make_appearance(
-            image_class, width=width, height=3 * width // 4, seed=1000 * seed + number, occluders=0
+            image_class, markers=markers, width=width, height=3 * width // 4, seed=1000 * seed + number, occluders=0
         )
         layer = PressedLayer(gel, appearance.grid)
         strongest = gel.youngs_modulus * (appearance.grid.pitch * 1e-3) ** 2 * 30
@@ -56,7 +63,7 @@ def measure_forces(
         renderer, tracker = AccurateGelRenderer(appearance), MarkerTracker()
         noise = 0.05 / appearance.pixels_per_mm * 1e-3
         estimator = ForceEstimator(gel, appearance.grid, noise=noise)
-        tracker.start(renderer.render(np.zeros((130, 2))).image)
+        tracker.start(renderer.render(np.zeros((markers, 2))).image)
         middle = (float(appearance.width) / 2, float(appearance.height) / 2)
         for image in range(1, IMAGES + 1):
             now = replace(
