@@ -92,11 +92,6 @@ class WatchedTraining:
             for name, which in (("success", episodes.success), ("failure", ~episodes.success))
             if which.any()
         }
-        progress("drawing films of the newest policy")
-        record_films(
-            network.batch_policy(count), batch, list(films.values()),
-            episodes=self._episodes, seed=self._seed, max_frames=_MAX_FRAMES,
-        )  # fmt: skip
         result = episodes.result("policy")
         low, high = result.confidence_interval()
         lines = [
@@ -104,6 +99,11 @@ class WatchedTraining:
             f"(95 %: {low:.1%} to {high:.1%}), return {result.reward:.1f}",
             *worst_ranges(ranges),
         ]
+        progress("  \n".join([*lines, "drawing films of it"]))
+        record_films(
+            network.batch_policy(count), batch, list(films.values()),
+            episodes=self._episodes, seed=self._seed, max_frames=_MAX_FRAMES,
+        )  # fmt: skip
         picture = rasterize(failure_figure(ranges)) if ranges else None
         shown = {name: film.frames for name, film in films.items()}
         return ShownEpisodes("  \n".join(lines), picture, shown, batch.frames_per_second)
