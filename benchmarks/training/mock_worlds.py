@@ -5,7 +5,7 @@
     python -m benchmarks.training.mock_worlds --worlds "as in training" --part hexagon --parts 20 --out hexagon.json
 
 The policy is that of the part. A world is changed by the file of `gelflow mock --world`; the lab file holds what a user
-of that cell would know. The same command continues a run that was killed.
+of that cell would know. The same command continues a run that was killed; another command starts anew.
 """
 
 import json
@@ -29,7 +29,6 @@ from gelflow.toml_tables import toml_text
 
 TRAINING = "as in training"
 SERIES = 10  # parts
-_SOFT_GELS = {"left": 0.5, "right": 0.5}
 
 WORLDS: Mapping[str, Mapping[str, Any]] = {
     TRAINING: {},
@@ -52,11 +51,11 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
     "low friction": {"friction": {"pads": 0.5, "hole": 0.3}},
     "creep, crosstalk, unequal gains": {"sensor": {"creep": 0.3, "crosstalk": 0.2, "gain_spread": 0.1}},
     "soft arm, 10 N/mm": {"arm": {"stiffness": 1e4}},
-    "all of these": {
+    "most of these at once, milder": {
         "cameras": {"tilt_deg": [4.0, 0.0], "barrel": 0.03, "light": 90.0, "contrast": 0.45, "noise": 2.5},
         "markers": {"jitter_mm": 0.05, "missing": 0.02},
         "taught_error": {"x": 0.001, "yaw_deg": 2.0, "z": 0.0005},
-        "gels": _SOFT_GELS,
+        "gels": {"left": 0.5, "right": 0.5},
         "friction": {"pads": 0.8, "hole": 0.5},
         "sensor": {"creep": 0.3, "crosstalk": 0.2, "gain_spread": 0.1},
         "arm": {"stiffness": 1e4},
@@ -75,26 +74,28 @@ def main() -> int:
     parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
     args = parser.parse_args()
     names, parts = (args.worlds[:2], 1) if args.quick else (args.worlds, args.parts)
+    settings = {"part": args.part or "cuboid", "checkpoint": args.checkpoint and str(args.checkpoint)}
+    settings |= {"parts": parts, "seed": args.seed, "factor": args.factor}
     unfinished = args.out.with_suffix(".part")
-    rows: dict[str, Any] = json.loads(unfinished.read_text()) if unfinished.is_file() else {}
+    stored = json.loads(unfinished.read_text()) if unfinished.is_file() else {}
+    rows: dict[str, Any] = stored["worlds"] if stored.get("settings") == settings else {}
     with script.progress("worlds", len(names)) as advance:
         for name in names:
             if name not in rows:
                 rows[name] = inserted(WORLDS[name], parts, args)
-                script.save(unfinished, rows)
+                script.save(unfinished, {"settings": settings, "worlds": rows})
             advance(1)
     table = Table("world", "inserted", "robot and truth agree", "corrections", "stops")
     for name, row in rows.items():
         length = "" if row["corrections"] is None else f"{row['corrections']:.2f}"
         table.add_row(name, f"{row['inserted']} of {row['parts']}", str(row["agree"]), length, "; ".join(row["stops"]))
-    settings = {"part": args.part or "cuboid", "parts": parts, "seed": args.seed}
     script.finish(args, script.header() | settings | {"worlds": rows}, table)
     unfinished.unlink(missing_ok=True)
     return 0
 
 
 def inserted(world: Mapping[str, Any], parts: int, args: Any) -> dict[str, Any]:
-    """Counts of one world: parts that are inserted in truth, and those of which the robot says the same.
+    """Counts of one world: parts inserted in truth, and parts whose outcome the robot measured correctly.
 
     Each series of up to `SERIES` parts has a mock robot of its own: a stop, which a busy computer may cause, ends one.
     """

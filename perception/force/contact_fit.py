@@ -358,7 +358,7 @@ def _loads(
 
 
 def _cholesky(matrix: Array) -> Array:
-    """Lower Cholesky factor of `matrix`, of which the triangle above the diagonal is read and which is overwritten."""
+    """Lower Cholesky factor. Reads the triangle above the diagonal of `matrix`, and overwrites `matrix`."""
     factor, info = lapack.dpotrf(matrix.T, lower=1, clean=0, overwrite_a=1)
     if info != 0:
         raise LinAlgError("the equations of the remainder are not positive definite")

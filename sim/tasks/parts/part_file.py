@@ -34,6 +34,8 @@ def shipped_mesh(part: Part) -> "TriangleMesh | None":
 
     None for other parts: their descriptions hold only the digest of the mesh file.
     """
+    if not part.mesh:
+        return None
     from gelflow.sim.tasks.parts import mesh_file, mesh_part
 
     for file in Path(str(_folder())).glob("*.obj"):

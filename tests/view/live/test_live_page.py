@@ -88,7 +88,7 @@ def test_an_address_in_use_is_refused_before_anything_starts() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with (
-            pytest.raises(UsageError, match=f"port {port} of 127.0.0.1 is in use"),
+            pytest.raises(UsageError, match=f"^port {port} of 127.0.0.1 is in use"),
             LiveView(host="127.0.0.1", port=port),
         ):
             pass

@@ -29,8 +29,6 @@ from gelflow.view.session.pad_pictures import decision_picture, pads_picture
 from gelflow.view.session.recorded_session import RecordedSession
 from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
 
-_BLACK = cv2.imencode(".jpg", np.zeros((8, 8, 3), dtype=np.uint8))[1].tobytes()
-
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -228,7 +226,19 @@ def test_a_recording_of_track_starts_with_its_first_image(tmp_path: Path) -> Non
     with SessionRecorder(tmp_path / "tracked.mcap", clock) as recorder:
         recorder.metadata({"format": 1, "source": "images"})
         for clock.time in (500.0, 502.0):
-            recorder.image(0, CameraImage(_BLACK, clock.time, int(clock.time)))
+            recorder.image(0, CameraImage(b"\xff\xd8no picture\xff\xd9", clock.time, int(clock.time)))
+    with RecordedSession(tmp_path / "tracked.mcap") as session:
+        assert (session.start, session.end, session.first_view) == (500.0, 502.0, 500.0)
+        assert session.cell is None and session.notes == []
+
+
+def test_recorded_markers_of_an_unknown_camera_give_a_curve_in_pixels(tmp_path: Path) -> None:
+    clock = ManualClock(0.0)
+    black = cv2.imencode(".jpg", np.zeros((8, 8, 3), dtype=np.uint8))[1].tobytes()
+    with SessionRecorder(tmp_path / "tracked.mcap", clock) as recorder:
+        recorder.metadata({"format": 1, "source": "images"})
+        for clock.time in (500.0, 502.0):
+            recorder.image(0, CameraImage(black, clock.time, int(clock.time)))
             moved = np.full((1, 2), 3.0 * (clock.time - 500.0))
             markers = {
                 "rows": 1, "cols": 1, "spacing_px": 9.0, "position_px": moved, "displacement_px": moved,
@@ -236,8 +246,6 @@ def test_a_recording_of_track_starts_with_its_first_image(tmp_path: Path) -> Non
             }  # fmt: skip
             recorder.markers(0, clock.time, markers)
     with RecordedSession(tmp_path / "tracked.mcap") as session:
-        assert (session.start, session.end, session.first_view) == (500.0, 502.0, 500.0)
-        assert session.cell is None and session.notes == []
         curves = Curves(session.start, session.end)
         for _ in read_curves(session, curves):
             pass
