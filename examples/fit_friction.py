@@ -6,7 +6,6 @@ import gelflow.sim as gs
 
 scene = gs.load_scene("pushing")
 sim = gs.Simulator(scene)
-sim.q[:] = scene.q0
 state = gs.torch_state(sim)
 u = torch.zeros((60, 1, scene.nu), dtype=torch.float64)
 u[:, :, scene.u("gripper_x")] = 1.0

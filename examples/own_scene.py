@@ -59,7 +59,6 @@ with tempfile.TemporaryDirectory() as folder:
     scene = gs.load_scene(Path(folder, "press.toml"))
 
 sim = gs.Simulator(scene)
-sim.q[:] = scene.q0
 sim.step(np.array([[-1e-3]]), steps=250)  # the target is 1 mm below the top of the ball
 sim.check()
 normal = sim.tactile()[0, :, 2].reshape(7, 7)  # [N]

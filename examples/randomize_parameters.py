@@ -8,7 +8,6 @@ N = 64
 rng = np.random.default_rng(0)
 scene = gs.load_scene("pushing", preset="fast")
 sim = gs.Simulator(scene, num_envs=N)
-sim.q[:] = scene.q0
 sim.param("box_ground.mu")[:] = rng.uniform(0.3, 1.0, N)  # a view of shape (N,)
 sim.param("box.mass")[:] *= rng.uniform(0.5, 2.0, N)
 

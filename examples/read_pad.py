@@ -6,7 +6,6 @@ import gelflow.sim as gs
 
 scene = gs.load_scene("pushing")  # a finger with a pad pushes a box on the ground
 sim = gs.Simulator(scene)
-sim.q[:] = scene.q0
 
 u = np.zeros((1, scene.nu))  # one row of controls per environment
 u[:, scene.u("gripper_x")] = 1.0  # [N]

@@ -6,7 +6,6 @@ import gelflow.sim as gs
 
 scene = gs.load_scene("pushing")
 sim = gs.Simulator(scene)
-sim.q[:] = scene.q0
 
 steps = 40
 u = torch.zeros((steps, 1, scene.nu), dtype=torch.float64)  # (steps, environments, controls)

@@ -43,7 +43,8 @@ class Simulator:
 
     Attributes
     ----------
-    q, v: positions (N, nq) and velocities (N, nv); writable views of the simulator's memory, like all state arrays
+    q, v: positions (N, nq), of a scene its `q0` at first, and velocities (N, nv), 0 at first; writable views of the
+        simulator's memory, like all state arrays
     params: physical parameters (N, parameters), writable; see `param`
     anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
@@ -92,6 +93,7 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._tactile: NDArray[Any] | None = None  # created by the first call of `tactile`
+        self.reset()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, contents(self, self._threads)
@@ -114,11 +116,14 @@ class Simulator:
         return column
 
     def reset(self, which: ArrayLike | None = None) -> None:
-        """Reset to the reference positions at rest, with cleared history; all environments, or those with `which` (N,).
+        """Return to the start at rest, with cleared history; all environments, or those with `which` (N,).
 
-        Parameters keep their values.
+        The start is the scene's `q0`, and the reference configuration for a core model. Parameters keep their values.
         """
-        checked(self._batch.reset, self._mask("which", which))
+        mask = self._mask("which", which)
+        checked(self._batch.reset, mask)
+        if (start := getattr(self.scene, "q0", None)) is not None:
+            self.q[slice(None) if mask is None else mask.view(bool)] = start
 
     def _mask(self, name: str, mask: ArrayLike | None) -> NDArray[np.uint8] | None:
         """Flags of the environments in `mask` for the core; None: all of them."""

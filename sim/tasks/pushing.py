@@ -264,7 +264,6 @@ class Pushing(ControlTask):
         self._action[rows] = 0
         self._set_box(rows)
         self.sim.reset(which)
-        self.sim.q[rows] = self.scene.q0
         # The side of a box of any size is at the same distance from the finger.
         self.sim.q[rows, self._box_q[0]] += values["half_size"][:, 0] - self._half_size[0]
         self.sim.q[rows, self._box_q[1]] = values["offset"]

@@ -119,7 +119,6 @@ class Rolling(ControlTask):
     def _settle(self) -> dict[str, NDArray[Any]]:
         """The state of one environment with the pad at rest on the ball."""
         sim = Simulator(self.scene, threads=1)
-        sim.reset()
         u = np.zeros(self.scene.nu)
         u[self._lift_u] = self.description.lift
         sim.step(u, max(1, round(SETTLE_TIME / self.scene.step)))

@@ -26,7 +26,6 @@ def test_every_public_name_is_listed_and_resolves() -> None:
 def test_a_simulator_of_a_named_scene_takes_a_step() -> None:
     assert "insertion" in gs.scene_names()
     sim = gs.Simulator(gs.load_scene("insertion"), num_envs=3)
-    sim.q[:] = sim.scene.q0
     sim.step([0.0] * sim.model.nu)
     sim.check()
     assert sim.tactile().shape == (3, sim.model.num_markers, 3)

@@ -185,7 +185,6 @@ class SimulationPage:
     def _reset(self) -> None:
         self._set_playing(False)
         self._sim.reset()
-        self._sim.q[:] = self._scene.q0
         self._u[:] = start_controls(self._scene)
         self._steps = 0
         self._view.reset_scales()
@@ -225,9 +224,7 @@ class SimulationPage:
 
 def _start_drawing(scene: Scene) -> SceneDrawing:
     """The scene at its start."""
-    sim = Simulator(scene)
-    sim.q[:] = scene.q0
-    return scene_drawing(sim)
+    return scene_drawing(Simulator(scene))
 
 
 def open(sim: Simulator, *, env: int = 0, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT) -> SimulationPage:

@@ -220,7 +220,6 @@ def test_holding_controls_keep_the_scene_at_its_start() -> None:
     assert u[scene.u("hold_left")] == -0.0175
     assert u[scene.u("finger_left")] == 0
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     sim.step(u, 100)
     np.testing.assert_allclose(sim.q[0, :6], scene.q0[:6], atol=5e-3)
 

@@ -41,7 +41,6 @@ def controls(scene: Scene) -> Array:
 def started(scene: Any, envs: list[int], *, threads: int = 1, precision: Any = "double") -> Simulator:
     """A batch of the given environments, with individual starts and friction."""
     sim = Simulator(scene, num_envs=len(envs), threads=threads, precision=precision)
-    sim.q[:] = scene.q0
     sim.q[:, scene.q("arm_x")] += 1e-4 * np.array(envs)[:, None]
     sim.param("pad_left.mu")[:] = 1.0 + 0.1 * np.array(envs)
     return sim
@@ -206,7 +205,6 @@ def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
     # A corrected and reset environment continues.
     sim.param(name)[2] = reference.param(name)[2]
     sim.reset(np.arange(ENVS) == 2)
-    sim.q[2] = insertion.q0
     sim.step(u[0])
     sim.check()
 
@@ -327,7 +325,6 @@ from gelflow.sim.simulator import Simulator
 assert _core.LEVEL == "base"
 scene = load_scene("insertion", friction=sys.argv[1])
 sim = Simulator(scene)
-sim.q[0] = scene.q0
 for u in np.load(sys.argv[2]):
     sim.step(u)
 np.savez(sys.argv[3], q=sim.q, tactile=sim.tactile())
@@ -340,7 +337,6 @@ def test_portable_build_agrees_with_the_native_build(insertion: Scene, tmp_path:
     command = [sys.executable, "-c", BUILDS, insertion.friction, str(tmp_path / "u.npy"), str(tmp_path / "end.npz")]
     subprocess.run(command, env={**os.environ, "GELFLOW_CORE": "base"}, check=True)
     sim = Simulator(insertion)
-    sim.q[0] = insertion.q0
     for now in u:
         sim.step(now)
     other = np.load(tmp_path / "end.npz")

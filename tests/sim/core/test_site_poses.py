@@ -102,7 +102,6 @@ def test_gradient_through_a_rollout() -> None:
     """The gradient of a site's height by the controls is that of the positions, carried on by the reverse pass."""
     scene = with_sites("insertion")
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     site = scene.site(f"site{scene.body('part')}")
     u = torch.zeros((3, 1, scene.nu), dtype=torch.float64, requires_grad=True)
     run = torch_layer.torch_rollout(sim, torch_layer.torch_state(sim), u)

@@ -34,7 +34,6 @@ def threshold(scene: Scene) -> Array:
 def lowered(scene: Scene, *, threads: int = 1, precision: Any = "double") -> tuple[Simulator, Array]:
     """Parts in closed grippers, each at another offset, and the controls that lower them onto the rim."""
     sim = Simulator(scene, num_envs=ENVS, threads=threads, precision=precision)
-    sim.q[:] = scene.q0
     u = np.zeros((ENVS, scene.nu))
     u[:, [scene.u("finger_left"), scene.u("finger_right")]] = 8.0
     u[:, [scene.u("hold_left"), scene.u("hold_right")]] = -0.0175

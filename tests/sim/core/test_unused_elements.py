@@ -100,7 +100,6 @@ def described(scene: Scene) -> dict[str, Any]:
 def run(scene: Scene) -> bytes:
     """All positions and velocities, and the final marker forces of the pad; the unread pad is not evaluated."""
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     parts = []
     for _ in range(LONG):
         sim.step(PUSH)

@@ -160,7 +160,6 @@ def test_displaced_wall_pushes_the_part(precision: Any, integrator: str) -> None
     """Each environment has its own hole; a displaced wall pushes the part."""
     scene = load_scene("insertion", overrides={"integrator": integrator})
     sim = Simulator(scene, num_envs=3, precision=precision)
-    sim.q[:] = scene.q0
     part = sim.joint_q("part")
     sim.q[:, part : part + 3] = 0, 0, 0.0305  # 500 µm above the floor, in the hole
     shift = np.array([0, 5e-3, 0])
@@ -176,7 +175,6 @@ def test_displaced_wall_pushes_the_part(precision: Any, integrator: str) -> None
 def test_position_that_is_not_finite_is_refused(name: str) -> None:
     scene = load_scene("insertion")
     sim = Simulator(scene, num_envs=2)
-    sim.q[:] = scene.q0
     sim.param(name)[1] = np.nan
     with pytest.raises(UsageError, match=f"^environment 1: parameter '{name}' must be a number, got nan"):
         sim.step(np.zeros(scene.nu), 2)

@@ -73,7 +73,6 @@ def error_of(path: Path) -> str:
 
 def at_rest(scene: Scene) -> Simulator:
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     sim.step(np.zeros((1, 0)), 400)
     sim.check()
     return sim

@@ -95,7 +95,6 @@ def test_precision_and_tolerance_reach_the_simulator(tmp_path: Path) -> None:
     for tolerance in (1e-2, 1e-12):
         scene = load_scene("pushing", overrides={"tolerance": tolerance})
         sim = Simulator(scene)
-        sim.q[:] = scene.q0
         sim.step(np.eye(scene.nu)[scene.u("gripper_x")], 40)
         iterations.append(int(sim.iterations[0]))
     assert iterations[0] < iterations[1]

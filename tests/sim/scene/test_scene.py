@@ -55,7 +55,6 @@ def test_a_scene_built_in_python_is_simulated() -> None:
     ball = ball_on_ground()
     assert (ball.nq, ball.nv, ball.nu, ball.num_markers) == (7, 6, 0, 1)
     sim = Simulator(ball)
-    sim.q[:] = ball.q0
     depth = MASS * 9.81 / KN
     decay = PARAMS["kd"] * depth / (2 * MASS)  # of the oscillation about the rest position [1/s]
     sim.step(np.zeros((1, 0)), round(15 / decay / ball_on_ground().step))

@@ -95,7 +95,6 @@ def test_ball_rolls_between_pad_and_ground(friction: str) -> None:
     """Without slip the ball moves half as far as the pad and rotates by distance over radius."""
     scene = load_scene("rolling", friction=friction, overrides={"pads.pad.rows": 25, "pads.pad.cols": 25})
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     for force, steps in ROLLING[:1]:
         sim.step(np.array(force), steps)
     start = sim.q[0].copy()
@@ -120,7 +119,6 @@ def test_tactile_shear_has_the_direction_of_the_load(friction: str) -> None:
     scene = load_scene("rolling", friction=friction, overrides={"pads.pad.rows": 25, "pads.pad.cols": 25})
     for force, axis, sign in (((0.1, 0, 0.2), 0, -1), ((0, 0.1, 0.2), 1, 1)):
         sim = Simulator(scene)
-        sim.q[:] = scene.q0
         sim.step(np.array([0.0, 0, 0.2]), 100)
         before = sim.tactile()[0].sum(0)
         sim.step(np.array(force, dtype=float), 4)
@@ -133,7 +131,6 @@ def test_box_under_the_elastic_law_does_not_creep() -> None:
     """A box on the ground stays in place under a force below the friction limit."""
     scene = load_scene("pushing", friction="elastic")
     sim = Simulator(scene)
-    sim.q[:] = scene.q0
     u = np.zeros(scene.nu)
     u[scene.u("box_y")] = 0.2  # friction holds up to 0.8 × 0.735 N
     sim.step(u, 100)

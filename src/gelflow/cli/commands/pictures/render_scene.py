@@ -65,7 +65,6 @@ def run(args: argparse.Namespace) -> int:
 
     scene = load_scene(args.scene, preset=args.preset)
     sim = Simulator(scene)
-    sim.q[:] = sim.scene.q0
     controls = _controls(scene, args.controls)
     frames = _frames(args, len(controls) if args.controls else 0, scene.step, film=suffix in VIDEO_CODECS)
     drawings = record_rollout(sim, controls, frames)

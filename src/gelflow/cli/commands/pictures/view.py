@@ -92,7 +92,6 @@ def _view_scene(args: argparse.Namespace) -> int:
     from gelflow.view.simulation_page import SimulationPage
 
     sim = Simulator(load_scene(args.shown[0], preset=args.preset), num_envs=args.num_envs)
-    sim.q[:] = sim.scene.q0
     with SimulationPage(sim, env=args.env, host=args.host, port=args.port, controls=True) as page:
         return _serve(args, page.url, page.run)
 
