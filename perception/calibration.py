@@ -62,7 +62,7 @@ class Calibration:
     residual_px: float  # root mean square distance of the markers from the fitted grid
     largest_px: float  # largest distance of a marker from the fitted grid
     skipped: tuple[int, int, int, int] = (0, 0, 0, 0)  # printed lines not in the image: above, below, left, right
-    # Relative standard deviation of a length on the gel, due to an uneven print. None: of a file without it.
+    # Relative standard deviation of a length on the gel, due to an uneven print. None: the file does not contain it.
     scale_error: float | None = None
     # Share of the residuals' variance that changes slowly over the image, 0 to 1: a stretched print or a touched gel.
     smooth_share: float | None = None

@@ -30,7 +30,7 @@ _MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
 _SOUND = 0.04
 _LARGEST_SIZE = 0.6  # difference from the size of the median dot [radii]
 _TOLERATED = (0.16, 0.7)  # smallest and largest tolerated residual / contrast
-_USUAL = 0.03  # standard deviation of what the model does not explain of any dot: JPEG, steps of grey
+_USUAL = 0.03  # standard deviation of the residuals of a sound dot / contrast: JPEG, quantization
 _UNEXPLAINED = 6.0  # tolerated residual / standard deviation of what the model does not explain at rest
 _RINGS = 44  # bins of the radius in which the profile is averaged
 
@@ -45,10 +45,9 @@ class DotModel:
     # disc of radius 1; then the coefficients of the waves of its outline (`_waves`). Shape (markers, 8).
     shape: Floats
     contrast: Floats  # of each dot, negative for dark dots, shape (markers,)
-    tolerated: Floats  # residual of each dot that still has half the weight / contrast, shape (markers,)
-    profile: NDArray[
-        np.float32
-    ]  # at equidistant q up to _PROFILE_REACH², 1 inside, 0 outside, shape (PROFILE_STEPS + 1,)
+    tolerated: Floats  # residual / contrast at which a pixel has half the weight, shape (markers,)
+    # At equidistant squared radii up to _PROFILE_REACH², 1 inside, 0 outside; shape (PROFILE_STEPS + 1,).
+    profile: NDArray[np.float32]
     noise: float  # standard deviation of a pixel / background
     quality: Floats  # of the fit of each dot, 0 where not visible, shape (markers,)
 

@@ -83,11 +83,13 @@ class MarkerTracker:
         """Finds the grid of markers in `image` (B G R or grey) and makes it the reference, with zero displacements.
 
         `rows` and `cols` replace those of the configuration. Raises TrackerInitError when the image does not clearly
-        show such a grid, UsageError when `image` is not an image array.
+        show such a grid, UsageError when `image` is not an image array or only one of `rows` and `cols` is given.
         """
+        if (rows is None) != (cols is None):
+            raise UsageError("give both rows and cols, or neither")
         config = self.config
         image = _as_bgr(image)
-        rows, cols = (config.rows, config.cols) if rows is None and cols is None else (rows, cols)
+        rows, cols = (config.rows, config.cols) if rows is None else (rows, cols)
         request = GridRequest(rows, cols, config.either_way, config.polarity, config.skipped, config.anchor)
         grid = find_grid(image, request)
         shrink = max(1, int(np.ceil(grid.radius / _MAX_RADIUS)))
@@ -99,7 +101,8 @@ class MarkerTracker:
         return TrackingResult(rest, still, visible, ~visible, model.quality, rows, cols, grid.spacing)
 
     def track(self, image: NDArray[np.uint8]) -> TrackingResult:
-        """The markers in the next image (B G R or grey). The first call is equivalent to `start`.
+        """The markers in the next image (B G R or grey). Without `start`, the first image must show
+        the gel at rest: it becomes the reference.
 
         Markers that are hidden or ambiguous are not valid. Raises PeerError when the image size changes, UsageError
         when `image` is not an image array.

@@ -104,9 +104,9 @@ class Backpropagation(Learner):
         for group in self._optimizer.param_groups:
             group["lr"] = settings.learning_rate * max(0.0, 1 - self.steps / self._total)
         self._optimizer.zero_grad()
-        with self.clock.share("simulation"):
+        with self.clock.timed("simulation"):
             returns = run_episodes(episodes, self.actor, self._rng, window=settings.window)
-        with self.clock.share("learning"):
+        with self.clock.timed("learning"):
             norm = float(torch.nn.utils.clip_grad_norm_(self.actor.parameters(), settings.gradient_norm))
             if np.isfinite(norm):
                 self._optimizer.step()

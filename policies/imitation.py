@@ -114,14 +114,14 @@ class Imitation(Learner):
         """One iteration: attempts of the present network with exploration, then updates of the network."""
         progress = min(1.0, self.steps / self._total)
         sigma = float(np.interp(progress, [0, 1], self._settings.exploration))
-        with self.clock.share("simulation"):
+        with self.clock.timed("simulation"):
             if self._scale is None:
                 self._scale = feature_scale(self.task, self._basis, self._seed)
             seed = int(np.random.SeedSequence([self._seed, self._iterations]).generate_state(1)[0])
             attempts, success, reward = collect(
                 self._network(), self.task, self._settings.rollout, seed=seed, sigma=sigma
             )
-        with self.clock.share("learning"):
+        with self.clock.timed("learning"):
             self._memory.append(attempts)
             self._learn(progress, np.random.default_rng([self._seed, self._iterations, 2]))
         self._iterations += 1

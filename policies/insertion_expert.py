@@ -8,7 +8,7 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 _MIN_TOLERANCE = 1.5e-3  # [m]
-_SIDE = 0.8  # yaw to which the gripper turns a round part, as part of the workspace
+_SIDE = 0.8  # yaw to which the gripper turns a round part, as a fraction of the yaw of the workspace
 
 
 def expert_correction(task: InsertionTask, pose: Array, signs: Array) -> Array:

@@ -107,15 +107,15 @@ class PPO(Learner):
         """Collects one rollout and learns from it."""
         if self.steps == 0 and isinstance(self._actor.encoder, VectorEncoder):
             self._calibrate()
-        with self.clock.share("simulation"):
+        with self.clock.timed("simulation"):
             rollout, numbers = self._collect()
-        with self.clock.share("learning"):
+        with self.clock.timed("learning"):
             return numbers | self._learn(rollout)
 
     @torch.no_grad()
     def _calibrate(self) -> None:
         """Initializes the normalization of the observations by one rollout of random actions."""
-        with self.clock.share("simulation"):
+        with self.clock.timed("simulation"):
             n, k = self.task.num_envs, self._actions
             for _ in range(self._settings.rollout):
                 self._actor.absorb(torch.from_numpy(self.task.observation))

@@ -15,8 +15,9 @@ import serial
 from gelflow.clock import Clock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
 
-# Lower bound of every wait: with a fast clock, a peer on the same machine still needs time from the scheduler.
-SHORTEST_WALL_TIMEOUT = 0.5  # [s]
+# Lower bound of the time limits of connecting and writing [s, wall]: with a fast clock, a peer on the same machine
+# still needs time from the scheduler.
+SHORTEST_WALL_TIMEOUT = 0.5
 _READ_SIZE = 4096  # bytes
 _CLOSE_TIMEOUT = 0.2  # a peer that does not close its side is waited for no longer [s, wall]
 

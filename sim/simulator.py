@@ -44,7 +44,8 @@ class Simulator:
     Attributes
     ----------
     q, v: positions (N, nq), of a scene its `q0` at first, and velocities (N, nv), 0 at first; writable views of the
-        simulator's memory, like all state arrays
+        simulator's memory, like all state arrays. After writing them call `clear_history`, or friction anchors and the
+        BDF2 history belong to the state before
     params: physical parameters (N, parameters), writable; see `param`
     anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and

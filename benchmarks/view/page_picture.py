@@ -1,7 +1,7 @@
 """The picture of the page of a session in the documentation.
 
     gelflow demo --out runs/demo
-    python -m benchmarks.view.page_picture runs/demo/session.mcap --at 46 --out docs/pictures/session_page.png
+    python -m benchmarks.view.page_picture runs/demo/session.mcap --at 22.66 --out docs/pictures/session_page.png
 
 Needs Chromium, which draws by software.
 """

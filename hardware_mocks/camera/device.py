@@ -320,7 +320,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _part(image: bytes, stamp: float, corruption: Corruption | None) -> bytes:
-    """One part of the stream and the boundary behind it, with the headers and in the order of mjpg-streamer."""
+    """One part of the stream and the boundary after it, with the headers and in the order of mjpg-streamer."""
     length, body = len(image), image
     if corruption == "truncated":
         body = image[: len(image) // 2]

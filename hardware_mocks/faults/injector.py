@@ -20,7 +20,7 @@ from gelflow.time_sync import MIN_WAIT
 
 _STOPS = ("emergency_stop", "motors_off", "rapid_stop")  # of the arm
 _PERIOD = 0.002  # of the checks for events [s]
-# Heights of the lower face at which descent and lowering begin, without `below` [m]: 0.1 mm after the begin.
+# Heights of the lower face at which descent and lowering begin, without `below` [m]: 0.1 mm after their start.
 _DESCENT_BELOW = INSERTION.start_height - 0.1e-3
 _LOWERING_BELOW = INSERTION.start_height - INSERTION.descent - 0.1e-3
 
@@ -101,8 +101,8 @@ class Devices:
         return self.cameras if device == "cameras" else (self.cameras[device == "right_camera"],)
 
 
-def event_has_come(fault: Fault, progress: Progress) -> bool:
-    """Whether the event of a fault has come."""
+def event_occurred(fault: Fault, progress: Progress) -> bool:
+    """Whether the event of a fault has occurred."""
     gripped = progress.phase == PHASES.index("gripped")
     if fault.event == "gripped":
         return gripped
@@ -124,7 +124,7 @@ class Occurrence:
     def __init__(self, number: int, fault: Fault) -> None:
         self.number, self.fault = number, fault
         self._random = random.Random(f"begin {fault.seed}")
-        self._due: float | None = None  # of the next begin [s]
+        self._due: float | None = None  # of the next start [s]
         self._done = False
         self._end = math.inf  # while it is active [s]
         self.active = False
@@ -139,7 +139,7 @@ class Occurrence:
                 self._due = now + self._random.expovariate(fault.rate)
             elif fault.at is not None:
                 self._due = progress.started + fault.at
-            elif event_has_come(fault, progress):
+            elif event_occurred(fault, progress):
                 self._due = now + fault.after
         if self._due is None or now < self._due:
             return False

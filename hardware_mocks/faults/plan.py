@@ -66,11 +66,11 @@ class Fault:
 
     device: str  # one of DEVICES
     kind: str  # one of KINDS
-    at: float | None = None  # begin, after the first command to gripper or arm
-    event: str = ""  # begin at this event, one of EVENTS, instead of a time
-    rate: float = 0.0  # begin at random times, this often per second, instead of a time
+    at: float | None = None  # start, after the first command to gripper or arm
+    event: str = ""  # start at this event, one of EVENTS, instead of a time
+    rate: float = 0.0  # start at random times, this often per second, instead of a time
     seed: int = 0  # of all random numbers of this fault
-    after: float = 0.0  # delay of the begin after the event
+    after: float = 0.0  # delay of the start after the event
     below: float | None = None  # height of the lower face for the events descent and lowering
     attempt: int = 1  # the event counts from this attempt on
     duration: float = math.inf

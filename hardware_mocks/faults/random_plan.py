@@ -8,7 +8,7 @@ from gelflow.task import INSERTION
 _DOUBLE = 0.35  # fraction of the plans with two faults
 _ENDLESS = 0.4  # fraction of the faults that last until the end of the run
 _DURATION = (0.05, 8.0)  # of the others, uniform in the logarithm [s]
-_LATEST = 35.0  # begin of a fault at a time [s]
+_LATEST = 35.0  # latest start of a fault at a given time [s]
 _SHARES = (0.05, 0.3, 0.7, 1.0)
 _DELAYS = (0.02, 0.08, 0.3, 1.0)
 _RANGES = {"zoom": (0.75, 1.3), "factor of stiff_gel": (2.0, 10.0), "factor of slip": (0.05, 0.5)}

@@ -40,9 +40,9 @@ void DotAssignment::build_cells(const std::vector<Dot>& dots) {
   }
   for (std::size_t c = 1; c < cell_begin_.size(); ++c) cell_begin_[c] += cell_begin_[c - 1];
   cell_dots_.resize(positions_.size());
-  for (std::size_t d = positions_.size(); d-- > 0;)  // backwards: turns the end of each cell into its begin
+  for (std::size_t d = positions_.size(); d-- > 0;)  // backwards: turns the end of each cell into its start
     cell_dots_[std::size_t(--cell_begin_[std::size_t(cell_of_[d]) + 1])] = int(d);
-  // Entry c + 1 now holds the begin of cell c.
+  // Entry c + 1 now holds the start of cell c.
   for (std::size_t c = 0; c + 1 < cell_begin_.size(); ++c) cell_begin_[c] = cell_begin_[c + 1];
   cell_begin_.back() = int(positions_.size());
 }

@@ -19,7 +19,7 @@ struct TrackerSetup {
   std::vector<char> visible;      // whether the first image shows its dot
   std::vector<DotShape> shape;    // of its dot
   std::vector<double> contrast;   // of its dot, negative for dark dots
-  std::vector<double> tolerated;  // residual of its dot with half the weight / contrast
+  std::vector<double> tolerated;  // residual / contrast at which a pixel of its dot has half the weight
 };
 
 class Tracker {

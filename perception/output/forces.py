@@ -108,9 +108,9 @@ def draw_force(
     colour = _GROSS_SLIP if slip is not None and slip.gross else _FORCE
     pitch = float(np.median(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     share = np.sqrt(force.normal_field / force.normal_field.max())
-    for place, radius in zip(position, 0.5 * pitch * share, strict=True):
+    for point, radius in zip(position, 0.5 * pitch * share, strict=True):
         if radius > 0.05 * pitch:
-            cv2.circle(picture, _rounded(place), max(1, round(radius)), colour, 1, cv2.LINE_AA)
+            cv2.circle(picture, _rounded(point), max(1, round(radius)), colour, 1, cv2.LINE_AA)
     centre = force.normal_field @ position / force.normal_field.sum()
     tip = centre + 10 * pitch * force.shear / max(force.normal, 1e-9)
     for stroke, thickness in ((_EDGE, 5), (colour, 2)):
@@ -119,8 +119,8 @@ def draw_force(
 
 def _caption(picture: NDArray[np.uint8], text: str) -> None:
     for colour, thickness in ((_EDGE, 3), (_FORCE, 1)):
-        place = (8, picture.shape[0] - 10)
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, thickness, cv2.LINE_AA)
+        corner = (8, picture.shape[0] - 10)
+        cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, thickness, cv2.LINE_AA)
 
 
 def _rounded(point: NDArray[np.float64]) -> tuple[int, int]:

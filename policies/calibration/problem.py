@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
 CORRELATED = 9.0  # neighbouring markers that share this error: their residuals count as one
 DRIFT = 1e-3  # standard deviation of a common shift of all markers of a pad [N]
-POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])  # over which slopes by x, y [m] and yaw [rad] are taken
+# Half distance of the poses between which slopes by x, y [m] and yaw [rad] are taken. The forces have steps where
+# contact points cross edges of the hole: the slope of a smaller distance does not predict a finite change of pose.
+POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])
 _HUBER = 3.0  # residuals beyond this many standard deviations count linearly
 
 

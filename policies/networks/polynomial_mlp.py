@@ -1,8 +1,4 @@
-"""The policy network: polynomial features of the flow maps, a history of attempts and a small perceptron, in NumPy.
-
-A flat face in a grasp gives smooth flow maps. A fixed linear layer reduces each channel to the coefficients of a
-least-squares fit by low-order polynomials in row and column (130 values to 3). It averages the noise of the markers and
-keeps the mean force and its gradients over the pad.
+"""A feedforward policy for the insertion: polynomial features, a history of attempts and a perceptron, in NumPy.
 
 One attempt does not determine both yaw and translation, since both may load the same corner of the hole. The input
 therefore contains the previous attempts and the corrections between them; `History` builds it in training and in use.

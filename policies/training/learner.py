@@ -22,8 +22,8 @@ class Stopwatch:
         self.seconds: dict[str, float] = {"simulation": 0.0, "learning": 0.0}
 
     @contextlib.contextmanager
-    def share(self, name: str) -> Iterator[None]:
-        """Adds the time of the block to the share `name`."""
+    def timed(self, name: str) -> Iterator[None]:
+        """Adds the duration of the block to `seconds[name]`."""
         start = time.perf_counter()
         try:
             yield
@@ -35,7 +35,7 @@ class Learner(ABC):
     """An algorithm that improves a policy on a task, update by update.
 
     A subclass lists the numbers of an update in `columns` and adds the environment steps of each update to `steps`.
-    It divides its time into `clock.share("simulation")` and `clock.share("learning")`.
+    It puts its work into blocks of `clock.timed("simulation")` and `clock.timed("learning")`.
     """
 
     columns: tuple[str, ...] = ()
@@ -70,6 +70,6 @@ class Learner(ABC):
     def restart_episodes(self) -> None:
         """Starts new episodes in all environments.
 
-        The run calls it after each save: so the simulation needs no place in the state, and a resumed run continues as
-        an uninterrupted one does, bit for bit.
+        The run calls it after each save: the state need not contain the simulation, and a resumed run still continues
+        as an uninterrupted one does, bit for bit.
         """

@@ -166,7 +166,7 @@ class TrainingRun:
         """Evaluates the present policy; keeps it if it is the best."""
         learner, s = self.learner, self.settings
         tensors = learner.tensors()
-        with learner.clock.share("evaluation"):
+        with learner.clock.timed("evaluation"):
             network = learner.architecture.network(self.validation.description, tensors)
             policy = network.batch_policy(self.validation.num_envs)
             seed = s.seed + 1_000_003  # differs from the seed of the training

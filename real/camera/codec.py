@@ -51,7 +51,7 @@ def request(host: str, target: str) -> bytes:
 
 
 def parse_head(data: bytes) -> tuple[Head, bytes] | None:
-    """The head of an HTTP response and the data behind it; None while the head is incomplete.
+    """The head of an HTTP response and the data after it; None while the head is incomplete.
 
     Raises PeerError when `data` is not the start of an HTTP response.
     """

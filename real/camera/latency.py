@@ -45,10 +45,10 @@ def estimate_latency(
     fingers close, and end when the force is reached.
 
     Each signal changes between two of its samples, so the result is an interval as wide as both sampling periods
-    together: ±38 ms for images every 33 ms and gripper states every 40 ms. `combine_latencies` narrows it, to ±15 ms
-    with 20 grasps. A noise above 3 % of the change makes it less reliable. The delay of the gripper's own measurement
-    counts as a negative latency of the camera. Samples that were received in a burst widen the interval. Add the result
-    to the key `latency` of the camera in the lab file.
+    together: ±42 ms for images every 33 ms and gripper states every 50 ms. `combine_latencies` narrows it. A noise
+    above 3 % of the change makes it less reliable. The delay of the gripper's own measurement counts as a negative
+    latency of the camera. Samples that were received in a burst widen the interval. Add the result to the key `latency`
+    of the camera in the lab file.
 
     Raises UsageError for series of different lengths or unordered times.
     """

@@ -66,7 +66,7 @@ class CameraClock:
 def picture_digest(data: bytes) -> bytes:
     """Digest of an image without the parts that do not affect its pixels.
 
-    These are the padding behind the image and, in a JPEG, the comments and application segments, which may contain the
+    These are the padding after the image and, in a JPEG, the comments and application segments, which may contain the
     time of the server.
     """
     digest = hashlib.blake2b(digest_size=16)

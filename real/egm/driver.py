@@ -148,7 +148,7 @@ class EgmArm:
             None: those of the configuration
 
         Raises SafetyError when the target is refused or the arm is stopped, PeerTimeout on stale feedback. In a dry run
-        the target is checked and not sent.
+        the target is checked and not sent. Raises UsageError for arrays of another shape.
         """
         if np.shape(position) != (3,) or np.shape(quaternion) != (4,):
             shapes = f"{np.shape(position)} and {np.shape(quaternion)}"
@@ -181,7 +181,7 @@ class EgmArm:
                 self._send("target", *dataclasses.astuple(target))
 
     def hold(self) -> None:
-        """Freeze the reference within one cycle."""
+        """Come to rest: within 25 cycles the reference returns to the measured pose in bounded steps, and stays."""
         with self._lock:
             self._send("hold", "hold was called")
 

@@ -284,7 +284,7 @@ class ReferenceGenerator:
 
 
 def _difference(reference: PoseTuple, target: PoseTuple) -> tuple[Vector, Vector]:
-    """Displacement [m] and rotation vector [rad], in the reference's frame, from the reference to the target."""
+    """Displacement [m] in the base frame and rotation vector [rad] in the reference's frame, to the target."""
     (px, py, pz), (rw, rx, ry, rz) = reference
     (x, y, z), quaternion = target
     w, i, j, k = multiply((rw, -rx, -ry, -rz), quaternion)

@@ -6,20 +6,18 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal
 
 import numpy as np
 
 from gelflow import interrupts
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
-from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.protocols import CameraImage, Gripper, GripperState
 from gelflow.real.camera.driver import open_camera
 from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
-from gelflow.real.limits import LIMITS, MOCK_TIME_SCALE
+from gelflow.real.limits import LIMITS
 from gelflow.real.runner.lab import CameraSettings, Lab
 from gelflow.real.runner.touch.grasp_latency import LatencyMonitor
 from gelflow.real.transport import transport_for
@@ -28,6 +26,7 @@ from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import SENSORS
 
 # The EGM driver's workspace box is larger than the workspace by this margin [m]; the supervisor's check is tighter.
 _MARGIN = 2e-3
@@ -62,9 +61,9 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
         interrupts.defer()
         mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
         configs = [mount.tracker_config() for mount in mounts]
-        latency = LatencyMonitor(("left", "right"), configs, clock_factor=lab.clock_factor)
-        left = stack.enter_context(connect_camera(lab, clock, "left", 0, recorder, latency))
-        right = stack.enter_context(connect_camera(lab, clock, "right", 1, recorder, latency))
+        latency = LatencyMonitor(SENSORS, configs, clock_factor=lab.clock_factor)
+        left = stack.enter_context(connect_camera(lab, clock, "left", recorder, latency))
+        right = stack.enter_context(connect_camera(lab, clock, "right", recorder, latency))
         gripper = stack.enter_context(gripper_of(lab, clock, recorder, latency, dry_run=dry_run))
         controller = stack.enter_context(controller_monitor(lab, clock)) if lab.arm.web_services else None
         arm = EgmArm(egm_config(lab, dry_run=dry_run), clock=clock)
@@ -79,13 +78,13 @@ def open_cell(lab: Lab, recorder: SessionRecorder, *, dry_run: bool = False) -> 
 def connect_camera(
     lab: Lab,
     clock: ScaledClock,
-    name: Literal["left", "right"],
-    sensor: int,
+    name: str,
     recorder: SessionRecorder | None,
     latency: LatencyMonitor | None = None,
 ) -> StreamCamera:
-    """A connected camera; `recorder` and `latency`, if any, receive every image."""
+    """The connected camera `name`, one of `SENSORS`; `recorder` and `latency`, if any, receive every image."""
     settings: CameraSettings = getattr(lab.cameras, name)
+    sensor = SENSORS.index(name)
     stale = lab.limits.stale_frame
 
     def record(image: CameraImage) -> None:
@@ -100,7 +99,7 @@ def connect_camera(
         clock,
         timeout=stale,
         latency=settings.latency,
-        frozen_after=stale / _time_scale(lab),  # images arrive: the computer's jitter is no reason to wait longer
+        frozen_after=stale / lab.time_scale,  # images arrive: the computer's jitter is no reason to wait longer
         on_image=record,
     )
 
@@ -143,12 +142,7 @@ def gripper_of(
 def controller_monitor(lab: Lab, clock: ScaledClock) -> ControllerMonitor:
     """The monitor of the controller's mode and program, not yet opened."""
     client = WebServicesClient(lab.arm.web_services)
-    return ControllerMonitor(client, clock, stale=LIMITS.controller_age * _time_scale(lab))
-
-
-def _time_scale(lab: Lab) -> float:
-    """The factor by which time limits are larger for a mock robot."""
-    return MOCK_TIME_SCALE * lab.clock_factor if lab.time_sync else 1.0
+    return ControllerMonitor(client, clock, stale=LIMITS.controller_age * lab.time_scale)
 
 
 def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
@@ -158,11 +152,7 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
     corners = itertools.product(
         (-space.x, space.x), (-space.y, space.y), (space.height_min, space.height_max), (-yaw, 0.0, yaw)
     )
-    height = lab.part.grasp_height
-    positions = [
-        lab.tool_pose(lab.hole.pose @ Pose(np.array([x, y, z + height]), yaw_quaternion(turn))).position
-        for x, y, z, turn in corners
-    ]
+    positions = [lab.tool_pose(lab.gripper_at(x, y, turn, height)).position for x, y, height, turn in corners]
     low, high = np.min(positions, axis=0) - _MARGIN, np.max(positions, axis=0) + _MARGIN
     stale = lab.limits.stale_pose
     return EgmConfig(
@@ -177,7 +167,7 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
         max_step=space.max_step,
         max_turn=math.radians(space.max_turn_deg),
         stale=stale,
-        silence=5 * stale,
+        silence=stale * LIMITS.pose_silence / LIMITS.pose_age,
         max_lifetime=max(LIMITS.longest_target_lifetime, lab.limits.target_lifetime),
         connect_timeout=lab.arm.connect_timeout,
         dry_run=dry_run,

@@ -65,7 +65,7 @@ class DataChecks:
             check.test()
 
     def states(self) -> list[CheckState]:
-        """The state of every check, also of those behind one that fails, and of the bounds of the last target."""
+        """The state of every check, including those after a failed one, and of the bounds of the last target."""
         found = [_state(check) for check in self.table]
         latched = self._supervisor.latched
         found.append(

@@ -310,11 +310,10 @@ class Lab:
         real_time = self.clock_factor == 1 or bool(self.time_sync)
         text = f"clock_factor must be 1 without time_sync (a robot runs in real time), got {self.clock_factor}"
         _require(real_time, text)
-        scale = MOCK_TIME_SCALE * self.clock_factor if self.time_sync else 1.0
         for key, allowed in LAB_RANGES.items():
             if allowed.time_limit:
                 value = getattr(self.limits, key.removeprefix("limits."))
-                _check_range(key, value, allowed._replace(high=scale * allowed.high))
+                _check_range(key, value, allowed._replace(high=self.time_scale * allowed.high))
 
     @property
     def clock(self) -> ScaledClock:
@@ -324,6 +323,18 @@ class Lab:
     def to_json(self) -> dict[str, Any]:
         """Plain data for recordings."""
         return dataclasses.asdict(self)
+
+    @property
+    def time_scale(self) -> float:
+        """Factor of all time limits: above 1 for a mock robot."""
+        return MOCK_TIME_SCALE * self.clock_factor if self.time_sync else 1.0
+
+    def gripper_at(self, x: float, y: float, yaw: float, height: float) -> Pose:
+        """Gripper frame in the base frame, for a planar pose [m, m, rad] about the taught hole.
+
+        `height` is that of the part's lower face above the floor of the hole [m].
+        """
+        return self.hole.pose @ Pose(np.array([x, y, height + self.part.grasp_height]), yaw_quaternion(yaw))
 
     def tool_pose(self, gripper: Pose) -> Pose:
         """Tool pose of the controller, in the base frame, that brings the gripper frame to `gripper`."""

@@ -139,7 +139,7 @@ class MotionExecutor:
         self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
 
     def hold(self) -> None:
-        """Freeze the reference."""
+        """Give up the target and come to rest; see `EgmArm.hold`."""
         with self._lock:
             self._goal = None
             self._arm.hold()

@@ -1,6 +1,5 @@
 """Facts of a recorded run for the rules of a soak test: latches, motion after them, targets, stops."""
 
-import contextlib
 import itertools
 import tempfile
 from dataclasses import dataclass
@@ -101,10 +100,8 @@ def _distance_outside(applied: list[tuple[float, Pose]], lab: Lab) -> float:
     return max(0.0, float(beyond.max()))
 
 
-def largest_time_out(lab: Lab) -> float:
+def longest_wait(lab: Lab) -> float:
     """The longest time for which a run may wait without motion [s]."""
     limits = lab.limits
-    waits = [limits.attempt_time, limits.gripper_motion, lab.arm.connect_timeout, lab.part.load_wait]
-    with contextlib.suppress(AttributeError):
-        waits.append(limits.recording_delay)
-    return max(waits)
+    of_limits = (limits.attempt_time, limits.gripper_motion, limits.recording_delay)
+    return max(*of_limits, lab.arm.connect_timeout, lab.part.load_wait)

@@ -22,8 +22,8 @@ def check_limits(limits: WsgLimits, **values: float) -> None:
     """Raise SafetyError when a named value (width [m], speed [m/s], force [N]) is outside `limits`, or NaN."""
     for name, value in values.items():
         low, high = getattr(limits, name)
-        # The comparison is false for NaN; float32 on the wire may round a bound by parts in ten million.
-        if not low - 1e-9 <= value <= high + 1e-9:
+        slack = 2.0**-23 * max(abs(low), abs(high))  # a bound from the device is rounded to float32
+        if not low - slack <= value <= high + slack:  # false for NaN too
             raise SafetyError(f"{name} {value} is outside {low} to {high} (m, m/s, N): nothing was sent")
 
 

@@ -18,7 +18,7 @@ MM = 1e3  # mm in a metre
 ACKNOWLEDGE_KEY = b"ack"
 
 
-# Struct formats of the values behind the status SUCCESS; replies to other commands carry the status alone.
+# Struct formats of the values after the status SUCCESS; replies to other commands contain the status alone.
 _REPLY_LAYOUT = {
     Command.GET_ACCELERATION: "<f",
     Command.GET_FORCE_LIMIT: "<f",
@@ -92,7 +92,7 @@ class Decoder:
     """Incremental decoder: bytes in portions of any size in, packets out.
 
     Garbage is skipped and counted. A packet with a wrong checksum is reported as `Corrupt`, and the search continues
-    one byte further, so that a valid packet inside or behind it is still decoded. `plausible(id, payload length)`
+    one byte further, so that a valid packet inside or after it is still decoded. `plausible(id, payload length)`
     rejects false preambles before their bytes are awaited. `expire` abandons an incomplete packet.
     """
 
@@ -116,15 +116,11 @@ class Decoder:
         return packets
 
     def expire(self) -> list[Packet | Corrupt]:
-        """Abandon the incomplete packet (its rest did not arrive in time) and decode the bytes behind its start."""
+        """Abandon the incomplete packet, whose remainder is late, and decode the bytes after its first one."""
         if not self._buffer:
             return []
         self._drop(1)
         return self.feed(b"")
-
-    def reset(self) -> None:
-        """Discard all received bytes."""
-        self._drop(len(self._buffer))
 
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
@@ -188,7 +184,7 @@ class Reply:
     data: bytes = b""
 
     def values(self) -> tuple[float, ...]:
-        """The values behind the status, in the wire's units. Raises PeerError when they are missing or not finite."""
+        """The values after the status, in the wire's units. Raises PeerError when they are missing or not finite."""
         layout = _REPLY_LAYOUT.get(self.command, "<")
         if len(self.data) != struct.calcsize(layout):
             raise PeerError(

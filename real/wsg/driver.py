@@ -197,7 +197,8 @@ class WsgGripper:
     def move(self, *, width: float, speed: float) -> None:
         """Move the empty fingers to `width` [m] at `speed` [m/s]; returns when they have arrived.
 
-        Raises SafetyError outside the limits or while a part is held, PeerRefused when the fingers are blocked.
+        Raises SafetyError outside the limits or while a part is held, UsageError when the motion takes longer than the
+        time-out, PeerRefused when the fingers are blocked, PeerTimeout and PeerError as every command.
         """
         state = self._ready("move")
         check_limits(self._limits, width=width, speed=speed)
@@ -213,9 +214,10 @@ class WsgGripper:
         """Close on a part; returns when the device holds it.
 
         `width` [m] is the expected width of the part: the device moves there and continues through its clamping
-        travel (set on the device) until `force` [N] is reached. Contact before that band is AXIS_BLOCKED, no contact
-        within it is CMD_FAILED; both raise PeerRefused. Raises SafetyError outside the limits, when a part is already
-        held, or when `width` is above the present opening (the device would open).
+        travel (set on the device) until `force` [N] is reached. Contact before that travel is AXIS_BLOCKED, no
+        contact within it is CMD_FAILED; both raise PeerRefused. Raises SafetyError outside the limits, when a part is
+        already held, or when `width` is above the present opening (the device would open), UsageError when it takes
+        longer than the time-out, PeerTimeout and PeerError as every command.
         """
         state = self._ready("grasp")
         check_limits(self._limits, width=width, speed=speed, force=force)
@@ -235,7 +237,10 @@ class WsgGripper:
         self._settle(lambda s: s.grasp == "holding", "holding")
 
     def release(self, *, width: float, speed: float) -> None:
-        """Open to `width` [m] at `speed` [m/s] and release the part. Raises SafetyError when that would close."""
+        """Open to `width` [m] at `speed` [m/s] and release the part.
+
+        Raises SafetyError outside the limits or when the fingers would close, and the other errors of `move`.
+        """
         state = self._ready("release")
         check_limits(self._limits, width=width, speed=speed)
         check_opens(state, width)

@@ -66,7 +66,6 @@ class WsgLink:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self.corrupt = 0
-        self.unexpected = 0
 
     @property
     def address(self) -> str:
@@ -225,5 +224,4 @@ class WsgLink:
         if reply.command in STATE_COMMANDS and reply.status == Status.SUCCESS:
             self._on_update(reply, stamp)
         elif not inboxes:
-            self.unexpected += 1
             _log.warning("unexpected reply %s %s", reply.command.name, reply.status.name)

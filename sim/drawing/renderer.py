@@ -78,7 +78,7 @@ class Renderer:
         return self._start
 
     def _caster_for(self, drawing: SceneDrawing) -> RayCaster:
-        """The caster of the geometries; a new one where sizes or places on the bodies have changed."""
+        """The caster of the geometries; a new one where sizes or positions on the bodies have changed."""
         key = tuple(part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position))
         if self._caster is None or key != self._key:
             self._caster, self._key = RayCaster(drawing.geoms, len(drawing.poses)), key

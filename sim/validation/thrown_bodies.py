@@ -93,7 +93,7 @@ class EnergyChange:
 
 
 def throw_bodies(body: ThrownBody, rng: np.random.Generator, *, bodies: int, steps: int) -> EnergyChange:
-    """ThrownBody bodies from random places and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
+    """Throws bodies from random positions and at random speeds, up to some 5 m/s and 100 rad/s. Some start at rest."""
     sim = Simulator(_core.Model(body.model_spec()), num_envs=bodies, threads=1)
     gauge = EnergyGauge(body, num_envs=bodies)
     speed = np.exp(rng.uniform(np.log(0.01), np.log(2.0), (bodies, 1))) * (rng.random((bodies, 1)) < 0.9)

@@ -63,7 +63,10 @@ class Camera(Protocol):
         ...
 
     def next(self, after: int, timeout: float) -> CameraImage:
-        """The first image whose `sequence` is greater than `after`; waits at most `timeout` [s, robot time]."""
+        """The newest image with a `sequence` above `after`; images in between are skipped.
+
+        Waits at most `timeout` [s, robot time]. Raises PeerTimeout when no such image arrives.
+        """
         ...
 
     def close(self) -> None: ...
@@ -88,7 +91,7 @@ class Arm(Protocol):
         ...
 
     def hold(self) -> None:
-        """Keep the present reference, within one cycle."""
+        """Come to rest and keep the position."""
         ...
 
     def stop(self, reason: str) -> None:

@@ -11,8 +11,6 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
-# Half distance of the poses from whose readings a slope is taken [m, m, rad]. The forces have steps where contact
-# points cross edges of the hole, so that the slope of a smaller distance says nothing about a finite change of pose.
 _STEP = 0.2  # of differences in parameters and start heights, in standard deviations of their priors
 
 

@@ -45,10 +45,11 @@ class Descent:
 
 
 class HeldPart:
-    """One held part. The planar pose of the gripper is an argument of every motion; the height is relative to the rim.
+    """One held part. The planar pose of the gripper is an argument of every motion.
 
-    `height_offset` is the height of the rim found by touch above the taught one [m], `excess_latency` the measured time
-    by which images are later than the lab file says [s].
+    Heights are those of the part's lower face above the taught floor of the hole [m]. `height_offset` is the height of
+    the rim found by touch above the taught one [m], and part of `start_height`; `excess_latency` is the measured delay
+    of the images beyond that in the lab file [s].
     """
 
     def __init__(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerRefused, SafetyError
-from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.geometry import Pose
 from gelflow.observation import FlowMap
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell
@@ -137,9 +137,7 @@ class InsertionRunner:
 
     def pose(self, planar_pose: PlanarPose, height: float) -> Pose:
         """Gripper pose in the base frame from a planar pose about the taught hole and the lower face's `height` [m]."""
-        x, y, yaw = planar_pose
-        above = np.array([x, y, height + self._lab.part.grasp_height])
-        return self._lab.hole.pose @ Pose(above, yaw_quaternion(yaw))
+        return self._lab.gripper_at(*planar_pose, height)
 
     def _load(self, number: int) -> HeldPart:
         """Move above the hole, wait for a part, grasp it and check that both pads show its weight."""

@@ -16,7 +16,7 @@ def home(session: Session) -> Result:
     Raises SafetyError while the gripper reports a fault, PeerError when it does not answer or refuses.
     """
     with _gripper(session) as gripper:
-        state = _without_fault(gripper)
+        state = state_without_fault(gripper)
         held = may_hold_part(state, grasped=False)
         if held and not session.attended:
             raise SafetyError(
@@ -38,7 +38,7 @@ def open_fingers(session: Session) -> Result:
     """
     lab = session.lab.gripper
     with _gripper(session) as gripper:
-        state = _without_fault(gripper)
+        state = state_without_fault(gripper)
         if not state.referenced:
             raise SafetyError("open refused: the gripper is not homed; use: gelflow robot home")
         held = may_hold_part(state, grasped=False)
@@ -75,7 +75,8 @@ def _gripper(session: Session) -> WsgGripper:
     return gripper_of(session.lab, session.clock, session.recorder, dry_run=session.dry_run)
 
 
-def _without_fault(gripper: WsgGripper) -> GripperState:
+def state_without_fault(gripper: WsgGripper) -> GripperState:
+    """The state of the gripper. Raises SafetyError when it reports a fault."""
     state = gripper.state()
     if state.fault:
         raise SafetyError(f"the gripper reports {state.fault}; inspect it, then use: gelflow robot acknowledge")

@@ -15,6 +15,7 @@ from gelflow.real.camera.stream import StreamCamera
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.limits import LIMITS
 from gelflow.real.runner.cell import StopArm, connect_camera, controller_monitor, egm_config, gripper_of
+from gelflow.real.runner.manual.gripper_actions import state_without_fault
 from gelflow.real.runner.manual.question import Result, Session
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.phases import Phase
@@ -26,6 +27,7 @@ from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.real.wsg.checks import may_hold_part
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
+from gelflow.session.records import SENSORS
 from gelflow.task import INSERTION
 
 Axis = Literal["x", "y", "z", "yaw", "load"]
@@ -79,7 +81,7 @@ def jog(session: Session, wanted: Jog) -> Result:
     with contextlib.ExitStack() as stack:
         devices = stack.enter_context(_open(session))
         supervisor = Supervisor(lab)
-        held = _check_gripper(devices.gripper)
+        held = may_hold_part(state_without_fault(devices.gripper), grasped=False)
         before = _arm_pose(session, devices)
         steps = _steps(session, supervisor, before, wanted)
         if not steps:
@@ -119,10 +121,9 @@ def _open(session: Session) -> Iterator[_Devices]:
         gripper = stack.enter_context(gripper_of(lab, clock, session.recorder, dry_run=True))
         cameras: list[StreamCamera] = []
         blind = ""
-        for sensor, name in enumerate(("left", "right")):
+        for name in SENSORS:
             try:
-                side: Literal["left", "right"] = "left" if name == "left" else "right"
-                camera = stack.enter_context(connect_camera(lab, clock, side, sensor, session.recorder))
+                camera = stack.enter_context(connect_camera(lab, clock, name, session.recorder))
                 camera.next(-1, lab.limits.stale_frame)
                 cameras.append(camera)
             except GelflowError as error:
@@ -136,14 +137,6 @@ def _open(session: Session) -> Iterator[_Devices]:
         interrupts.resume()
         stack.callback(interrupts.defer)
         yield _Devices(arm, gripper, [] if blind else cameras, controller, blind)
-
-
-def _check_gripper(gripper: WsgGripper) -> bool:
-    """Whether a part may be held. Raises SafetyError on a fault."""
-    state = gripper.state()
-    if state.fault:
-        raise SafetyError(f"the gripper reports {state.fault}; inspect it, then use: gelflow robot acknowledge")
-    return may_hold_part(state, grasped=False)
 
 
 def _arm_pose(session: Session, devices: _Devices) -> Pose:
@@ -169,8 +162,8 @@ def _steps(session: Session, supervisor: Supervisor, here: Pose, wanted: Jog) ->
         level = max(height, load)
         poses = [
             ("raise the gripper", _moved(here, z=level - height)),
-            ("move it above the taught hole", _above(session, level)),
-            ("lower it to the hand-over", _above(session, load)),
+            ("move it above the taught hole", session.lab.gripper_at(0.0, 0.0, 0.0, level)),
+            ("lower it to the hand-over", session.lab.gripper_at(0.0, 0.0, 0.0, load)),
         ]
     else:
         sideways = wanted.axis != "z" and height < INSERTION.start_height
@@ -198,12 +191,6 @@ def _steps(session: Session, supervisor: Supervisor, here: Pose, wanted: Jog) ->
 def _moved(pose: Pose, *, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Pose:
     """`pose` moved in its own frame."""
     return pose @ Pose(np.array([x, y, z]), yaw_quaternion(yaw))
-
-
-def _above(session: Session, height: float) -> Pose:
-    """The gripper above the taught hole, with the part's lower face at `height` [m]."""
-    lab = session.lab
-    return lab.hole.pose @ Pose(np.array([0.0, 0.0, height + lab.part.grasp_height]), yaw_quaternion(0.0))
 
 
 def _coordinates(supervisor: Supervisor, pose: Pose) -> dict[str, float]:

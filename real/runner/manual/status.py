@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import GelflowError
@@ -45,12 +45,12 @@ def _arm(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
         state = arm.state()
         motors_on, following = state.motors_on, state.running
     x, y, yaw, height = Supervisor(lab).hole_coordinates(lab.gripper_pose(state.position, state.quaternion))
-    place = f"x {1e3 * x:+.1f}, y {1e3 * y:+.1f}, height {1e3 * height:.1f} mm, yaw {math.degrees(yaw):+.1f}°"
+    position = f"x {1e3 * x:+.1f}, y {1e3 * y:+.1f}, height {1e3 * height:.1f} mm, yaw {math.degrees(yaw):+.1f}°"
     motors = f"motors {'on' if motors_on else 'off'}"
     follows = "follows references" if following else "follows no references (none are sent)"
     return {
         "ready": motors_on,
-        "text": f"{motors}, {follows}; {place} about the hole",
+        "text": f"{motors}, {follows}; {position} about the hole",
         "motors_on": motors_on,
         "following": following,
         "x": x,
@@ -63,7 +63,8 @@ def _arm(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
 
 def _controller(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
     with controller_monitor(lab, clock) as monitor:
-        return {"ready": True, "text": monitor.approve(), "operating_mode": monitor.operating_mode}
+        state = monitor.approve()
+    return {"ready": True, "text": str(state), "operating_mode": state.operating_mode}
 
 
 def _gripper(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
@@ -82,8 +83,8 @@ def _gripper(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
     }
 
 
-def _camera(lab: Lab, clock: ScaledClock, name: Literal["left", "right"]) -> dict[str, Any]:
-    with connect_camera(lab, clock, name, 0, None) as camera:
+def _camera(lab: Lab, clock: ScaledClock, name: str) -> dict[str, Any]:
+    with connect_camera(lab, clock, name, None) as camera:
         first, begun = camera.next(-1, lab.limits.stale_frame), clock.now()
         clock.sleep(_OBSERVED)
         last, ended = camera.latest(), clock.now()

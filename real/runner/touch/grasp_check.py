@@ -2,7 +2,7 @@
 
 The weight of the grasped part pulls the markers of both pads towards the fingertips. A camera whose image shows no such
 change, or a change in another direction, is not a sense of touch: it repeats an old image, belongs to another finger or
-is mounted as the lab file does not say. Fingers that close on a part without parallel sides also shear the pads
+is mounted differently than the lab file states. Fingers that close on a part without parallel sides also shear the pads
 sideways, with opposite forces on the part; as the axes y of the pads are opposite too, this is the mean of both y. The
 size of the change is a force known to both pads. A threshold below it is exceeded before a held part can slip: contact
 from below first takes the weight off the pads.

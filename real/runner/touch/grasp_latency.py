@@ -107,7 +107,7 @@ class LatencyMonitor:
         return max((estimate.low for estimate in known if estimate.low > self._tolerated), default=0.0)
 
     def warnings(self) -> list[str]:
-        """One line for each camera whose images are certainly later than the lab file says."""
+        """One line for each camera whose images are certainly later than the lab file states."""
         lines = []
         for name, known in zip(self._names, self.estimates, strict=True):
             if self._excess(known):

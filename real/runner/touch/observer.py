@@ -81,7 +81,6 @@ class TactileObserver:
         self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order
         self.reference: TactileReading | None = None
         self.readings: list[TactileReading] = []
-        self.unreadable = 0
 
     def start(self, since: float) -> TactileReading:
         """Set the reference to the first pair of images received after the robot time `since` [s].
@@ -110,11 +109,12 @@ class TactileObserver:
         """Wait for the next image of any camera, for at most 10 ms, and track all new ones.
 
         Returns the reading of the newest images, with depth 0; None without a new image, and when the newest image of a
-        pad is not readable.
-        Call it inside `clock.bounded(RUNNER)`, which ends after the decision that the reading leads to. Raises
-        PeerTimeout when a camera has sent no new image within the time limit.
+        pad is not readable. Call it inside `clock.bounded(RUNNER)`, which ends after the decision that depends on the
+        reading. Raises PeerTimeout when a camera has sent no new image within the time limit, and UsageError before
+        `start`.
         """
-        assert self.reference is not None, "call start() first"
+        if self.reference is None:
+            raise UsageError("the observer has no reference yet: call start first")
         self.pass_on()
         new = self._wait_for_images()
         for sensor, image in new:
@@ -130,8 +130,6 @@ class TactileObserver:
             if self._readable[sensor]:
                 self._readable_stamps[sensor] = image.stamp
                 self._not_passed_on.append(sensor)
-            else:
-                self.unreadable += 1
         if not new or not all(self._readable):
             return None
         frame = self._frame()
@@ -218,15 +216,19 @@ class TactileObserver:
         self.readings.append(reading)
 
     def chosen(self, depths: Sequence[float]) -> list[TactileReading]:
-        """For each depth [m] the nearest reading; the last one for depths below the end of the descent."""
+        """For each depth [m] the nearest reading; the last one for depths below the end of the descent.
+
+        Raises MarkersUnreadable without a reading.
+        """
         if not self.readings:
             raise MarkersUnreadable("no image of the descent could be tracked; inspect the gels")
         measured = np.array([reading.depth for reading in reversed(self.readings)])  # newest first for equal depths
         return [self.readings[-1 - int(np.abs(measured - min(depth, measured[0])).argmin())] for depth in depths]
 
     def observe(self, frames: Sequence[TactileReading], task: InsertionTask) -> FlowMap:
-        """The flow map of readings relative to the reference."""
-        assert self.reference is not None
+        """The flow map of readings relative to the reference. Raises UsageError before `start`."""
+        if self.reference is None:
+            raise UsageError("the observer has no reference yet: call start first")
         return flow_map([reading.frame for reading in frames], self.reference.frame, grid=task.grid)
 
     def _pair(self, since: float) -> tuple[CameraImage, ...]:

@@ -7,7 +7,7 @@
 
 namespace gelflow {
 
-// W is stored by columns, each without the zeros before its first and behind its last row: rows that concern one pad
+// W is stored by columns, each without the zeros before its first and after its last row: rows that concern one pad
 // cost nothing at the markers of the others. Sums are in double precision and in the order of the markers.
 class TactileReduction {
  public:

@@ -57,7 +57,7 @@ void find_coupled_islands(const Model& m, Workspace<T>& w) {
   w.fit_matrices(m);
 }
 
-// Copies the numbers of the dofs of an island to consecutive places, and back.
+// Copies the numbers of the dofs of an island to consecutive elements, and back.
 template <class T>
 void gather_island(const IslandLayout& layout, const Island& island, const T* of_dofs, T* of_island) {
   layout.for_ranges(island, [&](int begin, int size, int at) { std::copy_n(of_dofs + begin, size, of_island + at); });

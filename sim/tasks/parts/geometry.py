@@ -154,5 +154,5 @@ def _with_inertia(body: BodyDef, mass: float, diagonal: Array) -> BodyDef:
 
 
 def with_points(points: PointsDef, local: Array, areas: Array) -> PointsDef:
-    """`points` at other places `local` (n, 3) [m], with area components `areas` (n, 3) [m²]."""
+    """`points` at other positions `local` (n, 3) [m], with area components `areas` (n, 3) [m²]."""
     return replace(points, points=local, areas=areas, weights=np.ones(len(local)))

@@ -9,7 +9,7 @@ import numpy as np
 from gelflow.gel.gel_file import save_gel
 from gelflow.perception.calibration import fit_calibration, save_calibration
 from gelflow.perception.frames import CameraMount
-from gelflow.real.limits import MOCK_TIME_SCALE
+from gelflow.real.limits import LIMITS, MOCK_TIME_SCALE
 from gelflow.real.runner import lab
 
 if TYPE_CHECKING:
@@ -128,13 +128,14 @@ def _write_gel(robot: "MockRobot", finger: int) -> str:
 
 def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0, pose: float = 1.0) -> lab.LimitsSettings:
     """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; `disk` and `pose` multiply two."""
+    robot = lab.LimitsSettings()
     return lab.LimitsSettings(
-        stale_pose=0.020 * scale * pose + jitter,
-        stale_frame=0.250 * scale + jitter,
-        stale_gripper=0.500 * scale + jitter,
-        target_lifetime=min(1.0, 0.100 * scale + jitter),
-        gripper_reply=1.0 * scale + jitter,
-        gripper_motion=6.0 * scale + jitter,
-        attempt_time=60.0 * scale + jitter,
-        recording_delay=1.0 * scale * disk + jitter,
+        stale_pose=robot.stale_pose * scale * pose + jitter,
+        stale_frame=robot.stale_frame * scale + jitter,
+        stale_gripper=robot.stale_gripper * scale + jitter,
+        target_lifetime=min(LIMITS.longest_target_lifetime, robot.target_lifetime * scale + jitter),
+        gripper_reply=robot.gripper_reply * scale + jitter,
+        gripper_motion=robot.gripper_motion * scale + jitter,
+        attempt_time=robot.attempt_time * scale + jitter,
+        recording_delay=robot.recording_delay * scale * disk + jitter,
     )

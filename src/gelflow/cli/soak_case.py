@@ -21,7 +21,7 @@ from gelflow.hardware_mocks.simulated_cell.world import World, plain_world
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.real.soak.rules import RunFacts, violations
-from gelflow.real.soak.session_facts import largest_time_out, read_session
+from gelflow.real.soak.session_facts import longest_wait, read_session
 from gelflow.toml_tables import toml_text
 
 REFUSED_WORLD = "no insertion: the mock robot refused the world"
@@ -69,7 +69,7 @@ class SoakCase:
             ) as (lab_file, truth_url):
                 shutil.copy(lab_file, folder / "lab.toml")
                 lab = load_lab(lab_file)
-                watch = _run_insertion(lab_file, folder, truth_url, largest_time_out(lab) + 1.0)
+                watch = _run_insertion(lab_file, folder, truth_url, longest_wait(lab) + 1.0)
             row = self._row(folder, lab, watch) | {"wall": round(time.monotonic() - begun, 2)}
             if keep is not None and row["violations"]:
                 shutil.copytree(folder, keep, dirs_exist_ok=True)
@@ -114,15 +114,15 @@ class _Watch:
     truth: dict[str, Any] = field(default_factory=dict)
     idle: float = 0.0  # longest time without motion [s]
     _moved_at: float | None = None  # None before the first motion [s]
-    _place: tuple[float, ...] = ()
+    _position: tuple[float, ...] = ()  # of tool and fingers
 
     def see(self, truth: dict[str, Any]) -> None:
         """Note a true state; motion of arm or fingers ends an idle time."""
         self.truth = truth
-        place = (*truth["tool"], truth["width"])
-        if any(abs(a - b) > _STILL for a, b in zip(place, self._place, strict=False)):
+        position = (*truth["tool"], truth["width"])
+        if any(abs(a - b) > _STILL for a, b in zip(position, self._position, strict=False)):
             self._moved_at = truth["time"]
-        self._place = place
+        self._position = position
         if self._moved_at is not None:
             self.idle = max(self.idle, truth["time"] - self._moved_at)
 

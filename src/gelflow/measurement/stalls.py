@@ -15,7 +15,7 @@ from typing import Self
 from gelflow.clock import raise_priority
 from gelflow.helper_process import HelperProcess, connect_to_parent
 
-Interval = tuple[float, float]  # begin and end on the system's monotonic clock [s]
+Interval = tuple[float, float]  # start and end on the system's monotonic clock [s]
 
 _SLEEP = 1e-3  # of the watching process [s]
 _SHORTEST = 3e-3  # a longer delay of its wake-up is a stall [s]

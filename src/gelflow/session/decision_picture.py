@@ -56,9 +56,9 @@ def _draw_row(line: Any, comparison: Comparison, grid: Grid, font_size: float) -
     line[0].set_ylabel(f"insertion {decision.insertion}, attempt {decision.attempt}", fontsize=font_size)
     first, second = _texts(comparison)
     for text, color, height, alignment in ((first, BLUE, 0.52, "bottom"), (second, VERMILION, 0.48, "top")):
-        place = {"transform": line[-1].transAxes, "va": alignment if second else "center"}
+        layout = {"transform": line[-1].transAxes, "va": alignment if second else "center"}
         line[-1].text(
-            1.06, height if second else 0.5, text, color=color if second else "black", fontsize=font_size, **place
+            1.06, height if second else 0.5, text, color=color if second else "black", fontsize=font_size, **layout
         )
 
 

@@ -103,4 +103,5 @@ class LiveReader(SessionReader):
             self._found.chunk_indexes.append(index)
 
     def _opened(self) -> SeekingReader:
-        raise PeerError(f"{self.path} is still being recorded; only its records by time can be read")
+        state = "was recorded while it was read" if self.finished else "is still being recorded"
+        raise PeerError(f"{self.path} {state}; only its records by time can be read here")

@@ -102,8 +102,8 @@ class SessionReader:
     def records(self, topics: Collection[str] | None = None, *, damage: Damage | None = None) -> Iterator[Record]:
         """All records, or those of `topics`, in the order of recording.
 
-        Raises UsageError for an unknown topic, and PeerError where the file is damaged. With `damage`, the reader goes
-        on behind damaged records and adds their number to it.
+        Raises UsageError for an unknown topic, and PeerError where the file is damaged. With `damage`, the reader
+        continues after damaged records and adds their number to it.
         """
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])

@@ -42,7 +42,7 @@ _TILES = 4  # lines of a plane over the height of the view, about
 
 @dataclass
 class Shown:
-    """Choice of the contents besides the bodies."""
+    """What is shown in addition to the bodies."""
 
     contacts: bool = True
     labels: bool = True
@@ -89,7 +89,7 @@ class SceneView:
         self._set_camera()
 
     def reset_scales(self) -> None:
-        """Choose the scales of forces anew; they grow with the forces and never shrink by themselves."""
+        """Reset the scales of forces; they grow with the forces and never shrink by themselves."""
         self._seen = [0.0, 0.0, 0.0]
 
     def show(self, drawing: SceneDrawing) -> None:
@@ -152,19 +152,19 @@ class SceneView:
 
     def _add_geom(self, number: int, geom: GeomDef, body: str) -> None:
         name = f"{self._root}/bodies/{body}/{number} {geom.name.replace('/', ' ')}"
-        place = {"position": geom.pose.position, "wxyz": geom.pose.quaternion}
+        pose = {"position": geom.pose.position, "wxyz": geom.pose.quaternion}
         if geom.kind == "plane":
             size, tile = 7 * self._camera.distance, round_scale(self._camera.distance / _TILES / 2)
             self._page.scene.add_grid(
                 name, size, size, cell_size=tile, section_size=5 * tile, plane_opacity=0.6, plane_color=(238, 238, 234),
-                cell_color=(205, 205, 205), section_color=(170, 170, 170), **place,
+                cell_color=(205, 205, 205), section_color=(170, 170, 170), **pose,
             )  # fmt: skip
             return
         vertices, faces = triangles(geom)
         color = tuple(int(c) for c in body_colors(np.array([geom.body]))[0])
         node = self._page.scene.add_mesh_simple(
             name, vertices, faces, color=color, flat_shading=has_edges(geom), side="double",
-            opacity=_OPACITY_WORLD if geom.body == WORLD else _OPACITY, **place,
+            opacity=_OPACITY_WORLD if geom.body == WORLD else _OPACITY, **pose,
         )  # fmt: skip
         clicked = self._clicked
         if clicked is not None:

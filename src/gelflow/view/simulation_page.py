@@ -100,7 +100,7 @@ class SimulationPage:
         return True
 
     def run(self, *, until: Callable[[], bool] = lambda: False) -> None:
-        """Step the simulator as the buttons of the page say, until `until()` is true or Ctrl-C."""
+        """Step the simulator as selected by the buttons of the page, until `until()` is true or Ctrl-C."""
         before, due = time.perf_counter(), 0.0
         while not until():
             self._handle_events()
@@ -148,7 +148,7 @@ class SimulationPage:
             for name, label in choices:
                 box = gui.add_checkbox(label, initial_value=True)
                 box.on_update(lambda event, name=name: self._post(setattr, self._view.shown, name, event.target.value))
-            gui.add_button("Choose scales anew").on_click(lambda _: self._post(self._view.reset_scales))
+            gui.add_button("Reset force scales").on_click(lambda _: self._post(self._view.reset_scales))
         self._coordinates = coordinates(self._scene)
         self._joints: Sliders | None = None
         if playable:

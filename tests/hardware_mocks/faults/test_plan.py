@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.hardware_mocks.faults.injector import event_has_come
+from gelflow.hardware_mocks.faults.injector import event_occurred
 from gelflow.hardware_mocks.faults.plan import DEVICES, EVENTS, KINDS, Fault, FaultPlan
 from gelflow.hardware_mocks.faults.plan_file import load_plan, plan_from_tables, plan_to_tables
 from gelflow.hardware_mocks.faults.random_plan import random_plan
@@ -103,7 +103,7 @@ def test_events_come_in_the_order_of_an_insertion() -> None:
         for height in heights:
             monitor.update(0.0, phase, height)
             for name, fault in list(waiting.items()):
-                if event_has_come(fault, monitor.progress):
+                if event_occurred(fault, monitor.progress):
                     seen.append(name)
                     del waiting[name]
 

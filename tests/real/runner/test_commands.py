@@ -65,6 +65,24 @@ def test_mock_reports_why_it_cannot_start(capsys: pytest.CaptureFixture[str]) ->
     assert port in output and output.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("command", "name", "message"),
+    [
+        ("mock", "lab.toml", "lab.toml exists, and gelflow mock did not write it; name another file with --out"),
+        ("demo", "out/session.mcap", "session.mcap is not the file of a demo; name another folder with --out"),
+    ],
+)
+def test_files_of_others_are_not_replaced(
+    command: str, name: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("# lab 3\n", encoding="utf-8")
+    assert main([command, "--out", str(path if command == "mock" else path.parent)]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert path.read_text(encoding="utf-8") == "# lab 3\n"
+
+
 def test_demo_reports_a_mock_that_does_not_start() -> None:
     with pytest.raises(PeerError, match="did not start"), mock_robot(factor=-3.0, seed=0):
         pass

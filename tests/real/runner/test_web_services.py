@@ -1,5 +1,6 @@
 """The controller's mode over Robot Web Services: shown and checked by preflight, and a change of it ends the run."""
 
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +8,13 @@ from pathlib import Path
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
+from gelflow.cli.main import main
 from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import PeerError, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.hardware_mocks.web_services.device import MockWebServices
 from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.run_plan import dry_run, run_insertions
 from gelflow.session.reader import SessionReader
 
@@ -33,6 +36,18 @@ def test_preflight_shows_the_mode(robot: MockRobot, tmp_path: Path) -> None:
         server.opmode = "MANR"
         text = arm_text(robot, tmp_path / "with", lab_with(robot, server.url))
     assert "mode manual reduced, motors on, program running" in text
+
+
+def test_status_shows_the_controller(robot: MockRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "lab.toml"
+    with MockWebServices() as server:
+        save_lab(lab_with(robot, server.url), path, title="test")
+        assert main(["robot", "status", "--lab", str(path), "--json"]) == 0
+        status = json.loads(capsys.readouterr().out)
+        assert main(["robot", "status", "--lab", str(path)]) == 0
+    text = "mode auto, motors on, program running"
+    assert status["controller"] == {"ready": True, "text": text, "operating_mode": "auto"}
+    assert text in capsys.readouterr().out
 
 
 def test_preflight_refuses_manual_full_speed(robot: MockRobot, tmp_path: Path) -> None:

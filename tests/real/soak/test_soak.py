@@ -17,7 +17,7 @@ from gelflow.hardware_mocks.simulated_cell.world import World, plain_world, worl
 from gelflow.real.runner import lab as labs
 from gelflow.real.soak.ledger import Ledger
 from gelflow.real.soak.rules import RULES, RunFacts, violations
-from gelflow.real.soak.session_facts import SessionFacts, largest_time_out, read_session
+from gelflow.real.soak.session_facts import SessionFacts, longest_wait, read_session
 from gelflow.session.recorder import SessionRecorder
 from gelflow.toml_tables import read_toml, toml_text
 
@@ -136,7 +136,7 @@ def test_an_unfinished_session_is_read_from_its_recovered_copy(tmp_path: Path) -
 
 
 def test_longest_wait_is_the_longest_time_out_of_the_lab() -> None:
-    assert largest_time_out(lab()) == lab().limits.attempt_time
+    assert longest_wait(lab()) == lab().limits.attempt_time
 
 
 def row(**changes: Any) -> dict[str, Any]:

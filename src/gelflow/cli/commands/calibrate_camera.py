@@ -127,24 +127,24 @@ def _start(
     image: NDArray[np.uint8], args: argparse.Namespace
 ) -> tuple[MarkerTracker, TrackingResult, VisiblePart | None]:
     """A tracker started with `image`, its result, and the visible part of the printed grid (None: the whole grid)."""
-    told = [lines for lines in (args.visible_rows, args.visible_cols) if lines is not None]
-    if told and (args.rows is None or args.cols is None):
+    given = [lines for lines in (args.visible_rows, args.visible_cols) if lines is not None]
+    if given and (args.rows is None or args.cols is None):
         raise UsageError("--visible-rows and --visible-cols need --rows and --cols, the numbers of printed lines")
-    if not told:
+    if not given:
         tracker = MarkerTracker()
         try:
             return tracker, tracker.start(image, rows=args.rows, cols=args.cols), None
         except TrackerInitError:
             if args.rows is None or args.cols is None:
                 raise
-    part = _visible_part(image, args, told=bool(told))
+    part = _visible_part(image, args, given=bool(given))
     tracker = MarkerTracker(part.tracker_config())
     return tracker, tracker.start(image), part
 
 
-def _visible_part(image: NDArray[np.uint8], args: argparse.Namespace, *, told: bool) -> VisiblePart:
+def _visible_part(image: NDArray[np.uint8], args: argparse.Namespace, *, given: bool) -> VisiblePart:
     """The part of the printed grid that the image shows. Raises UsageError when there is none or a choice."""
-    possible = find_visible_part(image, args.rows, args.cols, either_way=not told)
+    possible = find_visible_part(image, args.rows, args.cols, either_way=not given)
     parts = [
         part
         for part in possible

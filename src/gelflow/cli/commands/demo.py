@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from gelflow.view.live.live_view import LiveView
 
 _DELAY_NOTE = 0.1  # share of the wall time that robot time must have waited for a note below the table
+_FOLDER = Path("out/demo")  # unless --out names another one
+_MARKER = ".gelflow-demo"  # in a folder whose sessions and pictures are those of a demo
 _EPISODES = 100  # parts in simulation without the mock robot
 
 
@@ -54,7 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_quick(parser)
     add_seed(parser, default=1)
     add_preset(parser)
-    add_out(parser, "folder for pictures and sessions", default=Path("out/demo"), folder=True)
+    add_out(parser, "folder for pictures and sessions", default=_FOLDER, folder=True)
     add_json(parser)
 
 
@@ -291,11 +293,15 @@ def _to_json(session: Path, results: list[_SeriesResult], evaluations: "list[Eva
 
 
 def _clear(out: Path) -> None:
-    """Remove the files of an earlier demo, and no others."""
+    """Remove the files of an earlier demo. Raises UsageError when such files in `out` are of something else."""
+    marker = out / _MARKER
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for pattern in ("session*.mcap", "insertion-*.png"):
-            for path in out.glob(pattern):
-                path.unlink()
+        old = [path for pattern in ("session*.mcap", "insertion-*.png") for path in sorted(out.glob(pattern))]
+        if old and not marker.exists() and out != _FOLDER:
+            raise UsageError(f"{old[0]} is not the file of a demo; name another folder with --out")
+        for path in old:
+            path.unlink()
+        marker.touch()
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error

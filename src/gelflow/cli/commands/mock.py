@@ -13,9 +13,12 @@ from rich.table import Table
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_part, add_preset, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output
+from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot, Rotation
+
+_LAB_TITLE = "Written by gelflow mock for the running mock robot."
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.real.runner.lab_file import save_lab
 
     check_at_least(args, seed=0, jitter=0)
+    if args.out is not None:
+        _check_replaceable(args.out)
     task = part_task(args.part)
     world = load_world(args.world, task.part) if args.world is not None else None
     config = MockRobotConfig(
@@ -75,14 +80,23 @@ def run(args: argparse.Namespace) -> int:
     sys.setswitchinterval(5e-4)
     with MockRobot(args.factor, config) as robot:
         if args.out is not None:
-            save_lab(
-                lab_for(robot, jitter=args.jitter),
-                args.out,
-                title="Written by gelflow mock for the running mock robot.",
-            )
+            save_lab(lab_for(robot, jitter=args.jitter), args.out, title=_LAB_TITLE)
         _show(Output(args.json), robot, args.out)
         _wait_for_end(attached=args.attached)
     return SUCCESS
+
+
+def _check_replaceable(path: Path) -> None:
+    """Raise UsageError when `path` exists and is not the lab file of an earlier mock robot."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            first = file.readline().strip()
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UsageError(f"cannot replace {path}: {error.strerror}; name another file with --out") from None
+    if first != f"# {_LAB_TITLE}":
+        raise UsageError(f"{path} exists, and gelflow mock did not write it; name another file with --out")
 
 
 def _wait_for_end(*, attached: bool) -> None:

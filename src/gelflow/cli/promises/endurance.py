@@ -47,7 +47,7 @@ class CycleStatistics:
     cycles: int = 0  # messages received and answered
     lost: int = 0  # messages that did not arrive
     unanswered: int = 0  # messages that a newer one had overtaken
-    missed: list[tuple[float, float, int]] = field(default_factory=list)  # begin and end [s], number of missed cycles
+    missed: list[tuple[float, float, int]] = field(default_factory=list)  # start and end [s], number of missed cycles
     intervals: list[float] = field(default_factory=list)  # between two receptions [s]
     latencies: list[float] = field(default_factory=list)  # from reception to answer [s]
     _last: EgmCycle | None = None

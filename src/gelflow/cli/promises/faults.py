@@ -64,9 +64,9 @@ def blind(kind: str, *, when: Moment = in_descent) -> Scenario:
             values = {"loop": 1} if kind == "freeze" else {}
             run = rig.run(lambda process: rig.robot.cameras[1].begin_fault(1, kind, values), when=when)
             hold = run.stop(run.at)
-            told = run.first("pad not readable", after=run.at)
+            unreadable = run.first("pad not readable", after=run.at)
             if kind == "blacken":
-                last = told.time - told.values["seconds"] if told is not None else -math.inf
+                last = unreadable.time - unreadable.values["seconds"] if unreadable is not None else -math.inf
             else:
                 last = _last_new_image(run)
             return Outcome(1e3 * (hold - last), _ended_safely(rig, run, "right"))
