@@ -222,8 +222,8 @@ def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMoun
     """The tactile frame of all sensors: one tracking result and one mount per sensor, sensor 0 (left finger) first.
 
     The unit is "mm" if every mount has a scale, otherwise "px"; `stamp` is in seconds. Markers outside the visible part
-    of a grid are not valid. Raises UsageError when the
-    numbers of results and mounts differ, the pads have different grids, or a tracked grid is not that of its mount.
+    of a grid are not valid. Raises UsageError when the numbers of results and mounts differ, the pads have different
+    grids, or a tracked grid is not that of its mount.
     """
     if not results or len(results) != len(mounts):
         raise UsageError(f"expected one tracking result per mount, got {len(results)} results, {len(mounts)} mounts")

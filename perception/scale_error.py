@@ -27,17 +27,17 @@ def scale_error(nodes: Floats, residual: Floats, *, degree: int) -> tuple[float,
     extent = np.ptp(nodes, axis=0).max() / 2
     at = (nodes - nodes.mean(axis=0)) / extent
     variance = float((residual**2).sum()) / max(2 * len(nodes) - 2 * _count(degree), 1)
-    smooth, rest, slope = 0.0, max(float((residual**2).mean()), _NO_RESIDUAL**2), 0.0
-    plain = _criterion(rest, len(nodes), 0)
+    smooth, mean_square, slope = 0.0, max(float((residual**2).mean()), _NO_RESIDUAL**2), 0.0
+    best = _criterion(mean_square, len(nodes), 0)
     for higher in _SMOOTH_DEGREES:
         if 2 * _count(higher) > len(nodes):
             break
         terms, along = _terms(at, higher), _slopes(at, higher)
         weights = np.linalg.lstsq(terms, residual, rcond=None)[0]
         unexplained = max(float(((residual - terms @ weights) ** 2).mean()), _NO_RESIDUAL**2)
-        if _criterion(unexplained, len(nodes), 2 * _count(higher)) < plain - _EVIDENCE:
-            plain = _criterion(unexplained, len(nodes), 2 * _count(higher))
-            smooth, variance = 1 - unexplained / rest, unexplained
+        if _criterion(unexplained, len(nodes), 2 * _count(higher)) < best - _EVIDENCE:
+            best = _criterion(unexplained, len(nodes), 2 * _count(higher))
+            smooth, variance = 1 - unexplained / mean_square, unexplained
             slope = float(np.mean([(part @ weights) ** 2 for part in along]))
     inverse = np.linalg.pinv(_terms(at, degree).T @ _terms(at, degree))
     random = variance * float(np.mean([np.einsum("ni,ij,nj->n", part, inverse, part) for part in _slopes(at, degree)]))

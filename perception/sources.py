@@ -168,8 +168,8 @@ def image_source(
     """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
     `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder; `profile` is that of the
-    sensor, whose part of each image is used. Raises UsageError when the
-    file or folder does not exist, or the folder contains no images.
+    sensor, whose part of each image is used. Raises UsageError when the file or folder does not exist, or the folder
+    contains no images.
     """
     if not text:
         raise UsageError("expected a folder, a file, a URL or a camera number, got an empty text")

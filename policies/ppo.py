@@ -131,7 +131,7 @@ class PPO(Learner):
         """Acts for `rollout` steps in all environments."""
         task, s = self.task, self._settings
         rows: list[tuple[Tensor, ...]] = []
-        rewards, final_values, rates = [], [], []
+        rewards, final_values, mean_rewards = [], [], []
         successes: list[bool] = []
         memories = self._actor_memory, self._critic_memory
         deviation = self._log_deviation.exp()
@@ -143,7 +143,7 @@ class PPO(Learner):
             rows.append((observation, critic_input, self._starts, action, self._log_prob(mean, action), value[:, 0]))
             task.step(action.clamp(-1, 1).numpy(), self._rng)
             done = task.terminated | task.truncated
-            rates.append(task.reward.mean())
+            mean_rewards.append(task.reward.mean())
             successes.extend(task.info["success"][done])
             rewards.append(self._scaled_reward(done))
             final_values.append(self._value_after_truncation())
@@ -155,7 +155,7 @@ class PPO(Learner):
         next_values = torch.where(ends, torch.stack(final_values), torch.cat([columns[5][1:], last_value]))
         advantages = _advantages(torch.stack(rewards), columns[5], next_values, ends, s)
         numbers = {
-            "reward": float(np.mean(rates)),
+            "reward": float(np.mean(mean_rewards)),
             "success": float(np.mean(successes)) if successes else float("nan"),
             "deviation": float(deviation.mean()),
         }

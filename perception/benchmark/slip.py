@@ -26,8 +26,8 @@ from gelflow.perception.synthetic.slipping_layer import (
 from gelflow.perception.tracker import MarkerTracker
 
 Array = NDArray[np.float64]
-Course = Literal["pull", "hold", "release"]
-COURSES: tuple[Course, ...] = get_args(Course)
+LoadHistory = Literal["pull", "hold", "release"]
+LOAD_HISTORIES: tuple[LoadHistory, ...] = get_args(LoadHistory)
 
 _SIZES = {  # lower and upper limit of size and radius [mm]
     "ball": ((0.0, 0.0), (5.0, 15.0)),
@@ -52,7 +52,7 @@ class SlippingContact:
     """A random contact."""
 
     shape: RigidObject
-    course: Course
+    history: LoadHistory
     friction: float
     center: tuple[float, float]  # on the pad [mm]
     normal: float  # [N]
@@ -62,7 +62,7 @@ class SlippingContact:
 
 
 def random_contact(
-    indenter: Indenter, course: Course, gel: ElasticGel, grid: Grid, rng: np.random.Generator
+    indenter: Indenter, history: LoadHistory, gel: ElasticGel, grid: Grid, rng: np.random.Generator
 ) -> SlippingContact:
     """A random contact in the middle half of the grid."""
     size, radius = _SIZES[indenter]
@@ -75,7 +75,7 @@ def random_contact(
         shape=RigidObject(
             indenter, float(rng.uniform(*size)), float(rng.uniform(*radius)), float(rng.uniform(0, np.pi))
         ),
-        course=course,
+        history=history,
         friction=friction,
         center=(float(center[0]), float(center[1])),
         normal=min(float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))) * strongest, strongest / friction),
@@ -86,7 +86,7 @@ def random_contact(
 
 
 def contact_states(contact: SlippingContact, gel: ElasticGel, grid: Grid, rate: float) -> Iterator[SlippingGel]:
-    """The gel at each image, `rate` images a second [Hz]: pressed, moved, and what the course says."""
+    """The gel at each image, at the rate of the images [Hz]: pressed, moved, then pulled, held or released."""
     start = ObjectMotion(contact.center, 0.0, 0.0)
     layer = SlippingLayer(gel, grid, contact.friction, contact.shape, start)
     velocity, moved, turned = np.array(contact.velocity), np.zeros(2), 0.0
@@ -111,12 +111,12 @@ def contact_states(contact: SlippingContact, gel: ElasticGel, grid: Grid, rate: 
             return
         load = float(np.linalg.norm(state.shear)) / (contact.friction * state.normal)
         duration = {"press": _PRESS, "hold": _HOLD, "back": _BACK}.get(phase, np.inf)
-        if phase == "move" and contact.course != "pull" and (load > contact.limit or state.gross):
+        if phase == "move" and contact.history != "pull" and (load > contact.limit or state.gross):
             phase, since = "hold", 0
         elif since >= round(min(duration, _LONGEST) * rate):
             if phase == "back":
                 return
-            after_hold = "back" if contact.course == "hold" else "release"
+            after_hold = "back" if contact.history == "hold" else "release"
             phase, since = {"press": "move", "hold": after_hold}[phase], 0
 
 
@@ -160,7 +160,7 @@ def measure_slip(
     for number in range(contacts):
         rng = np.random.default_rng((INDENTERS.index(indenter), number, seed))
         look = make_appearance(image_class, width=width, height=3 * width // 4, seed=1000 * seed + number, occluders=0)
-        contact = random_contact(indenter, COURSES[number % len(COURSES)], gel, look.grid, rng)
+        contact = random_contact(indenter, LOAD_HISTORIES[number % len(LOAD_HISTORIES)], gel, look.grid, rng)
         stated = contact.friction * (1 + friction_error) if friction_known else None
         estimator = SlipEstimator(look.grid, friction=stated, friction_deviation=abs(friction_error))
         states = list(contact_states(contact, gel, look.grid, rate))

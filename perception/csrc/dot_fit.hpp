@@ -202,8 +202,8 @@ struct FitSettings {
 };
 
 // Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
-// scale of the robust weight k relative to background times contrast. The quality is 0
-// when the fit leaves the central part of the window or the contrast changes sign.
+// scale of the robust weight k relative to background times contrast. The quality is 0 when the fit leaves the central
+// part of the window or the contrast changes sign.
 inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape,
                       const InverseHessian& inverse, double rest_contrast, double tolerated, Point position,
                       int max_iterations) {

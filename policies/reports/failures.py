@@ -14,11 +14,8 @@ from gelflow.policies.episodes import Episodes
 from gelflow.policies.evaluation import EvaluationResult
 
 QUANTILES = 5  # ranges of equally many episodes in which failures are counted
-_SHOWN = {
-    "m": ("mm", 1e3),
-    "kg": ("g", 1e3),
-    "rad": ("°", 180 / math.pi),
-}  # unit → unit and factor in text and pictures
+# Unit → unit and factor in text and pictures.
+_SHOWN = {"m": ("mm", 1e3), "kg": ("g", 1e3), "rad": ("°", 180 / math.pi)}
 _SMALL_FORCE = 0.2  # [N] below it forces are shown in mN
 _COLUMNS = 4  # of the picture
 _DECADES = 20.0  # ratio of the ends of a range above which its axis is logarithmic

@@ -6,8 +6,8 @@ Fields of the messages (protobuf; the schema is ABB's egm.proto in the package A
   euler), motorState, mciState, rapidExecState, mciConvergenceMet. Of planned, nothing is read.
 - EgmSensor, to the controller: header (seqno, tm, mtype = correction), planned.cartesian (pos, orient).
 
-protobuf rejects a second copy of a schema in one process, so no other
-EGM package (such as abb_robot_client) may be imported.
+protobuf rejects a second copy of a schema in one process, so no other EGM package (such as abb_robot_client) may be
+imported.
 """
 
 import math

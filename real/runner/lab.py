@@ -82,9 +82,8 @@ class ArmSettings:
     connect_timeout: float = 5.0  # for the first message of the robot [s]
     host: str = "0.0.0.0"  # address of this computer to listen on; 0.0.0.0: all
     robot: str = ""  # IP address of the controller; empty: the first sender
-    web_services: str = (
-        ""  # "http://HOST" of the controller's Robot Web Services; empty: mode and program not supervised
-    )
+    # "http://HOST" of the controller's Robot Web Services; empty: mode and program are not supervised.
+    web_services: str = ""
 
     def __post_init__(self) -> None:
         _check_ranges(self, "arm.")

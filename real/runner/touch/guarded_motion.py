@@ -59,7 +59,7 @@ def in_any_direction(change: Array) -> float:
 class GuardedMotion:
     """Moves a held part while both pads are observed.
 
-    `excess_latency` is the measured time by which images are later than the lab file says [s].
+    `excess_latency` is the measured delay of the images beyond that in the lab file [s].
     """
 
     def __init__(

@@ -19,13 +19,13 @@ namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// Spin time before sleeping. A wake-up takes about 100 µs, much more on a virtual machine; the spin time is a share of
+// Spin time before sleeping. A wake-up takes about 100 µs, much more on a virtual machine; the spin time is half
 // the duration of the last work, within these bounds.
 constexpr std::chrono::microseconds min_spin_time(100), max_spin_time(500);
-constexpr int spin_share = 2;
+constexpr int spin_divisor = 2;
 
 Clock::duration spin_time_after(Clock::time_point start) {
-  return std::clamp<Clock::duration>((Clock::now() - start) / spin_share, min_spin_time, max_spin_time);
+  return std::clamp<Clock::duration>((Clock::now() - start) / spin_divisor, min_spin_time, max_spin_time);
 }
 
 // Spins until the condition holds, at most for that long; returns whether it holds.

@@ -27,7 +27,8 @@
 
 namespace gelflow {
 
-// Coefficients of several points; kn, kt, kd and ks times the weight of the point, so the force at weight 0 is 0. P is a pack type (simd_pack.hpp).
+// Coefficients of several points; kn, kt, kd and ks times the weight of the point, so the force at weight 0 is 0. P is a
+// pack type (simd_pack.hpp).
 template <class P>
 struct PointLaw {
   P kn, kt, mu, kd, ks;

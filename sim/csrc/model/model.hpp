@@ -98,8 +98,8 @@ struct PackedDofs {
   std::vector<int> start;    // first dof of each pack
   std::vector<int> dof;      // per column; −1 where the dof moves neither body or both
   std::vector<double> sign;  // per column: +1 where the dof moves the first body, −1 the second, else 0
-  std::vector<double>
-      axis_coupling;  // columns × columns: 1 where ∂S_row/∂q_column counts (contact_jacobian.hpp), else 0
+  // Columns × columns: 1 where ∂S_row/∂q_column counts (contact_jacobian.hpp), else 0.
+  std::vector<double> axis_coupling;
   std::vector<std::uint8_t> linear;        // per column: it is a translation
   std::vector<std::uint8_t> has_coupling;  // per column: its row of `axis_coupling` has a 1
 };

@@ -286,10 +286,9 @@ Status newton(const Model& m, const T* params, const StepStart<T>& start, int po
 }
 
 // Continuation (homotopy), where Newton's method did not converge. The usual cause is saturation: points stick below a
-// tiny slip speed and slide above it; a servo saturates at its force limit beyond a tiny error. Full
-// steps jump back and forth over that narrow range, and a line search gets stuck beside it. So k_t, k_s and the gains
-// are scaled by a factor that starts small, which widens the range, and grows to 1; each solution is the next initial
-// guess.
+// tiny slip speed and slide above it; a servo saturates at its force limit beyond a tiny error. Full steps jump back and
+// forth over that narrow range, and a line search gets stuck beside it. So k_t, k_s and the gains are scaled by a factor
+// that starts small, which widens the range, and grows to 1; each solution is the next initial guess.
 template <class T>
 Status newton_by_continuation(const Model& m, const T* params, const StepStart<T>& start, int polish, VX<T>& v,
                               int& iterations, Workspace<T>& w) {

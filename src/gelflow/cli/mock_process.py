@@ -24,9 +24,8 @@ _STOP_LIMIT = 10.0  # [s, wall]
 def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: object) -> Iterator[tuple[Path, str]]:
     """Run a mock robot in a separate process; yields its lab file and the URL of its true state.
 
-    `more` are further options of `gelflow mock`, by name; None omits one.
-    Raises PeerError with the process's last line of standard error when it does not start, PeerRefused when that line
-    is a refusal of its options.
+    `more` are further options of `gelflow mock`, by name; None omits one. Raises PeerError with the process's last
+    line of standard error when it does not start, PeerRefused when that line is a refusal of its options.
     """
     truth_port = free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as errors:

@@ -69,7 +69,7 @@ class MarkerReader:
 
     @property
     def in_millimetres(self) -> bool:
-        """Whether `shear` has the unit mm; otherwise the recording does not say how the cameras are mounted."""
+        """Whether `shear` has the unit mm; otherwise the recording does not state how the cameras are mounted."""
         return bool(self._mounts)
 
     def shear(self, sensor: int, time: float) -> float:

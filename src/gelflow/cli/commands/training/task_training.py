@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DEFAULT_RECIPE = "default"
 TASKS = ("cap", "grasp", "insertion", "pushing")  # those of `gelflow.policies.recipes`, which is slow to import
-UNTRAINED = ("rolling",)  # without a recipe; the error says why
+UNTRAINED = ("rolling",)  # without a recipe; the error states the reason
 
 
 def refuse(args: argparse.Namespace, **unset: object) -> None:
