@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
 from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
+from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import reduce_maps
 from gelflow.task import InsertionTask, TaskDescription
@@ -92,6 +93,8 @@ class PolynomialGRUNetwork(FlowMapNetwork):
         self.reach = architecture.reach
         self.reflections = reflections(architecture.degree, task)
         self._tensors: dict[str, Array] = {name: values.astype(float) for name, values in tensors.items()}
+        prefix = "gru."
+        self._gru = {n.removeprefix(prefix): values for n, values in self._tensors.items() if n.startswith(prefix)}
 
     def batch_policy(self, count: int) -> "PolynomialGRUPolicy":
         """A policy for `count` parallel parts."""
@@ -103,17 +106,11 @@ class PolynomialGRUNetwork(FlowMapNetwork):
 
     def step(self, inputs: Array, state: Array) -> tuple[Array, Array]:
         """Outputs (n, 3) and next states (n, units) for inputs (n, inputs); equations of the GRU as in torch."""
-        first = np.tanh(self._linear("first", inputs))
-        from_input = self._linear("gru", first, "_ih").reshape(len(inputs), 3, -1)
-        from_state = self._linear("gru", state, "_hh").reshape(len(inputs), 3, -1)
-        reset, update = (_sigmoid(from_input[:, i] + from_state[:, i]) for i in (0, 1))
-        candidate = np.tanh(from_input[:, 2] + reset * from_state[:, 2])
-        state = (1 - update) * candidate + update * state
+        state = gru_cell(np.tanh(self._linear("first", inputs)), state, self._gru)
         return self._linear("output", np.tanh(self._linear("head", state))), state
 
-    def _linear(self, name: str, values: Array, suffix: str = "") -> Array:
-        weight, bias = self._tensors[f"{name}.weight{suffix}"], self._tensors[f"{name}.bias{suffix}"]
-        return np.asarray(np.einsum("ni,oi->no", values, weight) + bias)
+    def _linear(self, name: str, values: Array) -> Array:
+        return linear(values, self._tensors[f"{name}.weight"], self._tensors[f"{name}.bias"])
 
 
 class PolynomialGRUPolicy(CorrectionPolicy):
@@ -177,7 +174,3 @@ class PolynomialGRUPolicy(CorrectionPolicy):
     def corrections(self, images: NDArray[Any]) -> Array:
         """Corrections (count, 3) [m, m, rad] in the gripper frame for the latest flow maps; deterministic."""
         return self.correct(self.output(self.observe(images)))
-
-
-def _sigmoid(values: Array) -> Array:
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * values))

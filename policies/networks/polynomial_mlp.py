@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
 from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
+from gelflow.policies.networks.layers import linear
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import reduce_maps
 from gelflow.task import InsertionTask, TaskDescription
@@ -161,9 +162,8 @@ class PolynomialNetwork(FlowMapNetwork):
         """Corrections (n, 3) [m, m, rad] for inputs from `History.observe`."""
         values, signs = self.canonical(inputs)
         for weight, bias in self._layers[:-1]:
-            values = np.tanh(np.einsum("ni,oi->no", values, weight) + bias)
-        weight, bias = self._layers[-1]
-        out = np.clip(np.einsum("ni,oi->no", values, weight) + bias, -1, 1)
+            values = np.tanh(linear(values, weight, bias))
+        out = np.clip(linear(values, *self._layers[-1]), -1, 1)
         return np.asarray(out * signs * self.task.corrected_axes * np.asarray(self.architecture.reach))
 
 
