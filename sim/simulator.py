@@ -37,15 +37,13 @@ class Simulator:
     ----------
     scene: a `Scene` or a core model
     num_envs: number of environments N
-    threads: maximum number of threads; None uses all available cores, at most OMP_NUM_THREADS. Results do not
-        depend on it.
+    threads: maximum number; None: all available cores, at most OMP_NUM_THREADS. Results do not depend on it
     precision: "double" or "single"; None takes the scene's setting, and "double" for a core model
 
     Attributes
     ----------
-    q, v: positions (N, nq), of a scene its `q0` at first, and velocities (N, nv), 0 at first; writable views of the
-        simulator's memory, like all state arrays. After writing them call `clear_history`, or friction anchors and the
-        BDF2 history belong to the state before
+    q, v: positions (N, nq), at first the scene's `q0`, and velocities (N, nv); writable views, like all state arrays.
+        After writing them call `clear_history`, or anchors and BDF2 history belong to the state before
     params: physical parameters (N, parameters), writable; see `param`
     anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
@@ -54,8 +52,7 @@ class Simulator:
     iterations, halved: (N), Newton iterations and steps that were split into substeps, since the last reset
 
     In single precision the core stores the rounding residual of `q`, so that small increments accumulate, and computes
-    relative poses of bodies in double. Gradients are computed in double at the states of the trajectory; only the
-    contribution of viscous marker forces is in single precision.
+    relative poses of bodies in double. Gradients are in double, except the part of viscous marker forces.
 
     A call during the call of another thread raises UsageError. A signal handler that raises ends a call between two
     steps: each environment then has the state after its last complete step.
@@ -94,7 +91,10 @@ class Simulator:
         self.iterations: NDArray[np.int64] = self._batch.iterations
         self.halved: NDArray[np.int64] = self._batch.halved
         self._tactile: NDArray[Any] | None = None  # created by the first call of `tactile`
-        self.reset()
+        if (start := getattr(scene, "q0", None)) is not None:
+            self.q[:] = start
+            self.step(np.zeros(self.model.nu), 0)  # no step: it sets the positions of coupled joints
+        self._start: NDArray[Any] = self.q[0].copy()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, contents(self, self._threads)
@@ -117,14 +117,13 @@ class Simulator:
         return column
 
     def reset(self, which: ArrayLike | None = None) -> None:
-        """Return to the start at rest, with cleared history; all environments, or those with `which` (N,).
+        """Return to the start at rest: a scene's `q0`, or the reference configuration of a core model.
 
-        The start is the scene's `q0`, and the reference configuration for a core model. Parameters keep their values.
+        All environments, or those with `which` (N,). History is cleared; parameters keep their values.
         """
         mask = self._mask("which", which)
         checked(self._batch.reset, mask)
-        if (start := getattr(self.scene, "q0", None)) is not None:
-            self.q[slice(None) if mask is None else mask.view(bool)] = start
+        self.q[slice(None) if mask is None else mask.view(bool)] = self._start
 
     def _mask(self, name: str, mask: ArrayLike | None) -> NDArray[np.uint8] | None:
         """Flags of the environments in `mask` for the core; None: all of them."""

@@ -134,7 +134,7 @@ class HeldPart:
         """Move towards a start pose; False after contact, whose height is then that of the rim."""
         contact = self._guard.move(
             self._pose(planar_pose, height),
-            threshold=self.thresholds.contact,
+            threshold=self.thresholds.contact if speed is None else self.thresholds.fast,
             measure=in_any_direction,
             baseline=self._baseline,
             speed=speed,
@@ -218,7 +218,12 @@ class HeldPart:
         supervisor = self._motion.supervisor
         supervisor.phases.enter(Phase.RETREAT)
         x, y, yaw, _ = supervisor.hole_coordinates(self._motion.pose())
-        contact = self._guard.move(self._pose((x, y, yaw), height), threshold=self.thresholds.stuck, measure=downward)
+        contact = self._guard.move(
+            self._pose((x, y, yaw), height),
+            threshold=self.thresholds.stuck,
+            measure=downward,
+            baseline=self._baseline,  # before the first attempt the weight of the part: on a soft gel more than `stuck`
+        )
         if contact is not None:
             self._event("stuck", contact)
             raise PeerError("the part is stuck in the hole: it is pulled down while the arm moves up; free it by hand")

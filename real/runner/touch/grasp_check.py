@@ -19,6 +19,7 @@ from gelflow.real.runner.lab import DescentSettings
 from gelflow.real.runner.touch.observer import TactileReading
 
 _WEIGHT_FRACTION = 0.7  # of the change by the weight: the largest contact threshold
+_FAST_FRACTION = 0.3  # of it: the smallest threshold of fast motions, in which the motion alone gave 0.14
 _NOISE_FACTOR = 5.0  # a change is significant above this multiple of the noise of one reading
 _LEAST_NOISE = 3e-4  # of the mean change of a pad, for a few readings that agree by chance [mm]
 _LARGEST_ANGLE = 45.0  # between the change and the finger's axis [°]
@@ -36,6 +37,7 @@ class TouchThresholds:
     """Mean change of shear of a pad since a reference [mm]."""
 
     contact: float  # contact: the part is not free
+    fast: float  # contact in fast motions far above the hole: on a soft gel the motion alone exceeds `contact`
     stop: float  # a descent stops at once
     stuck: float  # an upward motion stops: the part is held by something else
 
@@ -58,7 +60,8 @@ class GraspCheck:
 
 def nominal_thresholds(settings: DescentSettings) -> TouchThresholds:
     """The thresholds of the lab file."""
-    return TouchThresholds(settings.contact_shear_mm, settings.stop_shear_mm, 2 * settings.stop_shear_mm)
+    contact, stop = settings.contact_shear_mm, settings.stop_shear_mm
+    return TouchThresholds(contact, contact, stop, 2 * stop)
 
 
 def check_grasp(
@@ -67,7 +70,8 @@ def check_grasp(
     """Compare the pads before and after a grasp, both at rest, and scale the thresholds.
 
     The contact threshold is that of the lab file, but at most 70 % of the change by the weight: a gel five times as
-    stiff moves its markers a fifth as far. The other thresholds are scaled by the same factor.
+    stiff moves its markers a fifth as far. The other thresholds are scaled by the same factor; that of fast motions
+    is at least 30 % of the change by the weight.
 
     Raises TouchImplausible when a pad shows no change, or a change in another direction than that of the weight.
     """
@@ -98,7 +102,8 @@ def check_grasp(
             "the gels are too stiff or the part is too light (descent.weight_check = false omits this check)"
         )
     scale = contact / nominal.contact
-    return GraspCheck(weight, noise, TouchThresholds(contact, scale * nominal.stop, scale * nominal.stuck))
+    fast = max(contact, _FAST_FRACTION * float(weight[:, 0].min()))
+    return GraspCheck(weight, noise, TouchThresholds(contact, fast, scale * nominal.stop, scale * nominal.stuck))
 
 
 def check_release(held: Sequence[TactileReading], released: Sequence[TactileReading], check: GraspCheck) -> None:

@@ -42,7 +42,7 @@ _TILES = 4  # lines of a plane over the height of the view, about
 
 @dataclass
 class Shown:
-    """What is shown in addition to the bodies."""
+    """The contents shown in addition to the bodies."""
 
     contacts: bool = True
     labels: bool = True

@@ -42,9 +42,9 @@ def test_status_shows_the_controller(robot: MockRobot, tmp_path: Path, capsys: p
     path = tmp_path / "lab.toml"
     with MockWebServices() as server:
         save_lab(lab_with(robot, server.url), path, title="test")
-        assert main(["robot", "status", "--lab", str(path), "--json"]) == 0
+        assert main(["robot", "status", "--lab", str(path), "--json"]) == 1  # the gripper is not homed
         status = json.loads(capsys.readouterr().out)
-        assert main(["robot", "status", "--lab", str(path)]) == 0
+        assert main(["robot", "status", "--lab", str(path)]) == 1
     text = "mode auto, motors on, program running"
     assert status["controller"] == {"ready": True, "text": text, "operating_mode": "auto"}
     assert text in capsys.readouterr().out

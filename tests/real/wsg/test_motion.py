@@ -4,6 +4,7 @@ import itertools
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 from tests.real.wsg.harness import CLOCK, CONFIG, CommandRecord, connected, eventually, mock, relayed, unmodified
 
@@ -11,6 +12,7 @@ from gelflow.errors import PeerRefused, SafetyError, UsageError
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.protocols import Gripper
 from gelflow.real.transport import transport_for
+from gelflow.real.wsg.checks import check_limits
 from gelflow.real.wsg.config import WsgConfig, WsgLimits
 from gelflow.real.wsg.driver import WsgGripper
 
@@ -89,6 +91,15 @@ def test_commands_outside_the_limits_are_not_sent() -> None:
                 with pytest.raises(SafetyError, match=name):
                     gripper.release(width=wrong["width"], speed=wrong["speed"])
         assert len(relay.sent) == before
+
+
+def test_a_width_that_equals_a_rounded_limit_of_the_device_is_allowed() -> None:
+    reported = float(np.float32(109.7)) / 1e3  # less than 0.1097 m
+    limits = WsgLimits(width=(0.0, reported))
+    check_limits(limits, width=0.1097)
+    for width in (0.1097 + 1e-6, math.nan):
+        with pytest.raises(SafetyError, match=r"outside 0\.0 to 0\.1096"):
+            check_limits(limits, width=width)
 
 
 def test_configured_limits_and_device_limits_are_combined() -> None:

@@ -41,8 +41,11 @@ def test_stiffer_gels_lower_all_thresholds_in_proportion(stiffness: float) -> No
 
 
 def test_softer_gels_and_heavier_parts_do_not_raise_the_thresholds() -> None:
+    """Except that of fast motions far above the hole."""
     thresholds = check_grasp(FREE, readings(4 * np.array(WEIGHT), seed=1), DescentSettings()).thresholds
     assert thresholds.contact == 0.04
+    assert thresholds.stop == pytest.approx(0.12) and thresholds.stuck == pytest.approx(0.24)
+    assert thresholds.fast == pytest.approx(0.3 * 4 * 0.056, rel=0.03)
 
 
 @pytest.mark.parametrize(
