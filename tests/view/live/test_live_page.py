@@ -109,10 +109,10 @@ def test_a_recording_that_grows_is_followed_until_it_ends(tmp_path: Path) -> Non
     with browser() as window, LiveView(host="127.0.0.1", port=0) as view:
         window.open(view.url)
         view.show(growing)
-        for end in range(0, len(data), 300_001):
-            growing.write_bytes(data[:end])
-            time.sleep(0.05)
-        growing.write_bytes(data)
+        with growing.open("ab", buffering=0) as file:  # a recorder appends, and never cuts the file
+            for begin in range(0, len(data), 300_001):
+                file.write(data[begin : begin + 300_001])
+                time.sleep(0.05)
         window.wait(lambda: "11.90 s of 11.9 s" in window.text())
         window.wait(lambda: "insertion 0, attempt 0" in window.text())
         assert window.errors() == []
