@@ -120,7 +120,6 @@ class SimulatedCell:
         self._weights = [resampling_weights(grid.positions(), config.grid) for grid in scene.grids]
         self._u = np.zeros(sim.model.nu)
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
-        sim.reset()
         self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=part.grasp_width)
         self._lock = threading.Lock()
         self._time = clock.now()

@@ -119,7 +119,7 @@ class HeldPart:
         self._motion.supervisor.phases.enter(phase)
         search_height = self._task.rim_height + self._lab.hole.height_error + _CLEARANCE
         if self._lower_face() > search_height:
-            self._move_to(planar_pose, search_height, speed=self._guard.free_speed)
+            self._move_to(planar_pose, search_height, fast=True)
         for _ in range(_SEARCHES):
             if self._move_to(planar_pose, self.start_height):
                 return
@@ -130,14 +130,14 @@ class HeldPart:
             f"contact {_SEARCHES} times on the way to the start of an attempt; check the taught hole and the grasp"
         )
 
-    def _move_to(self, planar_pose: PlanarPose, height: float, *, speed: float | None = None) -> bool:
+    def _move_to(self, planar_pose: PlanarPose, height: float, *, fast: bool = False) -> bool:
         """Move towards a start pose; False after contact, whose height is then that of the rim."""
         contact = self._guard.move(
             self._pose(planar_pose, height),
-            threshold=self.thresholds.contact if speed is None else self.thresholds.fast,
+            threshold=self.thresholds.fast if fast else self.thresholds.contact,
             measure=in_any_direction,
             baseline=self._baseline,
-            speed=speed,
+            speed=self._guard.free_speed if fast else None,
             deadline=self._deadline,
         )
         if contact is not None:
