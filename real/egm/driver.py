@@ -101,8 +101,8 @@ class EgmArm:
         EGM process has ended. While latched, returns the last feedback with the reason as `fault`.
         """
         with self._lock:
-            self._pump()
             record = self._latest()
+            self._pump()  # the event that explains the record was sent before it
             age = self._clock.now() - record.stamp
             if age > self._config.silence and not self._latched:
                 limit = self._config.silence
@@ -113,7 +113,7 @@ class EgmArm:
                 joints=np.array(record.joints),
                 stamp=record.stamp,
                 motors_on=EgmFlag.MOTORS_ON in record.flags,
-                running=self._running(),
+                running=EgmFlag.FOLLOWING in record.flags and not self._latched,
                 operating_mode="unknown",
                 fault=self._latched,
             )

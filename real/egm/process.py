@@ -21,12 +21,15 @@ from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.cycle_log import EgmCycle, EgmCycleLog
 from gelflow.real.egm.reference_generator import EgmEvent, EgmFlag, ReferenceGenerator
 from gelflow.real.egm.target import Target
+from gelflow.time_sync import ARM_DRIVER
 
 _LARGEST_MESSAGE = 4096
 # Period of the check that the parent still runs [s, wall]: the closed link does not show it while another process holds
 # the parent's end of the link.
 _PARENT_CHECK = 0.1
 _SHORTEST_WAIT = 2e-4  # [s, wall]
+# Robot time of a mock robot stands still when this process has not run for longer [s, wall].
+_LONGEST_GAP = 1.5 * _PARENT_CHECK
 
 
 class EgmLoop:
@@ -49,6 +52,7 @@ class EgmLoop:
         self._flush()
         self._event("listening", f"{'real-time' if raise_priority() else 'normal'} priority")
         while not self._parent.closed and os.getppid() == parent:
+            self._clock.grant(ARM_DRIVER, self._clock.now() + self._clock.factor * _LONGEST_GAP)
             self._report()
             # The time-out ends just after the instant at which the feedback becomes stale.
             left = self._clock.wall(self._generator.due - self._clock.now()) + _SHORTEST_WAIT
@@ -175,6 +179,7 @@ def main(arguments: list[str]) -> int:
     gc.disable()
     with suppress(ConnectionError):
         EgmLoop(config, clock, udp, parent, log).run()
+    clock.grant(ARM_DRIVER, math.inf)
     return 0
 
 

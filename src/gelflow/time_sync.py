@@ -2,7 +2,9 @@
 
 Robot time of a mock robot must not run faster than its simulation. Each process that has to keep up (a slot) grants
 robot time a limit, until its next step is done; robot time stops at the earliest limit. One of them, the simulated
-cell, accumulates the delay, so that robot time continues from where it stopped.
+cell, accumulates the delay, so that robot time continues from where it stopped. Two slots belong to the other side,
+since a mock robot and the runner share one computer: the arm's driver, and the runner, which may have to stop the arm
+after a camera frame.
 """
 
 import math
@@ -12,8 +14,8 @@ from array import array
 
 from gelflow.errors import UsageError
 
-_SLOTS = 6  # the last slot belongs to the runner, which may have to stop the arm after a camera frame
-SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, GRIPPER, RUNNER = range(_SLOTS)
+_SLOTS = 7
+SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, GRIPPER, ARM_DRIVER, RUNNER = range(_SLOTS)
 MAX_LEAD = 0.02  # lead of robot time over the last finished step, at most [s]
 MIN_WAIT = 2e-4  # shortest sleep while robot time stands still [s, wall]
 _WORDS = 1 + 2 * _SLOTS  # delay [s], then for each slot: wall time of its last grant [s], its limit [s, robot time]

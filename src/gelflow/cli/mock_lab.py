@@ -15,10 +15,9 @@ from gelflow.real.runner import lab
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
-# Limits that are wider still, since they measure the computer and not the robot: a process may not run, or a write may
-# take, for some tenths of a second.
-_DISK = 4  # of the delay of a recording
-_POSE = 2  # of the age of a pose, which ages while the driver's process does not run
+# The limit of a recording's delay is wider still, since it measures the computer and not the robot: a write may take
+# some tenths of a second.
+_DISK = 4
 
 _VISIBLE_LINE = 0.3  # fraction of the dots of a visible line that are inside the image
 
@@ -55,7 +54,7 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
         part=lab.PartSettings(
             grasp_height=cell.grasp_height, load_height=cell.load_height, presentation="wait", load_wait=1.0
         ),
-        limits=_limits(MOCK_TIME_SCALE * factor, pose=_POSE)
+        limits=_limits(MOCK_TIME_SCALE * factor)
         if jitter is None
         else _limits(1.0, jitter * factor, disk=_DISK * factor),
         clock_factor=factor,
@@ -126,11 +125,11 @@ def _write_gel(robot: "MockRobot", finger: int) -> str:
     return str(path)
 
 
-def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0, pose: float = 1.0) -> lab.LimitsSettings:
-    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; `disk` and `pose` multiply two."""
+def _limits(scale: float, jitter: float = 0.0, *, disk: float = 1.0) -> lab.LimitsSettings:
+    """Limits of a robot, `scale` times as long plus `jitter` [s, robot time]; `disk` multiplies that of recordings."""
     robot = lab.LimitsSettings()
     return lab.LimitsSettings(
-        stale_pose=robot.stale_pose * scale * pose + jitter,
+        stale_pose=robot.stale_pose * scale + jitter,
         stale_frame=robot.stale_frame * scale + jitter,
         stale_gripper=robot.stale_gripper * scale + jitter,
         target_lifetime=min(LIMITS.longest_target_lifetime, robot.target_lifetime * scale + jitter),

@@ -9,6 +9,7 @@ import pytest
 from tests.real.egm.harness import CONFIG, DOWN, START, ArmAndMock, near_start
 
 from gelflow.errors import PeerTimeout, SafetyError
+from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.reference_generator import EgmFlag
 
 
@@ -56,6 +57,23 @@ def test_motors_off_and_rapid_stop_latch(cell: ArmAndMock) -> None:
     assert cell.latched() == "RAPID stopped"
     with pytest.raises(SafetyError, match="RAPID stopped"):
         cell.arm.target(START, DOWN, lifetime=0.5)
+
+
+def test_a_stop_during_a_reading_of_the_state_comes_with_its_reason(
+    cell: ArmAndMock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flags came from one message and "running" from the next: a stop without a reason."""
+    latest = cell.arm._latest
+
+    def interrupted() -> EgmCycle:
+        record = latest()
+        cell.mock.motors(False)
+        cell.until(lambda: EgmFlag.FOLLOWING not in latest().flags, "the message with motors off")
+        return record
+
+    monkeypatch.setattr(cell.arm, "_latest", interrupted)
+    state = cell.arm.state()
+    assert (state.running, state.fault) == (False, "motors off")
 
 
 def test_reset_with_a_persisting_cause_does_not_allow_motion(cell: ArmAndMock) -> None:
