@@ -31,7 +31,10 @@ def main() -> int:
 
 
 def coverage(words: list[str]) -> int:
-    """Calibrate in random worlds and count how often the intervals contain the truth."""
+    """Calibrate in random worlds and count how often the intervals contain the truth.
+
+    The same command continues a run that was killed.
+    """
     arguments = script.parser(
         coverage.__doc__ or "", out="calibration_coverage.json", quick="two worlds with little effort"
     )
@@ -40,14 +43,20 @@ def coverage(words: list[str]) -> int:
     args = arguments.parse_args(words)
     count = 2 if args.quick else args.worlds
     seeds = range(args.first, args.first + count)
+    settings, unfinished = (_QUICK, ".quick.part") if args.quick else (FitSettings(), ".part")
+    part = args.out.with_suffix(unfinished)
     with script.progress("worlds", count) as advance:
-        result = measure_coverage(
-            seeds, settings=_QUICK if args.quick else FitSettings(), processes=2, progress=lambda world: advance(1)
-        )
+
+        def after_world(result: dict[str, Any]) -> None:
+            script.save(part, result)
+            advance(1)
+
+        result = measure_coverage(seeds, settings=settings, processes=2, measured=_results(part), progress=after_world)
     table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
     keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
     table.add_row(*(str(result[key]) for key in keys))
     script.finish(args, script.header() | result, table)
+    part.unlink(missing_ok=True)
     return 0
 
 
@@ -85,7 +94,7 @@ def transfer(words: list[str]) -> int:
     args = arguments.parse_args(words)
     episodes, below = (32, 0.0) if args.quick else (512, 0.9)
     unfinished = args.out.with_suffix(".quick.part" if args.quick else ".part")
-    rows = _rows(unfinished)
+    rows = {row["world"]: row for row in _results(unfinished)}
     with script.progress("worlds", len(worlds())) as advance:
         for world in worlds():
             if world.name not in rows:
@@ -101,9 +110,9 @@ def transfer(words: list[str]) -> int:
     return 0
 
 
-def _rows(file: Path) -> dict[str, Any]:
-    """The rows of a run that was killed."""
-    return {row["world"]: row for row in json.loads(file.read_text())["results"]} if file.is_file() else {}
+def _results(file: Path) -> list[dict[str, Any]]:
+    """The results of a run that was killed."""
+    return json.loads(file.read_text())["results"] if file.is_file() else []
 
 
 def _record(rows: dict[str, Any]) -> dict[str, Any]:

@@ -17,17 +17,24 @@ def measure_coverage(
     *,
     settings: FitSettings | None = None,
     processes: int = 1,
-    progress: Callable[[dict[str, Any]], None] = lambda world: None,
+    measured: Sequence[dict[str, Any]] = (),
+    progress: Callable[[dict[str, Any]], None] = lambda result: None,
 ) -> dict[str, Any]:
     """Calibrate from five insertions in the world of each seed; returns each world's results and the counts.
 
     A world counts as covered when every parameter that is reported as known lies in its interval. Worlds that cannot
-    be recorded, because the gripper loses the part or no attempt has contact, are listed as refused.
+    be recorded, because the gripper loses the part or no attempt has contact, are listed as refused. `measured` are the
+    results of worlds that are not measured again; `progress` gets the result so far after each world.
     """
-    worlds = []
+    known = {world["seed"]: world for world in measured}
+    worlds: list[dict[str, Any]] = []
     for seed in seeds:
-        worlds.append(_world(seed, settings, processes))
-        progress(worlds[-1])
+        worlds.append(known.get(seed) or _world(seed, settings, processes))
+        progress(_counted(worlds))
+    return _counted(worlds)
+
+
+def _counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
     done = [world for world in worlds if "refused" not in world]
     known = [entry for world in done for entry in world["known"].values()]
     return {
