@@ -67,17 +67,16 @@ def read_tendons(model: Any, actuators: Sequence[ActuatorDef]) -> tuple[TendonDe
     for t, name in enumerate(element_names(model, "tendon", model.ntendon)):
         if not is_fixed(model, t):
             continue
-        terms = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
-        joints = tuple(int(model.wrap_objid[i]) for i in terms)
+        terms = tendon_terms(model, t)
         limited = bool(model.tendon_limited[t])
-        hinges = any(model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE for j in joints)
+        hinges = any(joint_kind(model, j) == "hinge" for j in terms)
         inertia = 1 / max(float(model.tendon_invweight0[t]), 1e-9)
         driving = [a for a in actuators if a.tendon == len(tendons)]
         tendons.append(
             TendonDef(
                 name=name,
-                joints=joints,
-                coefficients=tuple(float(model.wrap_prm[i]) for i in terms),
+                joints=tuple(terms),
+                coefficients=tuple(terms.values()),
                 damping=float(model.tendon_damping[t]) + actuator_addition(model, "tendon", t, "damping"),
                 armature=_field(model, "tendon_armature", t) + actuator_addition(model, "tendon", t, "armature"),
                 stiffness=float(model.tendon_stiffness[t]),
@@ -93,7 +92,7 @@ def read_tendons(model: Any, actuators: Sequence[ActuatorDef]) -> tuple[TendonDe
 def read_couplings(model: Any) -> tuple[CouplingDef, ...]:
     """The active joint equalities: q₁ = q₁⁰ + P(q₂ − q₂⁰) with the positions q⁰ of the file."""
     couplings = []
-    for e, name in _active(model, (mujoco.mjtEq.mjEQ_JOINT,)):
+    for e, name in active_equalities(model, (mujoco.mjtEq.mjEQ_JOINT,)):
         joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
         if leader < 0:
             coefficients = np.array([model.eq_data[e, 0]])
@@ -102,15 +101,14 @@ def read_couplings(model: Any) -> tuple[CouplingDef, ...]:
             coefficients = Polynomial(model.eq_data[e, :5])(deviation).coef
         coefficients[0] += model.qpos0[model.jnt_qposadr[joint]]
         coefficients = np.trim_zeros(coefficients, "b")
-        kind = "slide" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"
-        couplings.append(CouplingDef(name, joint, leader, tuple(coefficients.tolist()), kind))
+        couplings.append(CouplingDef(name, joint, leader, tuple(coefficients.tolist()), joint_kind(model, joint)))
     return tuple(couplings)
 
 
 def read_loop_closures(model: Any, moving_body: NDArray[np.int64], poses: Sequence[Pose]) -> tuple[LoopClosureDef, ...]:
     """The active connect and weld equalities between moving bodies; `moving_body` and `poses` of each body."""
     closures = []
-    for e, name in _active(model, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)):
+    for e, name in active_equalities(model, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)):
         weld = model.eq_type[e] == mujoco.mjtEq.mjEQ_WELD
         data = model.eq_data[e]
         members = _bodies(model, e)
@@ -133,7 +131,7 @@ def read_loop_closures(model: Any, moving_body: NDArray[np.int64], poses: Sequen
 def loop_joints(model: Any) -> set[int]:
     """The joints of the closed loops: those that move one of the two bodies of a loop closure and not the other."""
     found: set[int] = set()
-    for e, _ in _active(model, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)):
+    for e, _ in active_equalities(model, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)):
         first, second = (_moving_joints(model, b) for b in _bodies(model, e))
         found |= first ^ second
     return found
@@ -168,7 +166,23 @@ def driving_actuators(actuators: Sequence[ActuatorDef], tendons: Sequence[Tendon
     return driving
 
 
-def _active(model: Any, kinds: Sequence[int]) -> list[tuple[int, str]]:
+def tendon_terms(model: Any, tendon: int) -> dict[int, float]:
+    """The coefficient of each joint in the length of a fixed tendon."""
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    terms: dict[int, float] = {}
+    for i in range(first, first + count):
+        joint = int(model.wrap_objid[i])
+        terms[joint] = terms.get(joint, 0.0) + float(model.wrap_prm[i])
+    return terms
+
+
+def joint_kind(model: Any, joint: int) -> str:
+    """`slide` or `hinge`."""
+    return "slide" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else "hinge"
+
+
+def active_equalities(model: Any, kinds: Sequence[int]) -> list[tuple[int, str]]:
+    """Index and name of each active equality of these kinds (mujoco.mjtEq)."""
     names = element_names(model, "equality", model.neq)
     wanted = [int(kind) for kind in kinds]
     return [(e, names[e]) for e in range(model.neq) if model.eq_active0[e] and int(model.eq_type[e]) in wanted]

@@ -27,6 +27,7 @@ from gelflow.sim.scene.mjcf.couplings import (
     read_tendons,
 )
 from gelflow.sim.scene.mjcf.model_file import compile_model, element_names
+from gelflow.sim.scene.mjcf.tendon_equalities import read_tendon_equalities
 from gelflow.sim.scene.mjcf.unsupported import apply_disable_flags, check_supported, not_modelled
 
 Array = NDArray[np.float64]
@@ -143,6 +144,8 @@ def read_mechanics(path: Path) -> Mechanics:
     moving_body, poses = _merge(model)
     actuators = read_actuators(model, path.name)
     tendons = read_tendons(model, actuators)
+    couplings = read_couplings(model)
+    more_couplings, stiff_tendons = read_tendon_equalities(model, couplings)
     frames = {name: (int(moving_body[b]), poses[b]) for b, name in enumerate(element_names(model, "body", model.nbody))}
     sites = {
         name: (int(moving_body[b]), poses[b] @ Pose(model.site_pos[i].copy(), model.site_quat[i].copy()))
@@ -154,8 +157,8 @@ def read_mechanics(path: Path) -> Mechanics:
         geoms=_geoms(model, moving_body, poses),
         frames=frames,
         sites=frames if compiled.urdf else sites,  # a URDF has no sites; its link frames take their place
-        tendons=tendons,
-        couplings=read_couplings(model),
+        tendons=tendons + stiff_tendons,
+        couplings=couplings + more_couplings,
         loop_closures=read_loop_closures(model, moving_body, poses),
         actuators=actuators,
         gravity=model.opt.gravity.copy(),

@@ -9,6 +9,7 @@ import numpy as np
 from gelflow.errors import UsageError
 from gelflow.sim.scene.mjcf.actuators import is_fixed
 from gelflow.sim.scene.mjcf.model_file import element_names
+from gelflow.sim.scene.mjcf.tendon_equalities import unsupported_equality
 
 Unsupported = tuple[str, str]  # element, advice
 
@@ -25,7 +26,8 @@ _FLAGS["PASSIVE"] = _FLAGS["SPRING"] + _FLAGS["DAMPER"]
 _FLAGS["CONSTRAINT"] = _FLAGS["LIMIT"] + _FLAGS["FRICTIONLOSS"] + _FLAGS["EQUALITY"]
 
 # Equalities that are modelled.
-_EQUALITIES = tuple(map(int, (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)))
+_TENDON = int(mujoco.mjtEq.mjEQ_TENDON)
+_EQUALITIES = (*map(int, (mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)), _TENDON)
 
 _TRANSMISSIONS = {
     mujoco.mjtTrn.mjTRN_TENDON: "on a spatial tendon",
@@ -106,7 +108,7 @@ def _elements(model: Any) -> Iterator[Unsupported]:
     for t in _nonzero(model, "tendon_", "stiffnesspoly", "dampingpoly"):
         yield f"polynomial stiffness or damping of tendon {tendons[t]!r}", "give one coefficient"
     for e in _nonzero(model, "eq_", "active0"):
-        if model.eq_type[e] not in _EQUALITIES:
+        if model.eq_type[e] not in _EQUALITIES or (model.eq_type[e] == _TENDON and unsupported_equality(model, e)):
             yield f"equality {_equality(model, e)}", "remove it, or make it inactive"
     for b, body in enumerate(bodies):
         if model.body_plugin[b] >= 0:

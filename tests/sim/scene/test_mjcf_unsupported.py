@@ -67,8 +67,8 @@ UNSUPPORTED = [
         "polynomial stiffness or damping of tendon 'split' is not supported: give one coefficient",
     ),
     (
-        section(TENDON.format("") + '<equality><tendon tendon1="split"/></equality>'),
-        "equality tendon of 'split' is not supported: remove it, or make it inactive",
+        section(ROPE.format("") + '<equality><tendon tendon1="rope"/></equality>'),
+        "equality tendon of 'rope' is not supported: remove it, or make it inactive",
     ),
     (
         (
