@@ -37,9 +37,9 @@ def test_two_joints_of_a_tendon_are_coupled_exactly_as_by_a_joint_equality(tmp_p
     equality = '<joint joint1="rocker" joint2="crank" polycoef="0.1 -0.5"/>'
     same = load(tmp_path, "joint.xml", chains(equality))
     assert (scene.nv, len(scene.tendons), len(scene.couplings)) == (3, 1, 1)
-    sim, twin = moved(scene, 0.3, 150), moved(same, 0.3, 150)
+    sim, other = moved(scene, 0.3, 150), moved(same, 0.3, 150)
     assert abs(sim.q[0, 0]) > 0.1, "it moves"
-    assert sim.q == pytest.approx(twin.q, abs=1e-9)
+    assert sim.q == pytest.approx(other.q, abs=1e-9)
     assert 2 * sim.q[0, 0] + 4 * (sim.q[0, 2] - 0.2) == pytest.approx(0.4, abs=1e-14)
 
 
