@@ -8,7 +8,10 @@ namespace gelflow {
 // Dry friction in a joint is viscous below this speed [m/s or rad/s].
 constexpr double friction_creep = 1e-3;
 
-// A joint limit is a damped spring that never pulls.
+// A joint limit is a damped spring that never pulls. Its damping begins over this depth [m or rad], so that the force is
+// continuous: without the ramp the step in which a light, fast joint arrives has no solution.
+constexpr double limit_ramp = 1e-5;
+
 template <class T>
 struct LimitForce {
   T force, dforce_dq, dforce_dv;
@@ -17,8 +20,14 @@ template <class T>
 LimitForce<T> limit_force(const JointParams<T>& p, const T& value, const T& v) {
   const bool above = value > p.upper, below = value < p.lower;
   if (!above && !below) return {T(0), T(0), T(0)};
-  const T force = p.limit_stiffness * (value - (above ? p.upper : p.lower)) + p.limit_damping * v;
-  if (above ? force > T(0) : force < T(0)) return {force, p.limit_stiffness, p.limit_damping};
+  const T beyond = value - (above ? p.upper : p.lower);
+  T damping = p.limit_damping, stiffness = p.limit_stiffness;
+  if (const T share = (above ? beyond : T(-beyond)) / T(limit_ramp); share < T(1)) {
+    stiffness += (above ? v : T(-v)) * damping / T(limit_ramp);
+    damping *= share;
+  }
+  const T force = p.limit_stiffness * beyond + damping * v;
+  if (above ? force > T(0) : force < T(0)) return {force, stiffness, damping};
   return {T(0), T(0), T(0)};
 }
 

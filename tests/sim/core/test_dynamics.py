@@ -302,6 +302,19 @@ def test_position_servo_deflects_under_load_and_clips_its_control() -> None:
     assert sim.v[0, 0] == pytest.approx((-4.0 / 2.0 - GRAVITY) * 0.1, rel=1e-12)
 
 
+def test_a_light_joint_that_arrives_fast_is_stopped_by_its_limit() -> None:
+    """A damping that begins at once left no solution for the step in which the joint arrives, however short."""
+    inertia, stiffness = 0.03, 3e7  # a period of 0.2 ms, as of a fingertip of 20 g on a limit for a motor of 10 N m
+    limit = {"upper": 0.5, "limit_stiffness": stiffness, "limit_damping": 2 * (stiffness * inertia) ** 0.5}
+    for share in np.linspace(0, 1, 21):  # of a step until the joint arrives
+        for speed in (1.0, 20.0, 300.0):
+            sim = one_joint("hinge", **limit)
+            sim.q[0], sim.v[0] = 0.5 - share * speed * 1e-3, speed
+            sim.step(np.zeros(0), 20)
+            sim.check()
+            assert sim.q[0, 0] < 0.5 + 2e-2 and sim.v[0, 0] < 1e-3
+
+
 def test_gear_scales_force_and_length() -> None:
     servo = {"kp": 200.0, "kd": 20.0, "gear": 3.0}
     sim = one_joint("slide", actuator=servo)
