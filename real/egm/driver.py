@@ -38,7 +38,7 @@ _POLL = 0.002
 class EgmArm:
     """An ABB IRB 120 as a `gelflow.protocols.Arm`: it follows checked targets in bounded steps over EGM.
 
-    Nothing is opened before `connect`. The caller must fetch the cycle log with `drain_log` regularly: a full log
+    `with` connects and closes; nothing is opened before. The caller must fetch the cycle log with `drain_log` regularly: a full log
     stops the arm, because no cycle may be lost.
     """
 
@@ -248,6 +248,8 @@ class EgmArm:
             self._latched, self._tool = "", None
 
     def __enter__(self) -> "EgmArm":
+        if self._helper is None:
+            self.connect()
         return self
 
     def __exit__(

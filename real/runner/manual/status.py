@@ -41,7 +41,6 @@ def _read(reader: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 def _arm(lab: Lab, clock: ScaledClock) -> dict[str, Any]:
     with EgmArm(egm_config(lab, dry_run=True), clock=clock) as arm:
-        arm.connect()
         state = arm.state()
         motors_on, following = state.motors_on, state.running
     x, y, yaw, height = Supervisor(lab).hole_coordinates(lab.gripper_pose(state.position, state.quaternion))

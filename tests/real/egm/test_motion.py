@@ -173,8 +173,8 @@ def test_dry_run_checks_targets_and_sends_nothing() -> None:
     mock = MockEgmArm(plant, clock=clock, config=dataclasses.replace(MOCK, port=port))
     mock.start()
     try:
-        with EgmArm(dataclasses.replace(CONFIG, port=port, dry_run=True), clock=clock) as arm:
-            arm.connect(timeout=60)
+        config = dataclasses.replace(CONFIG, port=port, dry_run=True, connect_timeout=60.0)
+        with EgmArm(config, clock=clock) as arm:
             arm.target(near_start(0.01, 0, 0), DOWN, lifetime=0.5)
             with pytest.raises(SafetyError, match="outside the workspace"):
                 arm.target(near_start(0.1, 0, 0), DOWN, lifetime=0.5)

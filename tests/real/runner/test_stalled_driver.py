@@ -12,10 +12,8 @@ from gelflow.real.runner.cell import egm_config
 
 def test_pose_stays_fresh_while_the_drivers_process_does_not_run(robot: MockRobot) -> None:
     lab = lab_for(robot)
-    arm = EgmArm(egm_config(lab, dry_run=True), clock=lab.clock)
-    arm.connect()
     oldest = 0.0
-    try:
+    with EgmArm(egm_config(lab, dry_run=True), clock=lab.clock) as arm:
         assert arm.pid is not None
         os.kill(arm.pid, signal.SIGSTOP)
         end = time.monotonic() + 1.0  # 4 s of robot time
@@ -27,6 +25,4 @@ def test_pose_stays_fresh_while_the_drivers_process_does_not_run(robot: MockRobo
         stopped = lab.clock.now()
         while arm.state().stamp < stopped:
             time.sleep(0.01)
-    finally:
-        arm.close()
     assert oldest < lab.limits.stale_pose

@@ -62,7 +62,6 @@ def invalid_targets(folder: Path) -> Outcome:
     with Rig(folder, seed=near_seed()) as rig:
         lab = rig.lab
         with EgmArm(egm_config(lab), clock=rig.robot.clock) as arm:
-            arm.connect()
             arm.wait_following(5.0)
             accepted = [name for name, refuses in _refusals(lab, arm) if not refuses()]
             time.sleep(0.3)
