@@ -1,4 +1,4 @@
-"""Hints where the step or the integrator of a scene is poor for its free bodies and contacts (`gelflow describe`)."""
+"""Hints where step, integrator or start of a scene are poor for its bodies and contacts (`gelflow describe`)."""
 
 from collections.abc import Iterator
 
@@ -19,11 +19,15 @@ SPIN = 30.0  # [rad/s] of the test of a body that rotates freely
 LARGEST_LOSS = 0.01  # of its energy per turn, without a hint
 LARGEST_PHASE = 1.0  # [rad] of the oscillation of a contact per step, without a hint
 _DIFFERENCE = 1e-6  # [m, rad] of numerical derivatives
+_OUTSIDE = 1e-3  # [m, rad] outside of its range by which a joint may start, without a hint
 
 
 def accuracy_hints(scene: Scene) -> tuple[str, ...]:
-    """One line for each body and each contact that the step and integrator of a scene resolve poorly."""
-    return (*_spin_hints(scene), *_contact_hints(scene))
+    """One line for each body and each contact that the step and integrator of a scene resolve poorly.
+
+    Also one for each joint that starts outside its range.
+    """
+    return (*_spin_hints(scene), *_contact_hints(scene), *_start_hints(scene))
 
 
 def energy_change_per_turn(inertia: Array, step: float, integrator: str) -> float:
@@ -82,6 +86,19 @@ def _contact_hints(scene: Scene) -> Iterator[str]:
             yield (
                 f"contact {contact.name}: the bodies oscillate on one of its points with a period of {milliseconds}: "
                 f"impacts lose energy and are late; bdf2 with steps of {1e3 * period / 20:.2g} ms resolves them"
+            )
+
+
+def _start_hints(scene: Scene) -> Iterator[str]:
+    for joint in scene.joints:
+        if joint.range is None:
+            continue
+        (low, high), start = joint.range, float(scene.q0[joint.q_start])
+        if not low - _OUTSIDE < start < high + _OUTSIDE:
+            unit = "m" if joint.type == "slide" else "rad"
+            yield (
+                f"joint {joint.name}: starts at {start:g} {unit}, outside its range of {low:g} to {high:g} {unit}: its "
+                'limit pushes it back; give an MJCF file a keyframe "start", or set sim.q before the first step'
             )
 
 

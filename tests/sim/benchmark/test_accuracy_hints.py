@@ -84,6 +84,16 @@ def test_restitution_of_an_undamped_contact_at_the_bound(integrator: str, tmp_pa
         assert kept[0] < 0.1
 
 
+def test_hint_names_a_joint_that_starts_outside_its_range(tmp_path: Path) -> None:
+    """The right thumb of the Allegro hand begins at 0.263 rad and its URDF, as all, starts at 0."""
+    (tmp_path / "thumb.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body name="thumb"><joint name="turn" range="0.263 1.396"/>'
+        '<joint name="bend" axis="0 1 0" range="0 1.6"/><geom size="0.01"/></body></worldbody></mujoco>'
+    )
+    (line,) = accuracy_hints(load_scene(tmp_path / "thumb.xml"))
+    assert line.startswith("joint turn: starts at 0 rad, outside its range of 0.263 to 1.396 rad: its limit pushes it")
+
+
 def test_hints_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene(tmp_path, kn=1e6)
     assert main(["describe", str(tmp_path / "s.toml"), "--no-timing"]) == 0
