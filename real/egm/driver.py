@@ -38,8 +38,8 @@ _POLL = 0.002
 class EgmArm:
     """An ABB IRB 120 as a `gelflow.protocols.Arm`: it follows checked targets in bounded steps over EGM.
 
-    `with` connects and closes; nothing is opened before. The caller must fetch the cycle log with `drain_log` regularly: a full log
-    stops the arm, because no cycle may be lost.
+    `with` connects and closes; nothing is opened before. The caller must fetch the cycle log with `drain_log`
+    regularly: a full log stops the arm, because no cycle may be lost.
     """
 
     abortable = True
