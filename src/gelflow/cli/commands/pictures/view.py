@@ -117,11 +117,10 @@ def _replayed(session: SessionReader, checkpoint: Path | None) -> list[Compariso
 
 def _serve(args: argparse.Namespace, url: str, serve: Callable[[], None]) -> int:
     output = Output(args.json)
-    output.text(f"open {url} in a browser; Ctrl-C ends")
-    output.result({"url": url})
-    sys.stdout.flush()  # it goes on
-    try:
+    # Ctrl-C is the normal end from the first line on, which other programs wait for.
+    with contextlib.suppress(KeyboardInterrupt):
+        output.text(f"open {url} in a browser; Ctrl-C ends")
+        output.result({"url": url})
+        sys.stdout.flush()  # it goes on
         serve()
-    except KeyboardInterrupt:
-        return SUCCESS
     return SUCCESS
