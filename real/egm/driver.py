@@ -191,13 +191,18 @@ class EgmArm:
         An EGM process that does not confirm the stop is killed, which has the same effect.
         """
         with self._lock:
-            if self._helper is None:
-                return
-            try:
-                self._send("stop", reason or "stop was called")
-                self._wait(lambda: bool(self._latched), _COMMAND_TIMEOUT, "the EGM process did not confirm the stop")
-            except PeerError:
-                self._helper.kill()
+            helper = self._helper
+        if helper is None:
+            return
+        try:
+            self._send("stop", reason or "stop was called")
+            # Without the lock: a thread for which robot time of a mock robot waits may need the state of the arm.
+            self._wait(lambda: bool(self._latched), _COMMAND_TIMEOUT, "the EGM process did not confirm the stop")
+        except UsageError:
+            return  # closed meanwhile
+        except PeerError:
+            helper.kill()
+            with self._lock:
                 self._latched = self._latched or reason or "stop was called"
 
     def reset(self) -> None:

@@ -1,13 +1,15 @@
-"""A computer that does not run the arm driver's process for a second: robot time of the mock robot waits."""
+"""Robot time of the mock robot waits for the arm's driver and for the runner, and neither for the other."""
 
 import os
 import signal
+import threading
 import time
 
 from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.runner.cell import egm_config
+from gelflow.time_sync import RUNNER
 
 
 def test_pose_stays_fresh_while_the_drivers_process_does_not_run(robot: MockRobot) -> None:
@@ -26,3 +28,23 @@ def test_pose_stays_fresh_while_the_drivers_process_does_not_run(robot: MockRobo
         while arm.state().stamp < stopped:
             time.sleep(0.01)
     assert oldest < lab.limits.stale_pose
+
+
+def test_the_state_is_readable_during_a_stop(robot: MockRobot) -> None:
+    """A thread in a bounded block waited for the state, and the stop for robot time: the process was killed."""
+    lab = lab_for(robot)
+    with EgmArm(egm_config(lab), clock=lab.clock) as arm:
+        arm.wait_following(60.0)
+        start = arm.state()
+        stopping = threading.Thread(target=arm.stop, args=("the test stops it",))
+        up = start.position + [0.0, 0.0, 0.01]
+        arm.target(up, start.quaternion, lifetime=0.5)
+        while arm.state().position[2] < start.position[2] + 1e-4:
+            arm.target(up, start.quaternion, lifetime=0.5)
+        with lab.clock.bounded(RUNNER):
+            time.sleep(0.1)  # robot time stands still from now on, and the arm does not come to rest
+            stopping.start()
+            time.sleep(0.1)
+            assert not arm.state().fault
+        stopping.join()
+        assert arm.state().fault == "the test stops it"
