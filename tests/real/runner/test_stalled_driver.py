@@ -5,6 +5,8 @@ import signal
 import threading
 import time
 
+import numpy as np
+
 from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.egm.driver import EgmArm
@@ -37,7 +39,7 @@ def test_the_state_is_readable_during_a_stop(robot: MockRobot) -> None:
         arm.wait_following(60.0)
         start = arm.state()
         stopping = threading.Thread(target=arm.stop, args=("the test stops it",))
-        up = start.position + [0.0, 0.0, 0.01]
+        up = start.position + np.array([0.0, 0.0, 0.01])
         arm.target(up, start.quaternion, lifetime=0.5)
         while arm.state().position[2] < start.position[2] + 1e-4:
             arm.target(up, start.quaternion, lifetime=0.5)
