@@ -100,11 +100,11 @@ $(SETUP): pyproject.toml constraints.txt CMakeLists.txt sim/csrc/CMakeLists.txt 
 	@$(PYTHON) -m venv .venv
 	@$(INSTALL) $(BUILD_TOOLS)
 	@$(INSTALL) $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
-	@$(INSTALL) --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[dev]'
+	@$(INSTALL) --no-build-isolation --config-settings=build-dir=$(BUILD) -e '.[dev]'
 	@touch $@
 
 $(DOCS_SETUP): $(SETUP)
-	@$(INSTALL) --no-build-isolation -Cbuild-dir=$(BUILD) -e '.[docs]'
+	@$(INSTALL) --no-build-isolation --config-settings=build-dir=$(BUILD) -e '.[docs]'
 	@touch $@
 
 clean:
