@@ -43,20 +43,22 @@ def coverage(words: list[str]) -> int:
     args = arguments.parse_args(words)
     count = 2 if args.quick else args.worlds
     seeds = range(args.first, args.first + count)
-    settings, unfinished = (_QUICK, ".quick.part") if args.quick else (FitSettings(), ".part")
-    part = args.out.with_suffix(unfinished)
+    settings = _QUICK if args.quick else FitSettings()
+    unfinished = _unfinished(args)
     with script.progress("worlds", count) as advance:
 
         def after_world(result: dict[str, Any]) -> None:
-            script.save(part, result)
+            script.save(unfinished, result)
             advance(1)
 
-        result = measure_coverage(seeds, settings=settings, processes=2, measured=_results(part), progress=after_world)
+        result = measure_coverage(
+            seeds, settings=settings, processes=2, measured=_results(unfinished), progress=after_world
+        )
     table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
     keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
     table.add_row(*(str(result[key]) for key in keys))
     script.finish(args, script.header() | result, table)
-    part.unlink(missing_ok=True)
+    unfinished.unlink(missing_ok=True)
     return 0
 
 
@@ -93,7 +95,7 @@ def transfer(words: list[str]) -> int:
     arguments = script.parser(transfer.__doc__ or "", out="transfer.json", quick="few insertions, no fine-tuning")
     args = arguments.parse_args(words)
     episodes, below = (32, 0.0) if args.quick else (512, 0.9)
-    unfinished = args.out.with_suffix(".quick.part" if args.quick else ".part")
+    unfinished = _unfinished(args)
     rows = {row["world"]: row for row in _results(unfinished)}
     with script.progress("worlds", len(worlds())) as advance:
         for world in worlds():
@@ -108,6 +110,12 @@ def transfer(words: list[str]) -> int:
     script.finish(args, _record(rows), table)
     unfinished.unlink(missing_ok=True)
     return 0
+
+
+def _unfinished(args: argparse.Namespace) -> Path:
+    """The file with the results of a run that is not finished."""
+    out: Path = args.out
+    return out.with_suffix(".quick.part" if args.quick else ".part")
 
 
 def _results(file: Path) -> list[dict[str, Any]]:

@@ -36,8 +36,9 @@ def read_tendon_equalities(
 ) -> tuple[tuple[CouplingDef, ...], tuple[TendonDef, ...]]:
     """The active equalities of fixed tendons: L₁ = L₁⁰ + P(L₂ − L₂⁰) with the lengths L⁰ of the file.
 
-    Those of one or two joints are couplings, in addition to `couplings`, of which no joint follows two others where
-    that can be avoided. Those of more joints are tendons whose spring is as stiff as that of a loop closure.
+    An equality of one or two joints becomes a coupling. Its second joint follows the first, or the first the second if
+    the second already follows a joint, by an equality before it or by one of `couplings`. An equality of more joints
+    becomes a tendon whose spring is as stiff as that of a loop closure.
     """
     added: list[CouplingDef] = []
     springs: list[TendonDef] = []
@@ -52,7 +53,7 @@ def read_tendon_equalities(
             if polynomial.degree() > 1:
                 added.append(_curved(model, name, terms, others, polynomial))
                 continue
-            slope = float((polynomial.deriv())(0.0))
+            slope = float(polynomial.deriv()(0.0))
             start -= slope * _length(model, others)
             for joint, coefficient in others.items():
                 terms[joint] = terms.get(joint, 0.0) - slope * coefficient

@@ -106,7 +106,7 @@ def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: 
     seconds = 5.0
     begun = robot.clock.now()
     # The error of the recording, or that of the next motion, which the latch refuses for the same reason.
-    with pytest.raises(GelflowError, match=r"is \d+\.\d s behind, at most 2 s is allowed; is the disk full or slow\?"):
+    with pytest.raises(GelflowError, match=r"is \d\.\d s behind, at most 2 s is allowed; is the disk full or slow\?"):
         finish()
     recorded = events(plan.session)
     stops = [values["at"] for name, values in recorded if name == "arm stopped" and "at" in values]
