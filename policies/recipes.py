@@ -130,10 +130,11 @@ def _pushing(observation: str, *, recurrent: int = 0) -> Recipe:
     return dataclasses.replace(recipe, best_by="return")
 
 
+# With more environments the network is updated less often for the same number of attempts, and learns less from them.
 _INSERTION = Recipe(
     "insertion",
     400_000,
-    512,
+    256,
     50_000,
     512,
     "imitation",
@@ -168,6 +169,7 @@ _RECIPES: dict[str, dict[str, Recipe]] = {
         FINE_TUNING: dataclasses.replace(
             _INSERTION,
             steps=50_000,
+            envs=512,
             evaluate_every=16_384,
             settings=ImitationSettings(memory=8, learning_rate=1e-3, bounded_after=0.0, exploration=(0.1, 0.03)),
         ),
