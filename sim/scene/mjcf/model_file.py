@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mjcf.urdf import complete_urdf, read_urdf
+from gelflow.sim.scene.mjcf.urdf import compile_urdf, complete_urdf, read_urdf
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,10 @@ def compile_model(path: Path) -> CompiledModel:
     try:
         with _no_log_file():
             spec = mujoco.MjSpec.from_file(str(path))
-            if robot is not None:
-                complete_urdf(spec, robot, path)
-            return _compiled(spec, urdf=robot is not None)
+            if robot is None:
+                return _compiled(spec, spec.compile(), urdf=False)
+            complete_urdf(spec, robot, path)
+            return _compiled(spec, compile_urdf(spec, path), urdf=True)
     except UsageError:
         raise
     except (ValueError, mujoco.FatalError) as error:
@@ -60,8 +61,7 @@ def _no_log_file() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _compiled(spec: Any, *, urdf: bool) -> CompiledModel:
-    model = spec.compile()
+def _compiled(spec: Any, model: Any, *, urdf: bool) -> CompiledModel:
     keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in ("start", "home"))
     key = next((k for k in keys if k >= 0), None)
     controls = None if key is None or not model.key_ctrl[key].any() else np.array(model.key_ctrl[key])

@@ -1,4 +1,4 @@
-"""Additions to the URDF reader of MuJoCo: files of meshes, motors, and repair of inertia that no rigid body has."""
+"""Additions to the URDF reader of MuJoCo: files of meshes, motors, and repair of masses that no rigid body has."""
 
 import os
 import warnings
@@ -18,6 +18,9 @@ from gelflow.sim.scene.geometry.mesh import TriangleMesh
 _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # rows and columns of xx, yy, zz, xy, xz, yz
 _ROUNDING = 1e-9  # relative violation of the triangle inequality that printed decimals of a thin body can cause
 _MARGIN = 1e-12  # relative, so that MuJoCo's exact comparison holds after its own rounding
+_THIN = 1e-6  # relative second moment of the mass of a body that the file makes infinitely thin, or thinner
+_LEAST_MASS, _LEAST_INERTIA = 1e-9, 1e-12  # [kg], [kg m²], of a link whose motion that of other masses determines
+_NO_INERTIA = 1e-15  # [kg m²], what MuJoCo takes for none
 
 
 def read_urdf(path: Path) -> ElementTree.Element | None:
@@ -44,12 +47,39 @@ def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
         mesh.file = _mesh_file(mesh.file, path)
         if Path(mesh.file).suffix.lower() == ".dae" and (path.parent / mesh.file).is_file():
             _insert_triangles(mesh, read_collada(path.parent / mesh.file))
-    for body in spec.bodies:
+    for body, moves in _links(spec.worldbody):
         if body.explicitinertial and np.isfinite(body.fullinertia).all():
-            body.fullinertia = _repaired(body.fullinertia, f"{path.name}: link {body.name!r}")
+            _repair_inertia(body, f"{path.name}: link {body.name!r}", moves=moves)
     mimics = _mimic_joints(robot, path)
     _couple(spec, mimics)
     _add_motors(spec, robot, without=mimics)
+
+
+def compile_urdf(spec: Any, path: Path) -> Any:
+    """Compile a completed URDF file (mujoco.MjSpec) to a mujoco.MjModel.
+
+    Links without mass between two joints get the least mass that can be simulated, with a warning. Raises UsageError if
+    one carries no mass either.
+    """
+    try:
+        return spec.compile()
+    except ValueError as error:
+        if "mjMINVAL" not in str(error):
+            raise
+    spec.compiler.boundmass, spec.compiler.boundinertia = _LEAST_MASS, _LEAST_INERTIA
+    model = spec.compile()
+    bounded = (model.body_mass <= _LEAST_MASS) | (model.body_inertia.min(axis=1) <= _LEAST_INERTIA)
+    moving = [i for i in np.flatnonzero(bounded) if model.body_dofnum[i] > 0]
+    names = [model.body(i).name for i in moving]
+    for i, name in zip(moving, names, strict=True):
+        if model.body_subtreemass[i] <= _LEAST_MASS * model.nbody:
+            raise UsageError(f"{path}: link {name!r} moves without any mass; give it an <inertial>")
+    warnings.warn(
+        f"{path.name}: moving links without mass or without inertia: {', '.join(names)}; simulated with at least "
+        f"{_LEAST_MASS:g} kg and {_LEAST_INERTIA:g} kg m²",
+        stacklevel=2,
+    )
+    return model
 
 
 def _mimic_joints(robot: ElementTree.Element, path: Path) -> dict[str, tuple[str, float, float]]:
@@ -121,33 +151,43 @@ def _candidates(package: str, inside: str, path: Path) -> Iterator[Path]:
         yield folder / inside
 
 
-def _repaired(packed: NDArray[np.float64], owner: str) -> NDArray[np.float64]:
-    """The nearest inertia that a rigid body can have, with a warning if it differs; both packed [kg m²].
+def _links(body: Any, moves: bool = False) -> Iterator[tuple[Any, bool]]:
+    """A body (mujoco.MjsBody) and those below it, each with whether there is a joint between it and the world."""
+    moves |= bool(body.joints)
+    yield body, moves
+    for child in body.bodies:
+        yield from _links(child, moves)
+
+
+def _repair_inertia(body: Any, owner: str, *, moves: bool) -> None:
+    """Give a link (mujoco.MjsBody) the nearest inertia that a rigid body can have, with a warning if it `moves`.
 
     The second moments of the mass, Σ = tr(I)/2 E − I, are not negative in a rigid body; negative ones are set to 0.
     """
     inertia = np.zeros((3, 3))
-    inertia[_PACKED] = packed
-    inertia.T[_PACKED] = packed
+    inertia[_PACKED] = body.fullinertia
+    inertia.T[_PACKED] = body.fullinertia
     principal, axes = np.linalg.eigh(inertia)
-    if not principal[0] > 0:
+    if np.abs(principal).max() < _NO_INERTIA:
+        body.fullinertia, body.inertia = np.full(6, np.nan), np.zeros(3)
+        return
+    if not principal[2] > 0:
         raise UsageError(f"{owner}: principal inertias must be positive, got {_text(principal)} kg m²")
     moments = principal.sum() / 2 - principal
     excess = -2 * float(moments.min())
-    smallest = _MARGIN * principal[2]
+    smallest = (_MARGIN if principal[0] > 0 else _THIN) * principal[2]
     if moments.min() >= smallest:
-        return packed
+        return
     moments = moments.clip(min=smallest)
     repaired = moments.sum() - moments
-    repaired_inertia: NDArray[np.float64] = axes @ np.diag(repaired) @ axes.T
-    if excess <= _ROUNDING * principal[2]:
-        return repaired_inertia[_PACKED]
+    body.fullinertia = (axes @ np.diag(repaired) @ axes.T)[_PACKED]
+    if excess <= _ROUNDING * principal[2] or not moves:
+        return
     warnings.warn(
         f"{owner}: principal inertias {_text(principal)} kg m² break the triangle inequality by {excess:.3g} kg m² "
         f"({100 * excess / principal[2]:.2g} % of the largest); simulated with {_text(repaired)} kg m²",
         stacklevel=2,
     )
-    return repaired_inertia[_PACKED]
 
 
 def _text(values: NDArray[np.float64]) -> str:

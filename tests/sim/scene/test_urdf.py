@@ -78,9 +78,63 @@ def test_possible_inertia_is_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.eigvalsh(matrix(scene.bodies[0].inertia)), [0.01, 0.02, 0.03], rtol=1e-9)
 
 
-def test_inertia_that_is_not_positive_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"link 'a': principal inertias must be positive, got -0\.01, 0\.02, 0\.03"):
-        load_scene(robot(tmp_path / "arm.urdf", ixx=-0.01))
+@pytest.mark.parametrize("ixx", [0.0, -1e-19, -0.005])
+def test_inertia_without_or_below_zero_is_repaired(ixx: float, tmp_path: Path) -> None:
+    """Rods without thickness, and the rounding errors of a computer-aided design: both are in published robots."""
+    with pytest.warns(UserWarning, match=r"link 'a': principal inertias .* break the triangle inequality by"):
+        scene = load_scene(robot(tmp_path / "arm.urdf", ixx=ixx))
+    principal = np.linalg.eigvalsh(matrix(scene.bodies[0].inertia))
+    assert principal[0] > 0
+    assert principal[0] + principal[1] >= principal[2] * (1 - 1e-12)
+    sim = Simulator(scene)
+    sim.step(np.zeros(2), 100)
+    assert (sim.status == 0).all()
+
+
+def test_inertia_that_is_nowhere_positive_is_refused(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf", ixx=-0.01)
+    path.write_text(path.read_text().replace('"0.02"', '"-0.02"').replace('"0.03"', '"-0.03"'))
+    with pytest.raises(UsageError, match=r"link 'a': principal inertias must be positive, got -0\.03, -0\.02, -0\.01"):
+        load_scene(path)
+
+
+def test_inertia_of_what_does_not_move_is_repaired_without_a_warning(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    base = LINK.format(name="base", ixx=0, geometry="").replace("0.02", "0")
+    path.write_text(path.read_text().replace('<link name="base"/>', base))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_scene(path)
+
+
+def test_links_without_mass_between_two_joints_move_as_if_they_were_not_there(tmp_path: Path) -> None:
+    """Real robots have such links where two joints cross in a point: the base of a thumb, the wrist of an arm."""
+    arm, rod = tmp_path / "arm.urdf", LINK.format(name="b", ixx=0.02, geometry="")
+    crossed = JOINT.format(name="ja", parent="base", child="a") + JOINT.format(name="jb", parent="a", child="b")
+    crossed = crossed.replace("0 0 1", "1 0 0", 1).replace("0 0 1", "0 1 0", 1)
+    arm.write_text(f'<robot name="r"><link name="base"/><link name="a"/>{rod}{crossed}</robot>')
+    with pytest.warns(UserWarning, match=r"arm\.urdf: moving links without mass or without inertia: a; simulated"):
+        scene = load_scene(arm, overrides={"step": 1e-3})
+    one_body = tmp_path / "arm.xml"
+    inertia = " ".join(f"{value:.17g}" for value in scene.bodies[1].inertia)
+    one_body.write_text(f"""<mujoco><compiler angle="radian"/><option timestep="0.001"/><worldbody><body>
+      <joint axis="1 0 0" range="-1 1"/><joint axis="0 1 0" range="-1 1"/>
+      <inertial pos="0 0 0.1" mass="1" fullinertia="{inertia}"/></body></worldbody></mujoco>""")
+    tilts = []
+    for sim in (Simulator(scene), Simulator(load_scene(one_body))):
+        sim.q[0, 0] = 0.1
+        sim.step(np.zeros(sim.model.nu), 400)
+        tilts.append(sim.q[0].copy())
+    assert tilts[0][0] > 0.4
+    np.testing.assert_allclose(tilts[0], tilts[1], atol=1e-6)
+
+
+def test_link_that_moves_without_any_mass_is_refused(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    last = '<link name="c"/>' + JOINT.format(name="jc", parent="b", child="c")
+    path.write_text(path.read_text().replace("</robot>", f"{last}</robot>"))
+    with pytest.raises(UsageError, match=r"arm\.urdf: link 'c' moves without any mass; give it an <inertial>"):
+        load_scene(path)
 
 
 TRANSMISSION = '<transmission name="t"><joint name="ja"/><joint name="jb"/>{}</transmission>'
