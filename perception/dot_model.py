@@ -137,28 +137,27 @@ class _DotWindows:
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
         steps = np.arange(-half, half + 1, max(1, round(grid.radius / 4)))  # denser samples add no information
         down, right = (a.reshape(-1) for a in np.meshgrid(steps, steps, indexing="ij"))
-        self.step = np.stack([right, down], axis=1).astype(np.float32)  # shape (pixels, 2)
+        self.step = np.stack([right, down]).astype(np.float32)  # shape (2, pixels)
         at = np.clip(self.centre_pixel[self.markers], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
         self.pixels = padded[at[:, 1, None] + half + down, at[:, 0, None] + half + right].astype(np.float32)
         self.offset = self._offsets(grid.positions.reshape(-1, 2), self.markers)
-        distance = np.linalg.norm(self.offset, axis=-1)
+        distance = _length(*self.offset)
         self.background = _fit_planes(self.pixels, self.step, (distance > 1.6 * grid.radius).astype(np.float32))
         ratio = self.pixels / np.maximum(self.background, 1.0) - 1
         inside = distance < 0.6 * grid.radius
         self.contrast = np.abs((ratio * inside).sum(1) / np.maximum(inside.sum(1), 1))
         sign = 1.0 if grid.appearance.bright else -1.0
         self.ink = sign * ratio / np.maximum(self.contrast, 1e-3)[:, None]
-        self.common = self._common_shapes(grid)
-        self.inner = np.linalg.norm(self.step, axis=1) < 1.6 * grid.radius + 1
+        self.common = self._common_shapes(grid, distance)
+        self.inner = np.flatnonzero(_length(*self.step) < 1.6 * grid.radius + 1)
 
-    def _common_shapes(self, grid: MarkerGrid) -> Floats:
+    def _common_shapes(self, grid: MarkerGrid, distance: Pixels) -> Floats:
         """Shapes as in `DotModel` of equal elliptic dots, from the second moments of the dots and the grid steps."""
-        inner = np.linalg.norm(self.offset, axis=-1) < 2.0 * grid.radius
-        weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * inner
-        total = np.maximum(weight.sum(1), 1e-9)[:, None]
-        mean = (weight[:, None] @ self.offset)[:, 0] / total
-        off = self.offset - mean[:, None]
-        moments = (off * weight[..., None]).transpose(0, 2, 1) @ off / total[..., None]
+        weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * (distance < 2.0 * grid.radius)
+        total = np.maximum(weight.sum(1), 1e-9)
+        off = np.stack(self.offset, axis=1)
+        off -= ((off @ weight[..., None]) / total[:, None, None]).astype(np.float32)
+        moments = off * weight[:, None] @ off.transpose(0, 2, 1) / total[:, None, None]
         steps = _grid_steps(grid)
         inverse = np.linalg.inv(steps)
         # In units of the grid steps, all dots have the same moments; a disc of radius 1 has second moments 1/4.
@@ -171,17 +170,18 @@ class _DotWindows:
         """The shapes with size, stretch and waves of each dot by least squares; the median size is kept."""
         markers = self.markers
         refined = shape[markers]
-        off = self._offsets(rest, markers)
-        ink, _ = self._ink(_in_dots(off, shape[markers])[2], np.ones(len(markers), dtype=bool))
-        ink, off = ink[:, self.inner], off[:, self.inner]
+        right, down = self._offsets(rest, markers)
+        ink = self._ink(_DotPixels.at(right, down, shape[markers]).radius, np.ones(len(markers), dtype=bool))[0]
+        ink, right, down = (np.take(values, self.inner, axis=1) for values in (ink, right, down))
         for _ in range(_SHAPE_STEPS):
-            x, y, radius = _in_dots(off, refined)
-            here, slope = _sample(profile, radius)
-            change = _least_squares(_outline_changes(x, y) * slope, ink - here)
+            pixels = _DotPixels.at(right, down, refined)
+            here, slope = _sample(profile, pixels.radius)
+            change = _least_squares(pixels.outline_changes() * slope, ink - here)
             change[:, 0] -= np.median(change[:, 0])
             change = np.clip(change, -_MAX_CHANGE, _MAX_CHANGE)
-            moved = np.linalg.solve(refined[:, :4].reshape(-1, 2, 2), change[:, 1:3, None])[:, None, :, 0]
-            off -= moved.astype(np.float32)
+            moved = np.linalg.solve(refined[:, :4].reshape(-1, 2, 2), change[:, 1:3, None]).astype(np.float32)
+            right -= moved[:, 0]
+            down -= moved[:, 1]
             refined = _reshaped(refined, change)
         size, raggedness = _deviations(refined, self.common[markers])
         sound = (raggedness < max(_SOUND, 3.5 * float(np.median(raggedness)))) & (size < _LARGEST_SIZE)
@@ -195,7 +195,7 @@ class _DotWindows:
         Damaged dots, whose shape is the common one, get the smallest value: their other parts must be without weight.
         """
         shape = model.shape[self.markers]
-        radius = _in_dots(self._offsets(model.rest, self.markers), shape)[2]
+        radius = _DotPixels.at(*self._offsets(model.rest, self.markers), shape).radius
         ink, _ = self._ink(radius, np.ones(len(self.markers), dtype=bool))
         residual = ink - _sample(model.profile, radius)[0]
         inside = radius < 1.5
@@ -207,22 +207,23 @@ class _DotWindows:
         result[self.markers] = np.clip(_TOLERATED[0] + _UNEXPLAINED * unexplained, *_TOLERATED)
         return result
 
-    def _offsets(self, rest: Floats, markers: NDArray[np.intp]) -> Pixels:
-        """Offsets of the pixels from the centres `rest` of all markers [px], shape (dots, pixels, 2)."""
-        return np.asarray(self.step - (rest - self.centre_pixel)[markers].astype(np.float32)[:, None])
+    def _offsets(self, rest: Floats, markers: NDArray[np.intp]) -> tuple[Pixels, Pixels]:
+        """Offsets of the pixels from the centres `rest` of all markers: right and down [px], shape (dots, pixels)."""
+        centre = (rest - self.centre_pixel)[markers].astype(np.float32)
+        return self.step[0] - centre[:, :1], self.step[1] - centre[:, 1:]
 
     def _ink(self, radius: Pixels, use: NDArray[np.bool_]) -> tuple[Pixels, Pixels]:
         """Ink at the distances `radius` from the centres, and value over background less 1, shape (dots, pixels)."""
         background = _fit_planes(self.pixels[use], self.step, (radius > 1.7).astype(np.float32))
         ratio = self.pixels[use] / np.maximum(background, 1.0) - 1
         inside = radius < 0.6
-        contrast = (ratio * inside).sum(1) / np.maximum(inside.sum(1), 1)
+        contrast = (ratio * inside).sum(1) / np.maximum(inside.sum(1, dtype=np.float32), 1)
         return ratio / np.where(np.abs(contrast) > 1e-3, contrast, np.float32(1e-3))[:, None], ratio
 
     def profile(self, rest: Floats, shape: Floats, visible: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
         """The mean profile, as in `DotModel`, and the pixel noise outside the dots."""
         use = visible[self.markers]
-        radius = _in_dots(self._offsets(rest, self.markers[use]), shape[self.markers[use]])[2]
+        radius = _DotPixels.at(*self._offsets(rest, self.markers[use]), shape[self.markers[use]]).radius
         ink, ratio = self._ink(radius, use)
         ring = np.minimum(radius / _PROFILE_REACH * _RINGS, _RINGS).astype(np.intp)
         sound = np.abs(ink - _edge(radius)) < 0.75  # excludes damaged parts of dots
@@ -240,34 +241,44 @@ class _DotWindows:
         return table.astype(np.float32), noise
 
 
-def _in_dots(off: Pixels, shape: Floats) -> tuple[Pixels, Pixels, Pixels]:
-    """Coordinates of offsets (dots, pixels, 2) in the frames of the dots, and distance relative to the outline."""
-    xx, xy, yx, yy, *waves = shape.astype(np.float32).T[:, :, None]
-    x, y = xx * off[..., 0] + xy * off[..., 1], yx * off[..., 0] + yy * off[..., 1]
-    bulge = sum(share * wave for share, wave in zip(waves, _waves(x, y), strict=True))
-    return x, y, np.asarray(np.hypot(x, y) * (1 - bulge))
+@dataclass(frozen=True)
+class _DotPixels:
+    """Pixels in the frames of their dots, in which a dot is a disc of radius 1; shapes (dots, pixels)."""
+
+    x: Pixels
+    y: Pixels
+    square: Pixels  # x² + y²
+    radius: Pixels  # distance from the centre relative to the outline
+    waves: tuple[Pixels, ...]  # of an outline: Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴ with z = x + i y
+
+    @classmethod
+    def at(cls, right: Pixels, down: Pixels, shape: Floats) -> "_DotPixels":
+        """The pixels at these offsets from the centres; `shape` as in `DotModel`."""
+        xx, xy, yx, yy, *shares = shape.astype(np.float32).T[:, :, None]
+        x, y = xx * right + xy * down, yx * right + yy * down
+        square, real, imaginary = x * x + y * y, x * x - y * y, 2 * x * y
+        inverse = 1 / np.square(np.maximum(square, np.float32(_WAVE_LIMIT)))
+        third = (x * real - y * imaginary) * inverse, (x * imaginary + y * real) * inverse
+        waves = (*third, (real * real - imaginary * imaginary) * inverse, 2 * real * imaginary * inverse)
+        bulge = sum(share * wave for share, wave in zip(shares, waves, strict=True))
+        return cls(x, y, square, np.asarray(np.sqrt(square) * (1 - bulge)), waves)
+
+    def outline_changes(self) -> Pixels:
+        """Changes of an outline by size, offset (right, down), stretch (two) and waves, shape (dots, 9, pixels)."""
+        x, y, square = self.x, self.y, np.maximum(self.square, np.float32(_WAVE_LIMIT))
+        inverse = 1 / np.sqrt(square)
+        stretch = (x * x - y * y) / square, 2 * x * y / square
+        return np.stack([np.ones_like(x), x * inverse, y * inverse, *stretch, *self.waves], axis=1)
 
 
-def _waves(x: Pixels, y: Pixels) -> tuple[Pixels, ...]:
-    """Waves of an outline: Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴ with z = x + i y."""
-    real, imaginary = x * x - y * y, 2 * x * y
-    inverse = 1 / np.square(np.maximum(x * x + y * y, np.float32(_WAVE_LIMIT)))
-    third = (x * real - y * imaginary) * inverse, (x * imaginary + y * real) * inverse
-    waves = (*third, (real * real - imaginary * imaginary) * inverse, 2 * real * imaginary * inverse)
-    return tuple(np.asarray(wave, dtype=np.float32) for wave in waves)
-
-
-def _outline_changes(x: Pixels, y: Pixels) -> Pixels:
-    """Changes of an outline by size, offset (right, down), stretch (two axes) and waves, shape (dots, 9, pixels)."""
-    square = np.maximum(x * x + y * y, _WAVE_LIMIT)
-    inverse = 1 / np.sqrt(square)
-    stretch = (x * x - y * y) / square, 2 * x * y / square
-    return np.stack([np.ones_like(x), x * inverse, y * inverse, *stretch, *_waves(x, y)], axis=1)
+def _length(x: Pixels, y: Pixels) -> Pixels:
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def _least_squares(terms: Pixels, values: Pixels) -> Floats:
     """Coefficients of `terms` (dots, n, pixels) that sum to `values` (dots, pixels), shape (dots, n)."""
-    matrix = (terms @ terms.transpose(0, 2, 1)).astype(np.float64) + 1e-5 * np.eye(terms.shape[1])
+    # The product of an array with its own transpose takes a routine of BLAS that is slow for small matrices.
+    matrix = (terms.copy() @ terms.transpose(0, 2, 1)).astype(np.float64) + 1e-5 * np.eye(terms.shape[1])
     return np.asarray(np.linalg.solve(matrix, terms @ values[..., None])[..., 0])
 
 
@@ -298,7 +309,7 @@ def _sample(profile: Pixels, radius: Pixels) -> tuple[Pixels, Pixels]:
 
 def _fit_planes(pixels: Pixels, step: Pixels, weight: Pixels) -> Pixels:
     """Weighted least-squares plane through the pixels of each window, shape (windows, pixels)."""
-    terms = np.concatenate([np.ones_like(step[:, :1]), step / np.abs(step).max()], axis=1)
+    terms = np.stack([np.ones_like(step[0]), *(step / np.abs(step).max())], axis=1)
     products = (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
     matrix = (weight @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
     right = (weight * pixels) @ terms

@@ -145,7 +145,7 @@ def _candidate_appearances(image: NDArray[np.uint8], polarity: Polarity) -> tupl
     if polarity != "auto":
         return DARK if polarity == "dark" else BRIGHT
     response = local_contrast(image, BRIGHT[0], round(5 * _RADII[2]))
-    return BRIGHT + DARK if float((response**3).mean()) > 0 else DARK + BRIGHT
+    return BRIGHT + DARK if float((response * response * response).mean()) > 0 else DARK + BRIGHT
 
 
 def _no_grid_error(image: NDArray[np.uint8], appearance: DotAppearance, polarity: Polarity) -> TrackerInitError:
