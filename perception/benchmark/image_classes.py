@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 SMALL, LARGE = (320, 240), (640, 480)  # image sizes [px]
 MARKERS = (63, 130, 154)
+MOST_MARKERS = 252  # those of a GelSlim; timed only
 
 
 @dataclass(frozen=True)

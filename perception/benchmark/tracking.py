@@ -8,7 +8,16 @@ import numpy as np
 
 from gelflow.measurement.timing import BenchmarkOptions, Report
 from gelflow.perception.benchmark.baselines import TRACKERS
-from gelflow.perception.benchmark.image_classes import CLASSES, FACTORED, LARGE, MARKERS, SIZED, SMALL, ImageClass
+from gelflow.perception.benchmark.image_classes import (
+    CLASSES,
+    FACTORED,
+    LARGE,
+    MARKERS,
+    MOST_MARKERS,
+    SIZED,
+    SMALL,
+    ImageClass,
+)
 from gelflow.perception.benchmark.metrics import TrackingMetrics
 from gelflow.perception.benchmark.speed import measure_speed
 from gelflow.perception.synthetic.appearance import make_appearance
@@ -207,7 +216,8 @@ def _largest_jumps(images: ImageClass, options: BenchmarkOptions) -> dict[str, d
 
 
 def _speed_report(options: BenchmarkOptions) -> Report:
-    sizes = [(130, SMALL), (130, LARGE)] if options.quick else [(n, size) for size in (SMALL, LARGE) for n in MARKERS]
+    numbers = (130,) if options.quick else (*MARKERS, MOST_MARKERS)
+    sizes = [(n, size) for size in (SMALL, LARGE) for n in numbers]
     options.progress.begin("tracking: speed", len(sizes))
     rows: list[tuple[str, ...]] = []
     results: list[dict[str, Any]] = []
