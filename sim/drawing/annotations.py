@@ -78,7 +78,7 @@ def annotate(
     length = _ARROW_SHARE * view.size[1] * view.camera.distance / view.focal / scales.contact  # [m/N]
     for contact in drawing.contacts:
         _draw_contact(picture, contact, view, length)
-    _draw_legend(picture, view, scales, tile, contacts=bool(drawing.contacts))
+    _draw_legend(picture, drawing, view, scales, tile)
     _draw_panels(picture, drawing.pads, scales)
     _text(picture, title, (8, 18))
 
@@ -126,8 +126,8 @@ def _draw_contact(picture: Picture, contact: ContactForce, view: View, length: f
     _dot(picture, pixels[0], 3, FORCE_COLOR)
 
 
-def _draw_legend(picture: Picture, view: View, scales: ForceScales, tile: float, *, contacts: bool) -> None:
-    """World axes, length of a tile, and the length of a contact force, at the lower left."""
+def _draw_legend(picture: Picture, drawing: SceneDrawing, view: View, scales: ForceScales, tile: float) -> None:
+    """World axes, distance of the lines on a plane, and the length of a contact force, at the lower left."""
     height = picture.shape[0]
     corner = np.array([34.0, height - 36.0])
     for axis, name in enumerate("xyz"):
@@ -136,8 +136,10 @@ def _draw_legend(picture: Picture, view: View, scales: ForceScales, tile: float,
             end = corner + 24 * np.array([right, -up])
             _arrow(picture, corner, end, _INK, 1)
             _text(picture, name, (int(end[0] + 5 * right) - 3, int(end[1] - 8 * up) + 4))
-    _text(picture, f"lines {quantity(1e3 * tile, 'mm') if tile < 1 else quantity(tile, 'm')} apart", (76, height - 10))
-    if contacts:
+    if any(geom.kind == "plane" for geom in drawing.geoms):
+        distance = quantity(1e3 * tile, "mm") if tile < 1 else quantity(tile, "m")
+        _text(picture, f"lines {distance} apart", (76, height - 10))
+    if drawing.contacts:
         size = _ARROW_SHARE * view.size[1]
         start = np.array([78.0, height - 32.0])
         end = start + np.array([size, 0.0])

@@ -1,5 +1,7 @@
 """Pictures: bodies, shadows and forces are at the pixels where geometry puts them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -53,6 +55,17 @@ def test_contact_force_is_an_arrow_that_appears_with_the_contact() -> None:
     assert arrow[:180].sum() > 30  # above the legend
     rows = np.flatnonzero(arrow[:180].any(1))
     assert np.ptp(rows) > 20  # upwards: the ground carries the box
+
+
+def test_distance_of_lines_is_written_where_a_plane_has_them(tmp_path: Path) -> None:
+    texts = []
+    for plane in ("", '<geom type="plane" size="1 1 0.1"/>'):
+        (tmp_path / "arm.xml").write_text(f"""<mujoco><worldbody>{plane}
+          <body pos="0 0 1"><joint/><geom size="0.1"/></body></worldbody></mujoco>""")
+        sim = gs.Simulator(gs.load_scene(tmp_path / "arm.xml"))
+        picture = gs.render(sim, size=(320, 240), camera=gs.Camera((0.0, 0.0, 1.0), 0.5, elevation=-60.0))
+        texts.append((picture[225:238, 72:200] < 128).any())  # seen from below, in front of the sky
+    assert texts == [False, True]
 
 
 def test_pad_panel_shows_normal_forces_as_colours() -> None:
