@@ -7,8 +7,10 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.cli.options import checkpoint_for
+from gelflow.errors import UsageError
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
 from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.recipes import recipe_for
 from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
@@ -37,6 +39,22 @@ def test_the_shipped_policy_of_the_peg_inserts_it_with_a_stiff_arm() -> None:
     result = evaluate_task("policy", network.batch_policy(32), batch, episodes=48, seed=5)
     assert result.successes >= 42  # more than three standard deviations below 48 · 0.97
     assert result.length < 8
+
+
+@pytest.mark.parametrize("algorithm", [[], ["--algorithm", "ppo"], ["--start"]])
+def test_training_has_the_environments_of_its_recipe(
+    algorithm: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = []
+
+    def train(task: str, folder: Path, *, recipe: str, envs: int, **options: object) -> None:
+        names.append(recipe)
+        assert envs == recipe_for(task, recipe).envs
+        raise UsageError("no training here")
+
+    monkeypatch.setattr("gelflow.policies.recipes.train", train)
+    assert main(["train", "insertion", *algorithm, "--out", str(tmp_path)]) == 2
+    assert len(names) == 1
 
 
 @pytest.mark.parametrize("algorithm", [[], ["--algorithm", "ppo"]])

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _DEFAULT = "imitation"
 _SHIPPED = Path("shipped")  # --start without a file
-_ENVS = {"imitation": 512, "ppo": 64}  # default number of environments by algorithm
+_ALGORITHMS = (_DEFAULT, "ppo")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,10 +49,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--minutes", type=float, metavar="M", help="stop after this time; such a run is not reproducible"
     )
     parser.add_argument(
-        "--algorithm", choices=list(_ENVS), default=_DEFAULT, help="learning algorithm (default %(default)s)"
+        "--algorithm", choices=_ALGORITHMS, default=_DEFAULT, help="learning algorithm (default %(default)s)"
     )
-    envs = " or ".join(f"{number} with {name}" for name, number in _ENVS.items())
-    parser.add_argument("--envs", type=int, metavar="N", help=f"parallel environments (insertion: {envs})")
+    parser.add_argument("--envs", type=int, metavar="N", help="parallel environments (default: docs/guide/training.md)")
     add_part(parser)
     add_randomization(parser)
     parser.add_argument(
@@ -77,7 +76,6 @@ def run(args: argparse.Namespace) -> int:
     if args.recipe is not None:
         raise UsageError("--recipe is for other tasks than the insertion, which has --algorithm")
     args.out = args.out or Path("runs/insertion")
-    args.envs = _ENVS[args.algorithm] if args.envs is None else args.envs
     check_at_least(args, envs=1, seed=0)
     output = Output(args.json)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
@@ -114,7 +112,9 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
         recipe = recipes.FINE_TUNING
         if args.start == _SHIPPED:
             args.start = default_checkpoint()
-    attempts = recipes.recipe_for("insertion", recipe).steps if args.attempts is None else args.attempts
+    defaults = recipes.recipe_for("insertion", recipe)
+    args.envs = defaults.envs if args.envs is None else args.envs
+    attempts = defaults.steps if args.attempts is None else args.attempts
     bar = progress.add_task("training", total=attempts)
 
     def report(point: "RunProgress") -> None:
