@@ -135,7 +135,8 @@ class _DotWindows:
         self.markers = np.flatnonzero(grid.visible)
         self.centre_pixel = np.round(grid.positions.reshape(-1, 2)).astype(np.intp)
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
-        steps = np.arange(-half, half + 1, max(1, round(grid.radius / 4)))  # denser samples add no information
+        sampling = max(1, round(grid.radius / 3.7))  # [px], about 3 samples a radius: denser ones add no information
+        steps = np.arange(-half, half + 1, sampling)
         down, right = (a.reshape(-1) for a in np.meshgrid(steps, steps, indexing="ij"))
         self.step = np.stack([right, down]).astype(np.float32)  # shape (2, pixels)
         at = np.clip(self.centre_pixel[self.markers], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
