@@ -114,7 +114,7 @@ def train_and_evaluate(row: Row, columns: list[Row], folder: Path, args: argpars
     """Success and corrections of the policy that is trained in `row`, by the names of the columns."""
     place = folder / folder_name(row.name)
     options = {name: value for name, value in row.options.items() if value is not None}
-    run = training_run("insertion", place, seed=args.seed, steps=args.attempts, envs=256, options=options)
+    run = training_run("insertion", place, seed=args.seed, steps=args.attempts, options=options)
     if not run.is_finished():
         run.train()
     stored = place / "evaluations.json"

@@ -18,9 +18,8 @@ from gelflow.sim.scene.geometry.mesh import TriangleMesh
 _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # rows and columns of xx, yy, zz, xy, xz, yz
 _ROUNDING = 1e-9  # relative violation of the triangle inequality that printed decimals of a thin body can cause
 _MARGIN = 1e-12  # relative, so that MuJoCo's exact comparison holds after its own rounding
-_THIN = 1e-6  # relative second moment of the mass of a body that the file makes infinitely thin, or thinner
-_LEAST_MASS, _LEAST_INERTIA = 1e-9, 1e-12  # [kg], [kg m²], of a link whose motion that of other masses determines
-_NO_INERTIA = 1e-15  # [kg m²], what MuJoCo takes for none
+_THIN = 1e-6  # the same where a principal inertia is zero or negative: a joint about its axis must be able to move
+_LEAST_MASS, _LEAST_INERTIA = 1e-9, 1e-12  # [kg], [kg m²]: far below those of the bodies that such a link carries
 
 
 def read_urdf(path: Path) -> ElementTree.Element | None:
@@ -70,12 +69,12 @@ def compile_urdf(spec: Any, path: Path) -> Any:
     model = spec.compile()
     bounded = (model.body_mass <= _LEAST_MASS) | (model.body_inertia.min(axis=1) <= _LEAST_INERTIA)
     moving = [i for i in np.flatnonzero(bounded) if model.body_dofnum[i] > 0]
-    names = [model.body(i).name for i in moving]
-    for i, name in zip(moving, names, strict=True):
+    for i in moving:
         if model.body_subtreemass[i] <= _LEAST_MASS * model.nbody:
-            raise UsageError(f"{path}: link {name!r} moves without any mass; give it an <inertial>")
+            raise UsageError(f"{path}: link {model.body(i).name!r} moves without any mass; give it an <inertial>")
+    names = ", ".join(model.body(i).name for i in moving)
     warnings.warn(
-        f"{path.name}: moving links without mass or without inertia: {', '.join(names)}; simulated with at least "
+        f"{path.name}: moving links without mass or without inertia: {names}; simulated with at least "
         f"{_LEAST_MASS:g} kg and {_LEAST_INERTIA:g} kg m²",
         stacklevel=2,
     )
@@ -162,13 +161,14 @@ def _links(body: Any, moves: bool = False) -> Iterator[tuple[Any, bool]]:
 def _repair_inertia(body: Any, owner: str, *, moves: bool) -> None:
     """Give a link (mujoco.MjsBody) the nearest inertia that a rigid body can have, with a warning if it `moves`.
 
-    The second moments of the mass, Σ = tr(I)/2 E − I, are not negative in a rigid body; negative ones are set to 0.
+    The second moments of the mass, Σ = tr(I)/2 E − I, are not negative in a rigid body; negative ones are set to a
+    small value.
     """
     inertia = np.zeros((3, 3))
     inertia[_PACKED] = body.fullinertia
     inertia.T[_PACKED] = body.fullinertia
     principal, axes = np.linalg.eigh(inertia)
-    if np.abs(principal).max() < _NO_INERTIA:
+    if np.abs(principal).max() < mujoco.mjMINVAL:  # none: see compile_urdf
         body.fullinertia, body.inertia = np.full(6, np.nan), np.zeros(3)
         return
     if not principal[2] > 0:

@@ -78,7 +78,7 @@ def test_possible_inertia_is_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.eigvalsh(matrix(scene.bodies[0].inertia)), [0.01, 0.02, 0.03], rtol=1e-9)
 
 
-@pytest.mark.parametrize("ixx", [0.0, -1e-19, -0.005])
+@pytest.mark.parametrize("ixx", [0.0, -1e-19, -0.005, -0.01])
 def test_inertia_without_or_below_zero_is_repaired(ixx: float, tmp_path: Path) -> None:
     """Rods without thickness, and the rounding errors of a computer-aided design: both are in published robots."""
     with pytest.warns(UserWarning, match=r"link 'a': principal inertias .* break the triangle inequality by"):

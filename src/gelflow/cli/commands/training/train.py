@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--algorithm", choices=_ALGORITHMS, default=_DEFAULT, help="learning algorithm (default %(default)s)"
     )
-    parser.add_argument("--envs", type=int, metavar="N", help="parallel environments (default: docs/guide/training.md)")
+    parser.add_argument("--envs", type=int, metavar="N", help="parallel environments (default: those of the recipe)")
     add_part(parser)
     add_randomization(parser)
     parser.add_argument(
