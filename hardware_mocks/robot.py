@@ -97,7 +97,8 @@ class MockRobot:
             )
             for finger, slot in enumerate((LEFT_CAMERA, RIGHT_CAMERA))
         )
-        self.faults = FaultInjector(config.faults, Devices(self.arm, self.gripper, self.cameras, self.cell), clock)
+        devices = Devices(self.arm, self.gripper, self.cameras, self.cell)
+        self.faults = FaultInjector(config.faults, devices, clock, config.cell.task)
         self._truth = _TruthServer((config.host, config.truth_port), self.cell, self.faults)
         self._stack = contextlib.ExitStack()
 

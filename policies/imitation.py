@@ -32,6 +32,12 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
+# Fields of a task that differ between parts whose policies have the same inputs and outputs.
+_OF_PART = (
+    *("part", "misalignment", "workspace", "rim_height", "start_height", "success_height"),
+    *("descent", "frame_depths"),
+)
+
 
 @dataclass(frozen=True)
 class ImitationSettings:
@@ -96,7 +102,7 @@ class Imitation(Learner):
         self._iterations = 0
 
     def start_from(self, checkpoint: Checkpoint) -> None:
-        """Takes the weights of a policy, which may be that of another part.
+        """Takes the weights of a policy, which may be that of another part and of descents to another depth.
 
         Raises UsageError when its observations, actions or layers are others.
         """
@@ -183,8 +189,8 @@ class Imitation(Learner):
 
 
 def _without_part(task: Mapping[str, Any]) -> dict[str, Any]:
-    """A description of the task, without part and misalignment."""
-    return {name: value for name, value in task.items() if name not in ("part", "misalignment", "workspace")}
+    """A description of the task, without part, misalignment and heights."""
+    return {name: value for name, value in task.items() if name not in _OF_PART}
 
 
 def architecture_for(task: InsertionTask) -> PolynomialGRU:

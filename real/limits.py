@@ -47,7 +47,7 @@ class MotionLimits:
     workspace_yaw_deg: float = 16.0  # |yaw| [°]
     workspace_tilt_deg: float = 1.0  # of the gripper's z axis [°]
     workspace_height: tuple[float, float] = (0.001, 0.060)  # of the part's lower face above the hole's floor [m]
-    descent_depth: float = 1.5e-3  # below the start of an attempt [m]
+    descent_depth: float = 4.5e-3  # below the start of an attempt [m]
 
     # One jog by hand (gelflow robot jog).
     jog_distance: float = 0.020  # [m]

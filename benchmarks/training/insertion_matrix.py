@@ -25,7 +25,7 @@ from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import training_run
 from gelflow.policies.reproduction.trials import folder_name
-from gelflow.sim.tasks.insertion import RANDOMIZATIONS
+from gelflow.sim.tasks.insertion_randomization import RANDOMIZATIONS
 from gelflow.sim.tasks.registry import make_task
 from gelflow.task import INSERTION
 

@@ -15,14 +15,12 @@ from gelflow.hardware_mocks.faults.plan import KINDS, Fault, FaultPlan
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
 from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
-from gelflow.task import INSERTION
+from gelflow.task import InsertionTask
 from gelflow.time_sync import MIN_WAIT
 
 _STOPS = ("emergency_stop", "motors_off", "rapid_stop")  # of the arm
 _PERIOD = 0.002  # of the checks for events [s]
-# Heights of the lower face at which descent and lowering begin, without `below` [m]: 0.1 mm after their start.
-_DESCENT_BELOW = INSERTION.start_height - 0.1e-3
-_LOWERING_BELOW = INSERTION.start_height - INSERTION.descent - 0.1e-3
+_AFTER_START = 0.1e-3  # below the start of descent and lowering they have begun, for faults without `below` [m]
 
 
 @dataclass(frozen=True)
@@ -101,8 +99,8 @@ class Devices:
         return self.cameras if device == "cameras" else (self.cameras[device == "right_camera"],)
 
 
-def event_occurred(fault: Fault, progress: Progress) -> bool:
-    """Whether the event of a fault has occurred."""
+def event_occurred(fault: Fault, progress: Progress, task: InsertionTask) -> bool:
+    """Whether the event of a fault has occurred in the insertion `task`."""
     gripped = progress.phase == PHASES.index("gripped")
     if fault.event == "gripped":
         return gripped
@@ -114,15 +112,17 @@ def event_occurred(fault: Fault, progress: Progress) -> bool:
         return False
     if fault.event == "attempt":
         return True
-    default = _DESCENT_BELOW if fault.event == "descent" else _LOWERING_BELOW
-    return progress.height < (default if fault.below is None else fault.below)
+    if fault.below is not None:
+        return progress.height < fault.below
+    start = task.start_height - (task.descent if fault.event == "lowering" else 0)
+    return progress.height < start - _AFTER_START
 
 
 class Occurrence:
     """The state of one fault of the plan: when it begins next, and when it ends."""
 
-    def __init__(self, number: int, fault: Fault) -> None:
-        self.number, self.fault = number, fault
+    def __init__(self, number: int, fault: Fault, task: InsertionTask) -> None:
+        self.number, self.fault, self._task = number, fault, task
         self._random = random.Random(f"begin {fault.seed}")
         self._due: float | None = None  # of the next start [s]
         self._done = False
@@ -139,7 +139,7 @@ class Occurrence:
                 self._due = now + self._random.expovariate(fault.rate)
             elif fault.at is not None:
                 self._due = progress.started + fault.at
-            elif event_occurred(fault, progress):
+            elif event_occurred(fault, progress, self._task):
                 self._due = now + fault.after
         if self._due is None or now < self._due:
             return False
@@ -159,9 +159,9 @@ class Occurrence:
 class FaultInjector:
     """Begins and ends the faults of a plan in a thread. Use `start` and `stop`."""
 
-    def __init__(self, plan: FaultPlan, devices: Devices, clock: ScaledClock) -> None:
+    def __init__(self, plan: FaultPlan, devices: Devices, clock: ScaledClock, task: InsertionTask) -> None:
         self._devices, self._clock = devices, clock
-        self._occurrences = [Occurrence(number, fault) for number, fault in enumerate(plan.faults)]
+        self._occurrences = [Occurrence(number, fault, task) for number, fault in enumerate(plan.faults)]
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: Exception | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.sim.scene.loader import find_scene, scene_tables
-from gelflow.sim.tasks.insertion import ARM_JOINTS, NOMINAL, simulator_parameters
+from gelflow.sim.tasks.insertion_randomization import ARM_JOINTS, NOMINAL, simulator_parameters
 from gelflow.toml_tables import toml_text
 
 SCENE, MODEL = "scene.toml", "insertion.xml"

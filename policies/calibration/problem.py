@@ -10,7 +10,7 @@ from gelflow.errors import UsageError
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.sim.tasks.insertion import NOMINAL
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 
 Array = NDArray[np.float64]
 

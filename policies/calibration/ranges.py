@@ -7,7 +7,7 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.report import FORMAT
-from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
+from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
 
 
 def read_ranges(path: Path) -> dict[str, list[float]]:

@@ -13,7 +13,7 @@ from gelflow.observation import Grid
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
-from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
+from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
 from gelflow.sim.tasks.randomization import fixed_values
 from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
 

@@ -26,8 +26,10 @@ from gelflow.sim.scene import Scene
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
-from gelflow.sim.tasks.insertion import RANDOMIZATIONS as RANDOMIZATIONS  # found by the registry beside `Insertion`
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import (
+    RANDOMIZATIONS as RANDOMIZATIONS,  # found by the registry beside `Insertion`
+)
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, InsertionTask

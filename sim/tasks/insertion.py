@@ -8,23 +8,24 @@ not depend on that pose, so it is simulated once per part.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.geometry import rotation_matrices
+from gelflow.geometry import rotation_matrices, turned_about_z
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.arguments import check_type
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES, PAD_QUANTITIES, PADS, pad_parameters
+from gelflow.sim.tasks.gripper.pads import PADS
+from gelflow.sim.tasks.insertion_randomization import ARM_JOINTS, insertion_randomization, simulator_parameters
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters, with_part
 from gelflow.sim.tasks.parts.registry import part_geometry
-from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Randomization, Uniform
-from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, PAIR_QUANTITIES, SENSOR_QUANTITIES, SensorModel
+from gelflow.sim.tasks.randomization import Randomization
+from gelflow.sim.tasks.sensor_model import SensorModel
 from gelflow.sim.trajectory import TouchStop, Trajectory
 from gelflow.task import INSERTION, InsertionTask
 
@@ -35,65 +36,15 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-DESCENT_TIME = (
-    0.225  # [s] of an attempt, as in Xu et al. (CoRL 2022): 45 steps of 5 ms, about ten times faster than the robot
-)
+# [m/s] of an attempt, as in Xu et al. (CoRL 2022): 1.1 mm in 45 steps of 5 ms, about ten times faster than the robot.
+DESCENT_SPEED = 1.1e-3 / 0.225
 SETTLE_TIME = 0.120  # [s] until the part is at rest in the closed gripper
-ARM_JOINTS = ("arm_x", "arm_y", "arm_z", "arm_yaw")
 ROLLOUT_SIZE = 64  # environments of one rollout
 _GRASP_STATE = ("q", "anchors", "anchored")
 _STATE = ("v", *_GRASP_STATE)
 _CLEAR_HEIGHT = 0.1  # [m] height of the part while the gripper closes, clear of the hole
 _OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
-
-# The ranges of contact, pad and grasp parameters are published (paper, appendix, Table 7). Quantities that the
-# published simulator does not have are chosen here.
-_HOLE_QUANTITIES: Mapping[str, Quantity] = {
-    "hole_kn": Quantity(LogUniform(2.5e3, 2e4), "N/m", "contact of part and hole, per point"),
-    "hole_mu": Quantity(Uniform(0.3, 1.5), "", "friction of part and hole, down to printed plastic"),
-}
-DEFAULT_RANDOMIZATION = Randomization(
-    {
-        **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is None},
-        **_HOLE_QUANTITIES,
-        **{name: row for name, row in PAD_QUANTITIES.items() if row.friction is not None},
-        "arm_stiffness": Quantity(LogUniform(200.0, 3e5), "N/m", "servo stiffness of the arm, paper to industrial arm"),
-        "grasp_force": Quantity(Uniform(2.5, 16.0), "N", "of each finger"),
-        "grasp_height": Quantity(Uniform(-10e-3, 5e-3), "m", "of the pad centres above the part's centre"),
-        # The robot stops at a marker displacement; the force at that displacement depends on the gel.
-        "stop_shear": Quantity(LogUniform(5e-3, 0.1), "N", "mean shear of the markers at which a descent stops"),
-        **NO_SENSOR_EFFECTS,
-        # From the published 1e-5 N to the noise of image tracking.
-        "noise": SENSOR_QUANTITIES["noise"],
-        **PAIR_QUANTITIES,
-        "start_height": Quantity(Fixed(0.2e-3), "m", "half-range of the lower face's start height, per attempt"),
-    }
-)
-
-# As the default, with the deviations of real pads.
-FULL_RANDOMIZATION = Randomization({**DEFAULT_RANDOMIZATION.quantities, **SENSOR_QUANTITIES})
-
-# Fixed parameters of the scene file, with the arm stiffness of a robot; for tests and pictures.
-NOMINAL = DEFAULT_RANDOMIZATION.replace(
-    **NOMINAL_PAD_VALUES,
-    hole_kn=5e3,
-    hole_mu=1.5,
-    arm_stiffness=1e5,
-    grasp_force=12.0,
-    grasp_height=0.0,
-    stop_shear=0.1,
-    noise=1e-5,
-    start_height=0.0,
-)
-RANDOMIZATIONS = {"nominal": NOMINAL, "default": DEFAULT_RANDOMIZATION, "full": FULL_RANDOMIZATION}
-
-
-def insertion_randomization(name: str, task: InsertionTask) -> Randomization:
-    """The table `name` of `RANDOMIZATIONS`, with the grasp height of the task's part. Raises UsageError if unknown."""
-    if name not in RANDOMIZATIONS:
-        raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {name!r}")
-    table = RANDOMIZATIONS[name]
-    return table if name == "nominal" else table.replace(grasp_height=task.part.grasp_height)
+_CONTACT = 1 / 3  # of the shear that stops a descent: above it, contact is left at its end; as in a lab file
 
 
 @dataclass(frozen=True)
@@ -104,7 +55,7 @@ class AttemptResult:
     divisor: Array  # shape (n,), in newtons: normalization of the flow maps
     height: Array  # [m], shape (n,): highest corner of the part's lower face above the hole's floor
     # Shape (n,): the lower face is inside the hole and below the task's success height, contact did not stop the
-    # descent, and no step failed.
+    # descent nor is left at its end, and no step failed.
     inserted: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # shape (n,): a simulation step failed
     depth: Array  # [m], shape (n,): of the gripper's target below its start when the descent ended, by contact or not
@@ -129,6 +80,11 @@ def insertion_scene(task: InsertionTask = INSERTION, *, preset: str | None = Non
     return with_part(scene, task.part)
 
 
+def descent_steps(task: InsertionTask, scene: Scene) -> int:
+    """Simulation steps of a descent at `DESCENT_SPEED`."""
+    return max(1, round(task.descent / DESCENT_SPEED / scene.step))
+
+
 class InsertionAttempts:
     """`num_envs` grippers, each holding a part above its hole.
 
@@ -137,9 +93,9 @@ class InsertionAttempts:
     num_envs: number of environments
     task: task description
     scene: `insertion_scene(task)`, or a scene with the same bodies, actuators and pads
-    randomization: distribution of the physical parameters; None: the default, with the grasp height of the task's part
+    randomization: distribution of the physical parameters; None: the default table of the task
     threads: of the simulator; None uses all available cores. Results do not depend on it.
-    steps: simulation steps of a descent; None gives 225 ms
+    steps: simulation steps of a descent; None gives `DESCENT_SPEED`
 
     `sensors` are the pads. `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to
     it between attempts. An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the memory of
@@ -161,11 +117,9 @@ class InsertionAttempts:
             raise UsageError(f"steps must be at least 1, got {steps}")
         self.task = task
         self.scene = insertion_scene(task) if scene is None else scene
-        self._steps = max(1, round(DESCENT_TIME / self.scene.step)) if steps is None else steps
+        self._steps = descent_steps(task, self.scene) if steps is None else steps
         self._settle_steps = max(1, round(SETTLE_TIME / self.scene.step))
-        if randomization is None:
-            randomization = DEFAULT_RANDOMIZATION.replace(grasp_height=task.part.grasp_height)
-        self.randomization = randomization
+        self.randomization = insertion_randomization("default", task) if randomization is None else randomization
         if [p.name for p in self.scene.pads] != list(PADS) or any(g != task.grid for g in self.scene.grids):
             raise UsageError(f"the scene's pads must be {', '.join(PADS)} with the task's markers {task.grid}")
         self.sim = Simulator(self.scene, num_envs=min(num_envs, ROLLOUT_SIZE), threads=threads)
@@ -257,7 +211,7 @@ class InsertionAttempts:
         rows = np.flatnonzero(chosen)
         jitter = rng.uniform(-1, 1, len(rows)) * self._start_height[rows]
         self._jitter[rows] = jitter
-        steps = sorted({self._reference_at, *self._frames})
+        steps = sorted({self._reference_at, *self._frames, self._steps})
         shear = np.zeros((len(steps), len(rows), self.scene.num_markers, 2))
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
         depth = np.full(len(rows), self.task.descent)
@@ -273,10 +227,17 @@ class InsertionAttempts:
             self._last_step[rows[part]] = np.where(stopped < 0, self._steps, stopped)
             inserted[part] &= ~failed[part] & (stopped < 0)
             depth[part] = np.where(stopped < 0, self.task.descent, self.task.descent * stopped / self._steps)
-        readings = self._readings(dict(zip(steps, shear, strict=True)), chosen, rng)
+        at = dict(zip(steps, shear, strict=True))
+        inserted &= ~self._in_contact(rows, at[self._steps] - at[self._reference_at])
+        readings = self._readings({k: at[k] for k in steps if k in (self._reference_at, *self._frames)}, chosen, rng)
         stack = np.stack([readings[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
         return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed, depth, jitter)
+
+    def _in_contact(self, rows: Rows, change: Array) -> Mask:
+        """Whether the shear along a finger shows contact, after its `change` (n, markers, 2) [N] in a descent."""
+        along = change[..., 0].reshape(len(rows), len(PADS), -1).mean(2)
+        return np.asarray(along.max(1) > _CONTACT * self._stop_shear[rows])
 
     def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
         """The descent of the grippers `rows`, read after `steps`."""
@@ -333,7 +294,7 @@ class InsertionAttempts:
         sim.q[:n, at] = x + cos * part[:, 0] - sin * part[:, 1]
         sim.q[:n, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
         sim.q[:n, at + 2] = part[:, 2] + lift
-        sim.q[:n, at + 3 : at + 7] = _rotated_z(part[:, 3:], yaw)
+        sim.q[:n, at + 3 : at + 7] = turned_about_z(part[:, 3:], yaw)
         sim.anchors[:n] = self._grasp["anchors"][rows]
         sim.anchored[:n] = self._grasp["anchored"][rows]
         u = np.zeros((sim.num_envs, self.scene.nu))
@@ -370,25 +331,3 @@ class InsertionAttempts:
 def _parts(count: int) -> list[slice]:
     """Slices of at most `ROLLOUT_SIZE` of `count` environments."""
     return [slice(first, min(first + ROLLOUT_SIZE, count)) for first in range(0, count, ROLLOUT_SIZE)]
-
-
-def _rotated_z(quat: NDArray[Any], yaw: Array) -> NDArray[Any]:
-    """Quaternions (N, 4) rotated by `yaw` (N,) [rad] about the world's z axis."""
-    cos, sin = np.cos(yaw / 2), np.sin(yaw / 2)
-    w, x, y, z = quat.T
-    return np.column_stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
-
-
-def simulator_parameters(sampled: Mapping[str, Array], *, elastic: bool) -> dict[str, Array]:
-    """Parameters of the simulator, name → (n,), for sampled quantities."""
-    hole = {"kn": sampled["hole_kn"], "mu": sampled["hole_mu"]}
-    if elastic:
-        hole["ks"] = hole["kn"] / 2
-    params = pad_parameters(sampled, elastic=elastic)
-    walls = ("left", "right", "front", "back")
-    params |= {f"part_hole/wall_{wall}.{key}": values for wall in walls for key, values in hole.items()}
-    # Published ratios to the stiffness: damping 1/200 s, yaw servo 0.05 m².
-    for arm, scale in zip(ARM_JOINTS, (1.0, 1.0, 1.0, 0.05), strict=True):
-        params[f"{arm}.kp"] = sampled["arm_stiffness"] * scale
-        params[f"{arm}.kd"] = sampled["arm_stiffness"] * scale / 200
-    return params

@@ -53,7 +53,7 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
 
 def _named_randomization(name: str, table: str, task: TaskDescription | None) -> Randomization:
     if name == "insertion":
-        from gelflow.sim.tasks.insertion import insertion_randomization  # deferred: loads the simulator
+        from gelflow.sim.tasks.insertion_randomization import insertion_randomization  # deferred: loads the simulator
 
         return insertion_randomization(table, task if isinstance(task, InsertionTask) else INSERTION)
     tables = randomizations(name)

@@ -91,6 +91,13 @@ def rotation_matrices(q: Array) -> Array:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
+def turned_about_z(q: Array, angle: Array) -> Array:
+    """Unit quaternions (N, 4) turned by `angle` (N,) [rad] about the z axis of the parent frame."""
+    cos, sin = np.cos(angle / 2), np.sin(angle / 2)
+    w, x, y, z = q.T
+    return np.column_stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
+
+
 def angle_between(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
     """Angle of the rotation between two unit quaternions [rad], 0 to π."""
     w, x, y, z = multiply(conjugate(a), b)

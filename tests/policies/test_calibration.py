@@ -28,7 +28,8 @@ from gelflow.session.records import Decision, describe_session
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
+from gelflow.sim.tasks.insertion import InsertionAttempts
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.sim.tasks.registry import make_task
 from gelflow.task import INSERTION
 

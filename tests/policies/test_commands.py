@@ -13,7 +13,6 @@ from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import recipe_for
 from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
-from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION
 from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
 
@@ -31,11 +30,10 @@ def test_the_shipped_policy_inserts_in_simulation() -> None:
     assert result.length < 8
 
 
-def test_the_shipped_policy_of_the_peg_inserts_it_with_a_stiff_arm() -> None:
+def test_the_shipped_policy_of_the_peg_inserts_it_in_simulation() -> None:
     task = load_part("peg")
     network = load_policy(checkpoint_for(task, None), task=task).network
-    stiff = DEFAULT_RANDOMIZATION.replace(arm_stiffness=(5e3, 3e5), grasp_height=task.part.grasp_height)
-    batch = Insertion(32, task=task, preset="fast", randomization=stiff, noise=FlowMapNoise())
+    batch = Insertion(32, task=task, preset="fast", noise=FlowMapNoise())
     result = evaluate_task("policy", network.batch_policy(32), batch, episodes=48, seed=5)
     assert result.successes >= 42  # more than three standard deviations below 48 · 0.97
     assert result.length < 8

@@ -203,10 +203,10 @@ def test_a_fine_tuning_starts_with_the_weights_of_its_checkpoint(tmp_path: Path)
     numbers = learner.update()
     assert numbers["success"] > 0.8
     np.testing.assert_array_equal(learner.tensors()["scale"], checkpoint.tensors["scale"])
-    for changed in ({"architecture": dataclasses.replace(SMALL, units=7)}, {"task": {**checkpoint.task, "descent": 1}}):
-        with pytest.raises(UsageError, match=r"cannot start from a policy with other .*(units|descent)"):
+    for changed in ({"architecture": dataclasses.replace(SMALL, units=7)}, {"task": {**checkpoint.task, "sensors": 1}}):
+        with pytest.raises(UsageError, match=r"cannot start from a policy with other .*(units|sensors)"):
             learner.start_from(dataclasses.replace(checkpoint, **changed))
-    other_part = {**checkpoint.task, "part": {"name": "mine"}, "misalignment": [0.0, 0.0, 0.0]}
+    other_part = {**checkpoint.task, "part": {"name": "mine"}, "misalignment": [0.0, 0.0, 0.0], "descent": 2e-3}
     learner.start_from(dataclasses.replace(checkpoint, task=other_part))
 
 

@@ -21,7 +21,8 @@ from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint
 from gelflow.policies.episodes import run_episodes
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
-from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, insertion_scene
+from gelflow.sim.tasks.insertion import insertion_scene
+from gelflow.sim.tasks.insertion_randomization import FULL_RANDOMIZATION
 from gelflow.sim.tasks.randomization import fixed_values
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS

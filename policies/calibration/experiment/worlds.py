@@ -15,7 +15,8 @@ from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_network
 from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
 from gelflow.session.motion_plan import PlannedMotion
-from gelflow.sim.tasks.insertion import FULL_RANDOMIZATION, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import FULL_RANDOMIZATION
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Randomization, Uniform
 from gelflow.task import INSERTION, InsertionTask
 

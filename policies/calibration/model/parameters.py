@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.recordings import Recordings
-from gelflow.sim.tasks.insertion import insertion_randomization
+from gelflow.sim.tasks.insertion_randomization import insertion_randomization
 from gelflow.sim.tasks.randomization import LogUniform, Uniform
 from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
 

@@ -18,7 +18,8 @@ from gelflow.geometry import rotation_matrices, yaw_quaternion
 from gelflow.sim import _core
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
-from gelflow.sim.tasks.insertion import ARM_JOINTS, DESCENT_TIME, SETTLE_TIME, insertion_scene, simulator_parameters
+from gelflow.sim.tasks.insertion import SETTLE_TIME, descent_steps, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import ARM_JOINTS, simulator_parameters
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters
 from gelflow.sim.tasks.parts.registry import part_geometry
@@ -72,7 +73,7 @@ class ShearModel:
         self._threads = threads
         step = self.scene.step
         self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)
-        self.step_depth = task.descent / round(DESCENT_TIME / step)  # of one step of a descent [m]
+        self.step_depth = task.descent / descent_steps(task, self.scene)  # of one step of a descent [m]
         self._geometry = part_geometry(task.part)
         self._clear_height = max(0.1, task.part.depth + task.part.size[2])
         self._part_q = self.scene.q("part").start

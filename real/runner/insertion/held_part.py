@@ -25,6 +25,7 @@ from gelflow.task import InsertionTask
 _SEARCHES = 3  # contacts on the way to one start pose after which the search of the rim ends
 _CLEARANCE = 0.5e-3  # of a fast motion above the range in which the rim is searched [m]
 _AT_DEPTH = 0.02e-3  # distance from its end at which a descent is complete [m]
+_BEYOND = 0.4e-3  # below the end of a descent, the gripper is too deep [m]
 
 
 class HoleNotFound(PeerError):
@@ -158,8 +159,8 @@ class HeldPart:
 
         def on_reading(reading: TactileReading) -> bool:
             depth = self._keep(reading, start)
-            if depth > self._lab.descent.max_depth:
-                raise SafetyError(f"the gripper is deeper than max_depth ({1e3 * self._lab.descent.max_depth:g} mm)")
+            if depth > depth_below + _BEYOND:
+                raise SafetyError(f"the gripper is deeper than its descent of {1e3 * depth_below:g} mm")
             return slip.add(depth, reading.shear)
 
         contact = self._guard.move(

@@ -64,7 +64,10 @@ class InsertionRunner:
         lab = cell.lab
         if task.descent > lab.descent.max_depth:
             deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
-            raise SafetyError(f"the task descends {deep:g} mm, the lab's max_depth allows {allowed:g} mm")
+            raise SafetyError(
+                f"the task descends by {deep:g} mm, descent.max_depth of the lab file allows {allowed:g} mm; raise it, "
+                "or train with a smaller [descent] depth in the part file"
+            )
         self._motions = policy.motions if isinstance(policy, PlanPolicy) else ()
         check_motions(self._motions, lab, task)
         self._cell, self._policy, self._task = cell, policy, task

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m³]
-_TABLES = ("format", "name", "part", "hole", "grasp", "misalignment", "symmetry")
+_TABLES = ("format", "name", "part", "hole", "grasp", "descent", "misalignment", "symmetry")
 _PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}
 _WEIGHTS = ("density", "mass")
 _OUTLINE_HOLE, _MESH_HOLE = ("clearance", "depth"), ("file", "scale", "depth")
@@ -55,7 +55,8 @@ def load_part(part: str | Path) -> InsertionTask:
     if (version := top.integer("format")) > FORMAT:
         raise UsageError(f"{path}: format is {version}; this gelflow reads format {FORMAT}")
     try:
-        return insertion_task(_read_part(top, path), misalignment=_misalignment(top.table("misalignment")))
+        misalignment = _misalignment(top.table("misalignment"))
+        return insertion_task(_read_part(top, path), misalignment=misalignment, descent=_descent(top.table("descent")))
     except UsageError as error:
         raise error if str(error).startswith(str(path)) else UsageError(f"{path}: {error}") from None
 
@@ -178,6 +179,10 @@ def _density(table: TomlTable, volume: float) -> float:
 def _pair(table: TomlTable, key: str, default: tuple[float, float]) -> tuple[float, float]:
     low, high = table.numbers(key, 2, default)
     return low, high
+
+
+def _descent(table: TomlTable) -> float | None:
+    return table.number("depth") if "depth" in table.check_keys(("depth",)).data else None
 
 
 def _misalignment(table: TomlTable) -> tuple[float, float, float]:

@@ -103,7 +103,7 @@ def test_events_come_in_the_order_of_an_insertion() -> None:
         for height in heights:
             monitor.update(0.0, phase, height)
             for name, fault in list(waiting.items()):
-                if event_occurred(fault, monitor.progress):
+                if event_occurred(fault, monitor.progress, INSERTION):
                     seen.append(name)
                     del waiting[name]
 

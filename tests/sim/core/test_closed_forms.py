@@ -5,7 +5,8 @@ import pytest
 
 from gelflow.sim import _core
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 
 RADIUS, DEPTH, STIFFNESS = 0.020, 1e-3, 1e8  # [m], [m], [N/m³]
 

@@ -9,7 +9,8 @@ from scipy.special import ellipk
 
 from gelflow.sim import _core
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.sim.validation.thrown_bodies import GRAVITY, MASS, ThrownBody
 
 Array = NDArray[np.float64]

@@ -13,7 +13,8 @@ from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, preset_con
 from gelflow.sim.scene import DEFAULT_TOLERANCE, PRESET_NAMES, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.task import INSERTION
 
 MODEL = """<mujoco><worldbody><geom name="ground" type="plane" size="1 1 1"/><body name="ball" pos="0 0 1"><freejoint/>

@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 
 from gelflow.errors import UsageError
 from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts
+from gelflow.sim.tasks.insertion import InsertionAttempts
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.task import INSERTION
 
 STAY = np.zeros(3, dtype=np.float32)

@@ -10,14 +10,8 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, TactileFrame, flow_map
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.insertion import (
-    DEFAULT_RANDOMIZATION,
-    NOMINAL,
-    ROLLOUT_SIZE,
-    InsertionAttempts,
-    insertion_scene,
-    simulator_parameters,
-)
+from gelflow.sim.tasks.insertion import ROLLOUT_SIZE, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION, NOMINAL, simulator_parameters
 from gelflow.task import INSERTION
 
 WEIGHT = 0.063 * 9.8  # of the part [N]

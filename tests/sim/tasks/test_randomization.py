@@ -7,7 +7,7 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid, TactileFrame, fill_invalid
-from gelflow.sim.tasks.insertion import DEFAULT_RANDOMIZATION, FULL_RANDOMIZATION, NOMINAL
+from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION, FULL_RANDOMIZATION, NOMINAL
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Normal, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, PAIR_QUANTITIES, SENSOR_QUANTITIES, SensorModel
 

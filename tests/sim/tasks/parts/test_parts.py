@@ -8,13 +8,16 @@ import pytest
 
 from gelflow.errors import UsageError
 from gelflow.part import CUBOID, Part
-from gelflow.sim.tasks.insertion import NOMINAL, InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.sim.tasks.parts import load_part, part_geometry, part_names, with_part
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.outline import Circle, Outline, Polygons, Rectangle, hole_grid
 from gelflow.task import INSERTION, InsertionTask, insertion_task
 
 PEG = load_part("peg")
+STIFF = NOMINAL.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no part is pressed
+ROD = '[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n'
 
 
 def poses(*millimetres: tuple[float, float]) -> np.ndarray:
@@ -114,7 +117,7 @@ def test_pads_indent_until_they_carry_the_grasp_force() -> None:
 
 
 def test_a_round_peg_is_inserted_where_its_outline_fits() -> None:
-    attempts = InsertionAttempts(6, task=PEG, randomization=NOMINAL, threads=1)
+    attempts = InsertionAttempts(6, task=PEG, randomization=STIFF, threads=1)
     rng = np.random.default_rng(0)
     attempts.draw(rng, misalignment=poses((0, 0), (0.4, 0), (0, -0.4), (1.0, 0), (0.8, -0.8), (4, 3)))
     held = attempts.sim.q[:, attempts.scene.q("part")]
@@ -164,14 +167,36 @@ def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
     assert task.part.name == "part"
     assert task.misalignment == pytest.approx((0.003, 0.006, np.radians(5)))
     assert (task.start_height, task.rim_height, task.success_height) == (15.5e-3, 15e-3, 14.7e-3)
-    attempts = InsertionAttempts(4, task=task, randomization=NOMINAL, threads=1)
+    attempts = InsertionAttempts(4, task=task, randomization=STIFF, threads=1)
     rng = np.random.default_rng(0)
     attempts.draw(rng, misalignment=poses((0, 0), (0.9, 1.4), (1.3, 0), (0, 1.8)))
     body = next(b for b in attempts.scene.bodies if b.name == "part")
     assert body.mass == pytest.approx(0.08)
     result = attempts.attempt(rng)
     assert result.inserted.tolist() == [True, True, False, False]
-    np.testing.assert_allclose(result.height[:2], 14.4e-3, atol=6e-5)
+    np.testing.assert_allclose(result.height[:2], 11.4e-3, atol=6e-5)
+
+
+def test_a_part_file_sets_the_depth_of_a_descent(tmp_path: Path) -> None:
+    assert PEG.descent == 4.1e-3 and PEG.frame_depths == (4.1e-3,)
+    given = load_part(written(tmp_path, ROD + "[descent]\ndepth = 0.0011"))
+    assert (given.descent, given.frame_depths) == (INSERTION.descent, INSERTION.frame_depths)
+    shallow = load_part(written(tmp_path, ROD + "depth = 0.002"))
+    assert shallow.descent == 1.5e-3  # 1 mm above the floor
+
+
+def test_a_soft_arm_presses_harder_in_a_deeper_descent() -> None:
+    """A servo of 0.2 N/mm: the forces of the markers grow with the depth below the rim, from 0.6 to 3.6 mm."""
+    soft = NOMINAL.replace(arm_stiffness=200.0)
+    divisors = []
+    for task in (dataclasses.replace(PEG, descent=1.1e-3, frame_depths=(1.1e-3,)), PEG):
+        attempts = InsertionAttempts(2, task=task, randomization=soft, threads=1)
+        rng = np.random.default_rng(0)
+        attempts.draw(rng, misalignment=poses((4, 0), (0, 4)))
+        result = attempts.attempt(rng)
+        assert not result.inserted.any() and not result.failed.any()
+        divisors.append(result.divisor)
+    assert (divisors[1] > 4 * divisors[0]).all()
 
 
 @pytest.mark.parametrize(
@@ -188,6 +213,9 @@ def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
          "height = [-0.03, 0]", "within ±0.025 m"),
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n[misalignment]\nx = 1',
          "at most 0.015"),
+        (ROD + "[descent]\ndepth = 0.0008", "must descend by more than 0.0008 m"),
+        (ROD + "depth = 0.002\n[descent]\ndepth = 0.0025", "less than 0.0025 m, the floor of the hole"),
+        (ROD + "[descent]\nmax_depth = 0.002", "unknown key 'max_depth'"),
     ],
 )  # fmt: skip
 def test_errors_of_a_part_file_name_the_file_and_the_key(tmp_path: Path, text: str, message: str) -> None:
