@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gelflow.errors import UsageError
-from gelflow.task import INSERTION, InsertionTask
+from gelflow.task import INSERTION, InsertionTask, insertion_task
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ class Reproduction:
 
 _YAW = INSERTION.misalignment[2]
 _WITHOUT_YAW = {"misalignment": [*INSERTION.misalignment[:2], 0.0], "workspace": [*INSERTION.workspace[:2], 0.0]}
+_DEEP = insertion_task(INSERTION.part)
+_DEEPER = {"descent": _DEEP.descent, "frame_depths": [*_DEEP.frame_depths]}  # as for one's own part
 _ONLY_YAW = {"misalignment": [0.0, 0.0, _YAW], "workspace": [0.0, 0.0, INSERTION.workspace[2]]}
 
 _REPRODUCTIONS = (
@@ -85,6 +87,7 @@ _REPRODUCTIONS = (
             Variant("translation", options={"task": _WITHOUT_YAW}),
             Variant("rotation and translation"),
             Variant("full randomization", options={"randomization": "full"}),
+            Variant("full randomization, deeper descents", options={"randomization": "full", "task": _DEEPER}),
         ),
     ),
 )

@@ -1,6 +1,7 @@
 """Insertion runner against the mock robot over pty, TCP, UDP and HTTP: insertions, lost parts, invalid actions."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.real.runner.harness import OraclePolicy, events, mean_displacement, plan_for
 
+from gelflow.cli.mock_lab import lab_for
 from gelflow.clock import ScaledClock
 from gelflow.errors import SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
@@ -141,3 +143,20 @@ def test_invalid_action_of_the_policy_causes_no_motion(robot: MockRobot, tmp_pat
     with pytest.raises(SafetyError, match="expected three finite numbers"):
         run_insertions(plan_for(robot, tmp_path, InvalidPolicy()))
     assert robot.cell.truth()["part"]["phase"] == "gripped"
+
+
+def test_a_gripper_below_the_end_of_its_descent_ends_the_run(
+    robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gelflow.real.runner.insertion.held_part._BEYOND", -0.9e-3)
+    with pytest.raises(SafetyError, match=r"deeper than its descent of 1\.1 mm"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot)))
+
+
+def test_a_task_that_descends_deeper_than_the_lab_allows_is_refused(robot: MockRobot, tmp_path: Path) -> None:
+    lab = lab_for(robot)
+    plan = plan_for(
+        robot, tmp_path, OraclePolicy(robot), lab=replace(lab, descent=replace(lab.descent, max_depth=1e-3))
+    )
+    with pytest.raises(SafetyError, match=r"descends by 1\.1 mm, descent\.max_depth of the lab file allows 1 mm"):
+        run_insertions(plan)
