@@ -32,7 +32,8 @@ USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before an
 _OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
 _YAWS = np.radians([-8.0, 0.0, 8.0])
 _STOP_SHEAR = 0.012  # mean shear of a pad at which contact stops a descent [N]: 0.12 mm of a gel of the scene
-_LEVELS = 8  # depths at which the stop is searched
+_LEVELS = 8  # depths at which the stop is searched, a constant ratio apart
+_FIRST_LEVEL = 0.44e-3  # [m] below the start of an attempt, shortly before the rim
 _SPREAD = 0.7  # of the scenarios' parameters, relative to the prior
 
 
@@ -118,7 +119,7 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
 def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float) -> Array:
     """Information (n, count + 3, count + 3) of attempts at poses in the hole frame, down to their stops by contact."""
     n, task = len(poses), readings.forces.task
-    depths = np.linspace(0.4, 1.0, _LEVELS) * task.descent
+    depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
     values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
     descents = Descents(np.repeat(poses, _LEVELS, 0), np.zeros(n * _LEVELS), np.tile(depths, n))
     reading, _ = readings.read(values, descents)
