@@ -103,5 +103,6 @@ def reproduction_for(task: str) -> Reproduction:
 
 def insertion_of(variant: Variant) -> InsertionTask:
     """The task description of a variant of the insertion."""
-    changes: dict[str, Any] = {name: tuple(values) for name, values in variant.options.get("task", {}).items()}
+    given = variant.options.get("task", {})
+    changes: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in given.items()}
     return dataclasses.replace(INSERTION, **changes)

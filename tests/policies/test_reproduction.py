@@ -1,5 +1,6 @@
 """Reproduction of the paper's experiments, in tiny settings: rows, continuation after a kill, curves, the command."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from gelflow.policies.reproduction.variants import (
     insertion_of,
     reproduction_for,
 )
+from gelflow.task import INSERTION
 
 TINY = Effort((0, 1), shorter=10**9, max_episodes=4, envs=4)
 PLAN = Reproduction(
@@ -94,6 +96,8 @@ def test_the_insertion_is_trained_by_imitation(tmp_path: Path) -> None:
     row = reproduce(plan, tmp_path, effort=effort, command=COMMAND)["variants"][0]
     assert row["oracle"]["corrections"] == 1 and row["curves"]["validation"]["x"] == [512.0]
     assert (insertion_of(plan.variants[0]).corrected_axes == [0, 0, 1]).all()
+    deeper = insertion_of(reproduction_for("insertion").variant("full randomization, deeper descents"))
+    assert deeper == dataclasses.replace(INSERTION, descent=4.1e-3, frame_depths=(4.1e-3,))
     assert reproduce(plan, tmp_path, effort=effort, command=COMMAND)["variants"][0] == row
 
 
