@@ -34,8 +34,14 @@ Array = NDArray[np.float64]
 
 # Fields of a task that differ between parts whose policies have the same inputs and outputs.
 _OF_PART = (
-    *("part", "misalignment", "workspace", "rim_height", "start_height", "success_height"),
-    *("descent", "frame_depths"),
+    "part",
+    "misalignment",
+    "workspace",
+    "rim_height",
+    "start_height",
+    "success_height",
+    "descent",
+    "frame_depths",
 )
 
 

@@ -211,7 +211,8 @@ class InsertionAttempts:
         rows = np.flatnonzero(chosen)
         jitter = rng.uniform(-1, 1, len(rows)) * self._start_height[rows]
         self._jitter[rows] = jitter
-        steps = sorted({self._reference_at, *self._frames, self._steps})
+        shown = sorted({self._reference_at, *self._frames})
+        steps = sorted({*shown, self._steps})
         shear = np.zeros((len(steps), len(rows), self.scene.num_markers, 2))
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
         depth = np.full(len(rows), self.task.descent)
@@ -229,7 +230,7 @@ class InsertionAttempts:
             depth[part] = np.where(stopped < 0, self.task.descent, self.task.descent * stopped / self._steps)
         at = dict(zip(steps, shear, strict=True))
         inserted &= ~self._in_contact(rows, at[self._steps] - at[self._reference_at])
-        readings = self._readings({k: at[k] for k in steps if k in (self._reference_at, *self._frames)}, chosen, rng)
+        readings = self._readings({step: at[step] for step in shown}, chosen, rng)
         stack = np.stack([readings[step] for step in self._frames], axis=1)
         image, divisor = normalize(stack, readings[self._reference_at], min_divisor=MIN_DIVISORS["N"])
         return AttemptResult(image.astype(np.float32), divisor, height, inserted, failed, depth, jitter)

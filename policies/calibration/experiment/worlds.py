@@ -15,7 +15,7 @@ from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_network
 from gelflow.policies.networks.flow_map_policy import FlowMapNetwork, NetworkPolicy
 from gelflow.session.motion_plan import PlannedMotion
-from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion import DESCENT_SPEED, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.insertion_randomization import FULL_RANDOMIZATION
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Randomization, Uniform
 from gelflow.task import INSERTION, InsertionTask
@@ -181,7 +181,7 @@ def _recordings(
 
 
 def _truth(values: Mapping[str, float], gain: Array, turn: Array) -> dict[str, float]:
-    ratio = values["gel_time"] / 0.225
+    ratio = values["gel_time"] * DESCENT_SPEED / INSERTION.descent
     lag = 1 - values["gel_creep"] * ratio * (1 - np.exp(-1 / ratio))  # a linear rise of the force during a descent
     names = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "marker_ks", "hole_kn", "hole_mu",
              "arm_stiffness", "grasp_force", "grasp_height", "crosstalk")  # fmt: skip

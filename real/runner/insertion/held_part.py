@@ -156,10 +156,11 @@ class HeldPart:
         self._check_weight()
         start = self._motion.pose().position[2]
         slip = SlipMonitor(self.thresholds.contact)
+        too_deep = min(depth_below + _BEYOND, self._lab.descent.max_depth)
 
         def on_reading(reading: TactileReading) -> bool:
             depth = self._keep(reading, start)
-            if depth > depth_below + _BEYOND:
+            if depth > too_deep:
                 raise SafetyError(f"the gripper is deeper than its descent of {1e3 * depth_below:g} mm")
             return slip.add(depth, reading.shear)
 

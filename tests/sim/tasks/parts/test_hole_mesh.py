@@ -4,16 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.sim.tasks.parts.harness import both_depths, make_attempts
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.tasks.insertion import InsertionAttempts
-from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.sim.tasks.parts import load_part, part_geometry
 from gelflow.sim.tasks.parts.shipped_meshes import obj_text, prism
 from gelflow.task import InsertionTask
 
-STIFF = NOMINAL.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no part is pressed
 PEG = """format = 1
 [part]
 shape = "cylinder"
@@ -56,12 +55,13 @@ def written(tmp_path: Path, hole: TriangleMesh, text: str = PEG) -> Path:
     return tmp_path / "part.toml"
 
 
-def test_a_round_peg_in_an_octagonal_hole_is_inserted_where_it_fits(tmp_path: Path) -> None:
+@both_depths
+def test_a_round_peg_in_an_octagonal_hole_is_inserted_where_it_fits(tmp_path: Path, deep: bool) -> None:
     task = load_part(written(tmp_path, block(octagon(10.8))))
     part = task.part
     assert part.clearance == pytest.approx((1.6e-3, 1.6e-3), abs=0.06e-3)
     assert (part.depth, part.symmetry, set(part.mirror)) == (0.025, 0, {"x", "y"})
-    attempts = InsertionAttempts(4, task=task, randomization=STIFF, threads=1)
+    attempts = make_attempts(4, task, deep=deep)
     rng = np.random.default_rng(0)
     attempts.draw(rng, misalignment=np.array([[0, 0, 0], [0.7e-3, 0, 0], [2e-3, 0, 0], [0, -3e-3, 0]]))
     result = attempts.attempt(rng)

@@ -5,19 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.sim.tasks.parts.harness import both_depths, make_attempts
 
 from gelflow.errors import UsageError
 from gelflow.part import CUBOID, Part
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
-from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
-from gelflow.sim.tasks.insertion_randomization import NOMINAL
+from gelflow.sim.tasks.insertion import insertion_scene
 from gelflow.sim.tasks.parts import load_part, part_geometry, shipped_mesh, with_part
 from gelflow.sim.tasks.parts.mesh_part import MeshPart, found_symmetry, grasped_sides
 from gelflow.sim.tasks.parts.mesh_picture import picture
 from gelflow.sim.tasks.parts.shipped_meshes import connector, hexagon, obj_text, prism
 from gelflow.task import InsertionTask
 
-STIFF = NOMINAL.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no part is pressed
 PART = """format = 1
 [part]
 shape = "mesh"
@@ -118,10 +117,11 @@ def test_the_mass_of_the_hexagon() -> None:
     assert part_geometry(part).mass == pytest.approx(area * 0.06 * 1500, rel=1e-5)
 
 
+@both_depths
 @pytest.mark.parametrize("name", ["hexagon", "connector"])
-def test_the_oracle_inserts_and_misaligned_parts_are_not_inserted(name: str) -> None:
+def test_the_oracle_inserts_and_misaligned_parts_are_not_inserted(name: str, deep: bool) -> None:
     task = load_part(name)
-    attempts = InsertionAttempts(4, task=task, randomization=STIFF, threads=1)
+    attempts = make_attempts(4, task, deep=deep)
     rng = np.random.default_rng(0)
     starts = np.array([[0, 0, 0], [3e-3, 0, 0], [0, -3e-3, 0], [0, 0, np.radians(10)]])
     attempts.draw(rng, misalignment=starts)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.sim.tasks.parts.harness import both_depths, make_attempts, with_published_descent
 
 from gelflow.errors import UsageError
 from gelflow.part import CUBOID, Part
@@ -16,7 +17,6 @@ from gelflow.sim.tasks.parts.outline import Circle, Outline, Polygons, Rectangle
 from gelflow.task import INSERTION, InsertionTask, insertion_task
 
 PEG = load_part("peg")
-STIFF = NOMINAL.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no part is pressed
 ROD = '[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 1e-3\n'
 
 
@@ -116,8 +116,9 @@ def test_pads_indent_until_they_carry_the_grasp_force() -> None:
     np.testing.assert_allclose(carried, force, rtol=1e-12)
 
 
-def test_a_round_peg_is_inserted_where_its_outline_fits() -> None:
-    attempts = InsertionAttempts(6, task=PEG, randomization=STIFF, threads=1)
+@both_depths
+def test_a_round_peg_is_inserted_where_its_outline_fits(deep: bool) -> None:
+    attempts = make_attempts(6, PEG, deep=deep)
     rng = np.random.default_rng(0)
     attempts.draw(rng, misalignment=poses((0, 0), (0.4, 0), (0, -0.4), (1.0, 0), (0.8, -0.8), (4, 3)))
     held = attempts.sim.q[:, attempts.scene.q("part")]
@@ -150,7 +151,8 @@ def test_yaw_errors_follow_from_the_symmetry() -> None:
     assert PEG.correction(np.array([0, 0, 1]))[2] == pytest.approx(2 * PEG.workspace[2])
 
 
-def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
+@both_depths
+def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path, deep: bool) -> None:
     text = """
     [part]
     shape = "box"
@@ -167,14 +169,14 @@ def test_a_box_may_have_another_size_mass_and_hole(tmp_path: Path) -> None:
     assert task.part.name == "part"
     assert task.misalignment == pytest.approx((0.003, 0.006, np.radians(5)))
     assert (task.start_height, task.rim_height, task.success_height) == (15.5e-3, 15e-3, 14.7e-3)
-    attempts = InsertionAttempts(4, task=task, randomization=STIFF, threads=1)
+    attempts = make_attempts(4, task, deep=deep)
     rng = np.random.default_rng(0)
     attempts.draw(rng, misalignment=poses((0, 0), (0.9, 1.4), (1.3, 0), (0, 1.8)))
     body = next(b for b in attempts.scene.bodies if b.name == "part")
     assert body.mass == pytest.approx(0.08)
     result = attempts.attempt(rng)
     assert result.inserted.tolist() == [True, True, False, False]
-    np.testing.assert_allclose(result.height[:2], 11.4e-3, atol=6e-5)
+    np.testing.assert_allclose(result.height[:2], 11.4e-3 if deep else 14.4e-3, atol=6e-5)
 
 
 def test_a_part_file_sets_the_depth_of_a_descent(tmp_path: Path) -> None:
@@ -189,7 +191,7 @@ def test_a_soft_arm_presses_harder_in_a_deeper_descent() -> None:
     """A servo of 0.2 N/mm: the forces of the markers grow with the depth below the rim, from 0.6 to 3.6 mm."""
     soft = NOMINAL.replace(arm_stiffness=200.0)
     divisors = []
-    for task in (dataclasses.replace(PEG, descent=1.1e-3, frame_depths=(1.1e-3,)), PEG):
+    for task in (with_published_descent(PEG), PEG):
         attempts = InsertionAttempts(2, task=task, randomization=soft, threads=1)
         rng = np.random.default_rng(0)
         attempts.draw(rng, misalignment=poses((4, 0), (0, 4)))
