@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import tempfile
 import threading
 from dataclasses import dataclass, field, replace
@@ -75,7 +76,7 @@ class MockRobot:
 
     def __init__(self, factor: float = 1.0, config: MockRobotConfig | None = None) -> None:
         self.config = config = config or MockRobotConfig()
-        self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-")
+        self._folder = tempfile.TemporaryDirectory(prefix="gelflow-mock-", dir=_memory_folder())
         time_sync = f"{self._folder.name}/time_sync" if config.time_sync else ""
         if time_sync:
             TimeSync.create(time_sync)
@@ -141,6 +142,16 @@ class MockRobot:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.stop()
+
+
+def _memory_folder() -> str | None:
+    """A folder in memory, None where the system has none.
+
+    Each process of the mock robot writes to the file of the time synchronization many times a second. On a disk such a
+    write waits while the disk is busy, for seconds at worst, and with it the arm or all images.
+    """
+    folder = "/dev/shm"
+    return folder if os.path.isdir(folder) and os.access(folder, os.W_OK | os.X_OK) else None
 
 
 class _Gel:
