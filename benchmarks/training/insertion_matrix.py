@@ -4,8 +4,9 @@
     python -m benchmarks.training.insertion_matrix randomizations
     python -m benchmarks.training.insertion_matrix observations
 
-Every training has the same number of attempts. Results are stored in --folder as they are found: a second call with the
-same folder computes what is missing. Writes a record and a picture.
+The task has the descents of Xu et al. (CoRL 2022). Every training has the same number of attempts. Results are stored
+in --folder as they are found: a second call with the same folder computes what is missing. Writes a record and a
+picture.
 """
 
 import argparse
@@ -27,10 +28,11 @@ from gelflow.policies.recipes import training_run
 from gelflow.policies.reproduction.trials import folder_name
 from gelflow.sim.tasks.insertion_randomization import RANDOMIZATIONS
 from gelflow.sim.tasks.registry import make_task
-from gelflow.task import INSERTION
+from gelflow.task import PUBLISHED_INSERTION
 
 EVALUATION_SEED = 7_000_003  # far from the seeds of trainings and their validations
 ENVS = 128
+_TASK = {"task": PUBLISHED_INSERTION}
 
 
 class Row(NamedTuple):
@@ -43,7 +45,7 @@ class Row(NamedTuple):
 def settings(presets: tuple[str, ...]) -> list[Row]:
     """Each shear law with each preset; "scene" stands for the values of the scene file."""
     return [
-        Row(f"{law}, {preset}", {"friction": law, "preset": None if preset == "scene" else preset})
+        Row(f"{law}, {preset}", {**_TASK, "friction": law, "preset": None if preset == "scene" else preset})
         for law in ("elastic", "viscous")
         for preset in presets
     ]
@@ -51,16 +53,17 @@ def settings(presets: tuple[str, ...]) -> list[Row]:
 
 def randomizations() -> list[Row]:
     """Each table of physical parameters; the nominal one has a single value of each."""
-    return [Row(name, {"randomization": name}) for name in RANDOMIZATIONS]
+    return [Row(name, {**_TASK, "randomization": name}) for name in RANDOMIZATIONS]
 
 
 def observations() -> list[Row]:
     """Each observation of the last frame, and of five frames where they differ."""
     five = tuple(depth * 1e-4 for depth in (3, 5, 7, 9, 11))
     rows = []
+    last = PUBLISHED_INSERTION.frame_depths
     for observation in ("flow map", "forces", "nothing"):
-        for frames in (INSERTION.frame_depths, five) if observation != "nothing" else (INSERTION.frame_depths,):
-            task = dataclasses.replace(INSERTION, observation=observation, frame_depths=frames)
+        for frames in (last, five) if observation != "nothing" else (last,):
+            task = dataclasses.replace(PUBLISHED_INSERTION, observation=observation, frame_depths=frames)
             rows.append(Row(f"{observation}, {len(frames)} frame{'s' * (len(frames) > 1)}", {"task": task}))
     return rows
 

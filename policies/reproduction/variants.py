@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gelflow.errors import UsageError
-from gelflow.task import INSERTION, InsertionTask, insertion_task
+from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,8 @@ class Reproduction:
 
 
 _YAW = INSERTION.misalignment[2]
-_WITHOUT_YAW = {"misalignment": [*INSERTION.misalignment[:2], 0.0], "workspace": [*INSERTION.workspace[:2], 0.0]}
-_DEEP = insertion_task(INSERTION.part)
-_DEEPER = {"descent": _DEEP.descent, "frame_depths": [*_DEEP.frame_depths]}  # as for one's own part
+_PUBLISHED = {"descent": PUBLISHED_INSERTION.descent, "frame_depths": [*PUBLISHED_INSERTION.frame_depths]}
+_ONLY_XY = {"misalignment": [*INSERTION.misalignment[:2], 0.0], "workspace": [*INSERTION.workspace[:2], 0.0]}
 _ONLY_YAW = {"misalignment": [0.0, 0.0, _YAW], "workspace": [0.0, 0.0, INSERTION.workspace[2]]}
 
 _REPRODUCTIONS = (
@@ -83,11 +82,11 @@ _REPRODUCTIONS = (
     Reproduction(
         "insertion",
         (
-            Variant("rotation", options={"task": _ONLY_YAW}),
-            Variant("translation", options={"task": _WITHOUT_YAW}),
-            Variant("rotation and translation"),
-            Variant("full randomization", options={"randomization": "full"}),
-            Variant("full randomization, deeper descents", options={"randomization": "full", "task": _DEEPER}),
+            Variant("rotation", options={"task": {**_PUBLISHED, **_ONLY_YAW}}),
+            Variant("translation", options={"task": {**_PUBLISHED, **_ONLY_XY}}),
+            Variant("rotation and translation", options={"task": _PUBLISHED}),
+            Variant("full randomization", options={"randomization": "full", "task": _PUBLISHED}),
+            Variant("full randomization, deeper descents", options={"randomization": "full"}),
         ),
     ),
 )

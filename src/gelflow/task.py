@@ -20,9 +20,9 @@ from gelflow.part import CUBOID, Part
 
 _START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
 _SUCCESS_BELOW_RIM = 0.3e-3  # [m]
-# [m] of an attempt with one's own part, unless contact ends it. An arm of 0.2 N/mm that stays 0.6 mm below the rim, as
-# with the published cuboid, presses with 0.1 N: the markers hardly move, and the policy learns little from an attempt.
-_PART_DESCENT = 4.1e-3
+# [m] of an attempt, unless contact ends it. In the published task it is 1.1 mm, and an arm of 0.2 N/mm, which then stays
+# 0.6 mm below the rim, presses with 0.1 N: the markers hardly move, and the policy learns little from an attempt.
+_DESCENT = 4.1e-3
 
 OBSERVATIONS = ("flow map", "forces", "nothing")
 
@@ -74,8 +74,8 @@ class InsertionTask(TaskDescription):
     grid: Grid = _POLICY_GRID  # grid of the flow map on each pad [mm]
     # Frames are selected by depth below the start of an attempt, not by time: the simulation descends faster.
     reference_depth: float = 0.0  # of the reference frame
-    frame_depths: tuple[float, ...] = (1.1e-3,)  # of the frames of the observation
-    descent: float = 1.1e-3  # of the gripper in an attempt, unless the part meets the hole's floor
+    frame_depths: tuple[float, ...] = (_DESCENT,)  # of the frames of the observation
+    descent: float = _DESCENT  # of the gripper in an attempt, unless the part meets the hole's floor
     start_height: float = 25.5e-3  # height of the part's lower face above the hole's floor at the start of an attempt
     rim_height: float = 25.0e-3  # height of the hole's rim above its floor
     # Necessary for success: the part's lower face is below this height. The simulation also requires the face inside
@@ -170,10 +170,12 @@ class InsertionTask(TaskDescription):
 
 
 INSERTION = InsertionTask()
+# With the descents of Xu et al., for comparison.
+PUBLISHED_INSERTION = InsertionTask(frame_depths=(1.1e-3,), descent=1.1e-3)
 
 
 def _default_descent(part: Part) -> float:
-    return round(min(_PART_DESCENT, _START_ABOVE_RIM + part.depth / 2), 9)
+    return round(min(_DESCENT, _START_ABOVE_RIM + part.depth / 2), 9)
 
 
 def insertion_task(

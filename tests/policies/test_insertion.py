@@ -93,7 +93,7 @@ def test_a_checkpoint_of_another_task_is_rejected_with_the_differing_fields(stor
     with pytest.raises(UsageError) as error_info:
         load_policy(stored, task=other)
     line = str(error_info.value)
-    assert "attempts 15 (here 7)" in line and "frame_depths [0.0011] (here [0.001])" in line
+    assert "attempts 15 (here 7)" in line and "frame_depths [0.0041] (here [0.001])" in line
     assert "workspace" not in line and "\n" not in line
     assert "observation" not in INSERTION.to_json()  # as in checkpoints of earlier versions
     with pytest.raises(UsageError, match="observation"):

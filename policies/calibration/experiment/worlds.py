@@ -99,7 +99,8 @@ def record_insertions(
         raise UsageError("no attempt in this world has contact")
     kept = sorted({row[0] for row in rows})
     recordings = _recordings(rows, kept, task, inserted, fixed, rng)
-    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0])
+    depth = float(np.mean([row[2] for row in rows]))
+    truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0], depth)
     heights = np.array([row[4] for row in rows])
     return RecordedWorld(recordings, truth, misalignment[kept], float(np.sqrt(2) * fixed["noise"]), heights)
 
@@ -180,9 +181,9 @@ def _recordings(
     )
 
 
-def _truth(values: Mapping[str, float], gain: Array, turn: Array) -> dict[str, float]:
-    ratio = values["gel_time"] * DESCENT_SPEED / INSERTION.descent
-    lag = 1 - values["gel_creep"] * ratio * (1 - np.exp(-1 / ratio))  # a linear rise of the force during a descent
+def _truth(values: Mapping[str, float], gain: Array, turn: Array, depth: float) -> dict[str, float]:
+    ratio = values["gel_time"] * DESCENT_SPEED / depth
+    lag = 1 - values["gel_creep"] * ratio * (1 - np.exp(-1 / ratio))  # the force rises linearly during a descent
     names = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "marker_ks", "hole_kn", "hole_mu",
              "arm_stiffness", "grasp_force", "grasp_height", "crosstalk")  # fmt: skip
     pads = {f"gain_{side}": float(gain[k] * lag) for k, side in enumerate(("left", "right"))}

@@ -117,7 +117,7 @@ def test_events_come_in_the_order_of_an_insertion() -> None:
     assert seen[-2:] == ["descent", "attempt"]
     reach("gripped", 0.0244, 0.0255, 0.0253)
     assert seen[-1] == "second descent"
-    reach("gripped", 0.0242)
+    reach("gripped", 0.0212)
     assert seen[-1] == "lowering"
     reach("gripped", 0.0099)
     assert seen[-1] == "deep"

@@ -149,7 +149,7 @@ def test_a_gripper_below_the_end_of_its_descent_ends_the_run(
     robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gelflow.real.runner.insertion.held_part._BEYOND", -0.9e-3)
-    with pytest.raises(SafetyError, match=r"deeper than its descent of 1\.1 mm"):
+    with pytest.raises(SafetyError, match=r"deeper than its descent of 4\.1 mm"):
         run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot)))
 
 
@@ -158,5 +158,5 @@ def test_a_task_that_descends_deeper_than_the_lab_allows_is_refused(robot: MockR
     plan = plan_for(
         robot, tmp_path, OraclePolicy(robot), lab=replace(lab, descent=replace(lab.descent, max_depth=1e-3))
     )
-    with pytest.raises(SafetyError, match=r"descends by 1\.1 mm, descent\.max_depth of the lab file allows 1 mm"):
+    with pytest.raises(SafetyError, match=r"descends by 4\.1 mm, descent\.max_depth of the lab file allows 1 mm"):
         run_insertions(plan)

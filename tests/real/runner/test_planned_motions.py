@@ -52,7 +52,7 @@ def test_a_plan_is_made_and_recorded_for_a_calibration(robot: MockRobot, tmp_pat
     [
         (PlannedMotion(0.02, 0.0, 0.0, 1e-3), r"motion 1 of the plan: \|x\| is 20, at most 15 mm"),
         (PlannedMotion(0.0, 0.0, 0.4, 1e-3), r"\|yaw\| is 22.92, at most 15 °"),
-        (PlannedMotion(0.0, 0.0, 0.0, 2e-3), "depth is 2, must be above 0 and at most 1.1 mm"),
+        (PlannedMotion(0.0, 0.0, 0.0, 5e-3), "depth is 5, must be above 0 and at most 4.1 mm"),
         (PlannedMotion(0.0, 0.0, 0.0, 0.0), "depth is 0, must be above 0"),
     ],
 )

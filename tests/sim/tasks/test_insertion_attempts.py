@@ -12,10 +12,12 @@ from gelflow.observation import MIN_DIVISORS, TactileFrame, flow_map
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import ROLLOUT_SIZE, InsertionAttempts, insertion_scene
 from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION, NOMINAL, simulator_parameters
-from gelflow.task import INSERTION
+from gelflow.sim.tasks.randomization import Randomization
+from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask
 
 WEIGHT = 0.063 * 9.8  # of the part [N]
 SILENT = NOMINAL.replace(noise=(1e-30, 1e-30))
+STIFF = SILENT.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no deep descent presses a part
 
 
 def poses(*millimetres_degrees: tuple[float, float, float]) -> NDArray[np.float64]:
@@ -67,13 +69,20 @@ def test_the_pads_carry_the_weight_and_the_grasp_force(friction: str) -> None:
     assert np.abs(reading[..., 1]).max() < 1e-3 * reading[..., 0].min()
 
 
-def test_aligned_parts_are_inserted_and_misaligned_ones_are_not() -> None:
+@pytest.mark.parametrize(
+    ("task", "values", "lowest"),
+    [(PUBLISHED_INSERTION, SILENT, 24.7e-3), (INSERTION, STIFF, 24.4e-3)],
+    ids=["1.1 mm", "4.1 mm, stiff walls"],
+)
+def test_aligned_parts_are_inserted_and_misaligned_ones_are_not(
+    task: InsertionTask, values: Randomization, lowest: float
+) -> None:
     cases = poses((0, 0, 0), (2.1, 0, 0), (0, -2.1, 0), (0, 0, 4), (2.6, 0, 0), (0, -2.6, 0), (0, 0, 8), (6, 6, 10))
-    _, result = attempted(cases)
+    _, result = attempted(cases, task=task, randomization=values)
     assert result.inserted.tolist() == [True] * 4 + [False] * 4
     assert not result.failed.any()
-    np.testing.assert_allclose(result.height[0], 25.5e-3 - 1.1e-3, atol=5e-5)
-    assert (result.height[4:] > 24.7e-3).all()
+    np.testing.assert_allclose(result.height[0], 25.5e-3 - task.descent, atol=5e-5)
+    assert (result.height[4:] > lowest).all()
 
 
 def test_insertion_agrees_with_geometry_under_randomized_physics() -> None:
@@ -98,7 +107,7 @@ def test_insertion_agrees_with_geometry_under_randomized_physics() -> None:
 
 def test_mirrored_misalignment_gives_mirrored_flow_map() -> None:
     """x → −x swaps the fingers; on the pads, y and the columns change sign. Detects a rotated pad frame."""
-    _, result = attempted(poses((1.5, 3, 4), (-1.5, 3, -4)))
+    _, result = attempted(poses((1.5, 3, 4), (-1.5, 3, -4)), task=PUBLISHED_INSERTION)
     maps = result.image.reshape(2, 2, 2, 13, 10)
     mirrored = maps[1][::-1, :, :, ::-1] * np.array([1, -1])[None, :, None, None]
     np.testing.assert_allclose(
@@ -152,14 +161,14 @@ def test_observation_is_the_flow_map_of_the_frames() -> None:
 
 
 def test_frames_are_recorded_at_the_depths_of_the_task() -> None:
-    task = dataclasses.replace(INSERTION, reference_depth=0.2e-3, frame_depths=(0.6e-3, 0.8e-3, 1.1e-3))
+    task = dataclasses.replace(PUBLISHED_INSERTION, reference_depth=0.2e-3, frame_depths=(0.6e-3, 0.8e-3, 1.1e-3))
     cases = poses((3, 0, 0), (0, 4, 0))
     _, several = attempted(cases, task=task)
     assert several.image.shape == (2, 12, 13, 10)
     strength = np.abs(several.image.reshape(2, 3, -1)).sum(2)
     assert (np.diff(strength, axis=1) > 0).all()  # forces increase with depth
-    with pytest.raises(UsageError, match=r"frame depth 0\.002 m is outside the descent"):
-        attempted(cases, task=dataclasses.replace(INSERTION, frame_depths=(2e-3,)))
+    with pytest.raises(UsageError, match=r"frame depth 0\.005 m is outside the descent"):
+        attempted(cases, task=dataclasses.replace(INSERTION, frame_depths=(5e-3,)))
 
 
 def test_contact_stops_the_descent() -> None:
@@ -167,11 +176,14 @@ def test_contact_stops_the_descent() -> None:
     caught, through = (3e-3, 2e-3, 0.05), (0.0, 0.0, 0.0)
     misalignment = np.array([caught, through])
     gentle = SILENT.replace(stop_shear=5e-3)
-    _, stopped = attempted(misalignment, randomization=gentle)
-    _, full = attempted(misalignment, randomization=SILENT.replace(stop_shear=9.0))
+    _, stopped = attempted(misalignment, task=PUBLISHED_INSERTION, randomization=gentle)
+    _, full = attempted(misalignment, task=PUBLISHED_INSERTION, randomization=SILENT.replace(stop_shear=9.0))
     assert 5e-3 < stopped.divisor[0] < 0.7 * full.divisor[0]
     assert np.abs(stopped.image[0] - full.image[0]).mean() < 0.15
     np.testing.assert_array_equal(stopped.inserted, [False, True])
+    _, deep = attempted(misalignment, randomization=gentle)
+    np.testing.assert_allclose(deep.image[0], stopped.image[0], atol=0.01)  # the limit of the depth is not reached
+    np.testing.assert_array_equal(deep.inserted, [False, True])
 
 
 def test_every_attempt_starts_from_the_same_grasp() -> None:
@@ -193,7 +205,7 @@ def test_results_depend_neither_on_the_batch_nor_on_threads() -> None:
 
 def test_some_environments_attempt_and_draw_while_the_others_rest() -> None:
     """More environments than one rollout simulates; the result of a part does not depend on its place."""
-    quiet = DEFAULT_RANDOMIZATION.replace(start_height=0.0, noise=1e-30)
+    quiet = DEFAULT_RANDOMIZATION.replace(start_height=0.0, noise=1e-40)
     attempts = InsertionAttempts(ROLLOUT_SIZE + 3, randomization=quiet)
     rng = np.random.default_rng(5)
     attempts.draw(rng)

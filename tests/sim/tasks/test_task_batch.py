@@ -18,7 +18,7 @@ from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
-from gelflow.task import INSERTION, InsertionTask, TaskDescription
+from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask, TaskDescription
 
 
 @dataclass(frozen=True)
@@ -201,4 +201,5 @@ def test_descriptions_of_tasks() -> None:
     assert task.digest() != LineTask().digest()
     with pytest.raises(UsageError, match="task description is of 'line', expected 'insertion'"):
         InsertionTask.from_json({"name": "line"})
-    assert INSERTION.digest() == "028d8d8be55f0e5f"
+    assert INSERTION.digest() == "cceede46a985d44f"
+    assert PUBLISHED_INSERTION.digest() == "028d8d8be55f0e5f"

@@ -6,15 +6,16 @@ import pytest
 
 from gelflow.sim.tasks.insertion import InsertionAttempts
 from gelflow.sim.tasks.insertion_randomization import NOMINAL
-from gelflow.task import INSERTION, InsertionTask
+from gelflow.task import PUBLISHED_INSERTION, InsertionTask
 
 STIFF = NOMINAL.replace(hole_kn=2e4, stop_shear=0.03)  # walls into which no deep descent presses a part
 both_depths = pytest.mark.parametrize("deep", [False, True], ids=["published descent", "deep descent, stiff walls"])
 
 
 def with_published_descent(task: InsertionTask) -> InsertionTask:
-    """The task with the depth of the cuboid's descents."""
-    return dataclasses.replace(task, descent=INSERTION.descent, frame_depths=INSERTION.frame_depths)
+    """The task with the depth of the published descents."""
+    published = PUBLISHED_INSERTION
+    return dataclasses.replace(task, descent=published.descent, frame_depths=published.frame_depths)
 
 
 def make_attempts(count: int, task: InsertionTask, *, deep: bool) -> InsertionAttempts:
