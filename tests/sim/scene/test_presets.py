@@ -128,7 +128,7 @@ def test_invalid_preset_value_or_name_is_an_error(tmp_path: Path) -> None:
 
 
 def test_attempts_have_the_same_duration_and_marker_grid() -> None:
-    for preset, steps in ((None, 45), ("fast", 22), ("accurate", 360)):
+    for preset, steps in ((None, 168), ("fast", 84), ("accurate", 1342)):
         attempts = InsertionAttempts(1, scene=insertion_scene(preset=preset), randomization=NOMINAL)
         assert attempts._steps == steps
         assert attempts.scene.grids == (INSERTION.grid, INSERTION.grid)

@@ -106,13 +106,16 @@ def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [pytest.param(-3e-3, id="too low"), pytest.param(3e-3, id="too high")])
-def test_rim_is_found_by_touch_when_the_hole_is_taught_3_mm_wrong(tmp_path: Path, error: float) -> None:
+@pytest.mark.parametrize(
+    ("error", "found"),
+    [pytest.param(-3e-3, 3e-3, id="too low"), pytest.param(3e-3, 0.0, id="too high: met in the descent")],
+)
+def test_rim_is_found_by_touch_when_the_hole_is_taught_3_mm_wrong(tmp_path: Path, error: float, found: float) -> None:
     with robot_in({"taught_error": {"z": error}}) as robot:
         result = insert(robot, tmp_path)
         truth = part(robot)
     assert result.inserted and truth["inserted"]
-    assert result.attempts[-1].height_offset == pytest.approx(-error, abs=0.5e-3)
+    assert result.attempts[-1].height_offset == pytest.approx(found, abs=0.5e-3)
     assert truth["largest_push"] < MOST_PUSHED and truth["largest_slip"] < MOST_PUSHED
 
 
