@@ -20,8 +20,8 @@ from gelflow.part import CUBOID, Part
 
 _START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
 _SUCCESS_BELOW_RIM = 0.3e-3  # [m]
-# [m] of an attempt, unless contact ends it. With the published 1.1 mm an attempt ends 0.6 mm below the rim, where an arm
-# of 0.2 N/mm presses with 0.1 N: the markers hardly move, and the policy learns little from it.
+# [m] of an attempt, unless contact ends it. With the published 1.1 mm it ends 0.6 mm below the rim, where an arm of 0.2
+# N/mm presses with 0.1 N: the markers hardly move, and the policy learns little from it.
 _DESCENT = 4.1e-3
 
 OBSERVATIONS = ("flow map", "forces", "nothing")
