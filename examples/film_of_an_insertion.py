@@ -18,9 +18,7 @@ env.reset(env.all, rng, options={"misalignment": (5e-3, -4e-3, np.radians(6.0))}
 attempts = []  # drawings of each attempt and its title
 while True:
     x, y, yaw = env.attempts.pose[0]
-    title = (
-        f"attempt {len(attempts) + 1}: {1e3 * x:+.1f} mm, {1e3 * y:+.1f} mm, {np.degrees(yaw):+.1f} deg from the hole"
-    )
+    title = f"attempt {len(attempts) + 1}: off by {1e3 * x:+.1f}, {1e3 * y:+.1f} mm, {np.degrees(yaw):+.1f} deg"
     attempts.append((env.attempts.drawings(0, 12), title))
     if env.terminated[0] or env.truncated[0]:
         break
