@@ -151,7 +151,7 @@ def _memory_folder() -> str | None:
     write waits while the disk is busy, for seconds at worst, and with it the arm or all images.
     """
     folder = "/dev/shm"
-    return folder if os.path.isdir(folder) and os.access(folder, os.W_OK | os.X_OK) else None
+    return folder if os.access(folder, os.W_OK | os.X_OK) else None
 
 
 class _Gel:

@@ -6,7 +6,6 @@ Values that change with every step pass through shared memory; rare requests pas
 import mmap
 import os
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from types import TracebackType
@@ -19,7 +18,7 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.progress import Progress
-from gelflow.helper_process import HelperProcess, Messages, connect_to_parent
+from gelflow.helper_process import HelperProcess, Messages, connect_to_parent, memory_file
 from gelflow.observation import Grid
 from gelflow.session.records import from_plain, to_plain
 
@@ -87,13 +86,15 @@ class SimulatedCellProcess:
     def start(self) -> Self:
         """Start the process and wait until it simulates. Raises SimulationError when it does not."""
         grid = self.config.grid
-        with tempfile.TemporaryFile() as file:
-            os.ftruncate(file.fileno(), _Shared.size(grid))
-            self._shared = _Shared(file.fileno(), grid)
+        memory = memory_file(_Shared.size(grid))
+        try:
+            self._shared = _Shared(memory, grid)
             self._shared.arm.write([*self._tool[0], *self._tool[1]])
             settings = {"cell": to_plain(self.config), "clock": self._clock.settings}
             module = "gelflow.hardware_mocks.simulated_cell.process"
-            self._helper = HelperProcess.start(module, settings, descriptors=(file.fileno(),))
+            self._helper = HelperProcess.start(module, settings, descriptors=(memory,))
+        finally:
+            os.close(memory)
         try:
             self._receive(self._helper, _START_LIMIT)
         except SimulationError:

@@ -5,13 +5,12 @@ partial record. Unread records are never overwritten: a full buffer rejects the 
 """
 
 import mmap
-import os
 import struct
-import tempfile
 from typing import NamedTuple
 
 from gelflow.errors import UsageError
 from gelflow.geometry import PoseTuple
+from gelflow.helper_process import memory_file
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.egm.timing import WORDS, EgmTiming, TimingCounters
 from gelflow.real.kinematics import Joints
@@ -59,13 +58,7 @@ class EgmCycleLog:
         """File descriptor of a log for `capacity` records; the file has no name and is deleted with its last user."""
         if capacity < 2:
             raise UsageError(f"a log needs a capacity of at least 2 records, got {capacity}")
-        if hasattr(os, "memfd_create"):
-            descriptor = os.memfd_create("gelflow-egm")
-        else:
-            with tempfile.TemporaryFile() as file:
-                descriptor = os.dup(file.fileno())
-        os.ftruncate(descriptor, _HEADER + capacity * _RECORD.size)
-        return descriptor
+        return memory_file(_HEADER + capacity * _RECORD.size)
 
     def close(self) -> None:
         """Unmap the memory."""

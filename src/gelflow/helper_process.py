@@ -162,6 +162,20 @@ class HelperProcess:
         self._errors.close()
 
 
+def memory_file(size: int) -> int:
+    """Descriptor of a new file of `size` bytes that both processes map; it has no name and ends with its last user.
+
+    In memory where the system allows it: on a disk, a write to a mapped file waits while the disk is busy.
+    """
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create("gelflow")
+    else:
+        with tempfile.TemporaryFile() as file:
+            descriptor = os.dup(file.fileno())
+    os.ftruncate(descriptor, size)
+    return descriptor
+
+
 def connect_to_parent(arguments: Sequence[str]) -> tuple[dict[str, Any], Messages, list[int]]:
     """The helper's side: its settings, the link to its parent, and the file descriptors that it inherited.
 

@@ -52,7 +52,7 @@ class RecordedWorld:
     heights: Array  # of the attempts' starts above the task's start height [m], (n,)
 
 
-def record_world(seed: int, *, plan: Sequence[PlannedMotion] = ()) -> RecordedWorld:
+def record_world(seed: int, *, task: InsertionTask = INSERTION, plan: Sequence[PlannedMotion] = ()) -> RecordedWorld:
     """Insertions with the shipped policy in the world of a seed, which differs from training in all quantities.
 
     With a `plan` its motions are made on the first part instead. Raises UsageError when the world cannot hold its part,
@@ -60,7 +60,7 @@ def record_world(seed: int, *, plan: Sequence[PlannedMotion] = ()) -> RecordedWo
     """
     rng = np.random.default_rng((seed, 0xCA1))
     drawn = widened(FULL_RANDOMIZATION).sample(rng, 1, friction="elastic")
-    return record_insertions({name: float(value[0]) for name, value in drawn.items()}, rng, plan=plan)
+    return record_insertions({name: float(value[0]) for name, value in drawn.items()}, rng, task=task, plan=plan)
 
 
 def record_insertions(

@@ -70,7 +70,7 @@ def mean_displacement(robot: MockRobot) -> NDArray[np.float64]:
 
 def plan_for(robot: MockRobot, folder: Path, policy: Any, **changes: Any) -> RunPlan:
     lab = changes.pop("lab", None) or lab_for(robot)
-    return RunPlan(lab=lab, policy=policy, task=INSERTION, session=folder / "session.mcap", **changes)
+    return RunPlan(lab=lab, policy=policy, task=robot.config.cell.task, session=folder / "session.mcap", **changes)
 
 
 def events(path: Path) -> list[tuple[str, Any]]:

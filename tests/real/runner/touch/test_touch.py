@@ -17,14 +17,15 @@ from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.world import world_from_tables
 from gelflow.real.runner.insertion.attempt import Insertion
 from gelflow.real.runner.run_plan import run_insertions
+from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask
 
 FACTOR = 6.0
 MOST_PUSHED = 1e-3  # of a part in the grip before the arm stops [m]
 
 
 @contextmanager
-def robot_in(world: dict[str, Any]) -> Iterator[MockRobot]:
-    cell = SimulatedCellConfig(seed=2, world=world_from_tables(world, "test"))
+def robot_in(world: dict[str, Any], task: InsertionTask = INSERTION) -> Iterator[MockRobot]:
+    cell = SimulatedCellConfig(seed=2, world=world_from_tables(world, "test"), task=task)
     with MockRobot(FACTOR, MockRobotConfig(cell=cell, egm_port=free_port(socket.SOCK_DGRAM))) as robot:
         yield robot
 
@@ -107,11 +108,18 @@ def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("error", "found"),
-    [pytest.param(-3e-3, 3e-3, id="too low"), pytest.param(3e-3, 0.0, id="too high: met in the descent")],
+    ("task", "error", "found"),
+    [
+        pytest.param(PUBLISHED_INSERTION, -3e-3, 3e-3, id="too low, descents of 1.1 mm"),
+        pytest.param(PUBLISHED_INSERTION, 3e-3, -3e-3, id="too high, descents of 1.1 mm"),
+        pytest.param(INSERTION, -3e-3, 3e-3, id="too low"),
+        pytest.param(INSERTION, 3e-3, 0.0, id="too high: met within the descent"),
+    ],
 )
-def test_rim_is_found_by_touch_when_the_hole_is_taught_3_mm_wrong(tmp_path: Path, error: float, found: float) -> None:
-    with robot_in({"taught_error": {"z": error}}) as robot:
+def test_rim_is_found_by_touch_when_the_hole_is_taught_3_mm_wrong(
+    tmp_path: Path, task: InsertionTask, error: float, found: float
+) -> None:
+    with robot_in({"taught_error": {"z": error}}, task) as robot:
         result = insert(robot, tmp_path)
         truth = part(robot)
     assert result.inserted and truth["inserted"]
