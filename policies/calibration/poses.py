@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.geometry import apply_planar
 from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, in_hole
 
 Array = NDArray[np.float64]
@@ -30,10 +31,7 @@ def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Gene
         # in_hole(misalignment, found) is a pose in the hole.
         pose = rng.normal(size=(8 * count, 3)) * _FREE
         yaw = pose[:, 2] - found[2]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        x = pose[:, 0] - cos * found[0] + sin * found[1]
-        y = pose[:, 1] - sin * found[0] - cos * found[1]
-        drawn = np.column_stack([x, y, yaw])
+        drawn = np.column_stack([apply_planar(np.column_stack([pose[:, :2], yaw]), -found[:2]), yaw])
         inside = drawn[(np.abs(drawn) <= 1.2 * limit).all(1)]
         result = np.vstack([result, inside if len(inside) else drawn])
     return result[:count]

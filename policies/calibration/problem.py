@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import compose_planar
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.recordings import Recordings
@@ -153,7 +154,4 @@ def huber_weights(residuals: Array) -> Array:
 
 def in_hole(misalignment: Array, planar_pose: Array) -> Array:
     """Gripper poses in the hole frame (…, 3) from misalignments and planar poses (…, 3)."""
-    x, y, yaw = np.moveaxis(misalignment, -1, 0)
-    px, py, turn = np.moveaxis(planar_pose, -1, 0)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.stack([x + cos * px - sin * py, y + sin * px + cos * py, yaw + turn], -1)
+    return compose_planar(misalignment, planar_pose)

@@ -7,9 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import rotated
 from gelflow.observation import FlowMap
 from gelflow.policies.networks.base import Array, BatchPolicy, Network
 from gelflow.task import InsertionTask, TaskDescription
+
+
+def in_frame_of_gripper(displacement: Array) -> Array:
+    """Displacements (n, 3: x, y, yaw) of the gripper from its first pose, turned to its present frame."""
+    return np.column_stack([rotated(displacement[:, :2], -displacement[:, 2]), displacement[:, 2]])
+
+
+def in_frame_of_start(corrections: Array, displacement: Array) -> Array:
+    """Corrections (n, 3: x, y, yaw) in the frame of a gripper at `displacement` (n, 3), turned to its first frame."""
+    return np.column_stack([rotated(corrections[:, :2], displacement[:, 2]), corrections[:, 2]])
 
 
 class CorrectionPolicy(BatchPolicy):

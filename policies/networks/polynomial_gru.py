@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
-from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
+from gelflow.policies.networks.flow_map_policy import (
+    CorrectionPolicy,
+    FlowMapNetwork,
+    in_frame_of_gripper,
+    in_frame_of_start,
+    insertion_task,
+)
 from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import reduce_maps
@@ -152,9 +158,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
         self._side = np.where(self.new, side, self._side)
         self.new[:] = False
         mirrored = np.take_along_axis(features, table.order[self._side], axis=1) * table.sign[self._side]
-        x, y, yaw = self._displacement.T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        displacement = np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1) / self._reach
+        displacement = in_frame_of_gripper(self._displacement) / self._reach
         return np.concatenate([mirrored, self._correction * self.signs, displacement * self.signs], axis=1)
 
     def output(self, inputs: Array) -> Array:
@@ -166,9 +170,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
         """The corrections (count, 3) [m, m, rad] of an output, which is limited to ±1; updates the memory."""
         self._correction = np.clip(output, -1, 1) * self.signs * self.network.task.corrected_axes
         corrections = np.asarray(self._correction * self._reach)
-        dx, dy, dyaw = corrections.T
-        cos, sin = np.cos(self._displacement[:, 2]), np.sin(self._displacement[:, 2])
-        self._displacement += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
+        self._displacement += in_frame_of_start(corrections, self._displacement)
         return corrections
 
     def corrections(self, images: NDArray[Any]) -> Array:

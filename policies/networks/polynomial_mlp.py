@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
-from gelflow.policies.networks.flow_map_policy import CorrectionPolicy, FlowMapNetwork, insertion_task
+from gelflow.policies.networks.flow_map_policy import (
+    CorrectionPolicy,
+    FlowMapNetwork,
+    in_frame_of_gripper,
+    in_frame_of_start,
+    insertion_task,
+)
 from gelflow.policies.networks.layers import linear
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import reduce_maps
@@ -94,9 +100,7 @@ class History:
         self._features[rows] = past
         existing = (self._attempts_made[rows, None] > np.arange(self._corrections.shape[1])).astype(float)
         self._attempts_made[rows] += 1
-        x, y, yaw = self._pose[rows].T
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        displacement = np.stack([cos * x + sin * y, cos * y - sin * x, yaw], axis=1) / self._reach
+        displacement = in_frame_of_gripper(self._pose[rows]) / self._reach
         progress = self._attempts_made[rows, None] / self._max_attempts
         flat = [values[rows].reshape(len(rows), -1) for values in (self._features, self._corrections)]
         return np.concatenate([*flat, existing, displacement, progress], axis=1)
@@ -111,10 +115,7 @@ class History:
             past = np.roll(self._corrections[rows], 1, axis=1)
             past[:, 0] = corrections[rows] / self._reach
             self._corrections[rows] = past
-        yaw = self._pose[rows, 2]
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        dx, dy, dyaw = corrections[rows].T
-        self._pose[rows] += np.stack([cos * dx - sin * dy, sin * dx + cos * dy, dyaw], axis=1)
+        self._pose[rows] += in_frame_of_start(corrections[rows], self._pose[rows])
 
 
 def _rows(count: int, which: NDArray[np.bool_] | None) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.geometry import rotation_matrices, turned_about_z
+from gelflow.geometry import apply_planar, rotation_matrices, turned_about_z
 from gelflow.observation import MIN_DIVISORS, normalize
 from gelflow.sim.arguments import check_type
 from gelflow.sim.scene import Scene, load_scene
@@ -289,11 +289,9 @@ class InsertionAttempts:
         part = grasp[:, at : at + 7]
         lift = self.task.start_height + jitter - (part[:, 2] - self.task.part.size[2] / 2)
         x, y, yaw = self.pose[rows].T
-        cos, sin = np.cos(yaw), np.sin(yaw)
         sim.q[:n] = grasp
         sim.q[:n, self._arm_q] = np.column_stack([x, y, grasp[:, self._arm_q[2]] + lift, yaw])
-        sim.q[:n, at] = x + cos * part[:, 0] - sin * part[:, 1]
-        sim.q[:n, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
+        sim.q[:n, at : at + 2] = apply_planar(self.pose[rows], part[:, :2])
         sim.q[:n, at + 2] = part[:, 2] + lift
         sim.q[:n, at + 3 : at + 7] = turned_about_z(part[:, 3:], yaw)
         sim.anchors[:n] = self._grasp["anchors"][rows]

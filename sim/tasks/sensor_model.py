@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.geometry import rotated
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Uniform
 
 Array = NDArray[np.float64]
@@ -172,10 +173,7 @@ class SensorModel:
         """The reading with each pad's gain and the rotation of its camera."""
         scaled = reading * self.gain[rows][:, self._pad_of, None]
         turn = self.turn[rows][:, self._pad_of]
-        cos, sin = np.cos(turn), np.sin(turn)
-        x, y = scaled[..., 0].copy(), scaled[..., 1].copy()
-        scaled[..., 0], scaled[..., 1] = cos * x - sin * y, sin * x + cos * y
-        return scaled
+        return rotated(scaled, turn)
 
     def _without_dead(self, reading: Array, rows: NDArray[np.int64]) -> Array:
         """Markers that are not found replaced by the inverse-distance mean of the nearest found ones."""

@@ -1,6 +1,6 @@
 """Rigid transforms: quaternions w x y z and poses.
 
-The functions take quaternions and vectors as sequences or arrays and return tuples of plain floats: the EGM process
+The functions of one quaternion or vector take sequences or arrays and return tuples of plain floats: the EGM process
 calls them in every 4 ms cycle, where arrays of four numbers cost much more. `Pose` holds arrays.
 """
 
@@ -89,6 +89,25 @@ def rotation_matrices(q: Array) -> Array:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def rotated(vectors: Array, angle: Array | float) -> Array:
+    """Vectors (…, 2) in a plane, rotated by `angle` (…) [rad]."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def apply_planar(pose: Array, points: Array) -> Array:
+    """Points (…, 2) of planar frames (…, 3: x, y, yaw), in the parent frame."""
+    cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([pose[..., 0] + cos * x - sin * y, pose[..., 1] + sin * x + cos * y], axis=-1)
+
+
+def compose_planar(a: Array, b: Array) -> Array:
+    """The planar poses `b` (…, 3: x, y, yaw), given relative to `a` (…, 3), in the parent frame of `a`."""
+    return np.concatenate([apply_planar(a, b[..., :2]), (a[..., 2] + b[..., 2])[..., None]], axis=-1)
 
 
 def turned_about_z(q: Array, angle: Array) -> Array:

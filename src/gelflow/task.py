@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import compose_planar, rotated
 from gelflow.observation import Grid
 from gelflow.part import CUBOID, Part
 
@@ -136,23 +137,14 @@ class InsertionTask(TaskDescription):
         whose z is the hole's. Each of x, y, yaw is clipped to its limit of the workspace.
         """
         pose, correction = np.asarray(pose, dtype=float), np.asarray(correction, dtype=float)
-        cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-        moved = np.stack(
-            [
-                pose[..., 0] + cos * correction[..., 0] - sin * correction[..., 1],
-                pose[..., 1] + sin * correction[..., 0] + cos * correction[..., 1],
-                pose[..., 2] + correction[..., 2],
-            ],
-            axis=-1,
-        )
         limit = np.asarray(self.workspace)
-        return np.asarray(np.clip(moved, -limit, limit))
+        return np.asarray(np.clip(compose_planar(pose, correction), -limit, limit))
 
     def centring_correction(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """The correction (…, 3) in the gripper frame from `pose` (…, 3) to the nearest pose where the part fits."""
-        x, y, yaw = np.moveaxis(np.asarray(pose, dtype=float), -1, 0)
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        centring = np.stack([-cos * x - sin * y, sin * x - cos * y, -self.part.yaw_error(yaw)], axis=-1)
+        pose = np.asarray(pose, dtype=float)
+        yaw = pose[..., 2]
+        centring = np.concatenate([rotated(-pose[..., :2], -yaw), -self.part.yaw_error(yaw)[..., None]], axis=-1)
         return np.asarray(centring * self.corrected_axes)
 
     def reward(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:

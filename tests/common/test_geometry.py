@@ -4,15 +4,19 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gelflow.geometry import (
     Pose,
     angle_between,
     angles_between,
+    apply_planar,
     columns_quaternion,
     compose,
+    compose_planar,
     invert,
+    rotated,
     rotation_columns,
     rotation_matrices,
     yaw_quaternion,
@@ -72,3 +76,20 @@ def test_a_pose_that_is_not_finite_gives_no_warning() -> None:
     far = Pose(np.array([0.0, np.inf, np.nan]), np.array([1.0, 0.0, 0.0, 0.0]))
     turned = Pose(np.zeros(3), yaw_quaternion(0.3))
     assert not np.isfinite((turned @ far).position).any()
+
+
+def test_planar_poses_agree_with_poses_in_space() -> None:
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(2, 20, 3))
+    composed = compose_planar(a, b)
+    assert composed.shape == (20, 3)
+    assert apply_planar(a, b[:, :2]) == pytest.approx(composed[:, :2])
+    assert a[:, :2] + rotated(b[:, :2], a[:, 2]) == pytest.approx(composed[:, :2])
+    for row in range(20):
+        both = in_space(a[row]) @ in_space(b[row])
+        assert both.is_near(in_space(composed[row]), 1e-12, 1e-7)
+    assert compose_planar(a[0], b) == pytest.approx(compose_planar(np.tile(a[0], (20, 1)), b))  # broadcast
+
+
+def in_space(planar: NDArray[np.float64]) -> Pose:
+    return Pose(np.array([*planar[:2], 0.0]), yaw_quaternion(float(planar[2])))

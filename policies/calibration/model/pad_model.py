@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.geometry import rotated
 from gelflow.sim.tasks.sensor_model import nearest_markers
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ class PadModel:
         gain, turn = (np.stack([values[f"{kind}_{side}"] for side in SIDES], -1)[..., self._pad]
                       for kind in ("gain", "turn"))  # fmt: skip
         mixed = self._mixed(shear, np.asarray(values["crosstalk"])[..., None, None])
-        return np.asarray(gain[..., None] * _turned(mixed, turn))
+        return np.asarray(gain[..., None] * rotated(mixed, turn))
 
     def derivatives(self, shear: Array, values: Mapping[str, float]) -> dict[str, Array]:
         """Derivatives of the readings with respect to gains [per unit of gain], rotations [per rad] and crosstalk."""
@@ -48,9 +49,3 @@ class PadModel:
         change = shear[..., self._neighbours, :].mean(-2) - shear
         result["crosstalk"] = self.read(change, {**number, "crosstalk": np.asarray(0.0)})
         return result
-
-
-def _turned(vectors: Array, angle: Array) -> Array:
-    cos, sin = np.cos(angle), np.sin(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x - sin * y, sin * x + cos * y], -1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.geometry import rotation_matrices, yaw_quaternion
+from gelflow.geometry import apply_planar, rotated, rotation_matrices, yaw_quaternion
 from gelflow.sim import _core
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
@@ -176,10 +176,8 @@ class ShearModel:
         part = grasp.q[:, at : at + 7]
         lift = self.task.start_height + self.task.part.size[2] / 2 + descents.z - part[:, 2]
         x, y, yaw = descents.pose.T
-        cos, sin = np.cos(yaw), np.sin(yaw)
         q[:, self._arm_q] = np.column_stack([x, y, q[:, self._arm_q[2]] + lift, yaw])
-        q[:, at] = x + cos * part[:, 0] - sin * part[:, 1]
-        q[:, at + 1] = y + sin * part[:, 0] + cos * part[:, 1]
+        q[:, at : at + 2] = apply_planar(descents.pose, part[:, :2])
         q[:, at + 2] += lift
         turn = np.stack([yaw_quaternion(angle) for angle in yaw])
         q[:, at + 3 : at + 7] = _product(turn, part[:, 3:])
@@ -294,9 +292,8 @@ class ShearModel:
         """Derivative of the start of a descent, from that of the grasp at rest and of the pose."""
         q, u, at = settled.q.copy(), settled.u.copy(), sim.joint_v("part")
         x, y, yaw = descent.pose[0]
-        cos, sin = np.cos(yaw), np.sin(yaw)
         lift = -q[at + 2]
-        q[at : at + 3] = cos * q[at] - sin * q[at + 1], sin * q[at] + cos * q[at + 1], 0.0
+        q[at : at + 2], q[at + 2] = rotated(q[at : at + 2], yaw), 0.0
         q[self._arm_q] = 0.0, 0.0, q[self._arm_q[2]] + lift, 0.0
         u[self._arm_u] = 0.0, 0.0, u[self._arm_u[2]] + lift, 0.0
         if name in POSE:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.geometry import rotated
 from gelflow.observation import FlowMap
 from gelflow.real.runner.lab import Lab
 from gelflow.session.motion_plan import PlannedMotion
@@ -25,12 +26,10 @@ class PlanPolicy:
 
     def act(self, observation: FlowMap) -> NDArray[np.float64]:
         """The correction (dx [m], dy [m], dyaw [rad]) in the gripper frame to the next pose; zero after the last."""
-        x, y, yaw = self.motions[self._made].planar_pose
+        before = np.array(self.motions[self._made].planar_pose)
         self._made = min(self._made + 1, len(self.motions) - 1)
-        to_x, to_y, to_yaw = self.motions[self._made].planar_pose
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        dx, dy = to_x - x, to_y - y
-        return np.array([cos * dx + sin * dy, cos * dy - sin * dx, to_yaw - yaw])
+        change = np.array(self.motions[self._made].planar_pose) - before
+        return np.array([*rotated(change[:2], -before[2]), change[2]])
 
 
 def check_motions(motions: tuple[PlannedMotion, ...], lab: Lab, task: InsertionTask) -> None:
