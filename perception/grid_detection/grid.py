@@ -62,7 +62,7 @@ def find_grid(image: NDArray[np.uint8], request: GridRequest) -> MarkerGrid:
     """Finds the grid of markers in `image` (B G R).
 
     With `rows` and `cols` of the request, the grid has this shape or, with `either_way`, the transposed one; further
-    lines that the image border cuts are ignored. Without them, the grid consists of all lines that are mostly visible.
+    lines that the image border cuts are ignored. Without them, the grid consists of the lines that `trim` leaves.
     Raises TrackerInitError when no grid or a grid of another shape is found, UsageError for impossible requests.
     """
     _ = request.shapes  # raises UsageError

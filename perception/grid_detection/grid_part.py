@@ -21,6 +21,7 @@ Skipped = tuple[int, int, int, int]  # numbers of printed lines outside the imag
 Floats = NDArray[np.float64]
 
 _MOSTLY_COMPLETE = 0.6  # fraction of entire dots in the outer lines of a grid of unknown shape
+_PRINTED = 0.42  # the same of a line without a dot that the image border cuts: the others are missing in the print
 _PARTLY_COMPLETE = 0.3  # the same of a grid of known shape
 _MIN_COUNT = 0.7  # entire dots / nodes of a requested grid
 _ANCHOR_RADIUS = 0.4  # largest distance of a marker from its calibrated position / spacing; at 0.5 rows are exchanged
@@ -87,15 +88,18 @@ def completeness(lattice: Lattice, dots: DetectedDots) -> Floats:
     return np.where(occupied, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
 
 
-def trim(complete: Floats, least: float = _MOSTLY_COMPLETE) -> tuple[int, int, int, int]:
-    """The part of the grid whose outer lines are complete to at least `least`: top, bottom, left, right."""
+def trim(complete: Floats, least: float = _MOSTLY_COMPLETE, printed: float = _PRINTED) -> tuple[int, int, int, int]:
+    """The part of the grid whose outer lines are complete enough: top, bottom, left, right.
+
+    A line is if at least `least` of its dots are entire, or `printed` where the image border cuts none of them.
+    """
     top, bottom, left, right = 0, complete.shape[0], 0, complete.shape[1]
     while bottom - top >= 3 and right - left >= 3:
         part = complete[top:bottom, left:right]
-        rows, columns = part.mean(axis=1), part.mean(axis=0)
-        edges = (rows[0], rows[-1], columns[0], columns[-1])
-        worst = int(np.argmin(edges))
-        if edges[worst] >= least:
+        edges = (part[0], part[-1], part[:, 0], part[:, -1])
+        shares = [line.mean() / (least if ((line > 0) & (line < 1)).any() else min(least, printed)) for line in edges]
+        worst = int(np.argmin(shares))
+        if shares[worst] >= 1:
             break
         top, bottom = top + (worst == 0), bottom - (worst == 1)
         left, right = left + (worst == 2), right - (worst == 3)

@@ -256,6 +256,17 @@ def test_every_image_class_is_tracked_without_prior_knowledge(name: str) -> None
     )
 
 
+@pytest.mark.parametrize(("markers", "seed"), [(63, 2), (63, 5), (63, 11), (130, 3), (130, 13)])
+def test_an_outer_line_with_half_of_its_dots_belongs_to_the_grid(markers: int, seed: int) -> None:
+    appearance = make_appearance("typical", markers=markers, seed=seed, missing=0.15)
+    frame = next(iter(GelSequence(appearance, frames=1)))
+    started = MarkerTracker().start(frame.image)
+    assert (started.rows, started.cols) == (appearance.grid.rows, appearance.grid.cols)
+    off = np.linalg.norm(started.position - frame.position, axis=1)
+    assert started.valid[frame.visible].mean() > 0.95 and not started.valid[~frame.visible].any()
+    assert (off < 0.3 * appearance.spacing).all()  # of the missing ones as well
+
+
 def test_hidden_markers_are_inferred_and_recovered() -> None:
     results = track_sequence(GelSequence(make_appearance("typical", occluders=1), "shear", frames=24, period=30))
     hidden = np.array([~frame.visible for frame, _, _ in results])
