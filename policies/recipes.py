@@ -168,10 +168,9 @@ _RECIPES: dict[str, dict[str, Recipe]] = {
         DEFAULT: _INSERTION,
         FINE_TUNING: dataclasses.replace(
             _INSERTION,
-            steps=50_000,
-            envs=512,
-            evaluate_every=16_384,
-            settings=ImitationSettings(memory=8, learning_rate=1e-3, bounded_after=0.0, exploration=(0.1, 0.03)),
+            steps=80_000,
+            evaluate_every=20_000,
+            settings=ImitationSettings(memory=16, learning_rate=2e-3, bounded_after=0.0, exploration=(0.1, 0.03)),
         ),
         "ppo": dataclasses.replace(
             _INSERTION,

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
 from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
+from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.planning.suggestions import Suggestion, suggest
 from gelflow.policies.calibration.poses import find_poses
 from gelflow.policies.calibration.problem import Problem
@@ -18,6 +19,7 @@ Array = NDArray[np.float64]
 KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
 REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
 ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
+PREDICTED = 1.5  # largest residual of the held-out attempts relative to noise and model error
 _CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
 
 
@@ -30,12 +32,12 @@ class Estimate:
     low: float
     high: float
     relative_width: float  # of the interval, relative to that of the prior
-    reproduced: bool  # the fit reproduces the recordings
+    confirmed: bool  # the fit is good enough for this parameter
 
     @property
     def verdict(self) -> str:
         """Whether the recordings determine the parameter: known, partly or unknown; unknown if the fit is poor."""
-        if not self.reproduced:
+        if not self.confirmed:
             return "unknown"
         return "known" if self.relative_width < KNOWN else "partly" if self.relative_width < PARTLY else "unknown"
 
@@ -62,6 +64,7 @@ class Calibration:
     correlated: tuple[tuple[str, str, float], ...]  # pairs of parameters that only their combination determines
     fitted: FlowMaps
     held_out: FlowMaps | None  # None: there was one insertion only
+    held_out_residual: float | None  # root mean square of their whitened residuals after the calibration
     noise: float  # standard deviation of the difference of two readings of a marker
     unit: str
     suggestions: tuple[Suggestion, ...]
@@ -71,6 +74,15 @@ class Calibration:
     def reproduced(self) -> bool:
         """Whether the fit reproduces the recordings to within the noise and the expected error of the model."""
         return self.fit.best.chi <= REPRODUCED
+
+    @property
+    def predicted(self) -> bool | None:
+        """Whether the residual of the held-out attempts is at most `PREDICTED`; None: none held out.
+
+        It is nearly that of the fit at the true parameters, and several times larger in a wrong minimum, where the
+        poses of the fitted insertions make up for wrong forces.
+        """
+        return None if self.held_out_residual is None else self.held_out_residual <= PREDICTED
 
     @property
     def explained(self) -> bool | None:
@@ -116,14 +128,17 @@ def calibrate(
     problem = Problem(training)
     rng = np.random.default_rng((seed, 0xCA1))
     point = result.best.point[: result.count]
-    held_out = None
+    held_out, residual = None, None
     if hold_out:
-        held_out = _flow_maps(Problem(recordings.of(insertions[-1:])), point, rng)
+        other = Problem(recordings.of(insertions[-1:]))
+        found = find_poses(other, point, rng)
+        held_out, residual = _flow_maps(other, found, rng), other.chi(other.residuals(*found)[0])
     return Calibration(
-        _estimates(problem.fitted, result),
+        _estimates(problem.fitted, result, predicted=residual is None or residual <= PREDICTED),
         _pairs(problem.fitted, result),
-        _flow_maps(problem, point, rng, poses=result),
+        _flow_maps(problem, (result.best.point, result.best.misalignment), rng),
         held_out,
+        residual,
         recordings.noise(),
         recordings.unit,
         tuple(suggest(problem, result)),
@@ -131,8 +146,13 @@ def calibrate(
     )
 
 
-def _estimates(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[Estimate, ...]:
-    """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is."""
+def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> tuple[Estimate, ...]:
+    """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is.
+
+    The parameters of the simulator are confirmed only if the held-out insertion is predicted. Gains, rotations and
+    crosstalk follow from comparing the pads and the markers, and are right where the forces are not.
+    """
+    reproduced = result.best.chi <= REPRODUCED
     ratio, of_ratio = gain_ratio(fitted)
     directions = np.vstack([np.eye(len(fitted)), of_ratio])
     low, high = result.interval(directions)
@@ -144,7 +164,7 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[Estima
             float(p.value(low[i])),
             float(p.value(high[i])),
             float((high[i] - low[i]) / (2 * 1.96)),
-            result.best.chi <= REPRODUCED,
+            reproduced and (predicted or p.name not in QUANTITIES),
         )
         for i, p in enumerate((*fitted, ratio))
     )
@@ -162,12 +182,8 @@ def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str,
     return tuple(sorted(found, key=lambda pair: -abs(pair[2])))
 
 
-def _flow_maps(problem: Problem, point: Array, rng: np.random.Generator, *, poses: FitResult | None = None) -> FlowMaps:
-    """Flow maps with the scene's values and with calibrated ones; poses and start heights are searched for both.
-
-    With `poses` those of a fit are taken for the calibrated values.
-    """
+def _flow_maps(problem: Problem, after: tuple[Array, Array], rng: np.random.Generator) -> FlowMaps:
+    """Flow maps with the scene's values, whose poses and start heights are searched, and with a point and its poses."""
     before = find_poses(problem, problem.scene_point(), rng)
-    after = find_poses(problem, point, rng) if poses is None else (poses.best.point, poses.best.misalignment)
     recorded = problem.recorded_flow()
     return FlowMaps(recorded, problem.flow(*before), problem.flow(*after), problem.recordings.names)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.poses import best_poses, draw_poses
-from gelflow.policies.calibration.problem import MODEL_ERROR, Problem, huber_weights
+from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.uncertainty import covariance
 
@@ -175,8 +175,7 @@ def _descend(
         if better < cost:
             point, poses = moved, searched
     line = problem.linearize(point, poses)
-    residuals = line.residuals.reshape(-1)
-    chi = float(np.sqrt((huber_weights(residuals) * residuals**2).mean()))
+    chi = problem.chi(line.residuals)
     return StartResult(point, poses, covariance(problem, point, poses, chi), problem.cost(line.residuals, point), chi)
 
 

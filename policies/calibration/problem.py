@@ -136,6 +136,11 @@ class Problem:
         jacobian[rows, :, count + rows] = self.whiten(slopes[count], rows)
         return Linearization(self.whiten(reading - self.data, rows), jacobian)
 
+    @staticmethod
+    def chi(residuals: Array) -> float:
+        """Robust root mean square of whitened residuals: 1 as expected from noise and model error."""
+        return float(np.sqrt((huber_weights(residuals) * residuals**2).mean()))
+
     def cost(self, residuals: Array, point: Array) -> float:
         """Robust negative log posterior."""
         return float(huber(residuals).sum() / CORRELATED + 0.5 * point @ point)

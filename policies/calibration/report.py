@@ -41,6 +41,8 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "explained": result.explained,
             "not_modelled": result.not_modelled(),
             "reproduced": result.reproduced,
+            "held_out_residual": result.held_out_residual,
+            "predicted": result.predicted,
         },
         "record_next": [
             {"text": s.text, "pose": list(s.pose), "depth": s.depth, "gain": s.gain, "narrowed": s.narrowed}
@@ -159,6 +161,12 @@ def error_lines(result: Calibration) -> list[str]:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "
             "from noise and model; no parameter counts as known, and the intervals are not reliable"
+        )
+    elif result.predicted is False:
+        lines.append(
+            "the calibration does not predict the held-out insertion: its residual is "
+            f"{result.held_out_residual:.1f} times that expected from noise and model; no stiffness, friction or grasp "
+            "counts as known"
         )
     if result.explained:
         lines.append(f"the held-out error is at most {ALLOWED_ERROR:g} times the noise")

@@ -181,8 +181,8 @@ def compare_to_dual_numbers(
         direction = _core.RolloutInput(
             params=d["params"], q=d["q"], v=d["v"], anchors=d["anchors"], history=d["history"], u=d["u"][taken]
         )
-        exact = _core.directional_rollout(model, start, direction)
-        derivative = getattr(exact.derivative, loss.output)
+        exact = _core.directional_rollout(model, start, [direction])
+        derivative = getattr(exact.derivatives[0], loss.output)
         if loss.output == "tactile" and loss.reduction is not None:
             derivative = loss.reduction(derivative.reshape(-1, 3))
         along = loss.weights.ravel() @ derivative

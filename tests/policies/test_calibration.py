@@ -141,7 +141,7 @@ def test_the_ratio_of_the_gains_is_known_better_than_each_gain(calibrated: Calib
 
 
 def test_ranges_of_the_randomization_are_those_of_quantities_it_has(calibrated: Calibration) -> None:
-    estimates = tuple(dataclasses.replace(e, relative_width=0.1, reproduced=True) for e in calibrated.estimates)
+    estimates = tuple(dataclasses.replace(e, relative_width=0.1, confirmed=True) for e in calibrated.estimates)
     limits = {"gain_ratio": (1.2, 1.5), "turn_left": (-0.2, -0.1), "turn_right": (-0.1, 0.1), "crosstalk": (-0.1, 0.3)}
     estimates = tuple(
         dataclasses.replace(e, low=limits[e.parameter.name][0], high=limits[e.parameter.name][1])
@@ -160,7 +160,7 @@ def test_ranges_of_the_randomization_are_those_of_quantities_it_has(calibrated: 
 def test_calibrated_scene_has_the_known_values_and_no_others(calibrated: Calibration, tmp_path: Path) -> None:
     known = ("pad_ks", "marker_mu", "hole_kn", "arm_stiffness")
     estimates = tuple(
-        dataclasses.replace(e, relative_width=0.1 if e.parameter.name in known else 1.0, reproduced=True)
+        dataclasses.replace(e, relative_width=0.1 if e.parameter.name in known else 1.0, confirmed=True)
         for e in calibrated.estimates
     )
     value = {e.parameter.name: e.value for e in estimates}
@@ -187,7 +187,7 @@ def test_calibrated_scene_has_the_known_values_and_no_others(calibrated: Calibra
 
 
 def test_calibration_without_known_parameters_writes_no_scene(calibrated: Calibration, tmp_path: Path) -> None:
-    estimates = tuple(dataclasses.replace(e, reproduced=False) for e in calibrated.estimates)
+    estimates = tuple(dataclasses.replace(e, confirmed=False) for e in calibrated.estimates)
     assert write_scene(dataclasses.replace(calibrated, estimates=estimates), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
 
@@ -234,7 +234,7 @@ def test_the_report_is_one_self_contained_page(calibrated: Calibration) -> None:
 
 def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: Calibration) -> None:
     poor = dataclasses.replace(calibrated.fit.best, chi=2.0)
-    estimates = tuple(dataclasses.replace(e, reproduced=False, relative_width=0.01) for e in calibrated.estimates)
+    estimates = tuple(dataclasses.replace(e, confirmed=False, relative_width=0.01) for e in calibrated.estimates)
     result = dataclasses.replace(
         calibrated, estimates=estimates, fit=dataclasses.replace(calibrated.fit, starts=(poor,))
     )

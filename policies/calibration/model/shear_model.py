@@ -201,22 +201,22 @@ class ShearModel:
         anchored = np.zeros(sim.anchors.shape[1], np.uint8)
         zero = self._zero(sim)
         start = (params[0], q[0], np.zeros_like(zero.anchors), np.repeat(u, self._settle_steps, 0), anchored)
-        grasp, settled = None, {}
-        for name in wanted:
-            tangent = zero if name in POSE or name in _WITHOUT_GRASP else self._closing(sim, name, rows, params)
-            if grasp is not None and tangent is zero:
-                settled[name] = zero
-                continue
-            end = self._dual(sim, start, tangent)
-            anchored = end.anchored
-            grasp = _state(end.end, u[0], params[0])
-            settled[name] = _state(end.derivative, tangent.u, tangent.params)
-        if grasp is None:
+        if not wanted:
             raise UsageError("derivatives need at least one direction")
+        closing = {
+            name: self._closing(sim, name, rows, params)
+            for name in wanted
+            if name in QUANTITIES and name not in _WITHOUT_GRASP
+        }
+        end = self._dual(sim, start, list(closing.values()) or [zero])
+        grasp = _state(end.end, u[0], params[0])
+        settled = dict.fromkeys(wanted, zero)
+        for (name, tangent), derivative in zip(closing.items(), end.derivatives, strict=False):
+            settled[name] = _state(derivative, tangent.u, tangent.params)
         for name in wanted:
             if name in QUANTITIES:
                 settled[name] = _with_params(settled[name], self._param_direction(sim, name, params[0], values))
-        results = [self._descend(sim, grasp, anchored, settled, descents[np.array([i])], wanted)
+        results = [self._descend(sim, grasp, end.anchored, settled, descents[np.array([i])])
                    for i in range(len(descents.depth))]  # fmt: skip
         return np.stack([r[0] for r in results]), np.stack([r[1] for r in results])
 
@@ -227,9 +227,8 @@ class ShearModel:
         anchored: NDArray[np.uint8],
         settled: Mapping[str, _Grasp],
         descent: Descents,
-        wanted: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Value and derivatives of one descent."""
+        """Value of one descent, and its derivatives along the directions that `settled` names."""
         one = _Grasp(*(np.asarray(values)[None] for values in vars(grasp).values()))
         q, controls = self._start(one, descent)
         count, depth, z = int(self._steps(descent.depth)[0]), float(descent.depth[0]), self._arm_u[2]
@@ -237,14 +236,10 @@ class ShearModel:
         u[:count, z] -= depth * np.arange(1, count + 1) / count
         u[count:, z] -= depth
         start = (grasp.params, q[0], grasp.anchors, u, anchored)
-        change, slopes = None, []
-        for name in wanted:
-            tangent = self._placed(sim, name, settled[name], q[0], descent)
-            end = self._dual(sim, start, tangent)
-            change = _shear(end.end.tactile) - grasp.shear
-            slopes.append(_shear(end.derivative.tactile) - settled[name].shear)
-        assert change is not None
-        return change, np.stack(slopes)
+        tangents = [self._placed(sim, name, tangent, q[0], descent) for name, tangent in settled.items()]
+        end = self._dual(sim, start, tangents)
+        slopes = np.stack([_shear(derivative.tactile) for derivative in end.derivatives])
+        return _shear(end.end.tactile) - grasp.shear, slopes - np.stack([one.shear for one in settled.values()])
 
     def _zero(self, sim: Simulator) -> _Grasp:
         markers = (self.scene.num_markers, 2)
@@ -309,21 +304,24 @@ class ShearModel:
         return _Grasp(q, settled.anchors, u, settled.params, settled.shear)
 
     def _dual(
-        self, sim: Simulator, start: tuple[Array, Array, Array, Array, NDArray[np.uint8]], tangent: _Grasp
+        self, sim: Simulator, start: tuple[Array, Array, Array, Array, NDArray[np.uint8]], tangents: Sequence[_Grasp]
     ) -> _core.DirectionalRollout:
         params, q, anchors, u, anchored = start
         v, history = np.zeros(sim.model.nv), np.zeros(sim.history.shape[1])
         result = _core.directional_rollout(
             sim.model,
             _core.RolloutInput(params=params, q=q, v=v, anchors=anchors, history=history, u=u, anchored=anchored),
-            _core.RolloutInput(
-                params=tangent.params,
-                q=tangent.q,
-                v=v,
-                anchors=tangent.anchors,
-                history=history,
-                u=np.repeat(tangent.u[None], len(u), axis=0),
-            ),
+            [
+                _core.RolloutInput(
+                    params=tangent.params,
+                    q=tangent.q,
+                    v=v,
+                    anchors=tangent.anchors,
+                    history=history,
+                    u=np.repeat(tangent.u[None], len(u), axis=0),
+                )
+                for tangent in tangents
+            ],
         )
         if result.status:
             raise SimulationError(f"a recorded descent cannot be simulated: {STATUS_MESSAGES[result.status]}")

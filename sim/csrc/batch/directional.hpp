@@ -1,5 +1,5 @@
-// Directional derivative of a rollout by dual numbers through the whole core: the exact reference for the analytic
-// derivatives. One environment, double precision.
+// Directional derivatives of a rollout by dual numbers through the whole core: the exact reference for the analytic
+// derivatives, and the Jacobian of few inputs and many outputs. One environment, double precision.
 #pragma once
 
 #include "model/model.hpp"
@@ -19,12 +19,14 @@ struct RolloutEnd {
 };
 
 struct DirectionalRollout {
-  RolloutEnd end, derivative;
+  RolloutEnd end;
+  std::vector<RolloutEnd> derivatives;  // one of each direction
   std::vector<std::uint8_t> anchored;
   std::int32_t status = 0;
 };
 
+// Several directions together take less time than one after the other.
 DirectionalRollout directional_rollout(const Model& m, int steps, const RolloutInput& start,
-                                       const RolloutInput& direction);
+                                       const std::vector<RolloutInput>& directions);
 
 }  // namespace gelflow

@@ -1,6 +1,6 @@
-// Dual numbers a + b ε, ε² = 0, for forward-mode differentiation. The core is instantiated with them to verify its
-// analytic derivatives. Order comparisons use the real part only, so that a dual run takes the same branches as the real
-// run.
+// Dual numbers a + Σ b_k ε_k, ε_j ε_k = 0, for forward-mode differentiation along several directions at once. The core is
+// instantiated with them to verify its analytic derivatives. Order comparisons use the real part only, so that a dual run
+// takes the same branches as the real run.
 #pragma once
 
 #include <Eigen/Core>
@@ -9,22 +9,29 @@
 namespace gelflow {
 
 struct Dual {
+  static constexpr int directions = 4;
+  // Vector extension of GCC and Clang, with the alignment of a double: Eigen's arrays have no larger one.
+  typedef double Vector __attribute__((vector_size(directions * sizeof(double)), aligned(sizeof(double))));
+
   double a = 0;  // value
-  double b = 0;  // derivative along the seeded direction
+  Vector b{};    // derivatives along the seeded directions
 
   Dual() = default;
   Dual(double value) : a(value) {}  // implicit, so that constants mix with duals
-  Dual(double value, double derivative) : a(value), b(derivative) {}
+  Dual(double value, const Vector& derivatives) : a(value), b(derivatives) {}
 
-  Dual& operator+=(const Dual& o) { return *this = Dual(a + o.a, b + o.b); }
-  Dual& operator-=(const Dual& o) { return *this = Dual(a - o.a, b - o.b); }
-  Dual& operator*=(const Dual& o) { return *this = Dual(a * o.a, a * o.b + b * o.a); }
-  Dual& operator/=(const Dual& o) { return *this = Dual(a / o.a, (b - a / o.a * o.b) / o.a); }
+  Dual& operator+=(const Dual& o) { return *this = *this + o; }
+  Dual& operator-=(const Dual& o) { return *this = *this - o; }
+  Dual& operator*=(const Dual& o) { return *this = *this * o; }
+  Dual& operator/=(const Dual& o) { return *this = *this / o; }
 
-  friend Dual operator+(Dual x, const Dual& y) { return x += y; }
-  friend Dual operator-(Dual x, const Dual& y) { return x -= y; }
-  friend Dual operator*(Dual x, const Dual& y) { return x *= y; }
-  friend Dual operator/(Dual x, const Dual& y) { return x /= y; }
+  friend Dual operator+(const Dual& x, const Dual& y) { return {x.a + y.a, x.b + y.b}; }
+  friend Dual operator-(const Dual& x, const Dual& y) { return {x.a - y.a, x.b - y.b}; }
+  friend Dual operator*(const Dual& x, const Dual& y) { return {x.a * y.a, x.a * y.b + x.b * y.a}; }
+  friend Dual operator/(const Dual& x, const Dual& y) {
+    const double ratio = x.a / y.a;
+    return {ratio, (x.b - ratio * y.b) / y.a};
+  }
   friend Dual operator-(const Dual& x) { return {-x.a, -x.b}; }
   friend Dual operator+(const Dual& x) { return x; }
 
@@ -32,8 +39,12 @@ struct Dual {
   friend bool operator>(const Dual& x, const Dual& y) { return x.a > y.a; }
   friend bool operator<=(const Dual& x, const Dual& y) { return x.a <= y.a; }
   friend bool operator>=(const Dual& x, const Dual& y) { return x.a >= y.a; }
-  // Equality compares both parts: a linear solver that skips zeros must not skip a zero with a derivative.
-  friend bool operator==(const Dual& x, const Dual& y) { return x.a == y.a && x.b == y.b; }
+  // Equality compares all parts: a linear solver that skips zeros must not skip a zero with a derivative.
+  friend bool operator==(const Dual& x, const Dual& y) {
+    bool equal = x.a == y.a;
+    for (int k = 0; k < directions; ++k) equal = equal && x.b[k] == y.b[k];
+    return equal;
+  }
   friend bool operator!=(const Dual& x, const Dual& y) { return !(x == y); }
 };
 
@@ -68,9 +79,9 @@ struct NumTraits<gelflow::Dual> : NumTraits<double> {
     IsInteger = 0,
     IsSigned = 1,
     RequireInitialization = 1,
-    ReadCost = 2,
-    AddCost = 2,
-    MulCost = 6
+    ReadCost = 1 + gelflow::Dual::directions,
+    AddCost = 1 + gelflow::Dual::directions,
+    MulCost = 1 + 3 * gelflow::Dual::directions
   };
 };
 }  // namespace Eigen

@@ -1,4 +1,4 @@
-// The directional derivative of a rollout.
+// Directional derivatives of a rollout.
 #include "batch/directional.hpp"
 
 #include "python/arrays.hpp"
@@ -24,11 +24,13 @@ RolloutInput checked(const Model& m, const InputArrays& a, int q, py::ssize_t st
           a.anchored ? readable<std::uint8_t>(*a.anchored, {m.na}, "anchored") : nullptr};
 }
 
-DirectionalRollout run(const Model& m, const InputArrays& start, const InputArrays& direction) {
+DirectionalRollout run(const Model& m, const InputArrays& start, const std::vector<InputArrays>& directions) {
   if (!start.anchored) throw std::invalid_argument("start needs anchored");
+  if (directions.empty()) throw std::invalid_argument("directions must not be empty");
   const py::ssize_t steps = start.u.shape(0);
-  return directional_rollout(m, static_cast<int>(steps), checked(m, start, m.nq, steps),
-                             checked(m, direction, m.nv, steps));
+  std::vector<RolloutInput> inputs;
+  for (const InputArrays& direction : directions) inputs.push_back(checked(m, direction, m.nv, steps));
+  return directional_rollout(m, static_cast<int>(steps), checked(m, start, m.nq, steps), inputs);
 }
 
 void bind_end(py::module_& module) {
@@ -59,15 +61,15 @@ void bind_directional(py::module_& module) {
   bind_end(module);
   py::class_<DirectionalRollout>(module, "DirectionalRollout")
       .def_readonly("end", &DirectionalRollout::end)
-      .def_readonly("derivative", &DirectionalRollout::derivative)
+      .def_readonly("derivatives", &DirectionalRollout::derivatives)
       .def_property_readonly("anchored",
                              [](const DirectionalRollout& r) {
                                return py::array_t<std::uint8_t>(static_cast<py::ssize_t>(r.anchored.size()),
                                                                 r.anchored.data());
                              })
       .def_readonly("status", &DirectionalRollout::status);
-  module.def("directional_rollout", &run, py::arg("model"), py::arg("start"), py::arg("direction"),
-             "Derivative of a rollout of one environment along one direction, by dual numbers (for checks).");
+  module.def("directional_rollout", &run, py::arg("model"), py::arg("start"), py::arg("directions"),
+             "Derivatives of a rollout of one environment along directions, by dual numbers.");
 }
 
 }  // namespace gelflow

@@ -191,7 +191,7 @@ def test_slip_by_grip_force(name: str, solid: str, integrator: str, tmp_path: Pa
 
     still = {key: np.zeros_like(value) for key, value in start.items() if key not in ("q", "anchored")}
     along = _core.RolloutInput(q=np.zeros(sim.model.nv), u=by_grip, **still)
-    moved = _core.directional_rollout(sim.model, _core.RolloutInput(u=u, **start), along).derivative.q
+    moved = _core.directional_rollout(sim.model, _core.RolloutInput(u=u, **start), [along]).derivatives[0].q
     assert moved[sim.joint_v("lift")] - moved[sim.joint_v("object") + 2] == pytest.approx(gradient, rel=1e-9)
 
     def difference(size: float) -> float:
