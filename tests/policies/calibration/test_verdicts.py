@@ -1,0 +1,56 @@
+"""Which parameters a calibration calls known: those of a fit that reproduces the recordings and predicts others."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gelflow.policies.calibration import calibration
+from gelflow.policies.calibration.calibration import Calibration, calibrate
+from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
+from gelflow.policies.calibration.fit import FitSettings
+from gelflow.policies.calibration.model.shear_model import QUANTITIES
+from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.report import error_lines, plain_report
+
+LITTLE = FitSettings(starts=1, points=1, poses=16, steps=1)
+
+
+@pytest.fixture(scope="module")
+def world() -> RecordedWorld:
+    return record_world(8)
+
+
+def confirmed(result: Calibration) -> set[str]:
+    return {estimate.parameter.name for estimate in result.estimates if estimate.confirmed}
+
+
+def test_forces_count_only_if_the_held_out_insertion_is_predicted(
+    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recordings = world.recordings.of(np.array([0, 1]))
+    every = {estimate.parameter.name for estimate in calibrate(recordings, settings=LITTLE).estimates}
+    monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
+    for limit, expected in ((0.0, every - set(QUANTITIES)), (math.inf, every)):
+        monkeypatch.setattr(calibration, "PREDICTED", limit)
+        result = calibrate(recordings, settings=LITTLE)
+        assert confirmed(result) == expected and result.predicted is (limit > 0)
+        assert any("does not predict the held-out insertion" in line for line in error_lines(result)) is (limit == 0)
+        assert plain_report(result, [])["flow_maps"]["predicted"] is (limit > 0)
+    monkeypatch.setattr(calibration, "REPRODUCED", 0.0)
+    assert not confirmed(calibrate(recordings, settings=LITTLE))
+
+
+def test_one_insertion_holds_nothing_out(world: RecordedWorld) -> None:
+    result = calibrate(world.recordings.of(np.array([0])), settings=LITTLE)
+    assert result.held_out_residual is None and result.predicted is None
+
+
+def test_the_held_out_residual_tells_the_true_parameters_from_others(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.array([4])), threads=1)
+    truth = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted])
+    others = truth + np.random.default_rng(0).choice([-1.0, 1.0], (3, len(truth)))
+    rng = np.random.default_rng(1)
+    right, *wrong = (problem.chi(problem.residuals(*find_poses(problem, p, rng))[0]) for p in (truth, *others))
+    assert right < 1 and min(wrong) > calibration.PREDICTED
