@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
+from gelflow.helper_process import end_with_parent
 from gelflow.policies.calibration.poses import best_poses, draw_poses
 from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
 from gelflow.policies.calibration.recordings import Recordings
@@ -102,7 +103,7 @@ def fit(
             progress(len(results))
     else:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context) as pool:
+        with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=end_with_parent) as pool:
             futures = [pool.submit(_fit_start, *job) for job in jobs]
             for done, _ in enumerate(as_completed(futures)):
                 progress(done + 1)

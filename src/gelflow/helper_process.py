@@ -5,6 +5,7 @@ its global interpreter lock. It ends when the parent's end of the socket pair cl
 """
 
 import json
+import multiprocessing
 import os
 import select
 import signal
@@ -174,6 +175,21 @@ def memory_file(size: int) -> int:
             descriptor = os.dup(file.fileno())
     os.ftruncate(descriptor, size)
     return descriptor
+
+
+def end_with_parent() -> None:
+    """Initializer of the workers of a `ProcessPoolExecutor`: they end when their parent ends, also if it is killed.
+
+    Without it they would wait for work for ever.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "for worker processes"
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def connect_to_parent(arguments: Sequence[str]) -> tuple[dict[str, Any], Messages, list[int]]:
