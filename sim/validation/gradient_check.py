@@ -168,7 +168,7 @@ def compare_to_dual_numbers(
     tries = [(only, group == only) for only in np.unique(group)] if groups else []
     tries += [(only, np.ones(len(scale), bool)) for only in [*parts, "all"]] * directions
     taken = slice(trajectory.stopped_at[0] if trajectory.stopped_at[0] >= 0 else None)  # steps before a touch stop
-    drawn: list[dict[str, NDArray[np.float64]]] = []
+    drawn: list[dict[str, Any]] = []
     for only, chosen in tries:
         d = {name: np.zeros_like(value) for name, value in gradient.items()}
         for name in parts if only == "all" else [only if only in parts else "params"]:
@@ -179,7 +179,7 @@ def compare_to_dual_numbers(
         drawn.append(d)
     now = {name: getattr(sim, name)[0] for name in ("params", "q", "v", "anchors", "anchored", "history")}
     start = _core.RolloutInput(**now, u=loss.u[taken])
-    exact = _core.directional_rollout(model, start, [_direction(d, taken) for d in drawn])
+    exact = _core.directional_rollout(model, start, [_core.RolloutInput(**{**d, "u": d["u"][taken]}) for d in drawn])
     if np.abs(exact.end.q - trajectory.q[-1, 0]).max() > 1e-9:
         raise SimulationError("the run with dual numbers differs from the recorded run")
     differences: list[tuple[str, float, float]] = []  # input, difference, size
@@ -194,13 +194,6 @@ def compare_to_dual_numbers(
     floor = 1e-6 * max(size for *_, size in differences) + 1e-300  # below it rounding errors dominate
     error, most = max((difference / max(size, floor), only) for only, difference, size in differences)
     return Agreement(float(error), 0.0, most)
-
-
-def _direction(d: dict[str, NDArray[np.float64]], taken: slice) -> Any:
-    """A direction in the space of the inputs, with the controls of the steps that were `taken`."""
-    return _core.RolloutInput(
-        params=d["params"], q=d["q"], v=d["v"], anchors=d["anchors"], history=d["history"], u=d["u"][taken]
-    )
 
 
 def parameter_groups(model: Any) -> NDArray[np.str_]:
