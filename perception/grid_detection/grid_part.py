@@ -21,7 +21,7 @@ Skipped = tuple[int, int, int, int]  # numbers of printed lines outside the imag
 Floats = NDArray[np.float64]
 
 _MOSTLY_COMPLETE = 0.6  # fraction of entire dots in the outer lines of a grid of unknown shape
-_PRINTED = 0.42  # the same of a line without a dot that the image border cuts: the others are missing in the print
+_PRINTED = 0.42  # the same of a line without cut dots, whose other dots are missing in the print
 _PARTLY_COMPLETE = 0.3  # the same of a grid of known shape
 _MIN_COUNT = 0.7  # entire dots / nodes of a requested grid
 _ANCHOR_RADIUS = 0.4  # largest distance of a marker from its calibrated position / spacing; at 0.5 rows are exchanged
@@ -88,16 +88,16 @@ def completeness(lattice: Lattice, dots: DetectedDots) -> Floats:
     return np.where(occupied, np.where(dots.inside[lattice.dots], 1.0, 0.01), 0.0)
 
 
-def trim(complete: Floats, least: float = _MOSTLY_COMPLETE, printed: float = _PRINTED) -> tuple[int, int, int, int]:
+def trim(complete: Floats, least: float = _MOSTLY_COMPLETE) -> tuple[int, int, int, int]:
     """The part of the grid whose outer lines are complete enough: top, bottom, left, right.
 
-    A line is if at least `least` of its dots are entire, or `printed` where the image border cuts none of them.
+    A line is complete enough with `least` of its dots, or with `_PRINTED` of them if the image border cuts none.
     """
     top, bottom, left, right = 0, complete.shape[0], 0, complete.shape[1]
     while bottom - top >= 3 and right - left >= 3:
         part = complete[top:bottom, left:right]
         edges = (part[0], part[-1], part[:, 0], part[:, -1])
-        shares = [line.mean() / (least if ((line > 0) & (line < 1)).any() else min(least, printed)) for line in edges]
+        shares = [line.mean() / (least if ((line > 0) & (line < 1)).any() else min(least, _PRINTED)) for line in edges]
         worst = int(np.argmin(shares))
         if shares[worst] >= 1:
             break

@@ -79,8 +79,8 @@ class Calibration:
     def predicted(self) -> bool | None:
         """Whether the residual of the held-out attempts is at most `PREDICTED`; None: none held out.
 
-        It is nearly that of the fit at the true parameters, and several times larger in a wrong minimum, where the
-        poses of the fitted insertions make up for wrong forces.
+        A fit that ends in a wrong minimum may reproduce the recordings as well, because the poses of their insertions
+        make up for wrong forces. The pose of another insertion does not.
         """
         return None if self.held_out_residual is None else self.held_out_residual <= PREDICTED
 
@@ -150,7 +150,7 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
     """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is.
 
     The parameters of the simulator are confirmed only if the held-out insertion is predicted. Gains, rotations and
-    crosstalk follow from comparing the pads and the markers, and are right where the forces are not.
+    crosstalk are differences between pads and between markers, which a wrong force hardly changes.
     """
     reproduced = result.best.chi <= REPRODUCED
     ratio, of_ratio = gain_ratio(fitted)

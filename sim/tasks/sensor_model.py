@@ -173,7 +173,8 @@ class SensorModel:
         """The reading with each pad's gain and the rotation of its camera."""
         scaled = reading * self.gain[rows][:, self._pad_of, None]
         turn = self.turn[rows][:, self._pad_of]
-        return rotated(scaled, turn)
+        scaled[..., :2] = rotated(scaled[..., :2], turn)
+        return scaled
 
     def _without_dead(self, reading: Array, rows: NDArray[np.int64]) -> Array:
         """Markers that are not found replaced by the inverse-distance mean of the nearest found ones."""

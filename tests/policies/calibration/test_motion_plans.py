@@ -137,7 +137,7 @@ def test_calibrate_refuses_contradicting_options(tmp_path: Path, capsys: pytest.
 def test_calibrate_writes_a_plan_within_the_workspace_of_the_lab(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    example = Path(__file__).parents[2] / "real" / "runner" / "lab_example.toml"
+    example = Path(__file__).parents[3] / "real" / "runner" / "lab_example.toml"
     lab, plan = tmp_path / "lab.toml", tmp_path / "plan.toml"
     lab.write_text(example.read_text().replace("# x = 0.016 ", "x = 0.004 ").replace("# y = 0.016 ", "y = 0.004 "))
     assert main(["calibrate", "--plan", str(plan), "--lab", str(lab), "--motions", "2"]) == 0
