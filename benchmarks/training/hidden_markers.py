@@ -49,35 +49,38 @@ PARTS = (
     Part("without 2 lines on every side", slice(2, -2), slice(2, -2)),
 )
 
-Fill = Callable[[Array, NDArray[np.bool_], Grid], Array]  # (vectors (sensors, markers, 2), visible, grid) → vectors
+Fill = Callable[[NDArray[np.bool_], Grid], Array]  # (visible, grid) → weights (markers, markers) of the visible values
 
 
-def mean_of_six(vectors: Array, visible: NDArray[np.bool_], grid: Grid) -> Array:
-    """As the runner fills them."""
-    valid = np.broadcast_to(visible, vectors.shape[:2])
-    frame = TactileFrame(vectors.astype(np.float32), valid, grid.positions().astype(np.float32), 0.0, "N")
-    return fill_invalid(frame)
+def mean_of_six(visible: NDArray[np.bool_], grid: Grid) -> Array:
+    """As the runner fills them: its values of one marker at a time."""
+    markers = len(visible)
+    shear = np.repeat(np.eye(markers, dtype=np.float32)[:, :, None], 2, axis=2)
+    valid = np.broadcast_to(visible, (markers, markers))
+    frame = TactileFrame(shear, valid, grid.positions().astype(np.float32), 0.0, "N")
+    return fill_invalid(frame)[:, :, 0].T * visible
 
 
-def nearest(vectors: Array, visible: NDArray[np.bool_], grid: Grid) -> Array:
+def nearest(visible: NDArray[np.bool_], grid: Grid) -> Array:
     """The value of the nearest visible marker."""
-    weights = resampling_weights(grid.positions()[visible], grid)
-    return np.asarray(np.einsum("gm,smc->sgc", weights, vectors[:, visible]))
+    weights = np.zeros((len(visible), len(visible)))
+    weights[:, visible] = resampling_weights(grid.positions()[visible], grid)
+    return weights
 
 
-def zero(vectors: Array, visible: NDArray[np.bool_], grid: Grid) -> Array:
+def zero(visible: NDArray[np.bool_], grid: Grid) -> Array:
     """No motion."""
-    return vectors * visible[:, None]
+    return np.diag(visible.astype(float))
 
 
 FILLS: Mapping[str, Fill] = {"mean of six neighbours": mean_of_six, "nearest marker": nearest, "zero": zero}
 
 
 class Masked(BatchPolicy):
-    """A policy that sees flow maps with hidden markers, normalized again."""
+    """A policy that sees flow maps with hidden markers, filled by `weights` and normalized again."""
 
-    def __init__(self, policy: BatchPolicy, visible: NDArray[np.bool_], fill: Fill) -> None:
-        self._policy, self._visible, self._fill = policy, visible, fill
+    def __init__(self, policy: BatchPolicy, weights: Array) -> None:
+        self._policy, self._weights = policy, weights
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the memory of some environments."""
@@ -85,15 +88,15 @@ class Masked(BatchPolicy):
 
     def act(self, observations: NDArray[Any]) -> Array:
         """Actions (n, 3) of the policy."""
-        return self._policy.act(np.stack([self._masked(image) for image in observations]))
+        vectors = observations.reshape(len(observations), SENSORS, 2, -1).astype(float)
+        filled = np.einsum("gm,nscm->nscg", self._weights, vectors)
+        scale = np.minimum(_longest(vectors), 1.0) / np.maximum(_longest(filled), 1e-9)
+        return self._policy.act((filled * scale).reshape(observations.shape).astype(np.float32))
 
-    def _masked(self, image: NDArray[Any]) -> NDArray[np.float32]:
-        grid = INSERTION.grid
-        vectors = image.reshape(SENSORS, 2, -1).transpose(0, 2, 1).astype(float)
-        filled = self._fill(vectors, self._visible, grid)
-        longest = max(float(np.linalg.norm(filled, axis=-1).max()), 1e-9)
-        before = float(np.linalg.norm(vectors, axis=-1).max())
-        return np.asarray(filled.transpose(0, 2, 1).reshape(image.shape) * (min(before, 1.0) / longest), np.float32)
+
+def _longest(vectors: Array) -> Array:
+    """Length of the longest of the vectors (n, sensors, 2, markers) of each part, shape (n, 1, 1, 1)."""
+    return np.asarray(np.linalg.norm(vectors, axis=2, keepdims=True).max(axis=(1, 3), keepdims=True))
 
 
 def main() -> int:
@@ -109,7 +112,7 @@ def main() -> int:
             row: dict[str, Any] = {"visible": part.name, "share": float(visible.mean())}
             for name, fill in FILLS.items():
                 task = make_task("insertion", min(ENVS, episodes), noise=FlowMapNoise())
-                policy = Masked(network.batch_policy(task.num_envs), visible, fill)
+                policy = Masked(network.batch_policy(task.num_envs), fill(visible, INSERTION.grid))
                 row[name] = evaluate_task(name, policy, task, episodes=episodes, seed=args.seed).to_json()
                 advance(1)
             rows.append(row)

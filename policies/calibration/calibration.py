@@ -82,7 +82,7 @@ class Calibration:
         A fit that ends in a wrong minimum may reproduce the recordings as well, because the poses of their insertions
         make up for wrong forces. The pose of another insertion does not.
         """
-        return None if self.held_out_residual is None else self.held_out_residual <= PREDICTED
+        return _predicted(self.held_out_residual)
 
     @property
     def explained(self) -> bool | None:
@@ -134,7 +134,7 @@ def calibrate(
         found = find_poses(other, point, rng)
         held_out, residual = _flow_maps(other, found, rng), other.chi(other.residuals(*found)[0])
     return Calibration(
-        _estimates(problem.fitted, result, predicted=residual is None or residual <= PREDICTED),
+        _estimates(problem.fitted, result, predicted=_predicted(residual) is not False),
         _pairs(problem.fitted, result),
         _flow_maps(problem, (result.best.point, result.best.misalignment), rng),
         held_out,
@@ -144,6 +144,10 @@ def calibrate(
         tuple(suggest(problem, result)),
         result,
     )
+
+
+def _predicted(residual: float | None) -> bool | None:
+    return None if residual is None else residual <= PREDICTED
 
 
 def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> tuple[Estimate, ...]:

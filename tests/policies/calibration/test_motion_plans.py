@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.policies.calibration.recorded_world import WORLD
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
@@ -20,15 +21,9 @@ from gelflow.policies.calibration.uncertainty import covariance
 from gelflow.session.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
 from gelflow.task import INSERTION
 
-WORLD = 8
 LAB = nothing_recorded(INSERTION, grasp_force=12.0, grasp_height=0.0)
 NEAR = (4e-3, 4e-3, 0.0)  # a workspace with few candidates
 MOTIONS = (PlannedMotion(3e-3, -2e-3, 0.1, 1.1e-3), PlannedMotion(-6e-3, 0.0, -0.14, 0.9e-3))
-
-
-@pytest.fixture(scope="module")
-def world() -> RecordedWorld:
-    return record_world(WORLD)
 
 
 def test_a_plan_file_has_the_motions_that_were_written(tmp_path: Path) -> None:

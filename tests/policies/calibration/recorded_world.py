@@ -1,0 +1,6 @@
+"""The recorded world of the tests of the calibration, and the effort of their fits."""
+
+from gelflow.policies.calibration.fit import FitSettings
+
+WORLD = 8  # all five parts are inserted, with little noise
+LITTLE = FitSettings(starts=1, points=1, poses=16, steps=1)
