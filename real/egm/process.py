@@ -26,10 +26,11 @@ from gelflow.time_sync import ARM_DRIVER
 _LARGEST_MESSAGE = 4096
 # Period of the check that the parent still runs [s, wall]: the closed link does not show it while another process holds
 # the parent's end of the link.
-_PARENT_CHECK = 0.1
+_PARENT_CHECK = 0.05
 _SHORTEST_WAIT = 2e-4  # [s, wall]
-# Robot time of a mock robot stands still when this process has not run for longer [s, wall].
-_LONGEST_GAP = 1.5 * _PARENT_CHECK
+# Lead of a mock robot's time over the instant up to which this process has handled all messages, at most [s, wall]. It
+# is more than two waits, or robot time would stand still while the robot is silent.
+_LONGEST_GAP = 3 * _PARENT_CHECK
 
 
 class EgmLoop:
@@ -51,8 +52,12 @@ class EgmLoop:
         sources: list[socket.socket | Messages] = [self._udp, self._parent]
         self._flush()
         self._event("listening", f"{'real-time' if raise_priority() else 'normal'} priority")
+        start = self._clock.now()
         while not self._parent.closed and os.getppid() == parent:
-            self._clock.grant(ARM_DRIVER, self._clock.now() + self._clock.factor * _LONGEST_GAP)
+            # What the robot sent before `start` is in the log: a pose in it is never older than the lead, whenever this
+            # process is interrupted.
+            self._clock.grant(ARM_DRIVER, start + self._clock.factor * _LONGEST_GAP)
+            start = self._clock.now()
             self._report()
             # The time-out ends just after the instant at which the feedback becomes stale.
             left = self._clock.wall(self._generator.due - self._clock.now()) + _SHORTEST_WAIT
