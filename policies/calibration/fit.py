@@ -1,7 +1,7 @@
-"""The fit: Levenberg-Marquardt steps in the parameters, alternated with a search of the poses, from several starts.
+"""The fit: a global search, then Levenberg-Marquardt steps in the parameters and searches of the poses in turn.
 
-The starts are independent. The forces have kinks and steps where contact points cross edges of the hole, so that starts
-can end in different minima; their spread is part of the intervals.
+It is repeated from several independent starts. The forces have kinks and steps where contact points cross edges of the
+hole, so that starts can end in different minima; their spread is part of the intervals.
 """
 
 import multiprocessing
@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.helper_process import end_with_parent
-from gelflow.policies.calibration.poses import best_poses, draw_poses
+from gelflow.policies.calibration.ensemble import search_globally
+from gelflow.policies.calibration.poses import FREE, best_poses, prior_cost
 from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
 
-# Allowed error of the model while the search narrows, relative to the flow maps.
-_MODEL_ERRORS = (0.3, 0.15, 0.08, 0.04, MODEL_ERROR, MODEL_ERROR)
-_SEARCH = np.array([2e-3, 2e-3, np.radians(4)])  # spread of new poses around the present ones, at first [m, m, rad]
+_GLOBAL_ERROR = 0.04  # allowed error of the model in the global search, relative to the flow maps
+_MODEL_ERRORS = (0.04, 0.04, MODEL_ERROR, MODEL_ERROR)  # the same, in the rounds after it
+_SIZES = (0.5, 0.2, 0.07, 0.025)  # spread of new poses around the best ones, relative to their prior
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
 
 
@@ -32,8 +33,8 @@ class FitSettings:
     """Effort of a fit."""
 
     starts: int = 4  # independent fits
-    points: int = 2  # random points of which the best begins a fit
-    poses: int = 64  # random poses of each insertion, per search
+    members: int = 192  # of the ensemble of the global search
+    poses: int = 32  # random poses of each insertion at each size of a search
     steps: int = 3  # of Levenberg-Marquardt between two searches
 
 
@@ -120,41 +121,11 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
     rng = np.random.default_rng((seed, index))
     problem = Problem(recordings, threads=1)
     try:
-        point, poses = _first(problem, rng, settings, with_center=index == 0)
+        problem.set_model_error(_GLOBAL_ERROR)
+        point, poses = search_globally(problem, settings.members, rng)
         return _descend(problem, point, poses, rng, settings)
     except SimulationError:
         return None
-
-
-def _insertions(problem: Problem) -> int:
-    return int(problem.recordings.insertion.max()) + 1
-
-
-def _first(
-    problem: Problem, rng: np.random.Generator, settings: FitSettings, *, with_center: bool
-) -> tuple[Array, Array]:
-    """The best of random points of the prior, each with the best of random poses."""
-    found = []
-    problem.set_model_error(_MODEL_ERRORS[0])
-    for k in range(settings.points):
-        point = np.zeros(problem.size)
-        if k or not with_center:
-            point[: len(problem.fitted)] = 0.8 * np.clip(rng.normal(size=len(problem.fitted)), -1.7, 1.7)
-        candidates = [draw_poses(problem, i, settings.poses, rng) for i in range(_insertions(problem))]
-        found.append(_searched(problem, point, candidates))
-    _, point, poses = min(found, key=lambda item: item[0])
-    return point, poses
-
-
-def _searched(problem: Problem, point: Array, candidates: list[Array]) -> tuple[float, Array, Array]:
-    """The cost, the point with the best start heights, and the best poses."""
-    poses, costs, heights = best_poses(problem, point, candidates)
-    point = point.copy()
-    for i in range(len(candidates)):
-        rows = np.flatnonzero(problem.recordings.insertion == i)
-        point[len(problem.fitted) + rows] = heights[i][0]
-    prior = 0.5 * float(point[: len(problem.fitted)] @ point[: len(problem.fitted)])
-    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in poses])
 
 
 def _descend(
@@ -164,20 +135,37 @@ def _descend(
     for round_, error in enumerate(_MODEL_ERRORS):
         problem.set_model_error(error)
         point, cost, _ = levenberg_marquardt(problem, point, poses, settings.steps)
-        if round_ == len(_MODEL_ERRORS) - 1:
-            break
-        half = settings.poses // 2
-        around = rng.normal(size=(len(poses), half, 3)) * _SEARCH * rng.choice([1.0, 0.3], (len(poses), half, 1))
-        candidates = [
-            np.vstack([poses[i], poses[i] + around[i] / (1 + 0.5 * round_), draw_poses(problem, i, half, rng)])
-            for i in range(len(poses))
-        ]
-        better, moved, searched = _searched(problem, point, candidates)
-        if better < cost:
-            point, poses = moved, searched
+        if round_ < len(_MODEL_ERRORS) - 1:
+            better, moved, found = _searched(problem, point, poses, rng, settings)
+            if better < cost + _prior_cost(problem, poses):
+                point, poses = moved, found
     line = problem.linearize(point, poses)
     chi = problem.chi(line.residuals)
-    return StartResult(point, poses, covariance(problem, point, poses, chi), problem.cost(line.residuals, point), chi)
+    cost = problem.cost(line.residuals, point) + _prior_cost(problem, poses)
+    return StartResult(point, poses, covariance(problem, point, poses, chi), cost, chi)
+
+
+def _prior_cost(problem: Problem, poses: Array) -> float:
+    return float(sum(prior_cost(problem, i, poses[i : i + 1])[0] for i in range(len(poses))))
+
+
+def _searched(
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
+) -> tuple[float, Array, Array]:
+    """The cost, the point with better start heights, and better poses, searched ever closer around the best ones."""
+    count, insertions = len(problem.fitted), len(poses)
+    point, best = point.copy(), [poses[i][None] for i in range(insertions)]
+    costs: list[Array] = []
+    for size in _SIZES:
+        candidates = []
+        for i in range(insertions):
+            parents = best[i][rng.integers(0, min(3, len(best[i])), settings.poses)]
+            candidates.append(np.vstack([best[i], parents + size * rng.normal(size=parents.shape) * FREE]))
+        best, costs, heights = best_poses(problem, point, candidates, range_of_heights=size)
+        for i in range(insertions):
+            point[count + np.flatnonzero(problem.recordings.insertion == i)] = heights[i][0]
+    prior = 0.5 * float(point[:count] @ point[:count])
+    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in best])
 
 
 def levenberg_marquardt(

@@ -10,7 +10,8 @@ from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, in_
 
 Array = NDArray[np.float64]
 
-_FREE = (1.3e-3, 1.3e-3, np.radians(2.5))  # standard deviation of the pose of an inserted part in its hole [m, m, rad]
+# Standard deviation of the pose of an inserted part in its hole [m, m, rad].
+FREE = np.array([1.3e-3, 1.3e-3, np.radians(2.5)])
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
 _NEAR = np.array([2e-3, 2e-3, 0.07])  # spread of new poses around the best one, at first [m, m, rad]
@@ -29,7 +30,7 @@ def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Gene
     result = np.zeros((0, 3))
     while len(result) < count:
         # in_hole(misalignment, found) is a pose in the hole.
-        pose = rng.normal(size=(8 * count, 3)) * _FREE
+        pose = rng.normal(size=(8 * count, 3)) * FREE
         yaw = pose[:, 2] - found[2]
         drawn = np.column_stack([apply_planar(np.column_stack([pose[:, :2], yaw]), -found[:2]), yaw])
         inside = drawn[(np.abs(drawn) <= 1.2 * limit).all(1)]
@@ -42,7 +43,7 @@ def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
     found = problem.recordings.inserted.get(insertion)
     if found is None:
         return np.zeros(len(poses))
-    return np.asarray(0.5 * ((in_hole(poses, found[None]) / _FREE) ** 2).sum(1))
+    return np.asarray(0.5 * ((in_hole(poses, found[None]) / FREE) ** 2).sum(1))
 
 
 def prior_information(problem: Problem, insertion: int) -> Array:
@@ -51,7 +52,7 @@ def prior_information(problem: Problem, insertion: int) -> Array:
     if found is None:
         spread = np.maximum(np.asarray(problem.recordings.task.misalignment), 1e-9) / np.sqrt(3)
     else:
-        spread = np.asarray(_FREE)
+        spread = FREE
     return np.diag(1 / spread**2)
 
 

@@ -23,6 +23,7 @@ from gelflow.sim.tasks.insertion_randomization import ARM_JOINTS, simulator_para
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters
 from gelflow.sim.tasks.parts.registry import part_geometry
+from gelflow.sim.trajectory import Trajectory
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
+_BATCH = 256  # descents that are simulated at once: the states of all their steps stay in memory
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
 
 
@@ -80,10 +82,12 @@ class ShearModel:
         self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
         self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
         self._sims: dict[int, Simulator] = {}
+        self._trajectories: dict[tuple[int, ...], Trajectory] = {}  # by steps and descents, to be overwritten
 
     def _sim(self, count: int) -> Simulator:
         if count not in self._sims:
-            self._sims.clear()
+            if len(self._sims) > 3:
+                self._sims.clear()
             self._sims[count] = Simulator(self.scene, num_envs=count, threads=self._threads)
         return self._sims[count]
 
@@ -95,7 +99,15 @@ class ShearModel:
         `values` has the `QUANTITIES`, shape (n,) each.
         """
         n = len(descents.depth)
-        sim = self._sim(n)
+        change, ok = np.zeros((n, self.scene.num_markers, 2)), np.zeros(n, np.bool_)
+        # Descents of a similar length together: a batch has as many steps as its longest.
+        in_order = np.argsort(descents.depth, kind="stable")
+        for rows in np.split(in_order, range(_BATCH, n, _BATCH)):
+            change[rows], ok[rows] = self._shear({name: value[rows] for name, value in values.items()}, descents[rows])
+        return change, ok
+
+    def _shear(self, values: Mapping[str, Array], descents: Descents) -> tuple[Array, NDArray[np.bool_]]:
+        sim = self._sim(len(descents.depth))
         grasp, anchored, held = self._grasp(sim, values)
         q, controls = self._start(grasp, descents)
         steps = self._steps(descents.depth)
@@ -106,8 +118,17 @@ class ShearModel:
             u[first : first + count, i, z] -= depth * np.arange(1, count + 1) / count
             u[first + count :, i, z] -= depth
         sim.reset()
-        trajectory = sim.rollout(
-            u, q=q, v=np.zeros_like(sim.v), anchors=grasp.anchors, anchored=anchored, read_after=[len(u)]
+        size = u.shape[:2]
+        if size not in self._trajectories and len(self._trajectories) > 3:
+            self._trajectories.clear()
+        trajectory = self._trajectories[size] = sim.rollout(
+            u,
+            q=q,
+            v=np.zeros_like(sim.v),
+            anchors=grasp.anchors,
+            anchored=anchored,
+            read_after=[len(u)],
+            out=self._trajectories.get(size),
         )
         ok = (trajectory.status == 0) & held
         change = trajectory.tactile[0, :, :, :2] - grasp.shear

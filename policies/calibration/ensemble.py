@@ -1,0 +1,111 @@
+"""Global search of a fit: ensemble Kalman inversion of parameters, start heights and poses together.
+
+Each member is a guess of all unknowns with simulated flow maps of its own. Covariances over the ensemble take the place
+of derivatives: where contact points cross edges of the hole, forces jump with a pose, and the spread of the ensemble
+smooths the jumps. An ensemble takes the recordings into account in parts, each as large as the present residuals allow
+(Iglesias and Yang, Adaptive regularisation for ensemble Kalman inversion, Inverse Problems 37, 2021). The first one is
+drawn from the prior, the later ones around the best member so far.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import SimulationError
+from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost
+from gelflow.policies.calibration.problem import CORRELATED, Problem, huber
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 20  # of one ensemble, at most
+_LATER_ROUNDS = 10
+_LATER = 2  # ensembles around the best member
+_NARROW = 0.3  # spread of their members relative to the prior
+_FARTHEST = 1.7  # first values of the parameters, at most [sd]
+
+
+def search_globally(problem: Problem, members: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Unknowns and poses (insertions, 3) of the best of all members.
+
+    Raises SimulationError when the recorded descents cannot be simulated with three of four members.
+    """
+    insertions = int(problem.recordings.insertion.max()) + 1
+    count = len(problem.fitted)
+    points = rng.normal(size=(members, problem.size))
+    points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST)
+    poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
+    cost, point, pose = _invert(problem, points, poses, _ROUNDS, rng)
+    for _ in range(_LATER):
+        some = 2 * members // 3
+        points = point + _NARROW * rng.normal(size=(some, problem.size))
+        poses = pose + _NARROW * FREE * rng.normal(size=(some, insertions, 3))
+        found = _invert(problem, points, poses, _LATER_ROUNDS, rng)
+        if found[0] < cost:
+            cost, point, pose = found
+    return point, pose
+
+
+def _invert(
+    problem: Problem, points: Array, poses: Array, rounds: int, rng: np.random.Generator
+) -> tuple[float, Array, Array]:
+    """The lowest cost of any member in any round, with its unknowns and poses."""
+    members, insertions = poses.shape[:2]
+    scale = np.tile(FREE, insertions)
+    best = (np.inf, points[0], poses[0])
+    left = 1.0  # share of the recordings that is not yet taken into account
+    for _ in range(rounds):
+        residuals, ok = _residuals(problem, points, poses)
+        if ok.sum() <= members // 4:
+            raise SimulationError("the recorded descents cannot be simulated with most guesses of the parameters")
+        costs = np.where(ok, _costs(problem, residuals, points, poses), np.inf)
+        k = int(costs.argmin())
+        if costs[k] < best[0]:
+            best = float(costs[k]), points[k], poses[k]
+        if left <= 0:
+            break
+        replaced = np.where(ok, np.arange(members), rng.choice(np.flatnonzero(ok), members))
+        residuals, points, poses = residuals[replaced], points[replaced], poses[replaced]
+        share = min(left, _share(residuals))
+        left = left - share if share < left else 0.0
+        unknowns = np.hstack([points, poses.reshape(members, -1) / scale])
+        unknowns = _updated(unknowns, residuals, share, rng)
+        points = np.clip(unknowns[:, : problem.size], -4.0, 4.0)
+        poses = (unknowns[:, problem.size :] * scale).reshape(poses.shape)
+    return best
+
+
+def _residuals(problem: Problem, points: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Residuals (members, data) whose half squares add up to the robust cost, and which members could be simulated."""
+    members, n = len(points), len(problem.recordings)
+    values = {name: np.repeat(value, n) for name, value in problem.values(points).items()}
+    rows = np.tile(np.arange(n), members)
+    misalignment = poses[:, problem.recordings.insertion].reshape(-1, 3)
+    flow, ok = problem.predicted(values, rows, misalignment, problem.heights(points).reshape(-1))
+    whitened = problem.whiten(flow - problem.data[rows], rows)
+    robust = np.sign(whitened) * np.sqrt(2 * huber(whitened) / CORRELATED)
+    return robust.reshape(members, -1), ok.reshape(members, n).all(1)
+
+
+def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> Array:
+    """Robust negative log posterior of each member."""
+    of_poses = sum(prior_cost(problem, i, poses[:, i]) for i in range(poses.shape[1]))
+    return np.asarray(0.5 * (residuals**2).sum(1) + 0.5 * (points**2).sum(1) + of_poses)
+
+
+def _share(residuals: Array) -> float:
+    """The part of the recordings for which the update stays in the range of the present residuals."""
+    independent = residuals.shape[1] / CORRELATED
+    half_squares = 0.5 * (residuals**2).sum(1)
+    by_mean = independent / (2 * half_squares.mean())
+    by_spread = np.sqrt(independent / (2 * half_squares.var() + 1e-12))
+    return float(max(by_mean, by_spread))
+
+
+def _updated(unknowns: Array, residuals: Array, share: float, rng: np.random.Generator) -> Array:
+    """Members after a `share` of the recordings, with perturbed observations."""
+    members = len(unknowns)
+    spread = (residuals - residuals.mean(0)) / np.sqrt(members - 1)
+    change = (unknowns - unknowns.mean(0)) / np.sqrt(members - 1)
+    noise = 1 / share
+    wanted = np.sqrt(noise) * rng.normal(size=residuals.shape) - residuals
+    weights = np.linalg.solve(spread @ spread.T + noise * np.eye(members), spread @ wanted.T)
+    return np.asarray(unknowns + (change.T @ weights).T)
