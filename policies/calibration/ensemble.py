@@ -18,8 +18,7 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
-_LATER = 2  # ensembles around the best member
-_NARROW = 0.3  # spread of their members relative to the prior
+_LATER_SPREADS = (0.5, 0.3, 0.2, 0.1)  # of the ensembles around the best member, relative to the prior
 _FARTHEST = 1.7  # first values of the parameters, at most [sd]
 
 
@@ -34,10 +33,10 @@ def search_globally(problem: Problem, members: int, rng: np.random.Generator) ->
     points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST)
     poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
     cost, point, pose = _invert(problem, points, poses, _ROUNDS, rng)
-    for _ in range(_LATER):
+    for spread in _LATER_SPREADS:
         some = 2 * members // 3
-        points = point + _NARROW * rng.normal(size=(some, problem.size))
-        poses = pose + _NARROW * FREE * rng.normal(size=(some, insertions, 3))
+        points = point + spread * rng.normal(size=(some, problem.size))
+        poses = pose + spread * FREE * rng.normal(size=(some, insertions, 3))
         found = _invert(problem, points, poses, _LATER_ROUNDS, rng)
         if found[0] < cost:
             cost, point, pose = found

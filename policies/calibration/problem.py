@@ -40,11 +40,11 @@ class Problem:
     no useful gradient and are searched (`gelflow.policies.calibration.poses`).
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
         self.recordings = recordings
-        self.readings = ReadingModel(recordings, threads=threads)
+        self.readings = ReadingModel(recordings, threads=threads, preset=preset)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
         n = len(recordings)

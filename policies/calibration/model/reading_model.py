@@ -20,11 +20,12 @@ class ReadingModel:
     ----------
     recordings: give task, grasp, unit, settling time and the spread of start heights; they may have no attempt
     threads: of the simulator
+    preset: accuracy of the simulation; None: the scene's own settings
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
         self.fitted: tuple[Parameter, ...] = parameters(recordings)
-        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads)
+        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, preset=preset)
         self.pads = PadModel([pad.positions for pad in self.forces.scene.pads])
         self.height_spread = recordings.height_spread
         # Unit of the recordings per newton of a reading.

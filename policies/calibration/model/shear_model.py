@@ -67,11 +67,14 @@ class ShearModel:
     task: task of the descents
     settle: time at the end of a descent until the reading [s]; 0 for the training environment, which reads in motion
     threads: of the simulator
+    preset: accuracy of the simulation; None: the scene's own settings
     """
 
-    def __init__(self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None) -> None:
+    def __init__(
+        self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, preset: str | None = None
+    ) -> None:
         self.task = task
-        self.scene = insertion_scene(task)
+        self.scene = insertion_scene(task, preset=preset)
         self._threads = threads
         step = self.scene.step
         self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)
