@@ -32,7 +32,7 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
-_BATCH = 256  # descents that are simulated at once: the states of all their steps stay in memory
+_BATCH = 64  # descents that are simulated at once: the states of all their steps stay in memory, 100 MB
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
 
 
