@@ -81,7 +81,7 @@ def _residuals(problem: Problem, points: Array, poses: Array) -> tuple[Array, ND
     flow, ok = problem.predicted(values, rows, misalignment, problem.heights(points).reshape(-1))
     whitened = problem.whiten(flow - problem.data[rows], rows)
     robust = np.sign(whitened) * np.sqrt(2 * huber(whitened) / CORRELATED)
-    return robust.reshape(members, -1), ok.reshape(members, n).all(1)
+    return robust.reshape(members, -1), np.asarray(ok.reshape(members, n).all(axis=1))
 
 
 def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> Array:

@@ -1,0 +1,55 @@
+"""The global search: its update against the Kalman filter's, and the unknowns that it finds in a recorded world."""
+
+import numpy as np
+import pytest
+
+from gelflow.errors import SimulationError
+from gelflow.policies.calibration import ensemble
+from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.poses import draw_poses
+from gelflow.policies.calibration.problem import Problem
+
+
+@pytest.mark.parametrize("share", [1.0, 0.1])
+def test_an_update_is_that_of_a_kalman_filter(share: float) -> None:
+    rng = np.random.default_rng(0)
+    slopes, data = rng.normal(size=(5, 3)), rng.normal(size=5)
+    members = rng.normal(size=(1500, 3))
+    updated = ensemble._updated(members, members @ slopes.T - data, share, rng)
+    covariance = np.linalg.inv(np.eye(3) + share * slopes.T @ slopes)
+    np.testing.assert_allclose(updated.mean(0), share * covariance @ slopes.T @ data, atol=0.06)
+    np.testing.assert_allclose(np.cov(updated.T), covariance, atol=0.06)
+
+
+def test_two_updates_with_half_of_the_recordings_equal_one_with_all() -> None:
+    rng = np.random.default_rng(1)
+    slopes, data = rng.normal(size=(4, 2)), rng.normal(size=4)
+    members = rng.normal(size=(1500, 2))
+    once = ensemble._updated(members, members @ slopes.T - data, 1.0, rng)
+    twice = members
+    for _ in range(2):
+        twice = ensemble._updated(twice, twice @ slopes.T - data, 0.5, rng)
+    np.testing.assert_allclose(twice.mean(0), once.mean(0), atol=0.06)
+    np.testing.assert_allclose(np.cov(twice.T), np.cov(once.T), atol=0.06)
+
+
+def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.arange(2)), preset="fast")
+    problem.set_model_error(0.04)
+    point, poses = ensemble.search_globally(problem, 48, np.random.default_rng(0))
+    residuals, ok = ensemble._residuals(problem, point[None], poses[None])
+    found = ensemble._costs(problem, residuals, point[None], poses[None])[0]
+    rng = np.random.default_rng(1)
+    points = np.clip(rng.normal(size=(200, problem.size)), -1.7, 1.7)
+    guessed = np.stack([draw_poses(problem, i, 200, rng) for i in range(2)], axis=1)
+    residuals, _ = ensemble._residuals(problem, points, guessed)
+    assert ok.all()
+    assert found < 0.1 * ensemble._costs(problem, residuals, points, guessed).min()
+
+
+def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = Problem(world.recordings.of(np.arange(1)), preset="fast")
+    predicted = problem.predicted
+    monkeypatch.setattr(problem, "predicted", lambda *given: (predicted(*given)[0], np.zeros(len(given[1]), np.bool_)))
+    with pytest.raises(SimulationError, match="most guesses"):
+        ensemble.search_globally(problem, 8, np.random.default_rng(0))
