@@ -54,8 +54,8 @@ class EgmLoop:
         self._event("listening", f"{'real-time' if raise_priority() else 'normal'} priority")
         start = self._clock.now()
         while not self._parent.closed and os.getppid() == parent:
-            # What the robot sent before `start` is in the log: a pose in it is never older than the lead, whenever this
-            # process is interrupted.
+            # All messages that the robot sent before `start` are in the log: a pose in it is never older than the lead,
+            # whenever this process is interrupted.
             self._clock.grant(ARM_DRIVER, start + self._clock.factor * _LONGEST_GAP)
             start = self._clock.now()
             self._report()
