@@ -1,9 +1,9 @@
 """Marker forces of recorded descents as a function of physical parameters, with exact derivatives.
 
 A descent is simulated as in `InsertionAttempts`: the part comes to rest in the closed gripper, far above the hole, and
-is then lowered from a pose in the hole frame. Values of many descents are computed in one batch. Derivatives come from
-forward-mode differentiation of the core (dual numbers), one direction at a time; the grasp at rest, which all descents
-with equal parameters share, is differentiated once.
+is then lowered from a pose in the hole frame. Values of many descents are computed in batches. Derivatives come from
+forward-mode differentiation of the core (dual numbers); the grasp at rest, which all descents with equal parameters
+share, is differentiated once.
 """
 
 from collections.abc import Mapping, Sequence
