@@ -20,6 +20,7 @@ from rich.table import Table
 from gelflow.cli.mock_process import mock_robot
 from gelflow.errors import GelflowError
 from gelflow.policies.calibration.calibration import calibrate
+from gelflow.policies.calibration.experiment.coverage import counted, outcome
 from gelflow.policies.calibration.experiment.worlds import widened
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_policy
@@ -40,21 +41,19 @@ def main() -> int:
     args = parser.parse_args()
     seeds = range(args.seed, args.seed + (1 if args.quick else args.worlds))
     unfinished = args.out.with_suffix(".part")
-    rows: dict[str, Any] = json.loads(unfinished.read_text()) if unfinished.is_file() else {}
+    measured = json.loads(unfinished.read_text())["results"] if unfinished.is_file() else []
+    rows: dict[int, Any] = {row["seed"]: row for row in measured}
     with script.progress("worlds", len(seeds)) as advance:
         for seed in seeds:
-            if str(seed) not in rows:
-                rows[str(seed)] = calibrated(seed, args.factor)
-                script.save(unfinished, rows)
+            if seed not in rows:
+                rows[seed] = calibrated(seed, args.factor)
+                script.save(unfinished, counted(list(rows.values())))
             advance(1)
-    done = [row for row in rows.values() if "refused" not in row]
-    known = [inside for row in done for inside in row["known"].values()]
-    summary = {"worlds": len(done), "refused": len(rows) - len(done)}
-    summary |= {"covered_worlds": sum(all(row["known"].values()) for row in done)}
-    summary |= {"known": len(known), "known_in_interval": sum(known)}
+    result = counted(list(rows.values()))
     table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
-    table.add_row(*map(str, summary.values()))
-    script.finish(args, script.header() | summary | {"results": rows}, table)
+    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
+    table.add_row(*(str(result[key]) for key in keys))
+    script.finish(args, script.header() | result, table)
     unfinished.unlink(missing_ok=True)
     return 0
 
@@ -69,21 +68,13 @@ def calibrated(seed: int, factor: float) -> dict[str, Any]:
             recorded = time.monotonic()
             result = calibrate(read_recordings([session]), seed=seed, processes=2)
     except GelflowError as error:
-        return {"world": world, "refused": str(error)}
-    maps = result.held_out
+        return {"seed": seed, "world": world, "refused": str(error)}
     return {
+        "seed": seed,
         "world": world,
-        "known": {
-            e.parameter.name: bool(e.low <= truth[e.parameter.name] <= e.high)
-            for e in result.estimates
-            if e.verdict == "known" and e.parameter.name in truth
-        },
-        "estimates": {e.parameter.name: [e.verdict, e.low, e.value, e.high] for e in result.estimates},
         "truth": truth,
-        "residual": result.fit.best.chi,
-        "held_out_residual": result.held_out_residual,
-        "noise": result.noise,
-        "held_out_after": None if maps is None else maps.error(maps.after),
+        "intervals": {e.parameter.name: [e.low, e.high] for e in result.estimates},
+        **outcome(result, truth),
         "minutes_recording": round((recorded - begun) / 60, 2),
         "minutes_fit": round((time.monotonic() - recorded) / 60, 2),
     }

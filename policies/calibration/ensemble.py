@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
-from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost
+from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import CORRELATED, Problem, huber
 
 Array = NDArray[np.float64]
@@ -25,10 +25,9 @@ _FARTHEST = 1.7  # first values of the parameters, at most [sd]
 def search_globally(problem: Problem, members: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Unknowns and poses (insertions, 3) of the best of all members.
 
-    Raises SimulationError when the recorded descents cannot be simulated with three of four members.
+    Raises SimulationError when the recorded descents cannot be simulated with three quarters of the members.
     """
-    insertions = int(problem.recordings.insertion.max()) + 1
-    count = len(problem.fitted)
+    count, insertions = len(problem.fitted), problem.insertions
     points = rng.normal(size=(members, problem.size))
     points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST)
     poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
@@ -74,20 +73,15 @@ def _invert(
 
 def _residuals(problem: Problem, points: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Residuals (members, data) whose half squares add up to the robust cost, and which members could be simulated."""
-    members, n = len(points), len(problem.recordings)
-    values = {name: np.repeat(value, n) for name, value in problem.values(points).items()}
-    rows = np.tile(np.arange(n), members)
-    misalignment = poses[:, problem.recordings.insertion].reshape(-1, 3)
-    flow, ok = problem.predicted(values, rows, misalignment, problem.heights(points).reshape(-1))
-    whitened = problem.whiten(flow - problem.data[rows], rows)
+    whitened, ok = problem.residuals_of(points, poses)
     robust = np.sign(whitened) * np.sqrt(2 * huber(whitened) / CORRELATED)
-    return robust.reshape(members, -1), np.asarray(ok.reshape(members, n).all(axis=1))
+    return robust.reshape(len(points), -1), np.asarray(ok.all(axis=1))
 
 
 def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> Array:
     """Robust negative log posterior of each member."""
-    of_poses = sum(prior_cost(problem, i, poses[:, i]) for i in range(poses.shape[1]))
-    return np.asarray(0.5 * (residuals**2).sum(1) + 0.5 * (points**2).sum(1) + of_poses)
+    prior = 0.5 * (points**2).sum(1) + prior_cost_of_all(problem, poses)
+    return np.asarray(0.5 * (residuals**2).sum(1) + prior)
 
 
 def _share(residuals: Array) -> float:

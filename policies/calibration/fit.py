@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError
 from gelflow.helper_process import end_with_parent
 from gelflow.policies.calibration.ensemble import search_globally
-from gelflow.policies.calibration.poses import FREE, best_poses, prior_cost
+from gelflow.policies.calibration.poses import FREE, best_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.uncertainty import covariance
@@ -138,33 +138,26 @@ def _descend(
         point, cost, _ = levenberg_marquardt(problem, point, poses, settings.steps)
         if round_ < len(_MODEL_ERRORS) - 1:
             better, moved, found = _searched(problem, point, poses, rng, settings)
-            if better < cost + _prior_cost(problem, poses):
+            if better < cost + prior_cost_of_all(problem, poses[None])[0]:
                 point, poses = moved, found
     line = problem.linearize(point, poses)
     chi = problem.chi(line.residuals)
-    cost = problem.cost(line.residuals, point) + _prior_cost(problem, poses)
+    cost = problem.cost(line.residuals, point) + float(prior_cost_of_all(problem, poses[None])[0])
     return StartResult(point, poses, covariance(problem, point, poses, chi), cost, chi)
-
-
-def _prior_cost(problem: Problem, poses: Array) -> float:
-    return float(sum(prior_cost(problem, i, poses[i : i + 1])[0] for i in range(len(poses))))
 
 
 def _searched(
     problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
 ) -> tuple[float, Array, Array]:
     """The cost, the point with better start heights, and better poses, searched ever closer around the best ones."""
-    count, insertions = len(problem.fitted), len(poses)
-    point, best = point.copy(), [poses[i][None] for i in range(insertions)]
+    count, best = len(problem.fitted), [pose[None] for pose in poses]
     costs: list[Array] = []
     for size in _SIZES:
         candidates = []
-        for i in range(insertions):
-            parents = best[i][rng.integers(0, min(3, len(best[i])), settings.poses)]
-            candidates.append(np.vstack([best[i], parents + size * rng.normal(size=parents.shape) * FREE]))
-        best, costs, heights = best_poses(problem, point, candidates, range_of_heights=size)
-        for i in range(insertions):
-            point[count + np.flatnonzero(problem.recordings.insertion == i)] = heights[i][0]
+        for present in best:
+            parents = present[rng.integers(0, min(3, len(present)), settings.poses)]
+            candidates.append(np.vstack([present, parents + size * rng.normal(size=parents.shape) * FREE]))
+        best, costs, point = best_poses(problem, point, candidates, range_of_heights=size)
     prior = 0.5 * float(point[:count] @ point[:count])
     return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in best])
 

@@ -46,6 +46,11 @@ def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
     return np.asarray(0.5 * ((in_hole(poses, found[None]) / FREE) ** 2).sum(1))
 
 
+def prior_cost_of_all(problem: Problem, poses: Array) -> Array:
+    """Negative log prior of the misalignments of all insertions (m, insertions, 3), shape (m,)."""
+    return np.asarray(sum(prior_cost(problem, i, poses[:, i]) for i in range(problem.insertions)))
+
+
 def prior_information(problem: Problem, insertion: int) -> Array:
     """Information of the prior about the misalignment of an insertion, (3, 3) [1/m, 1/m, 1/rad each]."""
     found = problem.recordings.inserted.get(insertion)
@@ -58,14 +63,18 @@ def prior_information(problem: Problem, insertion: int) -> Array:
 
 def best_poses(
     problem: Problem, point: Array, candidates: list[Array], *, range_of_heights: float = 1.0
-) -> tuple[list[Array], list[Array], list[Array]]:
-    """The best candidates of each insertion: poses (k, 3), their costs (k,), and start heights (k, attempts) [sd].
+) -> tuple[list[Array], list[Array], Array]:
+    """The best candidates of each insertion: poses (k, 3), their costs (k,), and the point with their start heights.
 
     Candidates are first compared up to the size of the flow maps, which depends on the start height, then with the best
     of several start heights: `range_of_heights` is 1 for their whole range, less for a range around those of `point`.
     """
     short = [_by_shape(problem, point, i, poses, _SHORTLIST) for i, poses in enumerate(candidates)]
-    return _with_heights(problem, point, short, range_of_heights)
+    poses, costs, heights = _with_heights(problem, point, short, range_of_heights)
+    point = point.copy()
+    for i, of_best in enumerate(heights):
+        point[len(problem.fitted) + _rows(problem, i)] = of_best[0]
+    return poses, costs, point
 
 
 def _rows(problem: Problem, insertion: int) -> NDArray[np.int64]:
@@ -97,7 +106,7 @@ def _by_shape(problem: Problem, point: Array, insertion: int, poses: Array, keep
 def _with_heights(
     problem: Problem, point: Array, short: list[Array], range_of_heights: float
 ) -> tuple[list[Array], list[Array], list[Array]]:
-    """Costs of poses with the best start height of each attempt."""
+    """Poses (k, 3) of each insertion, the best first, their costs (k,), and their start heights (k, attempts) [sd]."""
     count = len(problem.fitted)
     costs, heights = [], []
     for insertion, poses in enumerate(short):
@@ -136,7 +145,7 @@ def find_poses(
     """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses."""
     point = np.zeros(problem.size)
     point[: len(parameters)] = parameters
-    insertions = int(problem.recordings.insertion.max()) + 1
+    insertions = problem.insertions
     best: list[Array] | None = None
     for number, size in enumerate(_SIZES):
         candidates = []
@@ -146,9 +155,7 @@ def find_poses(
             else:
                 near = best[i][0] + size * rng.normal(size=(_POSES // 4, 3)) * _NEAR
                 candidates.append(np.vstack([best[i], near]))
-        best, _, heights = best_poses(problem, point, candidates, range_of_heights=size)
-        for i in range(insertions):
-            point[len(parameters) + _rows(problem, i)] = heights[i][0]
+        best, _, point = best_poses(problem, point, candidates, range_of_heights=size)
         progress(number + 1)
     assert best is not None
     return point, np.stack([poses[0] for poses in best])

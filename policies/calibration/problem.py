@@ -62,6 +62,11 @@ class Problem:
         self._shift = 1 - self.sigma / np.sqrt(self.sigma**2 + self.markers * DRIFT**2)
 
     @property
+    def insertions(self) -> int:
+        """Number of insertions, each with its own pose."""
+        return int(self.recordings.insertion.max()) + 1
+
+    @property
     def size(self) -> int:
         """Number of unknowns."""
         return len(self.fitted) + len(self.recordings)
@@ -110,11 +115,20 @@ class Problem:
 
     def residuals(self, point: Array, misalignment: Array) -> tuple[Array, bool]:
         """Whitened residuals (n, markers * 2) with the misalignment (insertions, 3) of each insertion."""
-        n = len(self.recordings)
-        values = {name: np.full(n, value) for name, value in self.values(point).items()}
-        rows = np.arange(n)
-        flow, ok = self.predicted(values, rows, misalignment[self.recordings.insertion], self.heights(point))
-        return self.whiten(flow - self.data, rows), bool(ok.all())
+        residuals, ok = self.residuals_of(point[None], misalignment[None])
+        return residuals[0], bool(ok.all())
+
+    def residuals_of(self, points: Array, misalignment: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Whitened residuals (m, n, markers * 2) and whether they could be simulated (m, n), of m guesses.
+
+        A guess has unknowns (size,) and a misalignment (insertions, 3).
+        """
+        m, n = len(points), len(self.recordings)
+        rows = np.tile(np.arange(n), m)
+        values = {name: np.repeat(value, n) for name, value in self.values(points).items()}
+        poses = misalignment[:, self.recordings.insertion].reshape(-1, 3)
+        flow, ok = self.predicted(values, rows, poses, self.heights(points).reshape(-1))
+        return self.whiten(flow - self.data[rows], rows).reshape(m, n, -1), ok.reshape(m, n)
 
     def normal_equations(self, residuals: Array, jacobian: Array, point: Array) -> tuple[Array, Array]:
         """Gauss-Newton Hessian and gradient of `cost`, from flat residuals (m,) and their Jacobian (m, unknowns)."""

@@ -9,7 +9,7 @@ the cost has risen as a normal distribution predicts (a likelihood-ratio interva
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.policies.calibration.poses import prior_cost, prior_information
+from gelflow.policies.calibration.poses import prior_cost_of_all, prior_information
 from gelflow.policies.calibration.problem import CORRELATED, POSE_STEP, Problem, huber, huber_weights
 
 Array = NDArray[np.float64]
@@ -59,23 +59,17 @@ def _pose_columns(problem: Problem, point: Array, poses: Array) -> Array:
 
 def _residuals(problem: Problem, points: Array, poses: Array) -> Array:
     """Whitened residuals (m, n, markers * 2) at points (m, size) with poses (m, insertions, 3); nan where they fail."""
-    m, n = len(points), len(problem.recordings)
-    rows = np.tile(np.arange(n), m)
-    values = {name: np.repeat(value, n) for name, value in problem.values(points).items()}
-    flow, ok = problem.predicted(
-        values, rows, poses[:, problem.recordings.insertion].reshape(-1, 3), problem.heights(points).reshape(-1)
-    )
-    residuals = problem.whiten(flow - problem.data[rows], rows)
+    residuals, ok = problem.residuals_of(points, poses)
     residuals[~ok] = np.nan
-    return residuals.reshape(m, n, -1)
+    return residuals
 
 
 def _costs(problem: Problem, points: Array, poses: Array, scale: float) -> Array:
     """Negative log posterior (m,) with residuals divided by `scale`; inf where a simulation fails."""
     residuals = _residuals(problem, points, poses) / scale
     fit = huber(residuals).sum((1, 2)) / CORRELATED
-    of_poses = sum(prior_cost(problem, i, poses[:, i]) for i in range(poses.shape[1]))
-    return np.asarray(np.nan_to_num(fit + 0.5 * (points**2).sum(1) + of_poses, nan=np.inf))
+    prior = 0.5 * (points**2).sum(1) + prior_cost_of_all(problem, poses)
+    return np.asarray(np.nan_to_num(fit + prior, nan=np.inf))
 
 
 def _factors(problem: Problem, point: Array, poses: Array, axes: Array, scale: float) -> Array:
