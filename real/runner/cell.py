@@ -19,6 +19,7 @@ from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.limits import LIMITS
 from gelflow.real.runner.lab import CameraSettings, Lab
+from gelflow.real.runner.motion_executor import record_events
 from gelflow.real.runner.touch.grasp_latency import LatencyMonitor
 from gelflow.real.transport import transport_for
 from gelflow.real.web_services.client import WebServicesClient
@@ -175,7 +176,7 @@ def egm_config(lab: Lab, *, dry_run: bool = False) -> EgmConfig:
 
 
 class StopArm:
-    """Context manager that stops the arm at the exit and records the reason."""
+    """Context manager that stops the arm at the exit and records its last events and the reason."""
 
     def __init__(self, arm: EgmArm, recorder: SessionRecorder) -> None:
         self._arm = arm
@@ -190,4 +191,5 @@ class StopArm:
             self._arm.hold()
         self._arm.stop(reason)
         with contextlib.suppress(GelflowError):
+            record_events(self._arm, self._recorder)
             self._recorder.event("arm stopped", {"reason": reason})

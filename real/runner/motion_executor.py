@@ -34,6 +34,12 @@ _CHECKS_PERIOD = 0.5  # between two records of the checks [s]
 _LEAST_WAIT = 0.004  # between two checks, for clocks faster than real time [s, wall]
 
 
+def record_events(arm: EgmArm, recorder: SessionRecorder) -> None:
+    """Record all events of the arm's driver since the last call."""
+    for event in arm.drain_events():
+        recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
+
+
 class PartLost(PeerError):
     """The gripper lost the part: the attempt ends."""
 
@@ -273,8 +279,7 @@ class MotionExecutor:
             if self._cycles % RECORD_EVERY == 0 or record.flags != self._flags:
                 self._record(record)
             self._flags = record.flags
-        for event in self._arm.drain_events():
-            self._recorder.event(f"arm {event.kind}", {"text": event.text, "at": event.stamp})
+        record_events(self._arm, self._recorder)
 
     def _record_checks(self, now: float, *, always: bool = False) -> None:
         """Record the state of all checks from time to time."""

@@ -4,13 +4,18 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
+import pytest
+from tests.real.runner.harness import events
 
 from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.egm.driver import EgmArm
-from gelflow.real.runner.cell import egm_config
+from gelflow.real.runner.cell import egm_config, open_cell
+from gelflow.real.runner.run_plan import create_motion
+from gelflow.session.recorder import SessionRecorder
 from gelflow.time_sync import RUNNER
 
 
@@ -50,3 +55,29 @@ def test_the_state_is_readable_during_a_stop(robot: MockRobot) -> None:
             assert not arm.state().fault
         stopping.join()
         assert arm.state().fault == "the test stops it"
+
+
+def test_the_hold_of_an_interrupted_run_is_recorded(robot: MockRobot, tmp_path: Path) -> None:
+    """The driver's process confirms it late, when the thread that records events has already ended."""
+    lab = lab_for(robot)
+    path = tmp_path / "session.mcap"
+    with (
+        pytest.raises(KeyboardInterrupt),
+        SessionRecorder(path, lab.clock).open() as recorder,
+        open_cell(lab, recorder) as cell,
+    ):
+        cell.arm.wait_following(60.0)
+        with create_motion(cell)[1]:
+            start = cell.arm.state()
+            up = start.position + np.array([0.0, 0.0, 0.01])
+            cell.arm.target(up, start.quaternion, lifetime=1.0)
+            begun = lab.clock.now()
+            pid = cell.arm.pid
+            assert pid is not None
+            os.kill(pid, signal.SIGSTOP)
+            threading.Timer(0.3, os.kill, (pid, signal.SIGCONT)).start()
+            raise KeyboardInterrupt
+    recorded = events(path)
+    times = {name: values["at"] for name, values in recorded if "at" in values}
+    assert begun <= times["arm hold"] <= times["arm stopped"]
+    assert recorded[-1][0] == "arm stopped" and recorded[-1][1]["reason"] == "KeyboardInterrupt: "
