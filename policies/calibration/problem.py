@@ -59,7 +59,8 @@ class Problem:
         """Set the error of flow maps that residuals allow for; large values make the cost smooth."""
         self.sigma: Array = np.sqrt(self.noise**2 + (relative * self._power) ** 2 + 1e-12)
         # Subtracting this part of a pad's mean whitens residuals with a common shift.
-        self._shift = 1 - self.sigma / np.sqrt(self.sigma**2 + self.markers * DRIFT**2)
+        independent = self.markers / 2 / CORRELATED  # of each pad
+        self._shift = 1 - self.sigma / np.sqrt(self.sigma**2 + independent * DRIFT**2)
 
     @property
     def insertions(self) -> int:

@@ -26,7 +26,8 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
         raise SimulationError("no descent can be simulated with these parameters")
     sigma = np.sqrt(noise**2 + (MODEL_ERROR**2) * (reading**2).mean((1, 2)) + 1e-12)
     per_pad = columns.reshape(len(sigma), 2, -1, 2, columns.shape[-1])
-    shift = 1 - sigma / np.sqrt(sigma**2 + per_pad.shape[2] * DRIFT**2)  # a common shift of a pad is unknown as well
+    # A common shift of a pad is unknown as well.
+    shift = 1 - sigma / np.sqrt(sigma**2 + per_pad.shape[2] / CORRELATED * DRIFT**2)
     per_pad = per_pad - shift[:, None, None, None, None] * per_pad.mean(2, keepdims=True)
     jacobian = per_pad.reshape(len(sigma), -1, columns.shape[-1]) / sigma[:, None, None]
     full = np.einsum("nki,nkj->nij", jacobian, jacobian) / CORRELATED
