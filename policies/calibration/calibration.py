@@ -10,7 +10,7 @@ from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
 from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.planning.suggestions import Suggestion, suggest
-from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
 
@@ -48,7 +48,7 @@ def simulate(
 ) -> SimulatedSession:
     """Simulate the recorded attempts with the values of the scene; poses and start heights are searched.
 
-    `progress` gets the number of finished rounds of `SEARCH_ROUNDS`.
+    `progress` gets the number of finished insertions.
     """
     problem = Problem(recordings)
     point, poses = find_poses(problem, problem.scene_point(), np.random.default_rng(seed), progress)

@@ -7,48 +7,88 @@ smooths the jumps. An ensemble takes the recordings into account in parts, each 
 drawn from the prior, the later ones around the best member so far.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import CORRELATED, Problem, huber
+from gelflow.policies.calibration.recordings import Recordings
 
 Array = NDArray[np.float64]
 
 _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
-_LATER_SPREADS = (0.5, 0.3, 0.2, 0.1)  # of the ensembles around the best member, relative to the prior
+_SPREADS = (0.5, 0.3)  # of the ensembles around the best member, relative to the prior
 _FARTHEST = 1.7  # first values of the parameters, at most [sd]
+_MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
-def search_globally(problem: Problem, members: int, rng: np.random.Generator) -> tuple[Array, Array]:
+def rough_problem(recordings: Recordings, *, threads: int | None = None) -> Problem:
+    """The problem of a global search, simulated with the preset `fast`.
+
+    The preset changes the flow maps by some thousandths in the median, far less than the error that is allowed for.
+    """
+    problem = Problem(recordings, threads=threads, preset="fast")
+    problem.set_model_error(_MODEL_ERROR)
+    return problem
+
+
+def search_globally(
+    problem: Problem,
+    members: int,
+    rng: np.random.Generator,
+    *,
+    parameters: Array | None = None,
+    spreads: Sequence[float] = _SPREADS,
+) -> tuple[Array, Array]:
     """Unknowns and poses (insertions, 3) of the best of all members.
 
-    Raises SimulationError when the recorded descents cannot be simulated with three quarters of the members.
+    `parameters` are whitened and stay fixed; None: they are unknown. `spreads`: of the ensembles after the first one,
+    relative to the prior. Raises SimulationError when the recorded descents cannot be simulated with three quarters of
+    the members.
     """
     count, insertions = len(problem.fitted), problem.insertions
     points = rng.normal(size=(members, problem.size))
-    points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST)
+    points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST) if parameters is None else parameters
     poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
-    cost, point, pose = _invert(problem, points, poses, _ROUNDS, rng)
-    for spread in _LATER_SPREADS:
-        some = 2 * members // 3
-        points = point + spread * rng.normal(size=(some, problem.size))
-        poses = pose + spread * FREE * rng.normal(size=(some, insertions, 3))
-        found = _invert(problem, points, poses, _LATER_ROUNDS, rng)
-        if found[0] < cost:
-            cost, point, pose = found
-    return point, pose
+    found = _invert(problem, points, poses, _ROUNDS, rng)
+    for spread in spreads:
+        found = search_nearby(problem, *found, spread, 2 * members // 3, rng, parameters=parameters)
+    return found
+
+
+def search_nearby(
+    problem: Problem,
+    point: Array,
+    poses: Array,
+    spread: float,
+    members: int,
+    rng: np.random.Generator,
+    *,
+    parameters: Array | None = None,
+) -> tuple[Array, Array]:
+    """Unknowns and poses of the best member of an ensemble around `point` and `poses`, which are one of its members.
+
+    `spread` is relative to the prior; `parameters` as in `search_globally`.
+    """
+    points = point + spread * rng.normal(size=(members, problem.size))
+    if parameters is not None:
+        points[:, : len(problem.fitted)] = parameters
+    places = poses + spread * FREE * rng.normal(size=(members, *poses.shape))
+    points[0], places[0] = point, poses
+    return _invert(problem, points, places, _LATER_ROUNDS, rng)
 
 
 def _invert(
     problem: Problem, points: Array, poses: Array, rounds: int, rng: np.random.Generator
-) -> tuple[float, Array, Array]:
-    """The lowest cost of any member in any round, with its unknowns and poses."""
+) -> tuple[Array, Array]:
+    """Unknowns and poses of the best member of all rounds."""
     members, insertions = poses.shape[:2]
     scale = np.tile(FREE, insertions)
-    best = (np.inf, points[0], poses[0])
+    lowest, best = np.inf, (points[0], poses[0])
     left = 1.0  # share of the recordings that is not yet taken into account
     for _ in range(rounds):
         residuals, ok = _residuals(problem, points, poses)
@@ -56,8 +96,8 @@ def _invert(
             raise SimulationError("the recorded descents cannot be simulated with most guesses of the parameters")
         costs = np.where(ok, _costs(problem, residuals, points, poses), np.inf)
         k = int(costs.argmin())
-        if costs[k] < best[0]:
-            best = float(costs[k]), points[k], poses[k]
+        if costs[k] < lowest:
+            lowest, best = float(costs[k]), (points[k], poses[k])
         if left <= 0:
             break
         replaced = np.where(ok, np.arange(members), rng.choice(np.flatnonzero(ok), members))

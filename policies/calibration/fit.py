@@ -1,4 +1,4 @@
-"""The fit: a global search, then Levenberg-Marquardt steps in the parameters and searches of the poses in turn.
+"""The fit: a global search, then searches of the poses and Levenberg-Marquardt steps in the parameters in turn.
 
 It is repeated from several independent starts. The forces have kinks and steps where contact points cross edges of the
 hole, so that starts can end in different minima; their spread is part of the intervals.
@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.helper_process import end_with_parent
-from gelflow.policies.calibration.ensemble import search_globally
-from gelflow.policies.calibration.poses import FREE, best_poses, prior_cost_of_all
+from gelflow.policies.calibration.ensemble import rough_problem, search_globally, search_nearby
+from gelflow.policies.calibration.poses import prior_cost_of_all, refined_poses
 from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
 
-_GLOBAL_ERROR = 0.04  # allowed error of the model in the global search, relative to the flow maps
-_MODEL_ERRORS = (0.04, MODEL_ERROR, MODEL_ERROR)  # the same, in the rounds after it
-_SIZES = (0.5, 0.2, 0.07, 0.025)  # spread of new poses around the best ones, relative to their prior
+# Error of the model that an ensemble allows for, and its spread around the best member, relative to the prior.
+_NEARBY = ((0.04, 0.2), (MODEL_ERROR, 0.1), (MODEL_ERROR, 0.05))
+_SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, relative to their prior
+_SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
 
 
@@ -33,9 +34,11 @@ class FitSettings:
     """Effort of a fit."""
 
     starts: int = 4  # independent fits
-    members: int = 192  # of the ensemble of the global search
+    members: int = 192  # of the first ensemble of the global search
+    nearby: int = 80  # members of the ensembles around its result
+    rounds: int = 3  # of local searches and steps, at most
     poses: int = 32  # random poses of each insertion at each size of a search
-    steps: int = 3  # of Levenberg-Marquardt between two searches
+    steps: int = 3  # of Levenberg-Marquardt in each round
 
 
 @dataclass(frozen=True)
@@ -119,12 +122,13 @@ def fit(
 def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSettings) -> StartResult | None:
     """One start; None when it cannot be simulated."""
     rng = np.random.default_rng((seed, index))
-    # The preset changes the flow maps by some thousandths in the median, far less than the error that is allowed here.
-    rough = Problem(recordings, threads=1, preset="fast")
-    rough.set_model_error(_GLOBAL_ERROR)
+    problem = Problem(recordings, threads=1)
     try:
-        point, poses = search_globally(rough, settings.members, rng)
-        return _descend(Problem(recordings, threads=1), point, poses, rng, settings)
+        point, poses = search_globally(rough_problem(recordings, threads=1), settings.members, rng)
+        for error, spread in _NEARBY:
+            problem.set_model_error(error)
+            point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
+        return _descend(problem, point, poses, rng, settings)
     except SimulationError:
         return None
 
@@ -132,34 +136,23 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
 def _descend(
     problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
 ) -> StartResult:
-    """Steps and searches with a decreasing error of the model."""
-    for round_, error in enumerate(_MODEL_ERRORS):
-        problem.set_model_error(error)
-        point, cost, _ = levenberg_marquardt(problem, point, poses, settings.steps)
-        if round_ < len(_MODEL_ERRORS) - 1:
-            better, moved, found = _searched(problem, point, poses, rng, settings)
-            if better < cost + prior_cost_of_all(problem, poses[None])[0]:
-                point, poses = moved, found
-    line = problem.linearize(point, poses)
-    chi = problem.chi(line.residuals)
-    cost = problem.cost(line.residuals, point) + float(prior_cost_of_all(problem, poses[None])[0])
+    """Local searches of poses and start heights, and steps in parameters and start heights, in turn."""
+    cost = _cost(problem, point, poses)
+    for _ in range(settings.rounds):
+        before = cost
+        better, moved, found = refined_poses(problem, point, poses, rng, sizes=_SIZES, count=settings.poses)
+        if better < cost:
+            point, poses = moved, found
+        point, _, _ = levenberg_marquardt(problem, point, poses, settings.steps)
+        cost = _cost(problem, point, poses)
+        if before - cost < _SUFFICIENT:
+            break
+    chi = problem.chi(problem.residuals(point, poses)[0])
     return StartResult(point, poses, covariance(problem, point, poses, chi), cost, chi)
 
 
-def _searched(
-    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
-) -> tuple[float, Array, Array]:
-    """The cost, the point with better start heights, and better poses, searched ever closer around the best ones."""
-    count, best = len(problem.fitted), [pose[None] for pose in poses]
-    costs: list[Array] = []
-    for size in _SIZES:
-        candidates = []
-        for present in best:
-            parents = present[rng.integers(0, min(3, len(present)), settings.poses)]
-            candidates.append(np.vstack([present, parents + size * rng.normal(size=parents.shape) * FREE]))
-        best, costs, point = best_poses(problem, point, candidates, range_of_heights=size)
-    prior = 0.5 * float(point[:count] @ point[:count])
-    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in best])
+def _cost(problem: Problem, point: Array, poses: Array) -> float:
+    return problem.cost(problem.residuals(point, poses)[0], point) + float(prior_cost_of_all(problem, poses[None])[0])
 
 
 def levenberg_marquardt(

@@ -1,6 +1,6 @@
-"""Search of the misalignment of each insertion: random poses, compared with the recorded flow maps."""
+"""Priors of the misalignment of each insertion, and a local search: random poses, compared with the flow maps."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,7 @@ Array = NDArray[np.float64]
 FREE = np.array([1.3e-3, 1.3e-3, np.radians(2.5)])
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
-_NEAR = np.array([2e-3, 2e-3, 0.07])  # spread of new poses around the best one, at first [m, m, rad]
-_SIZES = (1.0, 0.5, 0.25, 0.12, 0.06)  # of the ranges of poses and heights in the rounds of `find_poses`
-SEARCH_ROUNDS = len(_SIZES)
-_POSES = 192  # candidates of `find_poses` for each insertion
+_PARENTS = 3  # best poses, around which new ones are drawn
 
 
 def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Generator) -> Array:
@@ -136,26 +133,21 @@ def _with_heights(
     return short, costs, heights
 
 
-def find_poses(
-    problem: Problem,
-    parameters: Array,
-    rng: np.random.Generator,
-    progress: Callable[[int], None] = lambda done: None,
-) -> tuple[Array, Array]:
-    """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses."""
-    point = np.zeros(problem.size)
-    point[: len(parameters)] = parameters
-    insertions = problem.insertions
-    best: list[Array] | None = None
-    for number, size in enumerate(_SIZES):
+def refined_poses(
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, sizes: Sequence[float], count: int
+) -> tuple[float, Array, Array]:
+    """Search the poses (insertions, 3) and start heights ever closer around the best ones, with fixed parameters.
+
+    Each of `sizes`, relative to the prior, has `count` random poses of each insertion. Returns the cost, the point with
+    the start heights, and the poses.
+    """
+    parameters, best = point[: len(problem.fitted)], [pose[None] for pose in poses]
+    costs: list[Array] = []
+    for size in sizes:
         candidates = []
-        for i in range(insertions):
-            if best is None:
-                candidates.append(draw_poses(problem, i, _POSES, rng))
-            else:
-                near = best[i][0] + size * rng.normal(size=(_POSES // 4, 3)) * _NEAR
-                candidates.append(np.vstack([best[i], near]))
-        best, _, point = best_poses(problem, point, candidates, range_of_heights=size)
-        progress(number + 1)
-    assert best is not None
-    return point, np.stack([poses[0] for poses in best])
+        for present in best:
+            parents = present[rng.integers(0, min(_PARENTS, len(present)), count)]
+            candidates.append(np.vstack([present, parents + size * rng.normal(size=parents.shape) * FREE]))
+        best, costs, point = best_poses(problem, point, candidates, range_of_heights=size)
+    prior = 0.5 * float(parameters @ parameters)
+    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in best])

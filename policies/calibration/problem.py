@@ -1,5 +1,6 @@
 """The least-squares problem of a calibration: residuals of flow maps, priors, and their derivatives."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -43,20 +44,28 @@ class Problem:
     def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
-        self.recordings = recordings
         self.readings = ReadingModel(recordings, threads=threads, preset=preset)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
-        n = len(recordings)
-        flow = recordings.flow.reshape(n, -1, 2) / self._scale
-        self.data = flow
-        self.markers = flow.shape[1]
         self.noise = recordings.noise() / self._scale
-        self._power = np.sqrt((flow**2).mean((1, 2)))
-        self.set_model_error(MODEL_ERROR)
+        self._set_recordings(recordings, MODEL_ERROR)
+
+    def of(self, insertion: int) -> "Problem":
+        """The same problem with the attempts of one insertion only."""
+        result = copy.copy(self)
+        result._set_recordings(self.recordings.of(np.array([insertion])), self._model_error)
+        return result
+
+    def _set_recordings(self, recordings: Recordings, model_error: float) -> None:
+        self.recordings = recordings
+        self.data = recordings.flow.reshape(len(recordings), -1, 2) / self._scale
+        self.markers = self.data.shape[1]
+        self._power = np.sqrt((self.data**2).mean((1, 2)))
+        self.set_model_error(model_error)
 
     def set_model_error(self, relative: float) -> None:
         """Set the error of flow maps that residuals allow for; large values make the cost smooth."""
+        self._model_error = relative
         self.sigma: Array = np.sqrt(self.noise**2 + (relative * self._power) ** 2 + 1e-12)
         # Subtracting this part of a pad's mean whitens residuals with a common shift.
         independent = self.markers / 2 / CORRELATED  # of each pad

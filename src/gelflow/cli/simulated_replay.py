@@ -2,6 +2,7 @@
 
 import argparse
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -10,7 +11,6 @@ from gelflow.cli.output import Output, progress_bar
 from gelflow.figures import save
 from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, simulate
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
-from gelflow.policies.calibration.poses import SEARCH_ROUNDS
 from gelflow.policies.calibration.session_recordings import read_recordings
 
 
@@ -19,7 +19,7 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
     output = Output(args.json)
     recordings = read_recordings([args.session])
     with progress_bar(count=True) as progress:
-        bar = progress.add_task("simulating", total=SEARCH_ROUNDS)
+        bar = progress.add_task("simulating", total=len(np.unique(recordings.insertion)))
         result = simulate(recordings, progress=lambda done: progress.update(bar, completed=done))
     names, errors, cosines = recordings.names, result.relative_error, result.cosine
     if args.out:

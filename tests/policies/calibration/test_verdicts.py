@@ -10,7 +10,7 @@ from gelflow.policies.calibration import calibration
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
-from gelflow.policies.calibration.poses import find_poses
+from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.report import error_lines, plain_report
 
