@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import SimulationError
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally
-from gelflow.policies.calibration.poses import refined_poses
+from gelflow.policies.calibration.poses import draw_poses, refined_poses
 from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
@@ -27,7 +28,8 @@ def find_poses(
 ) -> tuple[Array, Array]:
     """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses.
 
-    `progress` gets the number of finished insertions.
+    Where an insertion cannot be simulated with these parameters, its pose is drawn from the prior. `progress` gets the
+    number of finished insertions.
     """
     point, poses = np.zeros(problem.size), np.zeros((problem.insertions, 3))
     point[: len(parameters)] = parameters
@@ -42,13 +44,16 @@ def find_poses(
 
 def _search(problem: Problem, rough: Problem, parameters: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Unknowns and pose (1, 3) of one insertion."""
-    best: tuple[float, Array, Array] | None = None
+    lowest = np.inf
+    best = np.concatenate([parameters, np.zeros(len(problem.recordings))]), draw_poses(problem, 0, 1, rng)
     for _ in range(_STARTS):
-        start = search_globally(rough, _MEMBERS, rng, parameters=parameters, spreads=_SPREADS)
-        found = refined_poses(problem, *start, rng, sizes=_SIZES, count=_POSES)
-        if best is None or found[0] < best[0]:
-            best = found
-        if problem.chi(problem.residuals(*best[1:])[0]) <= _EXPLAINED:
+        try:
+            start = search_globally(rough, _MEMBERS, rng, parameters=parameters, spreads=_SPREADS)
+        except SimulationError:
+            return best
+        cost, *found = refined_poses(problem, *start, rng, sizes=_SIZES, count=_POSES)
+        if cost < lowest:
+            lowest, best = cost, (found[0], found[1])
+        if problem.chi(problem.residuals(*best)[0]) <= _EXPLAINED:
             break
-    assert best is not None
-    return best[1:]
+    return best

@@ -48,3 +48,13 @@ def test_the_held_out_residual_tells_the_true_parameters_from_others(world: Reco
     rng = np.random.default_rng(1)
     right, *wrong = (problem.chi(problem.residuals(*find_poses(problem, p, rng))[0]) for p in (truth, *others))
     assert right < 1 and min(wrong) > calibration.PREDICTED
+
+
+def test_an_insertion_that_cannot_be_simulated_has_the_error_of_no_motion(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.array([4])), threads=1)
+    parameters = np.zeros(len(problem.fitted))
+    names = [parameter.name for parameter in problem.fitted]
+    parameters[names.index("pad_kn")] = -6.0  # pads of 4 N/m do not hold the part
+    found = find_poses(problem, parameters, np.random.default_rng(0))
+    assert np.isfinite(found[0]).all() and np.isfinite(found[1]).all()
+    np.testing.assert_array_equal(problem.flow(*found), 0.0)
