@@ -19,7 +19,7 @@ from gelflow.policies.calibration.planning.motions import SCENARIOS, plan_motion
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.task import INSERTION
 
-_QUICK = FitSettings(starts=1, members=24, nearby=16, rounds=1, poses=8, steps=1)
+_QUICK = FitSettings(starts=1, members=24, nearby=16, poses=8, steps=1)
 
 
 def main() -> int:

@@ -22,8 +22,9 @@ from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
 
-# Error of the model that an ensemble allows for, and its spread around the best member, relative to the prior.
-_NEARBY = ((0.04, 0.2), (MODEL_ERROR, 0.1), (MODEL_ERROR, 0.05))
+# Ensembles and rounds of local searches after the global search. Of an ensemble: the error of the model that it allows
+# for, and its spread around the best member, relative to the prior.
+_PASSES = ((((0.04, 0.2), (MODEL_ERROR, 0.1)), 1), (((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3))
 _SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, relative to their prior
 _SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
@@ -36,7 +37,6 @@ class FitSettings:
     starts: int = 4  # independent fits
     members: int = 192  # of the first ensemble of the global search
     nearby: int = 80  # members of the ensembles around its result
-    rounds: int = 3  # of local searches and steps, at most
     poses: int = 32  # random poses of each insertion at each size of a search
     steps: int = 3  # of Levenberg-Marquardt in each round
 
@@ -125,20 +125,23 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
     problem = Problem(recordings, threads=1)
     try:
         point, poses = search_globally(rough_problem(recordings, threads=1), settings.members, rng)
-        for error, spread in _NEARBY:
-            problem.set_model_error(error)
-            point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
-        return _descend(problem, point, poses, rng, settings)
+        for ensembles, rounds in _PASSES:
+            for error, spread in ensembles:
+                problem.set_model_error(error)
+                point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
+            point, poses = _descend(problem, point, poses, rng, settings, rounds)
     except SimulationError:
         return None
+    chi = problem.chi(problem.residuals(point, poses)[0])
+    return StartResult(point, poses, covariance(problem, point, poses, chi), _cost(problem, point, poses), chi)
 
 
 def _descend(
-    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings
-) -> StartResult:
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, settings: FitSettings, rounds: int
+) -> tuple[Array, Array]:
     """Local searches of poses and start heights, and steps in parameters and start heights, in turn."""
     cost = _cost(problem, point, poses)
-    for _ in range(settings.rounds):
+    for _ in range(rounds):
         before = cost
         better, moved, found = refined_poses(problem, point, poses, rng, sizes=_SIZES, count=settings.poses)
         if better < cost:
@@ -147,8 +150,7 @@ def _descend(
         cost = _cost(problem, point, poses)
         if before - cost < _SUFFICIENT:
             break
-    chi = problem.chi(problem.residuals(point, poses)[0])
-    return StartResult(point, poses, covariance(problem, point, poses, chi), cost, chi)
+    return point, poses
 
 
 def _cost(problem: Problem, point: Array, poses: Array) -> float:

@@ -1,6 +1,7 @@
 """The least-squares problem of a calibration: residuals of flow maps, priors, and their derivatives."""
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -18,7 +19,9 @@ Array = NDArray[np.float64]
 
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
 CORRELATED = 9.0  # neighbouring markers that share this error: their residuals count as one
-DRIFT = 1e-3  # standard deviation of a common shift of all markers of a pad [N]
+# Standard deviation of a common shift of all markers of a pad between two readings [N]: that of each reading is up to
+# 3e-3, three times the limit of the randomization.
+DRIFT = 3e-3 * math.sqrt(2 / 3)
 # Half distance of the poses between which slopes by x, y [m] and yaw [rad] are taken. The forces have steps where
 # contact points cross edges of the hole: the slope of a smaller distance does not predict a finite change of pose.
 POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])

@@ -3,4 +3,4 @@
 from gelflow.policies.calibration.fit import FitSettings
 
 WORLD = 8  # all five parts are inserted, with little noise
-LITTLE = FitSettings(starts=1, members=24, nearby=16, rounds=1, poses=8, steps=1)
+LITTLE = FitSettings(starts=1, members=24, nearby=16, poses=8, steps=1)

@@ -211,7 +211,7 @@ def test_a_row_that_is_calibrated_and_fine_tuned(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_fit_is_reproducible(world: RecordedWorld) -> None:
-    settings = FitSettings(starts=1, members=8, nearby=8, rounds=1, poses=4, steps=1)
+    settings = FitSettings(starts=1, members=8, nearby=8, poses=4, steps=1)
     first, second = (fit(world.recordings.of(np.array([0])), seed=1, settings=settings) for _ in range(2))
     np.testing.assert_array_equal(first.best.point, second.best.point)
 

@@ -22,7 +22,7 @@ from gelflow.policies.calibration.session_recordings import nothing_recorded, re
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.session.motion_plan import save_motion_plan
 
-_QUICK = FitSettings(starts=2, members=48, nearby=32, rounds=1, poses=8, steps=1)
+_QUICK = FitSettings(starts=2, members=48, nearby=32, poses=8, steps=1)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
