@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import sys
 import tempfile
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import script
 from rich.table import Table
 
-from gelflow.policies.calibration.experiment.coverage import measure_coverage
+from gelflow.policies.calibration.experiment.coverage import counted, coverage_table, simulated_world
 from gelflow.policies.calibration.experiment.planned import measure_plan
 from gelflow.policies.calibration.experiment.transfer import measure_world, worlds
 from gelflow.policies.calibration.fit import FitSettings
@@ -44,21 +43,10 @@ def coverage(words: list[str]) -> int:
     count = 2 if args.quick else args.worlds
     seeds = range(args.first, args.first + count)
     settings = _QUICK if args.quick else FitSettings()
-    unfinished = _unfinished(args)
-    with script.progress("worlds", count) as advance:
-
-        def after_world(result: dict[str, Any]) -> None:
-            script.save(unfinished, result)
-            advance(1)
-
-        result = measure_coverage(
-            seeds, settings=settings, processes=2, measured=_results(unfinished), progress=after_world
-        )
-    table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
-    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
-    table.add_row(*(str(result[key]) for key in keys))
-    script.finish(args, script.header() | result, table)
-    unfinished.unlink(missing_ok=True)
+    result = counted(
+        script.measure_each(args, seeds, lambda seed: simulated_world(seed, settings=settings, processes=2), key="seed")
+    )
+    script.finish(args, script.header() | result, coverage_table(result))
     return 0
 
 
@@ -95,36 +83,18 @@ def transfer(words: list[str]) -> int:
     arguments = script.parser(transfer.__doc__ or "", out="transfer.json", quick="few insertions, no fine-tuning")
     args = arguments.parse_args(words)
     episodes, below = (32, 0.0) if args.quick else (512, 0.9)
-    unfinished = _unfinished(args)
-    rows = {row["world"]: row for row in _results(unfinished)}
-    with script.progress("worlds", len(worlds())) as advance:
-        for world in worlds():
-            if world.name not in rows:
-                with tempfile.TemporaryDirectory() as folder:
-                    rows[world.name] = measure_world(world, Path(folder), episodes=episodes, below=below, processes=2)
-                script.save(unfinished, _record(rows))
-            advance(1)
+
+    def measured(name: str) -> dict[str, Any]:
+        with tempfile.TemporaryDirectory() as folder:
+            return measure_world(named[name], Path(folder), episodes=episodes, below=below, processes=2)
+
+    named = {world.name: world for world in worlds()}
+    rows = script.measure_each(args, list(named), measured, key="world")
     table = Table("world", "shipped policy", "calibrated and fine-tuned")
-    for row in rows.values():
+    for row in rows:
         table.add_row(row["world"], *(_result(row, key) for key in ("before", "after")))
-    script.finish(args, _record(rows), table)
-    unfinished.unlink(missing_ok=True)
+    script.finish(args, script.header() | {"results": rows}, table)
     return 0
-
-
-def _unfinished(args: argparse.Namespace) -> Path:
-    """The file with the results of a run that is not finished."""
-    out: Path = args.out
-    return out.with_suffix(".quick.part" if args.quick else ".part")
-
-
-def _results(file: Path) -> list[dict[str, Any]]:
-    """The results of a run that was killed."""
-    return json.loads(file.read_text())["results"] if file.is_file() else []
-
-
-def _record(rows: dict[str, Any]) -> dict[str, Any]:
-    return script.header() | {"results": list(rows.values())}
 
 
 def _result(row: dict[str, Any], key: str) -> str:

@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,31 @@ def progress_share(name: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, completed=share)
 
 
+def measure_each(
+    args: argparse.Namespace, names: Sequence[Any], measure: Callable[[Any], dict[str, Any]], *, key: str
+) -> list[dict[str, Any]]:
+    """The row `measure` gives for each of `names`, which stands in the row under `key`.
+
+    Rows are stored after each measurement: the same command continues a run that was killed, until `finish`.
+    """
+    file = _unfinished(args)
+    stored = json.loads(file.read_text())["results"] if file.is_file() else []
+    rows = {row[key]: row for row in stored}
+    with progress("worlds", len(names)) as advance:
+        for name in names:
+            if name not in rows:
+                rows[name] = measure(name)
+                save(file, {"results": list(rows.values())})
+            advance(1)
+    return [rows[name] for name in names]
+
+
+def _unfinished(args: argparse.Namespace) -> Path:
+    """The file with the rows of a run that is not finished."""
+    out: Path = args.out
+    return out.with_suffix(".quick.part" if args.quick else ".part")
+
+
 def run(main: Callable[[], int]) -> int:
     """The exit status of `main`; 2, with a message on standard error, when it raises a gelflow error."""
     try:
@@ -74,6 +99,7 @@ def header() -> dict[str, Any]:
 def finish(args: argparse.Namespace, record: dict[str, Any], *tables: RenderableType) -> None:
     """Write the record to `args.out`; print the tables, or the record with --json."""
     write(args.out, record, args.json, *tables)
+    _unfinished(args).unlink(missing_ok=True)
 
 
 def write(file: Path, record: dict[str, Any], as_json: bool, *tables: RenderableType) -> None:

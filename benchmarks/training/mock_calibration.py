@@ -7,7 +7,6 @@ upper limits of the randomization; the calibration sees the recorded session onl
 was killed.
 """
 
-import json
 import tempfile
 import time
 from pathlib import Path
@@ -15,12 +14,11 @@ from typing import Any
 
 import numpy as np
 from benchmarks import script
-from rich.table import Table
 
 from gelflow.cli.mock_process import mock_robot
 from gelflow.errors import GelflowError
 from gelflow.policies.calibration.calibration import calibrate
-from gelflow.policies.calibration.experiment.coverage import counted, outcome
+from gelflow.policies.calibration.experiment.coverage import counted, coverage_table, outcome
 from gelflow.policies.calibration.experiment.worlds import widened
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_policy
@@ -40,21 +38,8 @@ def main() -> int:
     parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
     args = parser.parse_args()
     seeds = range(args.seed, args.seed + (1 if args.quick else args.worlds))
-    unfinished = args.out.with_suffix(".part")
-    measured = json.loads(unfinished.read_text())["results"] if unfinished.is_file() else []
-    rows: dict[int, Any] = {row["seed"]: row for row in measured}
-    with script.progress("worlds", len(seeds)) as advance:
-        for seed in seeds:
-            if seed not in rows:
-                rows[seed] = calibrated(seed, args.factor)
-                script.save(unfinished, counted(list(rows.values())))
-            advance(1)
-    result = counted(list(rows.values()))
-    table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
-    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
-    table.add_row(*(str(result[key]) for key in keys))
-    script.finish(args, script.header() | result, table)
-    unfinished.unlink(missing_ok=True)
+    result = counted(script.measure_each(args, seeds, lambda seed: calibrated(seed, args.factor), key="seed"))
+    script.finish(args, script.header() | result, coverage_table(result))
     return 0
 
 

@@ -56,7 +56,7 @@ def search_globally(
     poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
     found = _invert(problem, points, poses, _ROUNDS, rng)
     for spread in spreads:
-        found = search_nearby(problem, *found, spread, 2 * members // 3, rng, parameters=parameters)
+        found = search_nearby(problem, *found, spread, 2 * members // 3, rng, fixed=parameters is not None)
     return found
 
 
@@ -68,15 +68,15 @@ def search_nearby(
     members: int,
     rng: np.random.Generator,
     *,
-    parameters: Array | None = None,
+    fixed: bool = False,
 ) -> tuple[Array, Array]:
     """Unknowns and poses of the best member of an ensemble around `point` and `poses`, which are one of its members.
 
-    `spread` is relative to the prior; `parameters` as in `search_globally`.
+    `spread` is relative to the prior. With `fixed` all members have the parameters of `point`.
     """
     points = point + spread * rng.normal(size=(members, problem.size))
-    if parameters is not None:
-        points[:, : len(problem.fitted)] = parameters
+    if fixed:
+        points[:, : len(problem.fitted)] = point[: len(problem.fitted)]
     places = poses + spread * FREE * rng.normal(size=(members, *poses.shape))
     points[0], places[0] = point, poses
     return _invert(problem, points, places, _LATER_ROUNDS, rng)

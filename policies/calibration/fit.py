@@ -146,7 +146,7 @@ def _descend(
         better, moved, found = refined_poses(problem, point, poses, rng, sizes=_SIZES, count=settings.poses)
         if better < cost:
             point, poses = moved, found
-        point, _, _ = levenberg_marquardt(problem, point, poses, settings.steps)
+        point = _levenberg_marquardt(problem, point, poses, settings.steps)
         cost = _cost(problem, point, poses)
         if before - cost < _SUFFICIENT:
             break
@@ -157,10 +157,8 @@ def _cost(problem: Problem, point: Array, poses: Array) -> float:
     return problem.cost(problem.residuals(point, poses)[0], point) + float(prior_cost_of_all(problem, poses[None])[0])
 
 
-def levenberg_marquardt(
-    problem: Problem, point: Array, poses: Array, steps: int, damping: float = 1e-2
-) -> tuple[Array, float, float]:
-    """Up to `steps` Levenberg-Marquardt steps with fixed poses; returns the point, its cost and the damping.
+def _levenberg_marquardt(problem: Problem, point: Array, poses: Array, steps: int) -> Array:
+    """The point after up to `steps` Levenberg-Marquardt steps with fixed poses.
 
     The Jacobian is exact at the start, then follows the residuals (Broyden's update) until a step fails.
     """
@@ -171,7 +169,7 @@ def levenberg_marquardt(
     line = problem.linearize(point, poses)
     r = line.residuals.reshape(-1)
     jacobian = line.jacobian.reshape(len(r), -1)
-    fresh = True
+    damping, fresh = 1e-2, True
     for _ in range(steps):
         normal, gradient = problem.normal_equations(r, jacobian, point)
         before = cost
@@ -193,4 +191,4 @@ def levenberg_marquardt(
                 break
             line = problem.linearize(point, poses)
             jacobian, damping, fresh = line.jacobian.reshape(len(r), -1), 1e-2, True
-    return point, cost, damping
+    return point

@@ -70,9 +70,7 @@ class Problem:
         """Set the error of flow maps that residuals allow for; large values make the cost smooth."""
         self._model_error = relative
         self.sigma: Array = np.sqrt(self.noise**2 + (relative * self._power) ** 2 + 1e-12)
-        # Subtracting this part of a pad's mean whitens residuals with a common shift.
-        independent = self.markers / 2 / CORRELATED  # of each pad
-        self._shift = 1 - self.sigma / np.sqrt(self.sigma**2 + independent * DRIFT**2)
+        self._shift = part_of_mean(self.sigma, self.markers / 2)
 
     @property
     def insertions(self) -> int:
@@ -171,6 +169,14 @@ class Problem:
     def cost(self, residuals: Array, point: Array) -> float:
         """Robust negative log posterior."""
         return float(huber(residuals).sum() / CORRELATED + 0.5 * point @ point)
+
+
+def part_of_mean(sigma: Array, markers: float) -> Array:
+    """The part of a pad's mean whose subtraction whitens residuals with a common shift of the pad.
+
+    `sigma` is the standard deviation of its `markers`, of which `CORRELATED` count as one.
+    """
+    return np.asarray(1 - sigma / np.sqrt(sigma**2 + markers / CORRELATED * DRIFT**2))
 
 
 def huber(residuals: Array) -> Array:

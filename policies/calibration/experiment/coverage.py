@@ -1,10 +1,11 @@
 """How often the intervals of calibrations contain the truth, in random worlds that differ more than in training."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from gelflow.errors import GelflowError
 from gelflow.policies.calibration.calibration import Calibration, calibrate
@@ -12,30 +13,12 @@ from gelflow.policies.calibration.experiment.worlds import record_world
 from gelflow.policies.calibration.fit import FitSettings
 
 
-def measure_coverage(
-    seeds: Sequence[int],
-    *,
-    settings: FitSettings | None = None,
-    processes: int = 1,
-    measured: Sequence[dict[str, Any]] = (),
-    progress: Callable[[dict[str, Any]], None] = lambda result: None,
-) -> dict[str, Any]:
-    """Calibrate from five insertions in the world of each seed; returns each world's results and the counts.
+def counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
+    """The counts of the results of worlds, and the results.
 
     A world counts as covered when every parameter that is reported as known lies in its interval. Worlds that cannot
-    be recorded, because the gripper loses the part or no attempt has contact, are listed as refused. `measured` are the
-    results of worlds that are not measured again; `progress` gets the result so far after each world.
+    be recorded, because the gripper loses the part or no attempt has contact, count as refused.
     """
-    known = {world["seed"]: world for world in measured}
-    worlds: list[dict[str, Any]] = []
-    for seed in seeds:
-        worlds.append(known.get(seed) or _world(seed, settings, processes))
-        progress(counted(worlds))
-    return counted(worlds)
-
-
-def counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
-    """The counts of the results of worlds, and the results."""
     done = [world for world in worlds if "refused" not in world]
     known = [entry for world in done for entry in world["known"].values()]
     return {
@@ -48,7 +31,16 @@ def counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _world(seed: int, settings: FitSettings | None, processes: int) -> dict[str, Any]:
+def coverage_table(result: dict[str, Any]) -> Table:
+    """The counts as a table."""
+    table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
+    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
+    table.add_row(*(str(result[key]) for key in keys))
+    return table
+
+
+def simulated_world(seed: int, *, settings: FitSettings | None = None, processes: int = 1) -> dict[str, Any]:
+    """Calibrate from five insertions in the simulated world of a seed; its results, or why it was refused."""
     try:
         world = record_world(seed)
         begun = time.process_time()

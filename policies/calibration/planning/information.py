@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
-from gelflow.policies.calibration.problem import CORRELATED, DRIFT, MODEL_ERROR, POSE_STEP
+from gelflow.policies.calibration.problem import CORRELATED, MODEL_ERROR, POSE_STEP, part_of_mean
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -26,8 +26,7 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
         raise SimulationError("no descent can be simulated with these parameters")
     sigma = np.sqrt(noise**2 + (MODEL_ERROR**2) * (reading**2).mean((1, 2)) + 1e-12)
     per_pad = columns.reshape(len(sigma), 2, -1, 2, columns.shape[-1])
-    # A common shift of a pad is unknown as well.
-    shift = 1 - sigma / np.sqrt(sigma**2 + per_pad.shape[2] / CORRELATED * DRIFT**2)
+    shift = part_of_mean(sigma, per_pad.shape[2])  # a common shift of a pad is unknown as well
     per_pad = per_pad - shift[:, None, None, None, None] * per_pad.mean(2, keepdims=True)
     jacobian = per_pad.reshape(len(sigma), -1, columns.shape[-1]) / sigma[:, None, None]
     full = np.einsum("nki,nkj->nij", jacobian, jacobian) / CORRELATED
