@@ -120,6 +120,7 @@ LAB_RANGES = {
     "descent.settle": Range(0, 10, "s"),
     "descent.contact_shear_mm": Range(0.001, 1, "mm"),
     "descent.stop_shear_mm": Range(0.002, 2, "mm"),
+    "descent.planned_stop_shear_mm": Range(0.002, 2, "mm"),
     "descent.max_overshoot": Range(0.00002, 0.0005, "m"),
     "descent.max_depth": Range(0.0001, 0.01, "m"),
     "limits.stale_pose": Range(0.008, 0.1, "s", time_limit=True),

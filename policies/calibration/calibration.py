@@ -50,10 +50,16 @@ class FlowMaps:
     before: Array
     after: Array
     names: tuple[str, ...]  # of the attempts, (n,)
+    used: NDArray[np.bool_]  # markers that are compared (markers,)
+
+    @property
+    def noisy(self) -> int:
+        """Number of markers that are not compared."""
+        return int((~self.used).sum())
 
     def error(self, simulated: Array) -> float:
-        """Root mean square difference of a component of a marker vector."""
-        return float(np.sqrt(((simulated - self.recorded) ** 2).mean()))
+        """Root mean square difference of a component of a marker vector that is compared."""
+        return float(np.sqrt(((simulated - self.recorded)[:, self.used] ** 2).mean()))
 
 
 @dataclass(frozen=True)
@@ -95,10 +101,10 @@ class Calibration:
         maps = self.held_out
         if maps is None or self.explained:
             return ""
-        rest = maps.after - maps.recorded
+        rest = np.where(maps.used[:, None], maps.after - maps.recorded, np.nan)
         sides = rest.reshape(len(rest), 2, -1, 2)
-        power = (sides**2).mean((0, 2))
-        shift = float((sides.mean(2) ** 2).mean() / (sides**2).mean())
+        power = np.nanmean(sides**2, (0, 2))
+        shift = float((np.nanmean(sides, 2) ** 2).mean() / np.nanmean(sides**2))
         side, axis = np.unravel_index(int(power.argmax()), power.shape)
         times = maps.error(maps.after) / max(self.noise, 1e-30)
         return (
@@ -126,13 +132,15 @@ def calibrate(
     training = recordings.of(insertions[:-1]) if hold_out else recordings
     result = fit(training, seed=seed, settings=settings, processes=processes, progress=progress)
     problem = Problem(training)
+    problem.allow_for(drift=result.best.drift)
     rng = np.random.default_rng((seed, 0xCA1))
     point = result.best.point[: result.count]
     held_out, residual = None, None
     if hold_out:
         other = Problem(recordings.of(insertions[-1:]))
+        other.allow_for(drift=result.best.drift)
         found = find_poses(other, point, rng)
-        held_out, residual = _flow_maps(other, found, rng), other.chi(other.residuals(*found)[0])
+        held_out, residual = _flow_maps(other, found, rng), other.errors.chi(other.residuals(*found)[0])
     return Calibration(
         _estimates(problem.fitted, result, predicted=_predicted(residual) is not False),
         _pairs(problem.fitted, result),
@@ -190,4 +198,6 @@ def _flow_maps(problem: Problem, after: tuple[Array, Array], rng: np.random.Gene
     """Flow maps with the scene's values, whose poses and start heights are searched, and with a point and its poses."""
     before = find_poses(problem, problem.scene_point(), rng)
     recorded = problem.recorded_flow()
-    return FlowMaps(recorded, problem.flow(*before), problem.flow(*after), problem.recordings.names)
+    return FlowMaps(
+        recorded, problem.flow(*before), problem.flow(*after), problem.recordings.names, problem.errors.used
+    )

@@ -21,22 +21,29 @@ class SimulatedSession:
 
     recorded: Array
     simulated: Array
+    used: NDArray[np.bool_]  # markers that are compared (markers,)
 
     @property
     def error(self) -> float:
         """Root mean square difference of a component of a marker vector, over all attempts."""
-        return float(np.sqrt(((self.simulated - self.recorded) ** 2).mean()))
+        return float(np.sqrt((self._difference**2).mean()))
 
     @property
     def relative_error(self) -> Array:
         """Length of the difference of each attempt relative to that of its recorded flow map, (n,)."""
-        return np.asarray(_length(self.simulated - self.recorded) / np.maximum(_length(self.recorded), 1e-30))
+        return np.asarray(_length(self._difference) / np.maximum(_length(self.recorded[:, self.used]), 1e-30))
 
     @property
     def cosine(self) -> Array:
         """Cosine between recorded and simulated flow map of each attempt, (n,); 0 if there is no simulated contact."""
-        product = _length(self.simulated) * _length(self.recorded)
-        return np.asarray((self.simulated * self.recorded).sum((1, 2)) / np.maximum(product, 1e-30))
+        recorded, simulated = self.recorded[:, self.used], self.simulated[:, self.used]
+        return np.asarray(
+            (simulated * recorded).sum((1, 2)) / np.maximum(_length(simulated) * _length(recorded), 1e-30)
+        )
+
+    @property
+    def _difference(self) -> Array:
+        return np.asarray((self.simulated - self.recorded)[:, self.used])
 
 
 def _length(flow: Array) -> Array:
@@ -52,4 +59,4 @@ def simulate(
     """
     problem = Problem(recordings)
     point, poses = find_poses(problem, problem.scene_point(), np.random.default_rng(seed), progress)
-    return SimulatedSession(problem.recorded_flow(), problem.flow(point, poses))
+    return SimulatedSession(problem.recorded_flow(), problem.flow(point, poses), problem.errors.used)

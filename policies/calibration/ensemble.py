@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost_of_all
-from gelflow.policies.calibration.problem import CORRELATED, Problem, huber
+from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ def rough_problem(recordings: Recordings, *, threads: int | None = None) -> Prob
     The preset changes the flow maps by some thousandths in the median, far less than the error that is allowed for.
     """
     problem = Problem(recordings, threads=threads, preset="fast")
-    problem.set_model_error(_MODEL_ERROR)
+    problem.allow_for(model_error=_MODEL_ERROR)
     return problem
 
 
@@ -102,7 +102,7 @@ def _invert(
             break
         replaced = np.where(ok, np.arange(members), rng.choice(np.flatnonzero(ok), members))
         residuals, points, poses = residuals[replaced], points[replaced], poses[replaced]
-        share = min(left, _share(residuals))
+        share = min(left, _share(residuals, float(problem.errors.independent.sum())))
         left = left - share if share < left else 0.0
         unknowns = np.hstack([points, poses.reshape(members, -1) / scale])
         unknowns = _updated(unknowns, residuals, share, rng)
@@ -114,7 +114,7 @@ def _invert(
 def _residuals(problem: Problem, points: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Residuals (members, data) whose half squares add up to the robust cost, and which members could be simulated."""
     whitened, ok = problem.residuals_of(points, poses)
-    robust = np.sign(whitened) * np.sqrt(2 * huber(whitened) / CORRELATED)
+    robust = problem.errors.robust(whitened)
     return robust.reshape(len(points), -1), np.asarray(ok.all(axis=1))
 
 
@@ -124,9 +124,11 @@ def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> A
     return np.asarray(0.5 * (residuals**2).sum(1) + prior)
 
 
-def _share(residuals: Array) -> float:
-    """The part of the recordings for which the update stays in the range of the present residuals."""
-    independent = residuals.shape[1] / CORRELATED
+def _share(residuals: Array, independent: float) -> float:
+    """The part of the recordings for which the update stays in the range of the present residuals.
+
+    `independent` is the number of those that are independent.
+    """
     half_squares = 0.5 * (residuals**2).sum(1)
     by_mean = independent / (2 * half_squares.mean())
     by_spread = np.sqrt(independent / (2 * half_squares.var() + 1e-12))

@@ -16,8 +16,8 @@ from gelflow.errors import SimulationError
 from gelflow.helper_process import end_with_parent
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally, search_nearby
 from gelflow.policies.calibration.poses import prior_cost_of_all, refined_poses
-from gelflow.policies.calibration.problem import MODEL_ERROR, Problem
-from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.recordings import MODEL_ERROR, Recordings
 from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
@@ -50,6 +50,7 @@ class StartResult:
     covariance: Array  # of the unknowns, with unknown poses
     cost: float
     chi: float  # root mean square of the whitened residuals
+    drift: float  # standard deviation of a common shift of all markers of a pad [N]
 
 
 @dataclass(frozen=True)
@@ -127,13 +128,16 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
         point, poses = search_globally(rough_problem(recordings, threads=1), settings.members, rng)
         for ensembles, rounds in _PASSES:
             for error, spread in ensembles:
-                problem.set_model_error(error)
+                problem.allow_for(model_error=error)
                 point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
+            problem.allow_for_present_drift(point, poses)
             point, poses = _descend(problem, point, poses, rng, settings, rounds)
     except SimulationError:
         return None
-    chi = problem.chi(problem.residuals(point, poses)[0])
-    return StartResult(point, poses, covariance(problem, point, poses, chi), _cost(problem, point, poses), chi)
+    chi = problem.errors.chi(problem.residuals(point, poses)[0])
+    return StartResult(
+        point, poses, covariance(problem, point, poses, chi), _cost(problem, point, poses), chi, problem.errors.drift
+    )
 
 
 def _descend(

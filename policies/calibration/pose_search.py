@@ -34,6 +34,7 @@ def find_poses(
     point, poses = np.zeros(problem.size), np.zeros((problem.insertions, 3))
     point[: len(parameters)] = parameters
     rough = rough_problem(problem.recordings)
+    rough.allow_for(drift=problem.errors.drift)
     for i in range(problem.insertions):
         found = _search(problem.of(i), rough.of(i), parameters, rng)
         point[len(parameters) :][problem.recordings.insertion == i] = found[0][len(parameters) :]
@@ -54,6 +55,6 @@ def _search(problem: Problem, rough: Problem, parameters: Array, rng: np.random.
         cost, *found = refined_poses(problem, *start, rng, sizes=_SIZES, count=_POSES)
         if cost < lowest:
             lowest, best = cost, (found[0], found[1])
-        if problem.chi(problem.residuals(*best)[0]) <= _EXPLAINED:
+        if problem.errors.chi(problem.residuals(*best)[0]) <= _EXPLAINED:
             break
     return best

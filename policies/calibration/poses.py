@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.geometry import apply_planar
-from gelflow.policies.calibration.problem import CORRELATED, Problem, huber, in_hole
+from gelflow.policies.calibration.problem import Problem, in_hole
 
 Array = NDArray[np.float64]
 
@@ -93,10 +93,11 @@ def _by_shape(problem: Problem, point: Array, insertion: int, poses: Array, keep
     rows = np.repeat(attempts, m)
     z = np.repeat(problem.heights(point)[attempts], m)
     flow, ok = _simulate(problem, point, rows, np.tile(poses, (len(attempts), 1)), z)
-    model = problem.whiten(flow, rows)
-    data = problem.whiten(problem.data[rows], rows)
+    model = problem.errors.whiten(flow, rows)
+    data = problem.errors.whiten(problem.data[rows], rows)
     scale = np.clip((model * data).sum(1) / np.maximum((model**2).sum(1), 1e-12), 0.2, 5.0)
-    cost = np.where(ok, huber(scale[:, None] * model - data).sum(1) / CORRELATED, 1e9).reshape(len(attempts), m).sum(0)
+    misfit = problem.errors.misfit(scale[:, None] * model - data, rows)
+    cost = np.where(ok, misfit, 1e9).reshape(len(attempts), m).sum(0)
     return poses[np.argsort(cost + prior_cost(problem, insertion, poses))[:keep]]
 
 
@@ -121,7 +122,7 @@ def _with_heights(
             np.tile(np.repeat(poses, h, 0), (len(attempts), 1)),
             problem.recordings.height_spread * tried,
         )
-        fit = huber(problem.whiten(flow - problem.data[rows], rows)).sum(1) / CORRELATED + 0.5 * tried**2
+        fit = problem.errors.misfit(problem.errors.whiten(flow - problem.data[rows], rows), rows) + 0.5 * tried**2
         cost = np.where(ok, fit, 1e9).reshape(len(attempts), m, h)
         best = cost.argmin(2)
         chosen = np.take_along_axis(tried.reshape(cost.shape), best[..., None], 2)[..., 0]

@@ -1,7 +1,7 @@
 """The least-squares problem of a calibration: residuals of flow maps, priors, and their derivatives."""
 
 import copy
-import math
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.geometry import compose_planar
+from gelflow.policies.calibration.model.error_model import ErrorModel
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.recordings import Recordings
@@ -17,23 +18,17 @@ from gelflow.sim.tasks.insertion_randomization import NOMINAL
 
 Array = NDArray[np.float64]
 
-MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
-CORRELATED = 9.0  # neighbouring markers that share this error: their residuals count as one
-# Standard deviation of a common shift of all markers of a pad between two readings [N]: that of each reading is up to
-# 3e-3, three times the limit of the randomization.
-DRIFT = 3e-3 * math.sqrt(2 / 3)
 # Half distance of the poses between which slopes by x, y [m] and yaw [rad] are taken. The forces have steps where
 # contact points cross edges of the hole: the slope of a smaller distance does not predict a finite change of pose.
 POSE_STEP = np.array([0.5e-3, 0.5e-3, np.radians(1.0)])
-_HUBER = 3.0  # residuals beyond this many standard deviations count linearly
 
 
 @dataclass(frozen=True)
 class Linearization:
     """Residuals of all attempts at a point, and their Jacobian."""
 
-    residuals: Array  # (n, markers * 2), whitened
-    jacobian: Array  # (n, markers * 2, unknowns)
+    residuals: Array  # (n, 2 * markers), whitened
+    jacobian: Array  # (n, 2 * markers, unknowns)
 
 
 class Problem:
@@ -51,26 +46,31 @@ class Problem:
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
         self.noise = recordings.noise() / self._scale
-        self._set_recordings(recordings, MODEL_ERROR)
+        self._set_recordings(recordings)
 
     def of(self, insertion: int) -> "Problem":
         """The same problem with the attempts of one insertion only."""
         result = copy.copy(self)
-        result._set_recordings(self.recordings.of(np.array([insertion])), self._model_error)
+        result._set_recordings(self.recordings.of(np.array([insertion])))
+        result.allow_for(model_error=self.errors.model_error, drift=self.errors.drift)
         return result
 
-    def _set_recordings(self, recordings: Recordings, model_error: float) -> None:
+    def _set_recordings(self, recordings: Recordings) -> None:
         self.recordings = recordings
         self.data = recordings.flow.reshape(len(recordings), -1, 2) / self._scale
-        self.markers = self.data.shape[1]
-        self._power = np.sqrt((self.data**2).mean((1, 2)))
-        self.set_model_error(model_error)
+        self.errors = ErrorModel(self.noise, np.sqrt((self.data**2).mean((1, 2))), recordings.used)
 
-    def set_model_error(self, relative: float) -> None:
-        """Set the error of flow maps that residuals allow for; large values make the cost smooth."""
-        self._model_error = relative
-        self.sigma: Array = np.sqrt(self.noise**2 + (relative * self._power) ** 2 + 1e-12)
-        self._shift = part_of_mean(self.sigma, self.markers / 2)
+    def allow_for(self, *, model_error: float | None = None, drift: float | None = None) -> None:
+        """Set the errors that residuals allow for, see `ErrorModel`; a large model error makes the cost smooth."""
+        if model_error is not None:
+            self.errors = dataclasses.replace(self.errors, model_error=model_error)
+        if drift is not None:
+            self.errors = dataclasses.replace(self.errors, drift=drift)
+
+    def allow_for_present_drift(self, point: Array, misalignment: Array) -> None:
+        """Allow for the common shifts of pads that the differences at a point show."""
+        difference = self.flow(point, misalignment) / self._scale - self.data
+        self.allow_for(drift=self.errors.estimated_drift(difference))
 
     @property
     def insertions(self) -> int:
@@ -118,19 +118,13 @@ class Problem:
         """Recorded flow maps (n, markers, 2), in the unit of the recordings."""
         return self._scale * self.data
 
-    def whiten(self, difference: Array, rows: NDArray[np.int64]) -> Array:
-        """Whitened residuals (m, markers * 2) of differences (m, markers, 2) of the attempts `rows`."""
-        per_pad = difference.reshape(len(rows), 2, -1, 2)
-        per_pad = per_pad - self._shift[rows][:, None, None, None] * per_pad.mean(2, keepdims=True)
-        return np.asarray(per_pad.reshape(len(rows), -1) / self.sigma[rows][:, None])
-
     def residuals(self, point: Array, misalignment: Array) -> tuple[Array, bool]:
-        """Whitened residuals (n, markers * 2) with the misalignment (insertions, 3) of each insertion."""
+        """Whitened residuals (n, 2 * markers) with the misalignment (insertions, 3) of each insertion."""
         residuals, ok = self.residuals_of(point[None], misalignment[None])
         return residuals[0], bool(ok.all())
 
     def residuals_of(self, points: Array, misalignment: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Whitened residuals (m, n, markers * 2) and whether they could be simulated (m, n), of m guesses.
+        """Whitened residuals (m, n, 2 * markers) and whether they could be simulated (m, n), of m guesses.
 
         A guess has unknowns (size,) and a misalignment (insertions, 3).
         """
@@ -139,11 +133,11 @@ class Problem:
         values = {name: np.repeat(value, n) for name, value in self.values(points).items()}
         poses = misalignment[:, self.recordings.insertion].reshape(-1, 3)
         flow, ok = self.predicted(values, rows, poses, self.heights(points).reshape(-1))
-        return self.whiten(flow - self.data[rows], rows).reshape(m, n, -1), ok.reshape(m, n)
+        return self.errors.whiten(flow - self.data[rows], rows).reshape(m, n, -1), ok.reshape(m, n)
 
     def normal_equations(self, residuals: Array, jacobian: Array, point: Array) -> tuple[Array, Array]:
         """Gauss-Newton Hessian and gradient of `cost`, from flat residuals (m,) and their Jacobian (m, unknowns)."""
-        weights = huber_weights(residuals) / CORRELATED
+        weights = self.errors.weights(residuals.reshape(len(self.recordings), -1)).reshape(-1)
         return jacobian.T @ (weights[:, None] * jacobian) + np.eye(self.size), jacobian.T @ (
             weights * residuals
         ) + point
@@ -155,39 +149,15 @@ class Problem:
         descents = Descents(pose, self.heights(point), self.recordings.depth)
         reading, slopes = self.readings.slopes(point, descents)
         rows = np.arange(n)
-        jacobian = np.zeros((n, self.markers * 2, self.size))
+        jacobian = np.zeros((n, 2 * self.errors.markers, self.size))
         for i in range(count):
-            jacobian[:, :, i] = self.whiten(slopes[i], rows)
-        jacobian[rows, :, count + rows] = self.whiten(slopes[count], rows)
-        return Linearization(self.whiten(reading - self.data, rows), jacobian)
-
-    @staticmethod
-    def chi(residuals: Array) -> float:
-        """Robust root mean square of whitened residuals: 1 as expected from noise and model error."""
-        return float(np.sqrt((huber_weights(residuals) * residuals**2).mean()))
+            jacobian[:, :, i] = self.errors.whiten(slopes[i], rows)
+        jacobian[rows, :, count + rows] = self.errors.whiten(slopes[count], rows)
+        return Linearization(self.errors.whiten(reading - self.data, rows), jacobian)
 
     def cost(self, residuals: Array, point: Array) -> float:
         """Robust negative log posterior."""
-        return float(huber(residuals).sum() / CORRELATED + 0.5 * point @ point)
-
-
-def part_of_mean(sigma: Array, markers: float) -> Array:
-    """The part of a pad's mean whose subtraction whitens residuals with a common shift of the pad.
-
-    `sigma` is the standard deviation of its `markers`, of which `CORRELATED` count as one.
-    """
-    return np.asarray(1 - sigma / np.sqrt(sigma**2 + markers / CORRELATED * DRIFT**2))
-
-
-def huber(residuals: Array) -> Array:
-    """Half the square of residuals, linear beyond the limit."""
-    size = np.abs(residuals)
-    return np.where(size <= _HUBER, 0.5 * residuals**2, _HUBER * (size - 0.5 * _HUBER))
-
-
-def huber_weights(residuals: Array) -> Array:
-    """Weights of residuals in iteratively reweighted least squares."""
-    return np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12))
+        return float(self.errors.misfit(residuals).sum() + self.errors.log_determinant + 0.5 * point @ point)
 
 
 def in_hole(misalignment: Array, planar_pose: Array) -> Array:

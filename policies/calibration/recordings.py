@@ -12,6 +12,9 @@ from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
+MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
+_NOISY = 3.0  # median deviation of a noisy marker from its neighbours, relative to noise and model error
+
 
 @dataclass(frozen=True)
 class Recordings:
@@ -34,6 +37,12 @@ class Recordings:
     grasp_force: float | None = None  # commanded [N]; None: not recorded
     grasp_height: float | None = None  # of the pad centres above the part's centre, by the lab file [m]
     height_spread: float = 0.2e-3 / math.sqrt(3)  # standard deviation of the start height of an attempt [m]
+    # Markers that are compared, (pads * rows * cols,); empty: those that are not noisy.
+    used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        if not len(self.used):
+            object.__setattr__(self, "used", ~self._noisy())
 
     def __len__(self) -> int:
         return len(self.insertion)
@@ -55,6 +64,7 @@ class Recordings:
             self.grasp_force,
             self.grasp_height,
             self.height_spread,
+            self.used,
         )
 
     def noise(self) -> float:
@@ -70,3 +80,14 @@ class Recordings:
         second = corner - 2 * edge + 4 * f[:, :, 1:-1, 1:-1]
         of_pads = np.median(np.abs(second).reshape(f.shape[0] * f.shape[1], -1), axis=1)
         return float(np.quantile(of_pads, 0.25) / 0.6745 / 6)
+
+    def _noisy(self) -> NDArray[np.bool_]:
+        """Markers that deviate from the median of their neighbours in most attempts (pads * rows * cols,)."""
+        n, pads, rows, cols, _ = self.flow.shape
+        if n == 0:
+            return np.zeros(pads * rows * cols, dtype=bool)
+        padded = np.pad(self.flow, ((0, 0), (0, 0), (1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+        near = [padded[:, :, i : i + rows, j : j + cols] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+        expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * (self.flow**2).mean((1, 2, 3, 4)) + 1e-30)
+        deviation = np.abs(self.flow - np.nanmedian(near, axis=0)) / expected[:, None, None, None, None]
+        return np.asarray(np.median(deviation, axis=(0, 4)) > _NOISY).reshape(-1)

@@ -36,6 +36,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
         "flow_maps": {
             "unit": result.unit,
             "noise": result.noise,
+            "noisy_markers": result.fitted.noisy,
             "fitted": _errors(result.fitted),
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
@@ -157,6 +158,8 @@ def error_lines(result: Calibration) -> list[str]:
             f"{len(maps.recorded)} {kind} flow maps: error {before:.3g} {result.unit} before, "
             f"{after:.3g} {result.unit} after calibration; noise {result.noise:.3g} {result.unit}"
         )
+    if noisy := result.fitted.noisy:
+        lines.append(f"{noisy} of {len(result.fitted.used)} markers are too noisy and are not compared")
     if not result.reproduced:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.policies.calibration.poses import prior_cost_of_all, prior_information
-from gelflow.policies.calibration.problem import CORRELATED, POSE_STEP, Problem, huber, huber_weights
+from gelflow.policies.calibration.problem import POSE_STEP, Problem
 
 Array = NDArray[np.float64]
 
@@ -35,10 +35,9 @@ def covariance(problem: Problem, point: Array, poses: Array, chi: float) -> Arra
 def _gauss_newton(problem: Problem, point: Array, poses: Array, scale: float) -> Array:
     """Covariance of the unknowns and of the poses of all insertions, in units of `POSE_STEP`."""
     line = problem.linearize(point, poses)
-    residuals = line.residuals.reshape(-1) / scale
-    weights = huber_weights(residuals) / CORRELATED
+    weights = problem.errors.weights(line.residuals / scale).reshape(-1)
     columns = np.concatenate([line.jacobian, _pose_columns(problem, point, poses)], -1)
-    jacobian = columns.reshape(len(residuals), -1) / scale
+    jacobian = columns.reshape(len(weights), -1) / scale
     information = jacobian.T @ (weights[:, None] * jacobian)
     information[np.arange(problem.size), np.arange(problem.size)] += 1.0
     for i in range(len(poses)):
@@ -48,9 +47,9 @@ def _gauss_newton(problem: Problem, point: Array, poses: Array, scale: float) ->
 
 
 def _pose_columns(problem: Problem, point: Array, poses: Array) -> Array:
-    """Changes of the whitened residuals per `POSE_STEP` of each insertion's pose, (n, markers * 2, 3 * insertions)."""
+    """Changes of the whitened residuals per `POSE_STEP` of each insertion's pose, (n, 2 * markers, 3 * insertions)."""
     n, rows = len(problem.recordings), np.arange(len(problem.recordings))
-    result = np.zeros((n, problem.markers * 2, 3 * len(poses)))
+    result = np.zeros((n, 2 * problem.errors.markers, 3 * len(poses)))
     for axis in range(3):
         sides = [_residuals(problem, point[None], (poses + s * np.diag(POSE_STEP)[axis])[None])[0] for s in (1, -1)]
         result[rows, :, 3 * problem.recordings.insertion + axis] = (sides[0] - sides[1]) / 2
@@ -58,7 +57,7 @@ def _pose_columns(problem: Problem, point: Array, poses: Array) -> Array:
 
 
 def _residuals(problem: Problem, points: Array, poses: Array) -> Array:
-    """Whitened residuals (m, n, markers * 2) at points (m, size) with poses (m, insertions, 3); nan where they fail."""
+    """Whitened residuals (m, n, 2 * markers) at points (m, size) with poses (m, insertions, 3); nan where they fail."""
     residuals, ok = problem.residuals_of(points, poses)
     residuals[~ok] = np.nan
     return residuals
@@ -67,7 +66,7 @@ def _residuals(problem: Problem, points: Array, poses: Array) -> Array:
 def _costs(problem: Problem, points: Array, poses: Array, scale: float) -> Array:
     """Negative log posterior (m,) with residuals divided by `scale`; inf where a simulation fails."""
     residuals = _residuals(problem, points, poses) / scale
-    fit = huber(residuals).sum((1, 2)) / CORRELATED
+    fit = problem.errors.misfit(residuals).sum(1)
     prior = 0.5 * (points**2).sum(1) + prior_cost_of_all(problem, poses)
     return np.asarray(np.nan_to_num(fit + prior, nan=np.inf))
 

@@ -201,11 +201,14 @@ class InsertionAttempts:
             values[rows] = getattr(sim, name)[:n]
         self._grasp_shear[rows] = sim.tactile()[:n, :, :2]
 
-    def attempt(self, rng: np.random.Generator, *, which: Mask | None = None) -> AttemptResult:
+    def attempt(
+        self, rng: np.random.Generator, *, which: Mask | None = None, stop_shear: float | None = None
+    ) -> AttemptResult:
         """Simulate one attempt in the environments `which` (N,), or in all, starting from `pose`.
 
-        As on the robot, contact stops the descent: later frames repeat the forces at the stop. The first axis of the
-        results counts the environments in `which`.
+        As on the robot, contact stops the descent: later frames repeat the forces at the stop. `stop_shear` is the mean
+        shear of the markers that stops it [N]; None: that of the randomization. The first axis of the results counts
+        the environments in `which`.
         """
         chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
         rows = np.flatnonzero(chosen)
@@ -217,7 +220,7 @@ class InsertionAttempts:
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
         depth = np.full(len(rows), self.task.descent)
         for part in _parts(len(rows)):
-            trajectory = self._simulate(rows[part], jitter[part], steps)
+            trajectory = self._simulate(rows[part], jitter[part], steps, stop_shear)
             n = len(rows[part])
             for k, step in enumerate(steps):
                 # The markers of the start are those of the closed grasp.
@@ -240,14 +243,14 @@ class InsertionAttempts:
         along = change[..., 0].reshape(len(rows), len(PADS), -1).mean(2)
         return np.asarray(along.max(1) > _CONTACT * self._stop_shear[rows])
 
-    def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
-        """The descent of the grippers `rows`, read after `steps`."""
+    def _simulate(self, rows: Rows, jitter: Array, steps: list[int], stop_shear: float | None = None) -> Trajectory:
+        """The descent of the grippers `rows`, read after `steps`; `stop_shear` as in `attempt`."""
         sim, n, z = self.sim, len(rows), self._arm_u[2]
         start = self._start(rows, jitter)
         u = np.repeat(start[None], self._steps, axis=0)
         u[:, :n, z] = start[:n, z] - (self.task.descent * np.arange(1, self._steps + 1) / self._steps)[:, None]
         threshold = np.full(sim.num_envs, np.inf)
-        threshold[:n] = self._stop_shear[rows]
+        threshold[:n] = self._stop_shear[rows] if stop_shear is None else stop_shear
         can_stop = self._reference_at < self._steps
         self._trajectory = trajectory = sim.rollout(
             u,

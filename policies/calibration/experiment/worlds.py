@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.observation import FlowMap
 from gelflow.policies.calibration.model.parameters import COMMANDED_FORCE, TAUGHT_HEIGHT, WIDENING
+from gelflow.policies.calibration.model.reading_model import displacement_scale
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_network
@@ -113,11 +114,13 @@ def _planned(
     world: InsertionAttempts, misalignment: Array, plan: Sequence[PlannedMotion], rng: np.random.Generator
 ) -> list[_Row]:
     """The motions of a plan on the first part; those that fall into the hole have no contact and are not recorded."""
+    per_newton = displacement_scale(world.scene)
     rows = []
     for motion in plan:
         planar = np.array(motion.planar_pose)
         world.pose[0] = in_hole(misalignment[0], planar)
-        result = world.attempt(rng, which=np.arange(world.num_envs) == 0)
+        stop = None if motion.stop_shear_mm is None else motion.stop_shear_mm / per_newton
+        result = world.attempt(rng, which=np.arange(world.num_envs) == 0, stop_shear=stop)
         if result.failed[0]:
             raise UsageError("this world cannot be simulated")
         if not result.inserted[0]:

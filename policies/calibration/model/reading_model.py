@@ -9,6 +9,8 @@ from gelflow.policies.calibration.model.pad_model import PadModel
 from gelflow.policies.calibration.model.parameters import Parameter, parameters
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.recordings import Recordings
+from gelflow.sim.displacement import marker_displacement
+from gelflow.sim.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -29,7 +31,7 @@ class ReadingModel:
         self.pads = PadModel([pad.positions for pad in self.forces.scene.pads])
         self.height_spread = recordings.height_spread
         # Unit of the recordings per newton of a reading.
-        self.scale = 1.0 if recordings.unit == "N" else _displacement_scale(self.forces)
+        self.scale = 1.0 if recordings.unit == "N" else displacement_scale(self.forces.scene)
 
     def values(self, point: Array) -> dict[str, Array]:
         """Values of the parameters from points (…, at least the parameters)."""
@@ -71,10 +73,8 @@ class ReadingModel:
         return found
 
 
-def _displacement_scale(model: ShearModel) -> float:
+def displacement_scale(scene: Scene) -> float:
     """Displacement of a marker per force of the scene's gel [mm/N]."""
-    forces = np.zeros((1, model.scene.num_markers, 3))
+    forces = np.zeros((1, scene.num_markers, 3))
     forces[0, 0, 0] = 1.0
-    from gelflow.sim.displacement import marker_displacement
-
-    return float(1e3 * marker_displacement(model.scene, forces, np.float64)[0, 0, 0])
+    return float(1e3 * marker_displacement(scene, forces, np.float64)[0, 0, 0])

@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
+from gelflow.policies.calibration.model.error_model import ErrorModel
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
-from gelflow.policies.calibration.problem import CORRELATED, MODEL_ERROR, POSE_STEP, part_of_mean
+from gelflow.policies.calibration.problem import POSE_STEP
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -24,12 +25,10 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
     reading, columns, ok = _slopes(readings, point, descents)
     if not ok.any():
         raise SimulationError("no descent can be simulated with these parameters")
-    sigma = np.sqrt(noise**2 + (MODEL_ERROR**2) * (reading**2).mean((1, 2)) + 1e-12)
-    per_pad = columns.reshape(len(sigma), 2, -1, 2, columns.shape[-1])
-    shift = part_of_mean(sigma, per_pad.shape[2])  # a common shift of a pad is unknown as well
-    per_pad = per_pad - shift[:, None, None, None, None] * per_pad.mean(2, keepdims=True)
-    jacobian = per_pad.reshape(len(sigma), -1, columns.shape[-1]) / sigma[:, None, None]
-    full = np.einsum("nki,nkj->nij", jacobian, jacobian) / CORRELATED
+    errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool))
+    rows = np.arange(len(reading))
+    jacobian = np.stack([errors.whiten(columns[..., i], rows) for i in range(columns.shape[-1])], -1)
+    full = np.einsum("nki,nkj->nij", jacobian, jacobian) / errors.repeated[:, None, None]
     full[:, -1, -1] += 1.0
     of_height = full[:, :-1, -1]
     result = full[:, :-1, :-1] - of_height[:, :, None] * of_height[:, None, :] / full[:, -1:, -1:]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.policies.calibration.fit import FitResult
-from gelflow.policies.calibration.model.reading_model import ReadingModel
+from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import in_hole
@@ -31,7 +31,7 @@ MOTIONS = 5  # of a plan
 USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before anything is recorded [N]
 _OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
 _YAWS = np.radians([-8.0, 0.0, 8.0])
-_STOP_SHEAR = 0.012  # mean shear of a pad at which contact stops a descent [N]: 0.12 mm of a gel of the scene
+STOP_SHEAR_MM = 0.25  # mean shear of a pad at which contact stops a planned descent, unless a lab allows less
 _LEVELS = 8  # depths at which the stop is searched, a constant ratio apart
 _FIRST_LEVEL = 0.44e-3  # [m] below the start of an attempt, shortly before the rim
 _SPREAD = 0.7  # of the scenarios' parameters, relative to the prior
@@ -52,6 +52,7 @@ def plan_motions(
     fitted: FitResult | None = None,
     count: int = MOTIONS,
     workspace: tuple[float, float, float] | None = None,
+    stop_shear_mm: float = STOP_SHEAR_MM,
     scenarios: int = SCENARIOS,
     seed: int = 0,
     progress: Callable[[int], None] = lambda done: None,
@@ -63,6 +64,7 @@ def plan_motions(
     recordings: give task, unit and grasp, and the noise if they have attempts
     fitted: what is known already; None: the priors
     workspace: largest |x|, |y| [m], |yaw| [rad] of the gripper about the taught hole; None: that of the task
+    stop_shear_mm: mean shear along the finger at which contact stops a descent: more has more information
     scenarios: number of scenarios over which the information is averaged
     progress: gets the number of finished scenarios
 
@@ -77,13 +79,13 @@ def plan_motions(
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
-            found.append(_scenario(readings, point, in_hole(misalignment, candidates), noise))
+            found.append(_scenario(readings, point, in_hole(misalignment, candidates), noise, stop_shear_mm))
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
     before: Array = np.eye(len(readings.fitted)) if fitted is None else np.asarray(np.linalg.inv(fitted.covariance))
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
-    motions = tuple(PlannedMotion(x, y, yaw, task.descent) for x, y, yaw in candidates[chosen].tolist())
+    motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in candidates[chosen].tolist())
     names = [p.name for p in readings.fitted]
     widths = (np.sqrt(np.diag(np.linalg.inv(before))), after)
     return Plan(motions, gains, {name: (float(a), float(b)) for name, a, b in zip(names, *widths, strict=True)})
@@ -116,7 +118,7 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
     return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
 
 
-def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float) -> Array:
+def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float, stop_shear_mm: float) -> Array:
     """Information (n, count + 3, count + 3) of attempts at poses in the hole frame, down to their stops by contact."""
     n, task = len(poses), readings.forces.task
     depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
@@ -125,7 +127,7 @@ def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float) 
     reading, _ = readings.read(values, descents)
     shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
     shear[:, -1] = np.inf
-    stop = depths[(shear > _STOP_SHEAR).argmax(1)]
+    stop = depths[(shear > stop_shear_mm / displacement_scale(readings.forces.scene)).argmax(1)]
     return information(readings, point, Descents(poses, np.zeros(n), stop), noise)
 
 

@@ -147,9 +147,12 @@ class HeldPart:
             self._set_rim(found)
         return contact is None
 
-    def descend(self, planar_pose: PlanarPose, observer: TactileObserver, depth_below: float) -> Descent:
+    def descend(
+        self, planar_pose: PlanarPose, observer: TactileObserver, depth_below: float, stop_shear_mm: float | None = None
+    ) -> Descent:
         """Descend by `depth_below` [m] while `observer`, whose reference was taken at the start, keeps the readings.
 
+        `stop_shear_mm` replaces that of the lab file. As there, a gel on which the weight shows less stops earlier.
         Raises PartSlipped when the pads do not show the part's weight at the start, or the part slips by too much.
         """
         self._observe(observer)
@@ -157,6 +160,8 @@ class HeldPart:
         start = self._motion.pose().position[2]
         slip = SlipMonitor(self.thresholds.contact)
         too_deep = min(depth_below + _BEYOND, self._lab.descent.max_depth)
+        of_lab = self._lab.descent.stop_shear_mm
+        stop = self.thresholds.stop * (1.0 if stop_shear_mm is None else stop_shear_mm / of_lab)
 
         def on_reading(reading: TactileReading) -> bool:
             depth = self._keep(reading, start)
@@ -166,7 +171,7 @@ class HeldPart:
 
         contact = self._guard.move(
             self._pose(planar_pose, self.start_height - depth_below),
-            threshold=self.thresholds.stop,
+            threshold=stop,
             measure=along_finger,
             speed=self._lab.descent.speed,
             within=_AT_DEPTH,

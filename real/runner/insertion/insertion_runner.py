@@ -222,8 +222,9 @@ class InsertionRunner:
         self._motion.supervisor.phases.enter(Phase.DESCEND)
         self._motion.wait(self._lab.descent.settle)
         observer = self._observer()
-        depth = self._motions[index].depth if self._motions else self._task.descent
-        descent = part.descend(planar_pose, observer, depth)
+        motion = self._motions[index] if self._motions else None
+        depth, stop = (self._task.descent, None) if motion is None else (motion.depth, motion.stop_shear_mm)
+        descent = part.descend(planar_pose, observer, depth, stop)
         last, frames = descent.last, observer.chosen((depth,) if self._motions else self._task.frame_depths)
         contact = last.shear > part.thresholds.contact
         reached = self._task.start_height - last.depth < self._task.success_height

@@ -14,7 +14,7 @@ from gelflow.policies.calibration.fit import FitResult, StartResult
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
-from gelflow.policies.calibration.planning.motions import plan_motions
+from gelflow.policies.calibration.planning.motions import STOP_SHEAR_MM, plan_motions
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.policies.calibration.uncertainty import covariance
@@ -23,7 +23,7 @@ from gelflow.task import INSERTION
 
 LAB = nothing_recorded(INSERTION, grasp_force=12.0, grasp_height=0.0)
 NEAR = (4e-3, 4e-3, 0.0)  # a workspace with few candidates
-MOTIONS = (PlannedMotion(3e-3, -2e-3, 0.1, 1.1e-3), PlannedMotion(-6e-3, 0.0, -0.14, 0.9e-3))
+MOTIONS = (PlannedMotion(3e-3, -2e-3, 0.1, 1.1e-3), PlannedMotion(-6e-3, 0.0, -0.14, 0.9e-3, 0.25))
 
 
 def test_a_plan_file_has_the_motions_that_were_written(tmp_path: Path) -> None:
@@ -31,6 +31,7 @@ def test_a_plan_file_has_the_motions_that_were_written(tmp_path: Path) -> None:
     read = load_motion_plan(tmp_path / "plan.toml")
     for motion, expected in zip(read, MOTIONS, strict=True):
         assert (*motion.planar_pose, motion.depth) == pytest.approx((*expected.planar_pose, expected.depth), abs=1e-6)
+        assert motion.stop_shear_mm == expected.stop_shear_mm
     with pytest.raises(UsageError, match="exists; name a new file"):
         save_motion_plan(MOTIONS, tmp_path / "plan.toml", title="a test")
 
@@ -66,7 +67,7 @@ def test_attempts_without_contact_have_no_information(world: RecordedWorld) -> N
 def test_a_plan_has_its_most_informative_motions_first_and_keeps_to_the_workspace() -> None:
     plan = plan_motions(LAB, count=4, workspace=NEAR, scenarios=2)
     assert len(set(plan.motions)) == len(plan.motions) == 4
-    assert not any(motion.beyond(NEAR, INSERTION.descent) for motion in plan.motions)
+    assert not any(motion.beyond(NEAR, INSERTION.descent, (0.04, STOP_SHEAR_MM)) for motion in plan.motions)
     assert plan.gains[0] == max(plan.gains) and min(plan.gains) > 0
     assert all(after <= before for before, after in plan.widths.values())
     assert plan_motions(LAB, count=1, workspace=NEAR, scenarios=2).motions == plan.motions[:1]
@@ -77,7 +78,7 @@ def test_a_plan_has_its_most_informative_motions_first_and_keeps_to_the_workspac
 @pytest.mark.slow
 def test_a_plan_depends_on_what_is_known_already() -> None:
     count = len(ReadingModel(LAB).fitted)
-    known = StartResult(np.zeros(count), np.zeros((1, 3)), 1e-4 * np.eye(count), 0.0, 1.0)
+    known = StartResult(np.zeros(count), np.zeros((1, 3)), 1e-4 * np.eye(count), 0.0, 1.0, 1e-3)
     plan = plan_motions(LAB, fitted=FitResult((known,), count), count=2, workspace=NEAR, scenarios=1)
     unknown = plan_motions(LAB, count=2, workspace=NEAR, scenarios=1)
     assert plan.gains[0] < 0.5 * unknown.gains[0]
@@ -92,6 +93,15 @@ def test_planned_attempts_are_made_on_one_part_of_the_same_world(world: Recorded
     np.testing.assert_array_equal(planned.misalignment, world.misalignment[:1])
     more, fewer = expected_widths(world), expected_widths(world, attempts=1)
     assert all(more[name] <= fewer[name] * (1 + 1e-9) for name in more)
+
+
+def test_a_planned_attempt_presses_up_to_its_own_shear() -> None:
+    gentle, firm = (
+        record_world(WORLD, plan=[PlannedMotion(9e-3, 0.0, 0.0, INSERTION.descent, shear)]).recordings
+        for shear in (0.05, 0.2)
+    )
+    along = [np.abs(r.flow[0, ..., 0].mean((1, 2))).max() for r in (gentle, firm)]
+    assert firm.depth[0] > gentle.depth[0] and along[1] > 2 * along[0]
 
 
 @pytest.mark.slow
@@ -135,7 +145,10 @@ def test_calibrate_writes_a_plan_within_the_workspace_of_the_lab(
     example = Path(__file__).parents[3] / "real" / "runner" / "lab_example.toml"
     lab, plan = tmp_path / "lab.toml", tmp_path / "plan.toml"
     lab.write_text(example.read_text().replace("# x = 0.016 ", "x = 0.004 ").replace("# y = 0.016 ", "y = 0.004 "))
+    lab.write_text(lab.read_text().replace("# planned_stop_shear_mm = 0.25", "planned_stop_shear_mm = 0.2"))
     assert main(["calibrate", "--plan", str(plan), "--lab", str(lab), "--motions", "2"]) == 0
     assert "record it with: gelflow run insertion --lab LAB --plan" in capsys.readouterr().out
     motions = load_motion_plan(plan)
-    assert len(motions) == 2 and not any(m.beyond((4e-3, 4e-3, 0.28), INSERTION.descent) for m in motions)
+    assert len(motions) == 2
+    assert not any(m.beyond((4e-3, 4e-3, 0.28), INSERTION.descent, (0.04, 0.2)) for m in motions)
+    assert [m.stop_shear_mm for m in motions] == [0.2, 0.2]

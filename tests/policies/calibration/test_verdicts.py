@@ -46,7 +46,7 @@ def test_the_held_out_residual_tells_the_true_parameters_from_others(world: Reco
     truth = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted])
     others = truth + np.random.default_rng(0).choice([-1.0, 1.0], (3, len(truth)))
     rng = np.random.default_rng(1)
-    right, *wrong = (problem.chi(problem.residuals(*find_poses(problem, p, rng))[0]) for p in (truth, *others))
+    right, *wrong = (problem.errors.chi(problem.residuals(*find_poses(problem, p, rng))[0]) for p in (truth, *others))
     assert right < 1 and min(wrong) > calibration.PREDICTED
 
 

@@ -47,6 +47,16 @@ def test_a_plan_is_made_and_recorded_for_a_calibration(robot: MockRobot, tmp_pat
         assert session.description()["checkpoint"] is None
 
 
+def test_contact_stops_a_planned_descent_at_its_own_shear(robot: MockRobot, tmp_path: Path) -> None:
+    x, y, yaw = MOTIONS[0].planar_pose
+    motions = tuple(PlannedMotion(x, y, yaw, INSERTION.descent, shear) for shear in (None, 0.2))
+    (result,) = run_insertions(plan_for(robot, tmp_path, PlanPolicy(motions)))
+    assert result.outcome == "plan complete"
+    usual, firm = result.attempts
+    assert usual.stopped_by_contact and firm.stopped_by_contact and not firm.slipped
+    assert usual.shear < 0.2 < firm.shear and usual.depth < firm.depth < INSERTION.descent
+
+
 @pytest.mark.parametrize(
     ("motion", "message"),
     [
@@ -54,6 +64,8 @@ def test_a_plan_is_made_and_recorded_for_a_calibration(robot: MockRobot, tmp_pat
         (PlannedMotion(0.0, 0.0, 0.4, 1e-3), r"\|yaw\| is 22.92, at most 15 °"),
         (PlannedMotion(0.0, 0.0, 0.0, 5e-3), "depth is 5, must be above 0 and at most 4.1 mm"),
         (PlannedMotion(0.0, 0.0, 0.0, 0.0), "depth is 0, must be above 0"),
+        (PlannedMotion(0.0, 0.0, 0.0, 1e-3, 0.5), "stop_shear_mm is 0.5, must be above 0.04 and at most 0.25 mm"),
+        (PlannedMotion(0.0, 0.0, 0.0, 1e-3, 0.01), "stop_shear_mm is 0.01, must be above 0.04"),
     ],
 )
 def test_plans_beyond_the_limits_are_refused(

@@ -15,7 +15,7 @@ from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitResult, FitSettings
-from gelflow.policies.calibration.planning.motions import MOTIONS, SCENARIOS, Plan, plan_motions
+from gelflow.policies.calibration.planning.motions import MOTIONS, SCENARIOS, STOP_SHEAR_MM, Plan, plan_motions
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
@@ -38,7 +38,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--motions", type=int, default=MOTIONS, metavar="N", help="number of attempts of --plan (default %(default)s)"
     )
-    parser.add_argument("--lab", type=Path, metavar="FILE", help="lab file whose workspace and grasp --plan keeps to")
+    parser.add_argument(
+        "--lab", type=Path, metavar="FILE", help="lab file whose workspace, grasp and largest shear --plan keeps to"
+    )
     add_part(parser)
     add_out(
         parser, "new folder for report.html, report.json and scene.toml", default=Path("out/calibration"), folder=True
@@ -116,10 +118,11 @@ def _write_plan(
     args: argparse.Namespace, output: Output, recordings: Recordings, fitted: FitResult | None
 ) -> list[dict[str, float]]:
     """Make, write and print a plan; returns its motions as plain data."""
-    workspace = None
+    workspace, stop = None, STOP_SHEAR_MM
     if args.lab is not None:
-        space = load_lab(args.lab).workspace
-        workspace = (space.x, space.y, math.radians(space.yaw_deg))
+        lab = load_lab(args.lab)
+        workspace = (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
+        stop = lab.descent.planned_stop_shear_mm
     with progress_bar(count=True) as progress:
         bar = progress.add_task("planning", total=SCENARIOS)
         plan = plan_motions(
@@ -127,6 +130,7 @@ def _write_plan(
             fitted=fitted,
             count=args.motions,
             workspace=workspace,
+            stop_shear_mm=stop,
             seed=args.seed,
             progress=lambda done: progress.update(bar, completed=done),
         )
@@ -136,7 +140,7 @@ def _write_plan(
         output.text(line)
     output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {args.plan}")
     return [
-        {"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth, "gain": gain}
+        {"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth, "stop_shear_mm": stop, "gain": gain}
         for m, gain in zip(plan.motions, plan.gains, strict=True)
     ]
 

@@ -1,0 +1,114 @@
+"""Errors of flow maps that a fit allows for: noise of markers, error of the model, common shift of a pad."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.policies.calibration.recordings import MODEL_ERROR
+
+Array = NDArray[np.float64]
+
+# Standard deviation of a common shift of all markers of a pad between two readings [N]: that of each reading is up to
+# 3e-3, three times the limit of the randomization.
+DRIFT = 3e-3 * math.sqrt(2 / 3)  # until a fit estimates it
+_LARGEST_DRIFT = 3e-3 * math.sqrt(2)
+_CORRELATED = 9.0  # neighbouring markers that share the error of the model
+_HUBER = 3.0  # residuals beyond this many standard deviations count linearly
+
+
+@dataclass(frozen=True)
+class ErrorModel:
+    """The errors of n flow maps with two pads, and the residuals and robust losses that follow from them."""
+
+    noise: float  # standard deviation of the noise of a marker [N]
+    size: Array  # root mean square of each flow map [N], (n,)
+    used: NDArray[np.bool_]  # markers that are compared, (all markers,)
+    model_error: float = MODEL_ERROR  # relative to `size`
+    drift: float = DRIFT  # standard deviation of a common shift of all markers of a pad [N]
+
+    @cached_property
+    def markers(self) -> int:
+        """Number of markers that are compared."""
+        return int(self.used.sum())
+
+    @cached_property
+    def sigma(self) -> Array:
+        """Standard deviation of a marker without the common shift [N], (n,)."""
+        return np.sqrt(self.noise**2 + self._shared)
+
+    @cached_property
+    def _shared(self) -> Array:
+        """Variance of the error that neighbouring markers share, (n,)."""
+        return np.asarray((self.model_error * self.size) ** 2 + 1e-12)
+
+    @cached_property
+    def repeated(self) -> Array:
+        """How many markers count as one, (n,): between 1, with noise only, and `_CORRELATED`."""
+        return np.asarray((self.noise**2 + _CORRELATED * self._shared) / self.sigma**2)
+
+    @property
+    def independent(self) -> Array:
+        """Number of independent residuals of each flow map, (n,)."""
+        return np.asarray(2 * self.markers / self.repeated)
+
+    @cached_property
+    def _of_shift(self) -> Array:
+        """Variance of the common shift of a pad relative to that of its mean, (n,)."""
+        return np.asarray(self.independent / 4 * (self.drift / self.sigma) ** 2)
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Logarithm of the standard deviation of all residuals, relative to that without a common shift."""
+        return 2 * float(np.log1p(self._of_shift).sum())  # half of it for each of two pads and two components
+
+    def whiten(self, difference: Array, rows: NDArray[np.int64]) -> Array:
+        """Residuals (m, 2 * markers) of differences (m, all markers, 2) [N] of the flow maps `rows`."""
+        part = 1 - 1 / np.sqrt(1 + self._of_shift[rows])  # of a pad's mean
+        per_pad = difference.reshape(len(rows), 2, -1, 2)
+        per_pad = per_pad - part[:, None, None, None] * self._mean(per_pad)
+        compared = per_pad.reshape(len(rows), -1, 2)[:, self.used]
+        return np.asarray(compared.reshape(len(rows), -1) / self.sigma[rows][:, None])
+
+    def misfit(self, residuals: Array, rows: NDArray[np.int64] | None = None) -> Array:
+        """Robust loss (…, m) of residuals (…, m, k) of the flow maps `rows`, by default all."""
+        repeated = self.repeated if rows is None else self.repeated[rows]
+        return np.asarray(_huber(residuals).sum(-1) / repeated)
+
+    def robust(self, residuals: Array) -> Array:
+        """Values whose half squares add up to `misfit`, of residuals (…, n, k)."""
+        return np.asarray(np.sign(residuals) * np.sqrt(2 * _huber(residuals) / self.repeated[:, None]))
+
+    def weights(self, residuals: Array) -> Array:
+        """Weights (n, k) of residuals in iteratively reweighted least squares."""
+        return np.asarray(_huber_weights(residuals) / self.repeated[:, None])
+
+    @staticmethod
+    def chi(residuals: Array) -> float:
+        """Robust root mean square of residuals: 1 as expected from these errors."""
+        return float(np.sqrt((_huber_weights(residuals) * residuals**2).mean()))
+
+    def estimated_drift(self, difference: Array) -> float:
+        """`drift` from the differences (n, all markers, 2) [N] at the end of a fit, at most `_LARGEST_DRIFT`.
+
+        The fit takes up part of the shifts: their squares count twice.
+        """
+        mean = self._mean(difference.reshape(len(difference), 2, -1, 2))
+        return min(_LARGEST_DRIFT, float(np.sqrt(2 * (mean**2).mean())))
+
+    def _mean(self, per_pad: Array) -> Array:
+        """Mean (m, pads, 1, 2) over the markers that are compared, of (m, pads, markers of a pad, 2)."""
+        used = self.used.reshape(2, -1, 1)
+        return np.asarray((used * per_pad).sum(2, keepdims=True) / used.sum(1, keepdims=True))
+
+
+def _huber(residuals: Array) -> Array:
+    """Half the square of residuals, linear beyond the limit."""
+    size = np.abs(residuals)
+    return np.where(size <= _HUBER, 0.5 * residuals**2, _HUBER * (size - 0.5 * _HUBER))
+
+
+def _huber_weights(residuals: Array) -> Array:
+    return np.asarray(np.minimum(1.0, _HUBER / np.maximum(np.abs(residuals), 1e-12)))

@@ -1,0 +1,76 @@
+"""Errors that a fit allows for: noisy markers are found, and residuals have the covariance that they should."""
+
+import dataclasses
+
+import numpy as np
+from tests.policies.calibration.recorded_world import LITTLE
+
+from gelflow.policies.calibration.calibration import calibrate
+from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.model.error_model import ErrorModel
+from gelflow.policies.calibration.recordings import Recordings
+from gelflow.policies.calibration.report import error_lines, plain_report
+
+NOISE = 1e-3
+DEFECTIVE = np.array([0, 77, 140, 201])  # a corner, and others of both pads
+
+
+def with_noise(recordings: Recordings, factor: float) -> Recordings:
+    """Recordings with noise, and with `factor` times the noise at the defective markers."""
+    rng = np.random.default_rng(0)
+    level = np.full(recordings.flow.shape[1:-1], NOISE)
+    level.reshape(-1)[DEFECTIVE] *= factor
+    noise = level[..., None] * rng.normal(size=recordings.flow.shape)
+    return dataclasses.replace(recordings, flow=recordings.flow + noise, used=np.zeros(0, dtype=bool))
+
+
+def test_noisy_markers_are_found(world: RecordedWorld) -> None:
+    np.testing.assert_array_equal(np.flatnonzero(~with_noise(world.recordings, 10.0).used), DEFECTIVE)
+    assert with_noise(world.recordings, 1.0).used.all()
+
+
+def test_noisy_markers_are_those_of_all_insertions(world: RecordedWorld) -> None:
+    recordings = with_noise(world.recordings, 10.0)
+    part = recordings.of(np.array([4]))
+    np.testing.assert_array_equal(part.used, recordings.used)
+
+
+def test_noisy_markers_do_not_count_and_are_reported(world: RecordedWorld) -> None:
+    recordings = with_noise(world.recordings.of(np.array([0, 1])), 1e4)
+    result = calibrate(recordings, settings=LITTLE)
+    flow_maps = plain_report(result, [])["flow_maps"]
+    assert flow_maps["noisy_markers"] == len(DEFECTIVE)
+    assert flow_maps["fitted"]["after"] < 1.0  # [N]; the defective markers deviate by 10 N
+    assert any("4 of 260 markers are too noisy" in line for line in error_lines(result))
+
+
+def errors(size: float, **changes: float) -> ErrorModel:
+    used = np.ones(260, dtype=bool)
+    used[DEFECTIVE] = False
+    return ErrorModel(NOISE, np.full(4000, size), used, **changes)
+
+
+def test_residuals_of_noise_and_drift_are_independent() -> None:
+    model, rng = errors(0.0, drift=2e-3), np.random.default_rng(0)
+    shift = np.repeat(model.drift * rng.normal(size=(4000, 2, 1, 2)), 130, axis=2)
+    difference = shift.reshape(4000, 260, 2) + NOISE * rng.normal(size=(4000, 260, 2))
+    residuals = model.whiten(difference, np.arange(4000))
+    assert residuals.shape == (4000, 2 * 256)
+    assert abs((residuals**2).mean() - 1) < 0.01
+    left = residuals[:, : 2 * 128 : 2]
+    assert abs(left.mean(1).var() * 128 - 1) < 0.1  # the mean of 128 independent residuals
+    np.testing.assert_allclose(0.5 * (model.robust(residuals) ** 2).sum(1), model.misfit(residuals))
+
+
+def test_only_the_error_of_the_model_is_shared_by_neighbours() -> None:
+    np.testing.assert_allclose(errors(0.0).independent, 2 * 256, rtol=1e-4)
+    np.testing.assert_allclose(errors(1e3 * NOISE, model_error=0.02).independent, 2 * 256 / 9, rtol=0.03)
+
+
+def test_the_drift_is_estimated_from_the_differences() -> None:
+    model, rng = errors(0.0), np.random.default_rng(0)
+    for drift in (3e-4, 1e-3):
+        shift = np.repeat(drift * rng.normal(size=(8, 2, 1, 2)), 130, axis=2).reshape(8, 260, 2)
+        estimated = model.estimated_drift(shift + NOISE * rng.normal(size=(8, 260, 2)))
+        assert drift < estimated < 2 * drift
+    assert model.estimated_drift(np.ones((8, 260, 2))) < 5e-3
