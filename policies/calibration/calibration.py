@@ -79,7 +79,7 @@ class Calibration:
     @property
     def reproduced(self) -> bool:
         """Whether the fit reproduces the recordings to within the noise and the expected error of the model."""
-        return self.fit.best.chi <= REPRODUCED
+        return _reproduced(self.fit)
 
     @property
     def predicted(self) -> bool | None:
@@ -154,6 +154,10 @@ def calibrate(
     )
 
 
+def _reproduced(result: FitResult) -> bool:
+    return result.best.chi <= REPRODUCED
+
+
 def _predicted(residual: float | None) -> bool | None:
     return None if residual is None else residual <= PREDICTED
 
@@ -164,7 +168,6 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
     The parameters of the simulator are confirmed only if the held-out insertion is predicted. Gains, rotations and
     crosstalk are differences between pads and between markers, which a wrong force hardly changes.
     """
-    reproduced = result.best.chi <= REPRODUCED
     ratio, of_ratio = gain_ratio(fitted)
     directions = np.vstack([np.eye(len(fitted)), of_ratio])
     low, high = result.interval(directions)
@@ -176,7 +179,7 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
             float(p.value(low[i])),
             float(p.value(high[i])),
             float((high[i] - low[i]) / (2 * 1.96)),
-            reproduced and (predicted or p.name not in QUANTITIES),
+            _reproduced(result) and (predicted or p.name not in QUANTITIES),
         )
         for i, p in enumerate((*fitted, ratio))
     )

@@ -1,5 +1,6 @@
 """Recorded attempts, as arrays: what a calibration reads of sessions."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,7 +43,7 @@ class Recordings:
 
     def __post_init__(self) -> None:
         if not len(self.used):
-            object.__setattr__(self, "used", ~self._noisy())
+            object.__setattr__(self, "used", ~self._noisy_markers())
 
     def __len__(self) -> int:
         return len(self.insertion)
@@ -51,20 +52,14 @@ class Recordings:
         """The attempts of some insertions, counted from 0 again."""
         rows = np.isin(self.insertion, insertions)
         number = {int(old): new for new, old in enumerate(np.unique(self.insertion[rows]))}
-        return Recordings(
-            self.task,
-            np.array([number[int(i)] for i in self.insertion[rows]], dtype=np.int64),
-            self.planar_pose[rows],
-            self.depth[rows],
-            self.flow[rows],
-            self.unit,
-            tuple(name for name, row in zip(self.names, rows, strict=True) if row),
-            {number[i]: pose for i, pose in self.inserted.items() if i in number},
-            self.settle,
-            self.grasp_force,
-            self.grasp_height,
-            self.height_spread,
-            self.used,
+        return dataclasses.replace(
+            self,
+            insertion=np.array([number[int(i)] for i in self.insertion[rows]], dtype=np.int64),
+            planar_pose=self.planar_pose[rows],
+            depth=self.depth[rows],
+            flow=self.flow[rows],
+            names=tuple(name for name, row in zip(self.names, rows, strict=True) if row),
+            inserted={number[i]: pose for i, pose in self.inserted.items() if i in number},
         )
 
     def noise(self) -> float:
@@ -81,7 +76,7 @@ class Recordings:
         of_pads = np.median(np.abs(second).reshape(f.shape[0] * f.shape[1], -1), axis=1)
         return float(np.quantile(of_pads, 0.25) / 0.6745 / 6)
 
-    def _noisy(self) -> NDArray[np.bool_]:
+    def _noisy_markers(self) -> NDArray[np.bool_]:
         """Markers that deviate from the median of their neighbours in most attempts (pads * rows * cols,)."""
         n, pads, rows, cols, _ = self.flow.shape
         if n == 0:

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 DRIFT = 3e-3 * math.sqrt(2 / 3)  # until a fit estimates it
 _LARGEST_DRIFT = 3e-3 * math.sqrt(2)
 _CORRELATED = 9.0  # neighbouring markers that share the error of the model
+_LEAST_VARIANCE = 1e-12  # of a marker [N²], where a flow map is zero
 _HUBER = 3.0  # residuals beyond this many standard deviations count linearly
 
 
@@ -24,9 +25,9 @@ class ErrorModel:
     """The errors of n flow maps with two pads, and the residuals and robust losses that follow from them."""
 
     noise: float  # standard deviation of the noise of a marker [N]
-    size: Array  # root mean square of each flow map [N], (n,)
+    rms: Array  # root mean square of each flow map [N], (n,)
     used: NDArray[np.bool_]  # markers that are compared, (all markers,)
-    model_error: float = MODEL_ERROR  # relative to `size`
+    model_error: float = MODEL_ERROR  # relative to `rms`
     drift: float = DRIFT  # standard deviation of a common shift of all markers of a pad [N]
 
     @cached_property
@@ -37,53 +38,55 @@ class ErrorModel:
     @cached_property
     def sigma(self) -> Array:
         """Standard deviation of a marker without the common shift [N], (n,)."""
-        return np.sqrt(self.noise**2 + self._shared)
+        return np.sqrt(self._variance)
 
     @cached_property
-    def _shared(self) -> Array:
-        """Variance of the error that neighbouring markers share, (n,)."""
-        return np.asarray((self.model_error * self.size) ** 2 + 1e-12)
+    def _variance(self) -> Array:
+        return np.asarray(self.noise**2 + (self.model_error * self.rms) ** 2 + _LEAST_VARIANCE)
 
     @cached_property
-    def repeated(self) -> Array:
-        """How many markers count as one, (n,): between 1, with noise only, and `_CORRELATED`."""
-        return np.asarray((self.noise**2 + _CORRELATED * self._shared) / self.sigma**2)
+    def cluster_size(self) -> Array:
+        """How many neighbouring markers count as one, (n,): 1 with noise only, `_CORRELATED` without noise."""
+        shared = (self.model_error * self.rms) ** 2 + _LEAST_VARIANCE
+        return np.asarray((self.noise**2 + _CORRELATED * shared) / self._variance)
 
     @property
     def independent(self) -> Array:
         """Number of independent residuals of each flow map, (n,)."""
-        return np.asarray(2 * self.markers / self.repeated)
+        return np.asarray(2 * self.markers / self.cluster_size)
 
     @cached_property
-    def _of_shift(self) -> Array:
-        """Variance of the common shift of a pad relative to that of its mean, (n,)."""
-        return np.asarray(self.independent / 4 * (self.drift / self.sigma) ** 2)
+    def _of_pad(self) -> Array:
+        """Number of independent markers of a pad, (n,)."""
+        return np.asarray(self.markers / 2 / self.cluster_size)
 
     @cached_property
     def log_determinant(self) -> float:
         """Logarithm of the standard deviation of all residuals, relative to that without a common shift."""
-        return 2 * float(np.log1p(self._of_shift).sum())  # half of it for each of two pads and two components
+        of_one = 0.5 * np.log1p(self._of_pad * (self.drift / self.sigma) ** 2)
+        return 4 * float(of_one.sum())  # of two pads and two components
 
     def whiten(self, difference: Array, rows: NDArray[np.int64]) -> Array:
         """Residuals (m, 2 * markers) of differences (m, all markers, 2) [N] of the flow maps `rows`."""
-        part = 1 - 1 / np.sqrt(1 + self._of_shift[rows])  # of a pad's mean
+        sigma = self.sigma[rows]
+        of_mean = 1 - sigma / np.sqrt(sigma**2 + self._of_pad[rows] * self.drift**2)
         per_pad = difference.reshape(len(rows), 2, -1, 2)
-        per_pad = per_pad - part[:, None, None, None] * self._mean(per_pad)
+        per_pad = per_pad - of_mean[:, None, None, None] * self._mean(per_pad)
         compared = per_pad.reshape(len(rows), -1, 2)[:, self.used]
-        return np.asarray(compared.reshape(len(rows), -1) / self.sigma[rows][:, None])
+        return np.asarray(compared.reshape(len(rows), -1) / sigma[:, None])
 
     def misfit(self, residuals: Array, rows: NDArray[np.int64] | None = None) -> Array:
         """Robust loss (…, m) of residuals (…, m, k) of the flow maps `rows`, by default all."""
-        repeated = self.repeated if rows is None else self.repeated[rows]
-        return np.asarray(_huber(residuals).sum(-1) / repeated)
+        cluster = self.cluster_size if rows is None else self.cluster_size[rows]
+        return np.asarray(_huber(residuals).sum(-1) / cluster)
 
     def robust(self, residuals: Array) -> Array:
         """Values whose half squares add up to `misfit`, of residuals (…, n, k)."""
-        return np.asarray(np.sign(residuals) * np.sqrt(2 * _huber(residuals) / self.repeated[:, None]))
+        return np.asarray(np.sign(residuals) * np.sqrt(2 * _huber(residuals) / self.cluster_size[:, None]))
 
     def weights(self, residuals: Array) -> Array:
         """Weights (n, k) of residuals in iteratively reweighted least squares."""
-        return np.asarray(_huber_weights(residuals) / self.repeated[:, None])
+        return np.asarray(_huber_weights(residuals) / self.cluster_size[:, None])
 
     @staticmethod
     def chi(residuals: Array) -> float:

@@ -28,7 +28,7 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
     errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool))
     rows = np.arange(len(reading))
     jacobian = np.stack([errors.whiten(columns[..., i], rows) for i in range(columns.shape[-1])], -1)
-    full = np.einsum("nki,nkj->nij", jacobian, jacobian) / errors.repeated[:, None, None]
+    full = np.einsum("nki,nkj->nij", jacobian, jacobian) / errors.cluster_size[:, None, None]
     full[:, -1, -1] += 1.0
     of_height = full[:, :-1, -1]
     result = full[:, :-1, :-1] - of_height[:, :, None] * of_height[:, None, :] / full[:, -1:, -1:]
