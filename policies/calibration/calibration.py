@@ -53,7 +53,7 @@ class FlowMaps:
     used: NDArray[np.bool_]  # markers that are compared (markers,)
 
     @property
-    def noisy(self) -> int:
+    def num_noisy(self) -> int:
         """Number of markers that are not compared."""
         return int((~self.used).sum())
 

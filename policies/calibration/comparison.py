@@ -24,6 +24,11 @@ class SimulatedSession:
     used: NDArray[np.bool_]  # markers that are compared (markers,)
 
     @property
+    def num_noisy(self) -> int:
+        """Number of markers that are not compared."""
+        return int((~self.used).sum())
+
+    @property
     def error(self) -> float:
         """Root mean square difference of a component of a marker vector, over all attempts."""
         return float(np.sqrt((self._difference**2).mean()))

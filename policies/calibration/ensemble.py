@@ -102,7 +102,7 @@ def _invert(
             break
         replaced = np.where(ok, np.arange(members), rng.choice(np.flatnonzero(ok), members))
         residuals, points, poses = residuals[replaced], points[replaced], poses[replaced]
-        share = min(left, _share(residuals, float(problem.errors.independent.sum())))
+        share = min(left, _share(residuals, float(problem.errors.num_independent.sum())))
         left = left - share if share < left else 0.0
         unknowns = np.hstack([points, poses.reshape(members, -1) / scale])
         unknowns = _updated(unknowns, residuals, share, rng)

@@ -150,5 +150,5 @@ def refined_poses(
             parents = present[rng.integers(0, min(_PARENTS, len(present)), count)]
             candidates.append(np.vstack([present, parents + size * rng.normal(size=parents.shape) * FREE]))
         best, costs, point = best_poses(problem, point, candidates, range_of_heights=size)
-    prior = 0.5 * float(parameters @ parameters)
-    return float(sum(c[0] for c in costs)) + prior, point, np.stack([p[0] for p in best])
+    fixed = 0.5 * float(parameters @ parameters) + problem.errors.log_determinant
+    return float(sum(c[0] for c in costs)) + fixed, point, np.stack([p[0] for p in best])

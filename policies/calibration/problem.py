@@ -58,7 +58,8 @@ class Problem:
     def _set_recordings(self, recordings: Recordings) -> None:
         self.recordings = recordings
         self.data = recordings.flow.reshape(len(recordings), -1, 2) / self._scale
-        self.errors = ErrorModel(self.noise, np.sqrt((self.data**2).mean((1, 2))), recordings.used)
+        rms = np.sqrt((self.data[:, recordings.used] ** 2).mean((1, 2)))
+        self.errors = ErrorModel(self.noise, rms, recordings.used)
 
     def allow_for(self, *, model_error: float | None = None, drift: float | None = None) -> None:
         """Set the errors that residuals allow for, see `ErrorModel`; a large model error makes the cost smooth."""

@@ -14,7 +14,7 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
-_NOISY = 3.0  # median deviation of a noisy marker from its neighbours, relative to noise and model error
+_NOISY = 1.5  # median distance of a noisy marker from the range of its neighbours, relative to noise and model error
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,17 @@ class Recordings:
         return float(np.quantile(of_pads, 0.25) / 0.6745 / 6)
 
     def _noisy_markers(self) -> NDArray[np.bool_]:
-        """Markers that deviate from the median of their neighbours in most attempts (pads * rows * cols,)."""
+        """Markers that are beyond the range of their neighbours in most attempts (pads * rows * cols,).
+
+        Edges of contacts differ from the mean of their neighbours too, but they are within this range. As neighbours
+        are compared with each other, at most a part of a pad can be noisy.
+        """
         n, pads, rows, cols, _ = self.flow.shape
         if n == 0:
             return np.zeros(pads * rows * cols, dtype=bool)
         padded = np.pad(self.flow, ((0, 0), (0, 0), (1, 1), (1, 1), (0, 0)), constant_values=np.nan)
         near = [padded[:, :, i : i + rows, j : j + cols] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-        expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * (self.flow**2).mean((1, 2, 3, 4)) + 1e-30)
-        deviation = np.abs(self.flow - np.nanmedian(near, axis=0)) / expected[:, None, None, None, None]
-        return np.asarray(np.median(deviation, axis=(0, 4)) > _NOISY).reshape(-1)
+        size = (np.nanmedian(near, axis=0) ** 2).mean((1, 2, 3, 4))  # without single defective markers
+        expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * size + 1e-30)
+        beyond = np.maximum(self.flow - np.nanmax(near, axis=0), np.nanmin(near, axis=0) - self.flow)
+        return np.asarray(np.median(beyond / expected[:, None, None, None, None], axis=(0, 4)) > _NOISY).reshape(-1)

@@ -36,7 +36,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
         "flow_maps": {
             "unit": result.unit,
             "noise": result.noise,
-            "noisy_markers": result.fitted.noisy,
+            "noisy_markers": result.fitted.num_noisy,
             "fitted": _errors(result.fitted),
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
@@ -95,7 +95,7 @@ def _errors(maps: FlowMaps) -> dict[str, float]:
     return {
         "before": maps.error(maps.before),
         "after": maps.error(maps.after),
-        "rms": float(np.sqrt((maps.recorded**2).mean())),
+        "rms": float(np.sqrt((maps.recorded[:, maps.used] ** 2).mean())),
     }
 
 
@@ -105,7 +105,7 @@ def flow_picture(result: Calibration, grid: Grid) -> bytes:
     kind = "fitted" if result.held_out is None else "held-out"
     simulated = [("before", maps.before), ("calibrated", maps.after)]
     note = f"{kind} attempts; "
-    figure = draw_flow_maps(maps.recorded, simulated, maps.names, grid, result.unit, note=note)
+    figure = draw_flow_maps(maps.recorded, simulated, maps.names, grid, result.unit, used=maps.used, note=note)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=100)
     return data.getvalue()
@@ -158,7 +158,7 @@ def error_lines(result: Calibration) -> list[str]:
             f"{len(maps.recorded)} {kind} flow maps: error {before:.3g} {result.unit} before, "
             f"{after:.3g} {result.unit} after calibration; noise {result.noise:.3g} {result.unit}"
         )
-    if noisy := result.fitted.noisy:
+    if noisy := result.fitted.num_noisy:
         lines.append(f"{noisy} of {len(result.fitted.used)} markers are too noisy and are not compared")
     if not result.reproduced:
         lines.append(

@@ -260,7 +260,7 @@ class DescentSettings:
     # Thresholds of the mean change of shear along the finger since the reference, the larger of both pads [mm].
     contact_shear_mm: float = 0.04  # contact: the part is not in the hole
     stop_shear_mm: float = 0.12  # the descent stops at once
-    planned_stop_shear_mm: float = 0.25  # the largest one of a motion plan
+    planned_stop_shear_mm: float = 0.25  # up to this, a motion plan may set a larger stop_shear_mm
     weight_check: bool = True  # both pads must show the part's weight at every grasp, which scales the thresholds
     max_overshoot: float = 0.1e-3  # motion towards contact until the arm is at rest [m]: limits the speed of lowering
     max_depth: float = LIMITS.descent_depth  # largest depth below the start of an attempt [m]
@@ -268,9 +268,11 @@ class DescentSettings:
     def __post_init__(self) -> None:
         _check_ranges(self, "descent.")
         _require(self.stop_shear_mm > self.contact_shear_mm, "stop_shear_mm must be above contact_shear_mm")
-        _require(
-            self.planned_stop_shear_mm > self.contact_shear_mm, "planned_stop_shear_mm must be above contact_shear_mm"
-        )
+
+    @property
+    def largest_stop_shear_mm(self) -> float:
+        """Largest shear at which a motion plan may stop a descent [mm]."""
+        return max(self.stop_shear_mm, self.planned_stop_shear_mm)
 
 
 @dataclass(frozen=True)

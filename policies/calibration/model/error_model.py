@@ -25,7 +25,7 @@ class ErrorModel:
     """The errors of n flow maps with two pads, and the residuals and robust losses that follow from them."""
 
     noise: float  # standard deviation of the noise of a marker [N]
-    rms: Array  # root mean square of each flow map [N], (n,)
+    rms: Array  # root mean square of the compared markers of each flow map [N], (n,)
     used: NDArray[np.bool_]  # markers that are compared, (all markers,)
     model_error: float = MODEL_ERROR  # relative to `rms`
     drift: float = DRIFT  # standard deviation of a common shift of all markers of a pad [N]
@@ -51,29 +51,28 @@ class ErrorModel:
         return np.asarray((self.noise**2 + _CORRELATED * shared) / self._variance)
 
     @property
-    def independent(self) -> Array:
+    def num_independent(self) -> Array:
         """Number of independent residuals of each flow map, (n,)."""
         return np.asarray(2 * self.markers / self.cluster_size)
 
     @cached_property
-    def _of_pad(self) -> Array:
-        """Number of independent markers of a pad, (n,)."""
-        return np.asarray(self.markers / 2 / self.cluster_size)
+    def _shift_variance(self) -> Array:
+        """Variance of the common shift of each pad relative to that of the mean of its markers, (n, pads)."""
+        independent = self.used.reshape(2, -1).sum(1) / self.cluster_size[:, None]
+        return np.asarray(independent * (self.drift / self.sigma[:, None]) ** 2)
 
     @cached_property
     def log_determinant(self) -> float:
-        """Logarithm of the standard deviation of all residuals, relative to that without a common shift."""
-        of_one = 0.5 * np.log1p(self._of_pad * (self.drift / self.sigma) ** 2)
-        return 4 * float(of_one.sum())  # of two pads and two components
+        """Half the log-determinant of the covariance of all residuals, relative to that without a common shift."""
+        return float(np.log1p(self._shift_variance).sum())  # half of it for each of two components
 
     def whiten(self, difference: Array, rows: NDArray[np.int64]) -> Array:
         """Residuals (m, 2 * markers) of differences (m, all markers, 2) [N] of the flow maps `rows`."""
-        sigma = self.sigma[rows]
-        of_mean = 1 - sigma / np.sqrt(sigma**2 + self._of_pad[rows] * self.drift**2)
+        mean_fraction = 1 - 1 / np.sqrt(1 + self._shift_variance[rows])
         per_pad = difference.reshape(len(rows), 2, -1, 2)
-        per_pad = per_pad - of_mean[:, None, None, None] * self._mean(per_pad)
+        per_pad = per_pad - mean_fraction[:, :, None, None] * self._mean(per_pad)
         compared = per_pad.reshape(len(rows), -1, 2)[:, self.used]
-        return np.asarray(compared.reshape(len(rows), -1) / sigma[:, None])
+        return np.asarray(compared.reshape(len(rows), -1) / self.sigma[rows][:, None])
 
     def misfit(self, residuals: Array, rows: NDArray[np.int64] | None = None) -> Array:
         """Robust loss (…, m) of residuals (…, m, k) of the flow maps `rows`, by default all."""

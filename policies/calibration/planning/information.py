@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
-from gelflow.policies.calibration.model.error_model import ErrorModel
+from gelflow.policies.calibration.model.error_model import DRIFT, ErrorModel
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
 from gelflow.policies.calibration.problem import POSE_STEP
@@ -15,17 +15,18 @@ Array = NDArray[np.float64]
 _STEP = 0.2  # of differences in parameters and start heights, in standard deviations of their priors
 
 
-def information(readings: ReadingModel, point: Array, descents: Descents, noise: float) -> Array:
+def information(readings: ReadingModel, point: Array, descents: Descents, noise: float, drift: float = DRIFT) -> Array:
     """Fisher information of each of n descents about the whitened parameters and its pose, (n, count + 3, count + 3).
 
     The pose is in units of `POSE_STEP`; the start height of each descent is unknown. `noise` is the standard deviation
-    of the difference of two readings of a marker [N]. Slopes are differences of simulated readings, which are faster
-    than exact derivatives for many descents. Raises SimulationError when no descent can be simulated.
+    of the difference of two readings of a marker [N], `drift` that of a common shift of a pad [N]. Slopes are
+    differences of simulated readings, which are faster than exact derivatives for many descents. Raises SimulationError
+    when no descent can be simulated.
     """
     reading, columns, ok = _slopes(readings, point, descents)
     if not ok.any():
         raise SimulationError("no descent can be simulated with these parameters")
-    errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool))
+    errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool), drift=drift)
     rows = np.arange(len(reading))
     jacobian = np.stack([errors.whiten(columns[..., i], rows) for i in range(columns.shape[-1])], -1)
     full = np.einsum("nki,nkj->nij", jacobian, jacobian) / errors.cluster_size[:, None, None]

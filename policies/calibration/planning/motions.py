@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.policies.calibration.fit import FitResult
+from gelflow.policies.calibration.model.error_model import DRIFT
 from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
@@ -74,12 +75,15 @@ def plan_motions(
     task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
     candidates = _candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
+    drift = DRIFT if fitted is None else fitted.best.drift
     found = []
     for k in range(scenarios):
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
-            found.append(_scenario(readings, point, in_hole(misalignment, candidates), noise, stop_shear_mm))
+            poses = in_hole(misalignment, candidates)
+            stop = _stops(readings, point, poses, stop_shear_mm)
+            found.append(information(readings, point, Descents(poses, np.zeros(len(poses)), stop), noise, drift))
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
@@ -118,8 +122,8 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
     return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
 
 
-def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float, stop_shear_mm: float) -> Array:
-    """Information (n, count + 3, count + 3) of attempts at poses in the hole frame, down to their stops by contact."""
+def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear_mm: float) -> Array:
+    """Depths (n,) [m] at which contact stops attempts at poses (n, 3) in the hole frame."""
     n, task = len(poses), readings.forces.task
     depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
     values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
@@ -127,8 +131,7 @@ def _scenario(readings: ReadingModel, point: Array, poses: Array, noise: float, 
     reading, _ = readings.read(values, descents)
     shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
     shear[:, -1] = np.inf
-    stop = depths[(shear > stop_shear_mm / displacement_scale(readings.forces.scene)).argmax(1)]
-    return information(readings, point, Descents(poses, np.zeros(n), stop), noise)
+    return np.asarray(depths[(shear > stop_shear_mm / displacement_scale(readings.forces.scene)).argmax(1)])
 
 
 def _greedy(found: Array, before: Array, pose: Array, count: int) -> tuple[list[int], tuple[float, ...], Array]:

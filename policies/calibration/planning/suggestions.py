@@ -46,7 +46,7 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
         depth = _DEPTH + deeper
         try:
             descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
-            added = information(problem.readings, result.best.point, descents, problem.noise)[0]
+            added = information(problem.readings, result.best.point, descents, problem.noise, result.best.drift)[0]
             after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue

@@ -39,7 +39,7 @@ def check_motions(motions: tuple[PlannedMotion, ...], lab: Lab, task: InsertionT
     largest = tuple(min(pair) for pair in zip(of_lab, task.workspace, strict=True))
     x, y, yaw = largest
     for number, motion in enumerate(motions):
-        shear = lab.descent.contact_shear_mm, lab.descent.planned_stop_shear_mm
+        shear = lab.descent.contact_shear_mm, lab.descent.largest_stop_shear_mm
         if beyond := motion.beyond((x, y, yaw), task.descent, shear):
             raise UsageError(
                 f"motion {number + 1} of the plan: {beyond}; the limits are those of the lab file and the task: write "

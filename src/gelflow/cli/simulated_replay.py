@@ -25,7 +25,13 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
     if args.out:
         note = "values of the scene; "
         figure = draw_flow_maps(
-            result.recorded, [("", result.simulated)], names, recordings.task.grid, recordings.unit, note=note
+            result.recorded,
+            [("", result.simulated)],
+            names,
+            recordings.task.grid,
+            recordings.unit,
+            used=result.used,
+            note=note,
         )
         save(figure, args.out, make_folder=False)
     strange = [name for name, cosine in zip(names, cosines, strict=True) if cosine < NOTHING_IN_COMMON]
@@ -34,6 +40,7 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
             {
                 "unit": recordings.unit,
                 "noise": recordings.noise(),
+                "noisy_markers": result.num_noisy,
                 "error": result.error,
                 "attempts": [
                     {"name": name, "relative_error": float(error), "cosine": float(cosine)}
@@ -52,6 +59,8 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
         f"root mean square error {result.error:.3g} {recordings.unit} with the values of the scene, "
         f"noise {recordings.noise():.3g} {recordings.unit}"
     )
+    if result.num_noisy:
+        output.text(f"{result.num_noisy} of {len(result.used)} markers are too noisy and are not compared")
     for name in strange:
         output.text(f"warning: {name}: recorded and simulated flow map have nothing in common")
     if args.out:

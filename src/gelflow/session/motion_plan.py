@@ -23,7 +23,7 @@ class PlannedMotion:
     y: float  # [m]
     yaw: float  # [rad]
     depth: float  # largest depth below the start [m]; contact stops the descent earlier
-    stop_shear_mm: float | None = None  # mean shear along the finger at which it does; None: that of the lab file
+    stop_shear_mm: float | None = None  # mean shear along the finger that stops it; None: that of the lab file
 
     @property
     def planar_pose(self) -> tuple[float, float, float]:
@@ -38,11 +38,11 @@ class PlannedMotion:
         return f"{pose}, down to {1e3 * self.depth:.2f} mm{stop}"
 
     def beyond(
-        self, workspace: tuple[float, float, float], max_depth: float, stop_shear_mm: tuple[float, float]
+        self, workspace: tuple[float, float, float], max_depth: float, stop_shear_range: tuple[float, float]
     ) -> str:
         """How the motion exceeds the largest |x|, |y| [m], |yaw| [rad] and depth [m]; empty when it does not.
 
-        `stop_shear_mm` are the limits of the shear that stops the descent: above the first, at most the second.
+        `stop_shear_range` are the limits of `stop_shear_mm`: above the first, at most the second.
         """
         named = zip(("x", "y", "yaw"), self.planar_pose, workspace, (1e3, 1e3, 180 / math.pi), strict=True)
         found = [
@@ -52,7 +52,7 @@ class PlannedMotion:
         ]
         if not 0 < self.depth <= max_depth + 1e-9:
             found.append(f"depth is {1e3 * self.depth:.4g}, must be above 0 and at most {1e3 * max_depth:.4g} mm")
-        least, most = stop_shear_mm
+        least, most = stop_shear_range
         if self.stop_shear_mm is not None and not least < self.stop_shear_mm <= most:
             found.append(f"{_STOP} is {self.stop_shear_mm:.4g}, must be above {least:g} and at most {most:g} mm")
         return "; ".join(found)
@@ -84,7 +84,7 @@ def save_motion_plan(motions: tuple[PlannedMotion, ...], path: Path, *, title: s
         rows.append({**pose, "depth": round(m.depth, 7), **stop})
     heading = (
         f"# {title}\n# Poses of the gripper relative to the taught hole, and the largest depth of each descent, [m];\n"
-        f"# contact stops it earlier, at {_STOP} of mean shear along the finger.\n"
+        f"# contact stops it earlier, at {_STOP} of mean shear along the finger (without it, that of the lab file).\n"
     )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,6 +13,8 @@ from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.real.runner import PlanPolicy
+from gelflow.real.runner.insertion.planned_motions import check_motions
+from gelflow.real.runner.lab_file import load_lab
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.session.motion_plan import PlannedMotion, save_motion_plan
 from gelflow.session.reader import SessionReader
@@ -55,6 +57,16 @@ def test_contact_stops_a_planned_descent_at_its_own_shear(robot: MockRobot, tmp_
     usual, firm = result.attempts
     assert usual.stopped_by_contact and firm.stopped_by_contact and not firm.slipped
     assert usual.shear < 0.2 < firm.shear and usual.depth < firm.depth < INSERTION.descent
+
+
+def test_a_lab_with_a_larger_stop_shear_needs_no_limit_of_plans(tmp_path: Path) -> None:
+    lab = tmp_path / "lab.toml"
+    text = EXAMPLE.read_text().replace("# stop_shear_mm = 0.12", "stop_shear_mm = 0.5")
+    lab.write_text(text.replace("# contact_shear_mm = 0.04", "contact_shear_mm = 0.3"))
+    read = load_lab(lab)
+    assert read.descent.largest_stop_shear_mm == 0.5
+    check_motions((PlannedMotion(0.0, 0.0, 0.0, 1e-3, 0.5), PlannedMotion(0.0, 0.0, 0.0, 1e-3)), read, INSERTION)
+    assert load_lab(EXAMPLE).descent.largest_stop_shear_mm == 0.25
 
 
 @pytest.mark.parametrize(

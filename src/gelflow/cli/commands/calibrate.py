@@ -122,7 +122,7 @@ def _write_plan(
     if args.lab is not None:
         lab = load_lab(args.lab)
         workspace = (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
-        stop = lab.descent.planned_stop_shear_mm
+        stop = lab.descent.largest_stop_shear_mm
     with progress_bar(count=True) as progress:
         bar = progress.add_task("planning", total=SCENARIOS)
         plan = plan_motions(
