@@ -36,7 +36,7 @@ def test_two_updates_with_half_of_the_recordings_equal_one_with_all() -> None:
 def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: RecordedWorld) -> None:
     problem = Problem(world.recordings.of(np.arange(2)), preset="fast")
     problem.allow_for(model_error=0.04)
-    point, poses = ensemble.search_globally(problem, 48, np.random.default_rng(0))
+    point, poses = ensemble.search_globally(problem, 96, np.random.default_rng(0))
     residuals, ok = ensemble._residuals(problem, point[None], poses[None])
     found = ensemble._costs(problem, residuals, point[None], poses[None])[0]
     rng = np.random.default_rng(1)

@@ -73,7 +73,8 @@ def test_slow_descent_keeps_its_speed(cell: ArmAndMock) -> None:
     half = records[len(records) // 3 :]
     heights = np.array([r.applied[0][2] for r in half if r.applied is not None])
     times = np.array([r.controller_time for r in half])
-    speed = -np.polyfit(times, heights, 1)[0]
+    # The median over spans of 25 cycles: on a busy computer a target may expire, and the arm holds for a while.
+    speed = -np.median((heights[25:] - heights[:-25]) / (times[25:] - times[:-25]))
     assert speed == pytest.approx(0.5e-3, rel=0.05)
     measured = np.array([r.measured[0][2] for r in half])
     # The robot lags by 10 to 20 ms, which is 5 to 10 µm at this speed.
