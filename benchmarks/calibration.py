@@ -70,9 +70,7 @@ def plan(words: list[str]) -> int:
             row, half = result[key], 0.5 if key == "expected_half" else 1.0
             made = f"{row['motions_planned']:.1f}", f"{half * row['motions_unplanned']:.1f}"
             table.add_row(name, str(row["worlds"]), *made, f"{row['mean_ratio']:.2f}", str(row["same_or_narrower"]))
-    described = [
-        {"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth, "stop_shear_mm": m.stop_shear_mm} for m in motions
-    ]
+    described = [dataclasses.asdict(motion) for motion in motions]
     script.finish(args, script.header() | {"plan": described} | result, table)
     return 0
 

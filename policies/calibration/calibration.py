@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.policies.calibration.comparison import error
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
 from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
@@ -52,14 +53,9 @@ class FlowMaps:
     names: tuple[str, ...]  # of the attempts, (n,)
     used: NDArray[np.bool_]  # markers that are compared (markers,)
 
-    @property
-    def num_noisy(self) -> int:
-        """Number of markers that are not compared."""
-        return int((~self.used).sum())
-
     def error(self, simulated: Array) -> float:
         """Root mean square difference of a component of a marker vector that is compared."""
-        return float(np.sqrt(((simulated - self.recorded)[:, self.used] ** 2).mean()))
+        return error(self.recorded, simulated, self.used)
 
 
 @dataclass(frozen=True)

@@ -24,31 +24,38 @@ class SimulatedSession:
     used: NDArray[np.bool_]  # markers that are compared (markers,)
 
     @property
-    def num_noisy(self) -> int:
-        """Number of markers that are not compared."""
-        return int((~self.used).sum())
-
-    @property
     def error(self) -> float:
         """Root mean square difference of a component of a marker vector, over all attempts."""
-        return float(np.sqrt((self._difference**2).mean()))
+        return error(self.recorded, self.simulated, self.used)
 
     @property
     def relative_error(self) -> Array:
         """Length of the difference of each attempt relative to that of its recorded flow map, (n,)."""
-        return np.asarray(_length(self._difference) / np.maximum(_length(self.recorded[:, self.used]), 1e-30))
+        recorded, simulated = self._compared
+        return np.asarray(_length(simulated - recorded) / np.maximum(_length(recorded), 1e-30))
 
     @property
     def cosine(self) -> Array:
         """Cosine between recorded and simulated flow map of each attempt, (n,); 0 if there is no simulated contact."""
-        recorded, simulated = self.recorded[:, self.used], self.simulated[:, self.used]
-        return np.asarray(
-            (simulated * recorded).sum((1, 2)) / np.maximum(_length(simulated) * _length(recorded), 1e-30)
-        )
+        recorded, simulated = self._compared
+        product = _length(simulated) * _length(recorded)
+        return np.asarray((simulated * recorded).sum((1, 2)) / np.maximum(product, 1e-30))
 
     @property
-    def _difference(self) -> Array:
-        return np.asarray((self.simulated - self.recorded)[:, self.used])
+    def _compared(self) -> tuple[Array, Array]:
+        """Recorded and simulated vectors of the markers that are compared."""
+        return self.recorded[:, self.used], self.simulated[:, self.used]
+
+
+def error(recorded: Array, simulated: Array, used: NDArray[np.bool_]) -> float:
+    """Root mean square difference of a component of the marker vectors (n, markers, 2) that are compared."""
+    return float(np.sqrt(((simulated - recorded)[:, used] ** 2).mean()))
+
+
+def noisy_markers_text(used: NDArray[np.bool_]) -> str:
+    """One line about markers that are not compared; empty if all are."""
+    noisy = int((~used).sum())
+    return f"{noisy} of {len(used)} markers are too noisy and are not compared" if noisy else ""
 
 
 def _length(flow: Array) -> Array:

@@ -45,21 +45,23 @@ class Problem:
         self.readings = ReadingModel(recordings, threads=threads, preset=preset)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
-        self.noise = recordings.noise() / self._scale
         self._set_recordings(recordings)
+        self.errors = ErrorModel(recordings.noise() / self._scale, self._rms(), recordings.used)
 
     def of(self, insertion: int) -> "Problem":
         """The same problem with the attempts of one insertion only."""
         result = copy.copy(self)
         result._set_recordings(self.recordings.of(np.array([insertion])))
-        result.allow_for(model_error=self.errors.model_error, drift=self.errors.drift)
+        result.errors = dataclasses.replace(self.errors, rms=result._rms())
         return result
 
     def _set_recordings(self, recordings: Recordings) -> None:
         self.recordings = recordings
         self.data = recordings.flow.reshape(len(recordings), -1, 2) / self._scale
-        rms = np.sqrt((self.data[:, recordings.used] ** 2).mean((1, 2)))
-        self.errors = ErrorModel(self.noise, rms, recordings.used)
+
+    def _rms(self) -> Array:
+        """Root mean square of the compared markers of each flow map [N], (n,)."""
+        return np.asarray(np.sqrt((self.data[:, self.recordings.used] ** 2).mean((1, 2))))
 
     def allow_for(self, *, model_error: float | None = None, drift: float | None = None) -> None:
         """Set the errors that residuals allow for, see `ErrorModel`; a large model error makes the cost smooth."""

@@ -86,7 +86,8 @@ class Recordings:
         if n == 0:
             return np.zeros(pads * rows * cols, dtype=bool)
         padded = np.pad(self.flow, ((0, 0), (0, 0), (1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-        near = [padded[:, :, i : i + rows, j : j + cols] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+        around = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+        near = np.stack([padded[:, :, i : i + rows, j : j + cols] for i, j in around])
         size = (np.nanmedian(near, axis=0) ** 2).mean((1, 2, 3, 4))  # without single defective markers
         expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * size + 1e-30)
         beyond = np.maximum(self.flow - np.nanmax(near, axis=0), np.nanmin(near, axis=0) - self.flow)

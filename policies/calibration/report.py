@@ -11,6 +11,7 @@ import numpy as np
 
 from gelflow.observation import Grid
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
+from gelflow.policies.calibration.comparison import noisy_markers_text
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
 from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
@@ -36,7 +37,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
         "flow_maps": {
             "unit": result.unit,
             "noise": result.noise,
-            "noisy_markers": result.fitted.num_noisy,
+            "noisy_markers": int((~result.fitted.used).sum()),
             "fitted": _errors(result.fitted),
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
@@ -95,7 +96,7 @@ def _errors(maps: FlowMaps) -> dict[str, float]:
     return {
         "before": maps.error(maps.before),
         "after": maps.error(maps.after),
-        "rms": float(np.sqrt((maps.recorded[:, maps.used] ** 2).mean())),
+        "rms": maps.error(np.zeros_like(maps.recorded)),
     }
 
 
@@ -158,8 +159,8 @@ def error_lines(result: Calibration) -> list[str]:
             f"{len(maps.recorded)} {kind} flow maps: error {before:.3g} {result.unit} before, "
             f"{after:.3g} {result.unit} after calibration; noise {result.noise:.3g} {result.unit}"
         )
-    if noisy := result.fitted.num_noisy:
-        lines.append(f"{noisy} of {len(result.fitted.used)} markers are too noisy and are not compared")
+    if text := noisy_markers_text(result.fitted.used):
+        lines.append(text)
     if not result.reproduced:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "

@@ -97,10 +97,11 @@ class InsertionAttempts:
     threads: of the simulator; None uses all available cores. Results do not depend on it.
     steps: simulation steps of a descent; None gives `DESCENT_SPEED`
 
-    `sensors` are the pads. `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad]. Write to
-    it between attempts. An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the memory of
-    its trajectory; `sim` simulates that many, and holds the end of the last attempt. Raises UsageError when the scene
-    does not match the task.
+    `sensors` are the pads. `pose` (N, 3) holds the gripper poses in the hole's frame: x [m], y [m], yaw [rad];
+    `stop_shear` (N,) is the mean shear of the markers at which contact stops a descent [N]. Both are drawn with a part;
+    write to them between attempts. An attempt is one rollout of at most `ROLLOUT_SIZE` environments, which bounds the
+    memory of its trajectory; `sim` simulates that many, and holds the end of the last attempt. Raises UsageError when
+    the scene does not match the task.
     """
 
     def __init__(
@@ -132,12 +133,12 @@ class InsertionAttempts:
         self._geometry = part_geometry(task.part)
         self._clear_height = max(_CLEAR_HEIGHT, task.part.depth + task.part.size[2])
         self.pose: Array = np.zeros((num_envs, 3))
+        self.stop_shear: Array = np.full(num_envs, np.inf)
         self.drawn: dict[str, Array] = {}  # quantities of the latest `draw`, one value for each of its environments
         self.sensors = SensorModel([pad.positions for pad in self.scene.pads], num_envs)
         self._jitter: Array = np.zeros(num_envs)  # of the start height in the last attempt [m]
         self._last_step = np.zeros(num_envs, dtype=int)  # at which the last attempt ended
         self._start_height: Array = np.zeros(num_envs)  # half-range of the start height per attempt [m]
-        self._stop_shear: Array = np.full(num_envs, np.inf)
         self._params = np.repeat(self.sim.params[:1], num_envs, axis=0)
         # The right jaw is force controlled; the left one holds its position.
         self._param("hold_right.kp")[:] = self._param("hold_right.kd")[:] = 0
@@ -170,7 +171,7 @@ class InsertionAttempts:
         params = simulator_parameters(sampled, elastic=self.scene.friction == "elastic")
         for name, values in hole_parameters(self.scene, params).items():
             self._param(name)[rows] = values
-        self._stop_shear[rows], self._start_height[rows] = sampled["stop_shear"], sampled["start_height"]
+        self.stop_shear[rows], self._start_height[rows] = sampled["stop_shear"], sampled["start_height"]
         self.pose[rows] = self.task.draw_misalignment(rng, len(rows))
         if misalignment is not None:
             self.pose[rows] = misalignment
@@ -201,14 +202,11 @@ class InsertionAttempts:
             values[rows] = getattr(sim, name)[:n]
         self._grasp_shear[rows] = sim.tactile()[:n, :, :2]
 
-    def attempt(
-        self, rng: np.random.Generator, *, which: Mask | None = None, stop_shear: float | None = None
-    ) -> AttemptResult:
+    def attempt(self, rng: np.random.Generator, *, which: Mask | None = None) -> AttemptResult:
         """Simulate one attempt in the environments `which` (N,), or in all, starting from `pose`.
 
-        As on the robot, contact stops the descent: later frames repeat the forces at the stop. `stop_shear` is the mean
-        shear of the markers that stops it [N]; None: that of the randomization. The first axis of the results counts
-        the environments in `which`.
+        As on the robot, contact stops the descent at `stop_shear`: later frames repeat the forces at the stop. The
+        first axis of the results counts the environments in `which`.
         """
         chosen = np.ones(self.num_envs, dtype=bool) if which is None else which
         rows = np.flatnonzero(chosen)
@@ -220,7 +218,7 @@ class InsertionAttempts:
         height, inserted, failed = np.zeros(len(rows)), np.zeros(len(rows), bool), np.zeros(len(rows), bool)
         depth = np.full(len(rows), self.task.descent)
         for part in _parts(len(rows)):
-            trajectory = self._simulate(rows[part], jitter[part], steps, stop_shear)
+            trajectory = self._simulate(rows[part], jitter[part], steps)
             n = len(rows[part])
             for k, step in enumerate(steps):
                 # The markers of the start are those of the closed grasp.
@@ -241,16 +239,16 @@ class InsertionAttempts:
     def _in_contact(self, rows: Rows, change: Array) -> Mask:
         """Whether the shear along a finger shows contact, after its `change` (n, markers, 2) [N] in a descent."""
         along = change[..., 0].reshape(len(rows), len(PADS), -1).mean(2)
-        return np.asarray(along.max(1) > _CONTACT * self._stop_shear[rows])
+        return np.asarray(along.max(1) > _CONTACT * self.stop_shear[rows])
 
-    def _simulate(self, rows: Rows, jitter: Array, steps: list[int], stop_shear: float | None = None) -> Trajectory:
-        """The descent of the grippers `rows`, read after `steps`; `stop_shear` as in `attempt`."""
+    def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
+        """The descent of the grippers `rows`, read after `steps`."""
         sim, n, z = self.sim, len(rows), self._arm_u[2]
         start = self._start(rows, jitter)
         u = np.repeat(start[None], self._steps, axis=0)
         u[:, :n, z] = start[:n, z] - (self.task.descent * np.arange(1, self._steps + 1) / self._steps)[:, None]
         threshold = np.full(sim.num_envs, np.inf)
-        threshold[:n] = self._stop_shear[rows] if stop_shear is None else stop_shear
+        threshold[:n] = self.stop_shear[rows]
         can_stop = self._reference_at < self._steps
         self._trajectory = trajectory = sim.rollout(
             u,

@@ -114,13 +114,13 @@ def _planned(
     world: InsertionAttempts, misalignment: Array, plan: Sequence[PlannedMotion], rng: np.random.Generator
 ) -> list[_Row]:
     """The motions of a plan on the first part; those that fall into the hole have no contact and are not recorded."""
-    per_newton = displacement_scale(world.scene)
+    per_newton, drawn = displacement_scale(world.scene), float(world.stop_shear[0])
     rows = []
     for motion in plan:
         planar = np.array(motion.planar_pose)
         world.pose[0] = in_hole(misalignment[0], planar)
-        stop = None if motion.stop_shear_mm is None else motion.stop_shear_mm / per_newton
-        result = world.attempt(rng, which=np.arange(world.num_envs) == 0, stop_shear=stop)
+        world.stop_shear[0] = drawn if motion.stop_shear_mm is None else motion.stop_shear_mm / per_newton
+        result = world.attempt(rng, which=np.arange(world.num_envs) == 0)
         if result.failed[0]:
             raise UsageError("this world cannot be simulated")
         if not result.inserted[0]:

@@ -36,19 +36,23 @@ class ErrorModel:
         return int(self.used.sum())
 
     @cached_property
-    def sigma(self) -> Array:
-        """Standard deviation of a marker without the common shift [N], (n,)."""
-        return np.sqrt(self._variance)
+    def _of_model(self) -> Array:
+        """Variance of the error of the model, (n,)."""
+        return np.asarray((self.model_error * self.rms) ** 2)
 
     @cached_property
     def _variance(self) -> Array:
-        return np.asarray(self.noise**2 + (self.model_error * self.rms) ** 2 + _LEAST_VARIANCE)
+        """Variance of a marker without the common shift, (n,)."""
+        return np.asarray(self.noise**2 + self._of_model + _LEAST_VARIANCE)
+
+    @cached_property
+    def _sigma(self) -> Array:
+        return np.asarray(np.sqrt(self._variance))
 
     @cached_property
     def cluster_size(self) -> Array:
         """How many neighbouring markers count as one, (n,): 1 with noise only, `_CORRELATED` without noise."""
-        shared = (self.model_error * self.rms) ** 2 + _LEAST_VARIANCE
-        return np.asarray((self.noise**2 + _CORRELATED * shared) / self._variance)
+        return np.asarray((self.noise**2 + _CORRELATED * (self._of_model + _LEAST_VARIANCE)) / self._variance)
 
     @property
     def num_independent(self) -> Array:
@@ -59,7 +63,7 @@ class ErrorModel:
     def _shift_variance(self) -> Array:
         """Variance of the common shift of each pad relative to that of the mean of its markers, (n, pads)."""
         independent = self.used.reshape(2, -1).sum(1) / self.cluster_size[:, None]
-        return np.asarray(independent * (self.drift / self.sigma[:, None]) ** 2)
+        return np.asarray(independent * (self.drift / self._sigma[:, None]) ** 2)
 
     @cached_property
     def log_determinant(self) -> float:
@@ -72,7 +76,7 @@ class ErrorModel:
         per_pad = difference.reshape(len(rows), 2, -1, 2)
         per_pad = per_pad - mean_fraction[:, :, None, None] * self._mean(per_pad)
         compared = per_pad.reshape(len(rows), -1, 2)[:, self.used]
-        return np.asarray(compared.reshape(len(rows), -1) / self.sigma[rows][:, None])
+        return np.asarray(compared.reshape(len(rows), -1) / self._sigma[rows][:, None])
 
     def misfit(self, residuals: Array, rows: NDArray[np.int64] | None = None) -> Array:
         """Robust loss (…, m) of residuals (…, m, k) of the flow maps `rows`, by default all."""

@@ -32,7 +32,7 @@ MOTIONS = 5  # of a plan
 USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before anything is recorded [N]
 _OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
 _YAWS = np.radians([-8.0, 0.0, 8.0])
-STOP_SHEAR_MM = 0.25  # mean shear of a pad at which contact stops a planned descent, unless a lab allows less
+STOP_SHEAR_MM = 0.25  # mean shear along the finger at which contact stops a planned descent in an unknown lab
 _LEVELS = 8  # depths at which the stop is searched, a constant ratio apart
 _FIRST_LEVEL = 0.44e-3  # [m] below the start of an attempt, shortly before the rim
 _SPREAD = 0.7  # of the scenarios' parameters, relative to the prior
@@ -76,14 +76,15 @@ def plan_motions(
     candidates = _candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
     drift = DRIFT if fitted is None else fitted.best.drift
+    stop_shear = stop_shear_mm / displacement_scale(readings.forces.scene)
     found = []
     for k in range(scenarios):
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
             poses = in_hole(misalignment, candidates)
-            stop = _stops(readings, point, poses, stop_shear_mm)
-            found.append(information(readings, point, Descents(poses, np.zeros(len(poses)), stop), noise, drift))
+            depths = _stops(readings, point, poses, stop_shear)
+            found.append(information(readings, point, Descents(poses, np.zeros(len(poses)), depths), noise, drift))
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
@@ -122,8 +123,8 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
     return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
 
 
-def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear_mm: float) -> Array:
-    """Depths (n,) [m] at which contact stops attempts at poses (n, 3) in the hole frame."""
+def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear: float) -> Array:
+    """Depths (n,) [m] at which a mean shear of `stop_shear` [N] stops attempts at poses (n, 3) in the hole frame."""
     n, task = len(poses), readings.forces.task
     depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
     values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
@@ -131,7 +132,7 @@ def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear_mm: fl
     reading, _ = readings.read(values, descents)
     shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
     shear[:, -1] = np.inf
-    return np.asarray(depths[(shear > stop_shear_mm / displacement_scale(readings.forces.scene)).argmax(1)])
+    return np.asarray(depths[(shear > stop_shear).argmax(1)])
 
 
 def _greedy(found: Array, before: Array, pose: Array, count: int) -> tuple[list[int], tuple[float, ...], Array]:

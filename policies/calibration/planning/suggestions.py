@@ -46,7 +46,8 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
         depth = _DEPTH + deeper
         try:
             descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
-            added = information(problem.readings, result.best.point, descents, problem.noise, result.best.drift)[0]
+            noise, drift = problem.errors.noise, result.best.drift
+            added = information(problem.readings, result.best.point, descents, noise, drift)[0]
             after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue

@@ -9,7 +9,7 @@ from rich.table import Table
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.output import Output, progress_bar
 from gelflow.figures import save
-from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, simulate
+from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, noisy_markers_text, simulate
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.policies.calibration.session_recordings import read_recordings
 
@@ -40,7 +40,7 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
             {
                 "unit": recordings.unit,
                 "noise": recordings.noise(),
-                "noisy_markers": result.num_noisy,
+                "noisy_markers": int((~result.used).sum()),
                 "error": result.error,
                 "attempts": [
                     {"name": name, "relative_error": float(error), "cosine": float(cosine)}
@@ -59,8 +59,8 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
         f"root mean square error {result.error:.3g} {recordings.unit} with the values of the scene, "
         f"noise {recordings.noise():.3g} {recordings.unit}"
     )
-    if result.num_noisy:
-        output.text(f"{result.num_noisy} of {len(result.used)} markers are too noisy and are not compared")
+    if text := noisy_markers_text(result.used):
+        output.text(text)
     for name in strange:
         output.text(f"warning: {name}: recorded and simulated flow map have nothing in common")
     if args.out:

@@ -70,11 +70,13 @@ def test_slow_descent_keeps_its_speed(cell: ArmAndMock) -> None:
         cell.arm.target(floor, DOWN, lifetime=0.5, speed=0.5e-3)
         cell.clock.sleep(0.05)
     records = [r for r in cell.arm.drain_log() if r.commanded is not None and r.applied is not None]
-    half = records[len(records) // 3 :]
+    # A busy computer may interrupt a motion: messages are lost, or the target expires.
+    interrupted = np.flatnonzero(np.diff([r.sequence for r in records]) != 1) + 1
+    longest = max(np.split(np.arange(len(records)), interrupted), key=len)
+    half = [records[i] for i in longest[len(longest) // 3 :]]
     heights = np.array([r.applied[0][2] for r in half if r.applied is not None])
     times = np.array([r.controller_time for r in half])
-    # The median over spans of 25 cycles: on a busy computer a target may expire, and the arm holds for a while.
-    speed = -np.median((heights[25:] - heights[:-25]) / (times[25:] - times[:-25]))
+    speed = -np.polyfit(times, heights, 1)[0]
     assert speed == pytest.approx(0.5e-3, rel=0.05)
     measured = np.array([r.measured[0][2] for r in half])
     # The robot lags by 10 to 20 ms, which is 5 to 10 µm at this speed.

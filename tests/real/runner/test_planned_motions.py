@@ -11,6 +11,7 @@ from tests.real.runner.harness import plan_for
 from gelflow.cli.main import main
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
+from gelflow.policies.calibration.planning.motions import STOP_SHEAR_MM
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.real.runner import PlanPolicy
 from gelflow.real.runner.insertion.planned_motions import check_motions
@@ -66,7 +67,7 @@ def test_a_lab_with_a_larger_stop_shear_needs_no_limit_of_plans(tmp_path: Path) 
     read = load_lab(lab)
     assert read.descent.largest_stop_shear_mm == 0.5
     check_motions((PlannedMotion(0.0, 0.0, 0.0, 1e-3, 0.5), PlannedMotion(0.0, 0.0, 0.0, 1e-3)), read, INSERTION)
-    assert load_lab(EXAMPLE).descent.largest_stop_shear_mm == 0.25
+    assert load_lab(EXAMPLE).descent.largest_stop_shear_mm == STOP_SHEAR_MM == 0.25
 
 
 @pytest.mark.parametrize(

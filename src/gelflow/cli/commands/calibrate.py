@@ -1,10 +1,12 @@
 """`gelflow calibrate`: fit the simulator to recorded insertions, and plan the attempts to record next."""
 
 import argparse
+import dataclasses
 import json
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -116,7 +118,7 @@ def _lab_recordings(args: argparse.Namespace) -> Recordings:
 
 def _write_plan(
     args: argparse.Namespace, output: Output, recordings: Recordings, fitted: FitResult | None
-) -> list[dict[str, float]]:
+) -> list[dict[str, Any]]:
     """Make, write and print a plan; returns its motions as plain data."""
     workspace, stop = None, STOP_SHEAR_MM
     if args.lab is not None:
@@ -139,10 +141,7 @@ def _write_plan(
     for line in _plan_lines(plan):
         output.text(line)
     output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {args.plan}")
-    return [
-        {"x": m.x, "y": m.y, "yaw": m.yaw, "depth": m.depth, "stop_shear_mm": stop, "gain": gain}
-        for m, gain in zip(plan.motions, plan.gains, strict=True)
-    ]
+    return [dataclasses.asdict(motion) | {"gain": gain} for motion, gain in zip(plan.motions, plan.gains, strict=True)]
 
 
 def _plan_lines(plan: Plan) -> list[str]:
