@@ -35,12 +35,18 @@ class Episodes:
     metrics: dict[str, Array] = field(default_factory=dict)  # at the end
 
     def result(self, name: str) -> EvaluationResult:
-        """Means over the episodes."""
+        """Means over the episodes.
+
+        The mean return is that of the episodes with an action: one that the first attempt ends has none, and how many
+        do so differs between evaluations by chance.
+        """
+        acted = self.length > _first_length(self.length_unit)
+        mean_return = float(self.reward[acted].mean()) if acted.any() else 0.0
         lengths = self.length[self.success]
         mean = float(lengths.mean()) if len(lengths) else float("nan")
         counts = len(self.success), int(self.success.sum())
         metrics = {metric: float(values.mean()) for metric, values in self.metrics.items()}
-        return EvaluationResult(name, *counts, mean, float(self.reward.mean()), self.length_unit, metrics)
+        return EvaluationResult(name, *counts, mean, mean_return, self.length_unit, metrics)
 
 
 @dataclass
@@ -95,7 +101,7 @@ def run_episodes(
     episodes < 1.
     """
     rows: list[list[tuple[Any, ...]]] = [[] for _ in range(task.num_envs)]
-    first = 1 if task.length_unit == "attempts" else 0
+    first = _first_length(task.length_unit)
     length, reward = np.zeros(task.num_envs, dtype=np.int64), np.zeros(task.num_envs)
     for event, which in _play(policy, task, episodes=episodes, seed=seed):
         if event == "start":
@@ -149,6 +155,11 @@ def record_films(
 def _quota(count: int, episodes: int) -> NDArray[np.int64]:
     """Number of episodes of each of `count` environments."""
     return np.full(count, episodes // count) + (np.arange(count) < episodes % count)
+
+
+def _first_length(unit: str) -> int:
+    """Length of an episode before its first action."""
+    return 1 if unit == "attempts" else 0
 
 
 def _play(

@@ -15,7 +15,7 @@ class EvaluationResult:
     episodes: int
     successes: int
     length: float  # mean length of the successful episodes; nan without any
-    reward: float  # mean return
+    reward: float  # mean return of the episodes with an action
     length_unit: str = "corrections"  # "steps"; "attempts", the first included; or "corrections" between attempts
     metrics: Mapping[str, float] = field(default_factory=dict)  # means of `TaskBatch.metrics` at the end
 

@@ -21,6 +21,7 @@ from gelflow.policies.training.run import POLICY, Progress, RunSettings, Trainin
 from gelflow.sim.tasks.cap_rotation import CapRotationTask
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
 from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.grasp import GraspTask
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.pushing import Pushing, PushingTask
 from gelflow.sim.tasks.registry import make_task
@@ -112,8 +113,8 @@ _GRASP = dataclasses.replace(
 _PUSHING_PPO = PPOSettings(rollout=80, batch=128, entropy=0.0)
 
 
-def _grasp(steps: int, settings: PPOSettings) -> Recipe:
-    return Recipe("grasp", steps, 32, 4_096, 256, "ppo", settings, _ppo)
+def _grasp(settings: PPOSettings, **task: Any) -> Recipe:
+    return Recipe("grasp", 20_480, 32, 4_096, 256, "ppo", settings, _ppo, options={"task": GraspTask(**task)})
 
 
 def _cap(settings: PPOSettings, envs: int, **task: Any) -> Recipe:
@@ -149,7 +150,11 @@ _INSERTION_PPO = PPOSettings(
 )
 
 _RECIPES: dict[str, dict[str, Recipe]] = {
-    "grasp": {DEFAULT: _grasp(20_480, _GRASP), PAPER: _grasp(20_480, _TABLE_6)},
+    "grasp": {
+        DEFAULT: _grasp(_GRASP),
+        PAPER: _grasp(_TABLE_6),
+        "chosen-force": _grasp(_GRASP, force_range=(1.0, 16.0)),
+    },
     "pushing": {
         DEFAULT: _pushing("tactile", recurrent=64),
         PAPER: _pushing("tactile"),

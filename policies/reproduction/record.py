@@ -91,6 +91,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     pooled = EvaluationResult("", episodes, successes, float("nan"), float("nan"))
     unit = next(name for name in LENGTHS if name in rows[0])
     lengths = [row[unit] for row in rows if row[unit] is not None]
+    metrics = {name: statistics.fmean(row["metrics"][name] for row in rows) for name in rows[0].get("metrics", {})}
     return {
         "episodes": episodes,
         "success": pooled.success,
@@ -101,6 +102,7 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         f"{unit}_deviation": _deviation(lengths),
         "reward": statistics.fmean(row["reward"] for row in rows),
         "reward_deviation": _deviation([row["reward"] for row in rows]),
+        **({"metrics": metrics} if metrics else {}),
     }
 
 

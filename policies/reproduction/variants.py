@@ -57,6 +57,10 @@ _REPRODUCTIONS = (
             Variant("7 blocks", evaluation={"blocks": 7}, trained_as="11 blocks", paper=Published(0.933)),
             Variant("13 blocks", evaluation={"blocks": 13}, trained_as="11 blocks", paper=Published(0.998)),
             Variant("moving load", evaluation={"moving_load": True}, trained_as="11 blocks"),
+            Variant("chosen force", "chosen-force"),
+            Variant("chosen force, 7 blocks", evaluation={"blocks": 7}, trained_as="chosen force"),
+            Variant("chosen force, 13 blocks", evaluation={"blocks": 13}, trained_as="chosen force"),
+            Variant("chosen force, moving load", evaluation={"moving_load": True}, trained_as="chosen force"),
         ),
     ),
     Reproduction(

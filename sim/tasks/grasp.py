@@ -148,6 +148,8 @@ class Grasp(AttemptTask):
             max(1, round(time / self.scene.step)) for time in (task.close_time, task.lift_time, task.hold_time)
         )
         self.info |= {name: np.zeros(num_envs) for name in ("tilt", "lift", "divisor", "position", "force")}
+        if task.force_range is not None:
+            self.metrics = {"force [N]": self.info["force"]}
 
     def oracle(self) -> Array:
         """Actions to the centre of mass."""

@@ -1,5 +1,6 @@
 """Recipes, the evaluation report, and the commands `gelflow train` and `gelflow eval` of tasks other than insertion."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,16 @@ def test_every_episode_counts_once_whatever_its_length() -> None:
         assert (episodes.length <= 4).all()
     again = run_episodes(Direct(PointTask(7)), PointTask(7), episodes=50, seed=2)
     assert (again.reward == many.reward).all()
+
+
+def test_the_mean_return_is_that_of_the_episodes_with_an_action() -> None:
+    success, reward = np.array([True, True, True, False]), np.array([0.0, 100.0, 98.0, -3.0])
+    attempts = Episodes(success, ~success, np.array([1, 2, 3, 10]), reward, length_unit="attempts")
+    assert attempts.result("policy").reward == 65 and attempts.result("policy").length == 2
+    steps = dataclasses.replace(attempts, length_unit="steps")
+    assert steps.result("policy").reward == 48.75
+    first = Episodes(success[:1], ~success[:1], np.array([1]), reward[:1], length_unit="attempts")
+    assert first.result("policy").reward == 0
 
 
 def test_the_metrics_of_a_task_are_means_over_the_ends_of_the_episodes() -> None:

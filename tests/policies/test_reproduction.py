@@ -116,13 +116,14 @@ def test_the_tables_of_variants_are_complete() -> None:
 
 def test_rows_pool_the_episodes_and_spread_over_the_seeds() -> None:
     rows = [
-        {"episodes": 10, "successes": n, "success": n / 10, "steps": steps, "reward": -1.0}
+        {"episodes": 10, "successes": n, "success": n / 10, "steps": steps, "reward": -1.0, "metrics": {"force [N]": n}}
         for n, steps in ((9, 4.0), (10, 6.0), (0, None))
     ]
     pooled = over_seeds(rows)
     assert pooled["episodes"] == 30 and pooled["success"] == pytest.approx(19 / 30) and pooled["steps"] == 5
     assert pooled["success_deviation"] == pytest.approx(np.std([0.9, 1.0, 0.0], ddof=1))
     assert over_seeds(rows[:1])["success_deviation"] is None
+    assert pooled["metrics"] == {"force [N]": pytest.approx(19 / 3)}
 
 
 def test_the_command_writes_rows_and_a_picture(

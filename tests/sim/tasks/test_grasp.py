@@ -140,6 +140,8 @@ def test_policy_may_choose_the_force() -> None:
     batch.step(np.array([[0, -1], [0, 0], [0, 1]]), rng)
     np.testing.assert_allclose(batch.info["force"], [4, 10, 16])
     np.testing.assert_allclose(batch.reward, 100 - batch.info["force"])
+    np.testing.assert_allclose(batch.metrics["force [N]"], [4, 10, 16])
+    assert not Grasp(1, threads=1).metrics
     with pytest.raises(UsageError, match="force_range must be 0 < low < high"):
         GraspTask(force_range=(4.0, 25.0))
 
