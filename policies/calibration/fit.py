@@ -1,11 +1,14 @@
 """The fit: a global search, then searches of the poses and Levenberg-Marquardt steps in the parameters in turn.
 
+In between, the pose of each insertion is searched globally with the parameters found so far: local searches do not
+leave a wrong pose, for which wrong parameters make up.
+
 It is repeated from several independent starts. The forces have kinks and steps where contact points cross edges of the
 hole, so that starts can end in different minima; their spread is part of the intervals.
 """
 
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 
@@ -15,6 +18,7 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError
 from gelflow.helper_process import end_with_parent
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally, search_nearby
+from gelflow.policies.calibration.pose_search import better_poses
 from gelflow.policies.calibration.poses import prior_cost_of_all, refined_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import MODEL_ERROR, Recordings
@@ -22,9 +26,10 @@ from gelflow.policies.calibration.uncertainty import covariance
 
 Array = NDArray[np.float64]
 
-# Ensembles and rounds of local searches after the global search. Of an ensemble: the error of the model that it allows
-# for, and its spread around the best member, relative to the prior.
-_PASSES = ((((0.04, 0.2), (MODEL_ERROR, 0.1)), 1), (((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3))
+# Ensembles and rounds of local searches, before and after the poses of all insertions are searched once more. Of an
+# ensemble: the error of the model that it allows for, and its spread around the best member, relative to the prior.
+_BEFORE = ((0.04, 0.2), (MODEL_ERROR, 0.1)), 1
+_AFTER = ((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3
 _SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, relative to their prior
 _SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
@@ -36,7 +41,7 @@ class FitSettings:
 
     starts: int = 4  # independent fits
     members: int = 192  # of the first ensemble of the global search
-    nearby: int = 80  # members of the ensembles around its result
+    nearby: int = 80  # members of the later ensembles
     poses: int = 32  # random poses of each insertion at each size of a search
     steps: int = 3  # of Levenberg-Marquardt in each round
 
@@ -126,18 +131,32 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
     problem = Problem(recordings, threads=1)
     try:
         point, poses = search_globally(rough_problem(recordings, threads=1), settings.members, rng)
-        for ensembles, rounds in _PASSES:
-            for error, spread in ensembles:
-                problem.allow_for(model_error=error)
-                point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
-            problem.allow_for_present_drift(point, poses)
-            point, poses = _descend(problem, point, poses, rng, settings, rounds)
+        point, poses = _improve(problem, point, poses, rng, settings, *_BEFORE)
+        point, poses = better_poses(problem, point, poses, rng, members=settings.nearby, count=settings.poses)
+        point, poses = _improve(problem, point, poses, rng, settings, *_AFTER)
     except SimulationError:
         return None
     chi = problem.errors.chi(problem.residuals(point, poses)[0])
     return StartResult(
         point, poses, covariance(problem, point, poses, chi), _cost(problem, point, poses), chi, problem.errors.drift
     )
+
+
+def _improve(
+    problem: Problem,
+    point: Array,
+    poses: Array,
+    rng: np.random.Generator,
+    settings: FitSettings,
+    ensembles: Sequence[tuple[float, float]],
+    rounds: int,
+) -> tuple[Array, Array]:
+    """Ensembles around the present guess, then local searches."""
+    for error, spread in ensembles:
+        problem.allow_for(model_error=error)
+        point, poses = search_nearby(problem, point, poses, spread, settings.nearby, rng)
+    problem.allow_for_present_drift(point, poses)
+    return _descend(problem, point, poses, rng, settings, rounds)
 
 
 def _descend(

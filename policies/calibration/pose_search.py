@@ -7,17 +7,15 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally
-from gelflow.policies.calibration.poses import draw_poses, refined_poses
+from gelflow.policies.calibration.poses import costs_of_insertions, draw_poses, refined_poses
 from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
 
 _STARTS = 2  # independent searches of an insertion, until one explains the flow maps; the best one counts
 _EXPLAINED = 1.0  # root mean square of the whitened residuals up to which a search explains the flow maps
-_MEMBERS = 64  # of the first ensemble
-_SPREADS = (0.3, 0.1, 0.03)  # of the ensembles after it
+_SPREADS = (0.3, 0.1, 0.03)  # of the ensembles after the first one
 _SIZES = (0.1, 0.05, 0.025, 0.012)  # of the local search
-_POSES = 32  # random poses at each of these sizes
 
 
 def find_poses(
@@ -25,34 +23,55 @@ def find_poses(
     parameters: Array,
     rng: np.random.Generator,
     progress: Callable[[int], None] = lambda done: None,
+    *,
+    members: int = 64,
+    count: int = 32,
+    threads: int | None = None,
 ) -> tuple[Array, Array]:
     """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses.
 
     Where an insertion cannot be simulated with these parameters, its pose is drawn from the prior. `progress` gets the
-    number of finished insertions.
+    number of finished insertions. `members` are those of the first ensemble of a search, `count` the random poses at
+    each size of the local search.
     """
     point, poses = np.zeros(problem.size), np.zeros((problem.insertions, 3))
     point[: len(parameters)] = parameters
-    rough = rough_problem(problem.recordings)
+    rough = rough_problem(problem.recordings, threads=threads)
     rough.allow_for(drift=problem.errors.drift)
     for i in range(problem.insertions):
-        found = _search(problem.of(i), rough.of(i), parameters, rng)
+        found = _search(problem.of(i), rough.of(i), parameters, rng, members, count)
         point[len(parameters) :][problem.recordings.insertion == i] = found[0][len(parameters) :]
         poses[i] = found[1][0]
         progress(i + 1)
     return point, poses
 
 
-def _search(problem: Problem, rough: Problem, parameters: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+def better_poses(
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, members: int, count: int
+) -> tuple[Array, Array]:
+    """The point and poses (insertions, 3), with what `find_poses` finds for insertions that it fits better.
+
+    One thread is used, as in a fit.
+    """
+    n = len(problem.fitted)
+    other, found = find_poses(problem, point[:n], rng, members=members, count=count, threads=1)
+    better = costs_of_insertions(problem, other, found) < costs_of_insertions(problem, point, poses)
+    heights = np.where(better[problem.recordings.insertion], other[n:], point[n:])
+    return np.concatenate([point[:n], heights]), np.where(better[:, None], found, poses)
+
+
+def _search(
+    problem: Problem, rough: Problem, parameters: Array, rng: np.random.Generator, members: int, count: int
+) -> tuple[Array, Array]:
     """Unknowns and pose (1, 3) of one insertion."""
     lowest = np.inf
     best = np.concatenate([parameters, np.zeros(len(problem.recordings))]), draw_poses(problem, 0, 1, rng)
     for _ in range(_STARTS):
         try:
-            start = search_globally(rough, _MEMBERS, rng, parameters=parameters, spreads=_SPREADS)
+            start = search_globally(rough, members, rng, parameters=parameters, spreads=_SPREADS)
         except SimulationError:
             return best
-        cost, *found = refined_poses(problem, *start, rng, sizes=_SIZES, count=_POSES)
+        cost, *found = refined_poses(problem, *start, rng, sizes=_SIZES, count=count)
         if cost < lowest:
             lowest, best = cost, (found[0], found[1])
         if problem.errors.chi(problem.residuals(*best)[0]) <= _EXPLAINED:

@@ -48,6 +48,18 @@ def prior_cost_of_all(problem: Problem, poses: Array) -> Array:
     return np.asarray(sum(prior_cost(problem, i, poses[:, i]) for i in range(problem.insertions)))
 
 
+def costs_of_insertions(problem: Problem, point: Array, poses: Array) -> Array:
+    """Part of the negative log posterior that depends on the pose and start heights of each insertion, (insertions,).
+
+    Infinite where an attempt cannot be simulated.
+    """
+    residuals, ok = problem.residuals_of(point[None], poses[None])
+    heights = point[len(problem.fitted) :]
+    of_attempts = np.where(ok[0], problem.errors.misfit(residuals[0]) + 0.5 * heights**2, np.inf)
+    of_poses = [float(prior_cost(problem, i, poses[i : i + 1])[0]) for i in range(problem.insertions)]
+    return np.asarray(np.bincount(problem.recordings.insertion, of_attempts, problem.insertions) + of_poses)
+
+
 def prior_information(problem: Problem, insertion: int) -> Array:
     """Information of the prior about the misalignment of an insertion, (3, 3) [1/m, 1/m, 1/rad each]."""
     found = problem.recordings.inserted.get(insertion)
