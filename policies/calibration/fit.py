@@ -72,7 +72,7 @@ class FitResult:
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the whitened parameters within a start, the mean of the starts."""
+        """Covariance of the whitened parameters, the mean of the starts."""
         return np.asarray(np.mean(self._covariances, axis=0))
 
     def interval(self, directions: Array) -> tuple[Array, Array]:
@@ -88,7 +88,16 @@ class FitResult:
 
     @property
     def _covariances(self) -> list[Array]:
-        return [start.covariance[: self.count, : self.count] for start in self.starts]
+        factor = 1 + 2 * self._typical_excess / (self.best.point.size + self.best.misalignment.size)
+        return [factor * start.covariance[: self.count, : self.count] for start in self.starts]
+
+    @property
+    def _typical_excess(self) -> float:
+        """Median cost of the other starts above the best one: so far above the lowest minimum a search may end.
+
+        One standard deviation of each unknown costs half the number of unknowns.
+        """
+        return float(np.median([start.cost - self.best.cost for start in self.starts[1:]] or [0.0]))
 
 
 def fit(

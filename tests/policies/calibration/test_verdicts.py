@@ -9,6 +9,7 @@ from tests.policies.calibration.recorded_world import LITTLE
 from gelflow.policies.calibration import calibration
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.fit import FitResult, StartResult
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
@@ -34,6 +35,16 @@ def test_forces_count_only_if_the_held_out_insertion_is_predicted(
         assert plain_report(result, [])["flow_maps"]["predicted"] is (limit > 0)
     monkeypatch.setattr(calibration, "REPRODUCED", 0.0)
     assert not confirmed(calibrate(recordings, settings=LITTLE))
+
+
+def test_starts_that_end_at_different_costs_widen_the_intervals() -> None:
+    def width(*costs: float) -> float:
+        starts = [StartResult(np.zeros(4), np.zeros((2, 3)), np.eye(4), cost, 1.0, 1e-3) for cost in costs]
+        low, high = FitResult(tuple(starts), 2).interval(np.eye(2))
+        return float((high - low)[0] / (2 * 1.96))
+
+    assert width(7.0) == width(7.0, 7.0) == pytest.approx(1)
+    assert width(7.0, 12.0) == width(7.0, 8.0, 12.0, 20.0) == pytest.approx(math.sqrt(2))
 
 
 def test_one_insertion_holds_nothing_out(world: RecordedWorld) -> None:
