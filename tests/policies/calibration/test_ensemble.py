@@ -6,7 +6,8 @@ import pytest
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration import ensemble
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
-from gelflow.policies.calibration.poses import draw_poses
+from gelflow.policies.calibration.pose_search import better_poses
+from gelflow.policies.calibration.poses import costs_of_insertions, draw_poses
 from gelflow.policies.calibration.problem import Problem
 
 
@@ -45,6 +46,20 @@ def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: Record
     residuals, _ = ensemble._residuals(problem, points, guessed)
     assert ok.all()
     assert found < 0.1 * ensemble._costs(problem, residuals, points, guessed).min()
+
+
+def test_wrong_poses_are_replaced_and_right_ones_kept(world: RecordedWorld) -> None:
+    problem = Problem(world.recordings.of(np.arange(2)), threads=1)
+    point = np.zeros(problem.size)
+    point[: len(problem.fitted)] = [float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted]
+    point[len(problem.fitted) :] = world.heights[: len(problem.recordings)] / problem.recordings.height_spread
+    poses = world.misalignment[:2] + np.array([[0.0, 0.0, 0.0], [3e-3, -3e-3, np.radians(6.0)]])
+    before = costs_of_insertions(problem, point, poses)
+    found = better_poses(problem, point, poses, np.random.default_rng(0), members=48, count=16)
+    after = costs_of_insertions(problem, *found)
+    assert after[0] <= before[0] and after[1] < 0.1 * before[1]
+    moved = np.abs(found[1] - world.misalignment[:2])
+    assert (moved < [0.5e-3, 0.5e-3, np.radians(1.5)]).all()
 
 
 def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
