@@ -46,8 +46,9 @@ def open_camera(
 class MjpegCamera(StreamCamera):
     """An MJPEG stream over HTTP. The JPEG bytes are passed on as received.
 
-    `connect_timeout` [s, robot time] bounds the connection and the head of the response together. A stall does not
-    close the connection: images that arrive later are used.
+    `connect_timeout` [s] bounds the connection and the head of the response together; it is not robot time, because a
+    faster mock robot does not make the network faster. A stall does not close the connection: images that arrive later
+    are used.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class MjpegCamera(StreamCamera):
         return self._parser.damaged if self._parser else 0
 
     def _connect(self) -> None:
-        deadline = time.monotonic() + self._clock.wall(self._connect_timeout)
+        deadline = time.monotonic() + self._connect_timeout
         try:
             link = socket.create_connection(self._address, timeout=self._left(deadline))
         except TimeoutError as error:

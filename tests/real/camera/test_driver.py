@@ -43,8 +43,8 @@ def served(rate: float = 100.0) -> Iterator[tuple[MockMjpegCamera, Source]]:
 
 
 @contextmanager
-def raw_server(answer: bytes, *, close: bool = False) -> Iterator[str]:
-    """A server that sends these bytes to every client, and then nothing."""
+def raw_server(answer: bytes, *, close: bool = False, delay: float = 0.0) -> Iterator[str]:
+    """A server that sends these bytes to every client after a delay [s], and then nothing."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         links: list[socket.socket] = []
 
@@ -54,6 +54,7 @@ def raw_server(answer: bytes, *, close: bool = False) -> Iterator[str]:
                     link, _ = listener.accept()
                     links.append(link)
                     link.recv(4096)
+                    time.sleep(delay)
                     link.sendall(answer)
                     if close:
                         link.close()
@@ -195,6 +196,12 @@ def test_other_servers_are_reported(answer: bytes, kind: type[PeerError], text: 
     with raw_server(answer) as url, pytest.raises(kind, match=text) as caught:
         MjpegCamera(url, "left", CLOCK, connect_timeout=0.3 if kind is PeerTimeout else PATIENT).open()
     assert url in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_fast_clock_does_not_shorten_the_wait_for_the_server() -> None:
+    head = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=x123\r\n\r\n"
+    with raw_server(head, delay=0.2) as url:
+        MjpegCamera(url, "left", ScaledClock(1000.0), connect_timeout=PATIENT).open().close()
 
 
 def test_server_that_closes_before_it_answers_is_reported() -> None:
