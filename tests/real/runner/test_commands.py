@@ -10,8 +10,10 @@ from tests.real.runner.harness import untrained_checkpoint
 
 from gelflow.cli.main import main
 from gelflow.cli.mock_process import mock_robot, true_state
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, PeerTimeout
+from gelflow.real.runner import run_plan
 from gelflow.real.runner.lab_file import load_lab
+from gelflow.real.runner.run_plan import RunPlan
 
 FACTOR = 4.0
 
@@ -38,6 +40,21 @@ def test_dry_run_with_the_mock_robot(tmp_path: Path, checkpoint: Path, capsys: p
         assert true_state(truth)["waited"] >= 0
     with pytest.raises(PeerError, match="does not answer"):
         true_state(truth)  # the mock robot has ended
+
+
+def test_a_timeout_of_a_demo_that_is_faster_than_real_time_names_a_remedy(
+    tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stall(plan: RunPlan) -> None:
+        raise PeerTimeout("the arm's pose is 1202 ms old, at most 1200 ms is allowed")
+
+    monkeypatch.setattr(run_plan, "run_insertions", stall)
+    options = ["--quick", "--checkpoint", str(checkpoint), "--factor"]
+    assert main(["demo", "--out", str(tmp_path / "fast"), *options, "4"]) == 2
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "is allowed; delays of this computer are 4 times as long in robot time: close programs" in printed
+    assert main(["demo", "--out", str(tmp_path / "real"), *options, "1"]) == 2
+    assert "delays of this computer" not in capsys.readouterr().err
 
 
 @pytest.mark.slow

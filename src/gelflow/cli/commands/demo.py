@@ -28,7 +28,7 @@ from gelflow.cli.options import (
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
-from gelflow.errors import GelflowError, UsageError
+from gelflow.errors import GelflowError, PeerTimeout, UsageError
 from gelflow.interrupts import interruptible
 from gelflow.task import InsertionTask
 
@@ -205,7 +205,7 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
             try:
                 run_insertions(plan)
             except GelflowError as caught:
-                error = caught  # raised after the results so far are shown
+                error = _explained(caught, series.factor)  # raised after the results so far are shown
         waited = true_state(truth_url)["waited"] / series.factor
     wall = time.monotonic() - begun
     note = ""
@@ -215,6 +215,14 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
     _draw(result, lab, series)
     output.console.print(_table(result, series.title))
     return result
+
+
+def _explained(error: GelflowError, factor: float) -> GelflowError:
+    """The error, with a remedy where a short delay of the computer is a time-out because robot time is faster."""
+    if factor <= 1 or not isinstance(error, PeerTimeout):
+        return error
+    remedy = f"delays of this computer are {factor:g} times as long in robot time: close programs, or use --factor 1"
+    return PeerTimeout(f"{error}; {remedy}")
 
 
 def _draw(result: _SeriesResult, lab: "Lab", series: _Series) -> None:
