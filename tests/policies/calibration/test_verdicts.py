@@ -1,5 +1,6 @@
 """Which parameters a calibration calls known: those of a fit that reproduces the recordings and predicts others."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -23,18 +24,25 @@ def confirmed(result: Calibration) -> set[str]:
 def test_forces_count_only_if_the_held_out_insertion_is_predicted(
     world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recordings = world.recordings.of(np.array([0, 1]))
+    fitted = Problem(world.recordings, threads=1).fitted
+    once = calibrate(world.recordings.of(np.array([0, 1])), settings=LITTLE)
+
+    def with_present_limits() -> Calibration:
+        estimates = calibration._estimates(fitted, once.fit, predicted=once.predicted is not False)
+        return dataclasses.replace(once, estimates=estimates)
+
+    assert with_present_limits().estimates == once.estimates
     monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
     for limit in (0.0, math.inf):
         monkeypatch.setattr(calibration, "PREDICTED", limit)
-        result = calibrate(recordings, settings=LITTLE)
+        result = with_present_limits()
         every = {estimate.parameter.name for estimate in result.estimates}
         assert every > set(QUANTITIES)
         assert confirmed(result) == (every if limit else every - set(QUANTITIES)) and result.predicted is (limit > 0)
         assert any("does not predict the held-out insertion" in line for line in error_lines(result)) is (limit == 0)
         assert plain_report(result, [])["flow_maps"]["predicted"] is (limit > 0)
     monkeypatch.setattr(calibration, "REPRODUCED", 0.0)
-    assert not confirmed(calibrate(recordings, settings=LITTLE))
+    assert not confirmed(with_present_limits())
 
 
 def test_starts_that_end_at_different_costs_widen_the_intervals() -> None:
