@@ -24,6 +24,8 @@ def confirmed(result: Calibration) -> set[str]:
 def test_forces_count_only_if_the_held_out_insertion_is_predicted(
     world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
+    monkeypatch.setattr(calibration, "PREDICTED", 0.0)
     fitted = Problem(world.recordings, threads=1).fitted
     once = calibrate(world.recordings.of(np.array([0, 1])), settings=LITTLE)
 
@@ -31,8 +33,7 @@ def test_forces_count_only_if_the_held_out_insertion_is_predicted(
         estimates = calibration._estimates(fitted, once.fit, predicted=once.predicted is not False)
         return dataclasses.replace(once, estimates=estimates)
 
-    assert with_present_limits().estimates == once.estimates
-    monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
+    assert with_present_limits().estimates == once.estimates and confirmed(once)
     for limit in (0.0, math.inf):
         monkeypatch.setattr(calibration, "PREDICTED", limit)
         result = with_present_limits()
