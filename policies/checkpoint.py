@@ -26,6 +26,7 @@ from gelflow.task import INSERTION, InsertionTask, TaskDescription
 
 FORMAT = 1
 MAX_BYTES = 2_000_000  # [bytes]
+_SHOWN = 8  # longest list of a setting that a message shows
 _HEADER_KEY = "gelflow"
 _SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 
@@ -150,7 +151,11 @@ def task_differences(trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> s
     absent = "absent"
     names = [*wanted, *(name for name in trained if name not in wanted)]
     pairs = [(name, trained.get(name, absent), wanted.get(name, absent)) for name in names]
-    return ", ".join(f"{name} {old!r} (here {new!r})" for name, old, new in pairs if old != new)
+    return ", ".join(f"{name} {_short(old)} (here {_short(new)})" for name, old, new in pairs if old != new)
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list) and len(value) > _SHOWN else repr(value)
 
 
 def _read(path: Path) -> bytes:

@@ -17,6 +17,7 @@ from gelflow.policies.calibration.recordings import Recordings
 
 Array = NDArray[np.float64]
 
+FORMAT = 2  # of report.json
 KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
 REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
 ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
@@ -67,10 +68,19 @@ class Calibration:
     fitted: FlowMaps
     held_out: FlowMaps | None  # None: there was one insertion only
     held_out_residual: float | None  # root mean square of their whitened residuals after the calibration
-    noise: float  # standard deviation of the difference of two readings of a marker
-    unit: str
+    recordings: Recordings  # all of them
     suggestions: tuple[Suggestion, ...]
     fit: FitResult
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the difference of two readings of a marker."""
+        return self.recordings.noise()
+
+    @property
+    def unit(self) -> str:
+        """Unit of the flow maps and the noise."""
+        return self.recordings.unit
 
     @property
     def reproduced(self) -> bool:
@@ -143,8 +153,7 @@ def calibrate(
         _flow_maps(problem, (result.best.point, result.best.misalignment), rng),
         held_out,
         residual,
-        recordings.noise(),
-        recordings.unit,
+        recordings,
         tuple(suggest(problem, result)),
         result,
     )

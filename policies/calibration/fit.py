@@ -75,6 +75,22 @@ class FitResult:
         """Covariance of the whitened parameters, the mean of the starts."""
         return np.asarray(np.mean(self._covariances, axis=0))
 
+    @property
+    def joint_distribution(self) -> tuple[Array, Array]:
+        """Mean and covariance of a joint normal distribution of the whitened parameters.
+
+        The covariance of one start is too small in some combinations of the parameters, along which the ends of the
+        starts differ. Theirs is added. No direction is wider than its prior.
+        """
+        points = np.stack([start.point[: self.count] for start in self.starts])
+        between = points - points.mean(0)
+        variances, axes = np.linalg.eigh(self.covariance + between.T @ between / len(points))
+        return points.mean(0), np.asarray((axes * np.clip(variances, 0.0, 1.0)) @ axes.T)
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Whitened parameters (count, parameters) from the joint distribution."""
+        return rng.multivariate_normal(*self.joint_distribution, size=count, method="eigh")
+
     def interval(self, directions: Array) -> tuple[Array, Array]:
         """95 % intervals of linear combinations (k, count) of the whitened parameters.
 

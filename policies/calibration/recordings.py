@@ -38,10 +38,14 @@ class Recordings:
     grasp_force: float | None = None  # commanded [N]; None: not recorded
     grasp_height: float | None = None  # of the pad centres above the part's centre, by the lab file [m]
     height_spread: float = 0.2e-3 / math.sqrt(3)  # standard deviation of the start height of an attempt [m]
+    # Attempts that were motions of a plan, with a stop shear of their own, (n,); empty: none.
+    planned: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     # Markers that are compared, (pads * rows * cols,); empty: those that are not noisy.
     used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
+        if not len(self.planned):
+            object.__setattr__(self, "planned", np.zeros(len(self.insertion), dtype=bool))
         if not len(self.used):
             object.__setattr__(self, "used", ~self._noisy_markers())
 
@@ -58,6 +62,7 @@ class Recordings:
             planar_pose=self.planar_pose[rows],
             depth=self.depth[rows],
             flow=self.flow[rows],
+            planned=self.planned[rows],
             names=tuple(name for name, row in zip(self.names, rows, strict=True) if row),
             inserted={number[i]: pose for i, pose in self.inserted.items() if i in number},
         )
@@ -75,6 +80,17 @@ class Recordings:
         second = corner - 2 * edge + 4 * f[:, :, 1:-1, 1:-1]
         of_pads = np.median(np.abs(second).reshape(f.shape[0] * f.shape[1], -1), axis=1)
         return float(np.quantile(of_pads, 0.25) / 0.6745 / 6)
+
+    def stop_shear(self) -> tuple[float, float] | None:
+        """Range of the shear along a finger at which descents stopped, in `unit`; None: all were motions of a plan.
+
+        The mean over the markers of the pad with more shear, from the lower quartile of the attempts to the largest:
+        a descent that ends without a stop shows less, one that stops late shows more.
+        """
+        if self.planned.all():
+            return None
+        along = np.abs(self.flow[~self.planned][..., 0].mean((2, 3))).max(1)
+        return float(np.quantile(along, 0.25)), float(along.max())
 
     def _noisy_markers(self) -> NDArray[np.bool_]:
         """Markers that are beyond the range of their neighbours in most attempts (pads * rows * cols,).

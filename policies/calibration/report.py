@@ -10,15 +10,11 @@ from typing import Any
 import numpy as np
 
 from gelflow.observation import Grid
-from gelflow.policies.calibration.calibration import ALLOWED_ERROR, Calibration, Estimate, FlowMaps
+from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization, plain_part
+from gelflow.policies.calibration.calibration import ALLOWED_ERROR, FORMAT, Calibration, Estimate, FlowMaps
 from gelflow.policies.calibration.comparison import noisy_markers_text
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
-from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
-from gelflow.sim.tasks.randomization import fixed_values
-from gelflow.sim.tasks.sensor_model import PAIR_QUANTITIES
-
-FORMAT = 1
 
 
 def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any]:
@@ -32,7 +28,8 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": 0 if held_out is None else len(held_out.recorded),
         },
         "parameters": {e.parameter.name: _plain_estimate(e) for e in result.estimates},
-        "randomization": randomization_ranges(result),
+        "part": plain_part(result.recordings.task),
+        "randomization": calibrated_randomization(result),
         "correlated": [{"parameters": [a, b], "correlation": r} for a, b, r in result.correlated],
         "flow_maps": {
             "unit": result.unit,
@@ -54,29 +51,6 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
     }
     plain: dict[str, Any] = to_plain(values)
     return plain
-
-
-def randomization_ranges(result: Calibration) -> dict[str, list[float]]:
-    """Quantity of the randomization → its 95 % interval, of those that the recordings determine at least partly.
-
-    Differences between the pads are included only where their interval excludes equal pads, which is the default.
-    """
-    return {
-        e.parameter.name: _range(e)
-        for e in result.estimates
-        if e.verdict != "unknown" and e.parameter.name in DEFAULT_RANDOMIZATION and not _equal_pads(e)
-    }
-
-
-def _equal_pads(estimate: Estimate) -> bool:
-    equal = fixed_values(PAIR_QUANTITIES).get(estimate.parameter.name)
-    return equal is not None and estimate.low <= equal <= estimate.high
-
-
-def _range(estimate: Estimate) -> list[float]:
-    """The interval; of a crosstalk from 0."""
-    least = 0.0 if estimate.parameter.name == "crosstalk" else -np.inf
-    return [max(estimate.low, least), max(estimate.high, least)]
 
 
 def _plain_estimate(estimate: Estimate) -> dict[str, Any]:

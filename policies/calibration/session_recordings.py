@@ -26,6 +26,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
     labs: list[tuple[float, float]] = []
+    planned: list[bool] = []  # only a session of planned motions names no policy
     number = 0
     for path in paths:
         with SessionReader(path) as session:
@@ -36,6 +37,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
             task = own
             labs.append(_grasp(path, described, own))
             found, entered = _attempts(path, session, number)
+        planned += [described.get("checkpoint") is None] * len(found)
         rows += found
         inserted |= entered
         number = max([number, *(row["insertion"] + 1 for row in found), *(i + 1 for i in entered)])
@@ -58,6 +60,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         settle=AT_REST,
         grasp_force=float(np.mean([force for force, _ in labs])),
         grasp_height=float(np.mean([height for _, height in labs])),
+        planned=np.array(planned),
         height_spread=_HEIGHT,
     )
 

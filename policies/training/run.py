@@ -26,6 +26,7 @@ from gelflow.policies.training import progress_curve
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.progress_log import ProgressLog
 from gelflow.policies.training.state import load_state, save_state
+from gelflow.session.records import readable_json
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 FORMAT = 1
@@ -239,7 +240,7 @@ class TrainingRun:
         versions = {"gelflow": __version__, "python": platform.python_version()}
         versions |= {"numpy": np.__version__, "torch": str(torch.__version__)}
         values = {"format": FORMAT, "finished": finished, "command": list(self.command), "versions": versions}
-        text = json.dumps({**values, "configuration": configuration}, indent=2) + "\n"
+        text = readable_json({**values, "configuration": configuration})
         replace_file(self.folder / CONFIGURATION, text.encode())
 
     def _finish(self, start: float) -> TrainingResult:

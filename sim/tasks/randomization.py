@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.arguments import check_type
+from gelflow.sim.arguments import check_type, shown
 from gelflow.toml_tables import suggestion
 
 Array = NDArray[np.float64]
@@ -104,15 +104,21 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Randomization:
-    """A randomization table: name → quantity, sampled in the order of the rows, once per episode."""
+    """A randomization table: name → quantity, sampled in the order of the rows, once per episode.
+
+    Quantities in `samples`, of which all have the same number of values (k,), are not drawn from their distributions:
+    an episode takes the values at one random index, so that they keep their dependence on each other.
+    """
 
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    samples: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_type("quantities", self.quantities, Mapping, "a mapping of names to quantities")
         for name, row in self.quantities.items():
             check_type(f"quantity {name!r}", row, Quantity, "a Quantity")
         object.__setattr__(self, "quantities", MappingProxyType(dict(self.quantities)))
+        object.__setattr__(self, "samples", MappingProxyType(self._checked(self.samples)))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.quantities)
@@ -124,8 +130,10 @@ class Randomization:
 
     def sample(self, rng: np.random.Generator, count: int, *, friction: str) -> dict[str, Array]:
         """Values of `count` episodes, name → (count,), of the quantities that the friction law has."""
+        size = next((len(values) for values in self.samples.values()), 0)
+        chosen = rng.integers(size, size=count) if size else None
         return {
-            name: row.distribution.sample(rng, count)
+            name: self.samples[name][chosen] if name in self.samples else row.distribution.sample(rng, count)
             for name, row in self.quantities.items()
             if row.friction in (None, friction)
         }
@@ -138,27 +146,55 @@ class Randomization:
         quantity or an invalid range.
         """
         quantities = dict(self.quantities)
+        samples = {name: values for name, values in self.samples.items() if name not in changes}
         for name, value in changes.items():
             row = self[name]
             try:
                 quantities[name] = dataclasses.replace(row, distribution=_distribution(value, row.distribution))
             except UsageError as error:
                 raise UsageError(f"randomization: {name}: {error}") from None
-        return Randomization(quantities)
+        return Randomization(quantities, samples)
+
+    def drawn_from(self, samples: Mapping[str, Sequence[float] | Array]) -> "Randomization":
+        """The table with some quantities drawn together from `samples`, quantity → values (k,).
+
+        Raises UsageError for an unknown quantity, values that are not finite, and different numbers of values.
+        """
+        return Randomization(self.quantities, {**self.samples, **samples})  # type: ignore[dict-item]
+
+    def _checked(self, samples: Mapping[str, Any]) -> dict[str, Array]:
+        checked = {}
+        for name, values in samples.items():
+            self[name]  # raises UsageError
+            try:
+                checked[name] = np.array(values, dtype=float)
+            except (TypeError, ValueError):
+                checked[name] = np.zeros(0)
+            if checked[name].ndim != 1 or not len(checked[name]) or not np.isfinite(checked[name]).all():
+                raise UsageError(f"randomization: {name}: samples must be finite numbers, got {shown(values)}")
+        if len(sizes := {len(values) for values in checked.values()}) > 1:
+            raise UsageError(f"randomization: all quantities need equally many samples, got {sorted(sizes)}")
+        return checked
 
     def rows(self) -> list[dict[str, Any]]:
         """The table as plain data, for checkpoints and documents."""
         return [
             {
                 "quantity": name,
-                "distribution": type(row.distribution).__name__,
-                **vars(row.distribution),
+                **self._described(name),
                 "unit": row.unit,
                 "friction": row.friction,
                 "meaning": row.meaning,
             }
             for name, row in self.quantities.items()
         ]
+
+    def _described(self, name: str) -> dict[str, Any]:
+        if name in self.samples:
+            values = self.samples[name]
+            return {"distribution": "Samples", "low": float(values.min()), "high": float(values.max())}
+        given = self.quantities[name].distribution
+        return {"distribution": type(given).__name__, **vars(given)}
 
 
 def fixed_values(quantities: Mapping[str, Quantity]) -> dict[str, float]:

@@ -37,15 +37,18 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
 
     `options` are those of the task's class; all tasks have `task` (the description), `preset`, `friction`,
     `randomization` and `threads`. `randomization` may also be the name of one of the task's tables, such as "full".
-    `ranges` replaces ranges of this table, quantity → (low, high), for example by those of a calibration. Raises
-    UsageError for an unknown name and an invalid range.
+    `ranges` replaces ranges of this table, quantity → (low, high); with `samples`, quantity → values (k,), quantities
+    are drawn together, for example from the distribution in which a calibration ends. Raises UsageError for an unknown
+    name, an invalid range and invalid samples.
     """
     batch_class = getattr(_module(name), _TASKS[name][1])
     if isinstance(table := options.get("randomization"), str):
         options["randomization"] = _named_randomization(name, table, options.get("task"))
-    if ranges := options.pop("ranges", None):
+    ranges, samples = options.pop("ranges", None) or {}, options.pop("samples", None) or {}
+    if ranges or samples:
         table = options.get("randomization") or _named_randomization(name, "default", options.get("task"))
-        options["randomization"] = table.replace(**{key: tuple(limits) for key, limits in ranges.items()})
+        table = table.replace(**{key: tuple(limits) for key, limits in ranges.items()})
+        options["randomization"] = table.drawn_from(samples)
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch

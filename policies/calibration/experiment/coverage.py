@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from scipy.stats import chi2
 
 from gelflow.errors import GelflowError
 from gelflow.policies.calibration.calibration import Calibration, calibrate
@@ -27,14 +28,16 @@ def counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
         "covered_worlds": sum(world["covered"] for world in done),
         "known": len(known),
         "known_in_interval": sum(known),
+        "jointly_covered_worlds": sum(world["jointly_covered"] for world in done),
         "results": worlds,
     }
 
 
 def coverage_table(result: dict[str, Any]) -> Table:
     """The counts as a table."""
-    table = Table("worlds", "refused", "all known in their intervals", "known parameters", "of these in the interval")
-    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval")
+    heads = "all known in their intervals", "known parameters", "of these in the interval", "all in the joint region"
+    table = Table("worlds", "refused", *heads)
+    keys = ("worlds", "refused", "covered_worlds", "known", "known_in_interval", "jointly_covered_worlds")
     table.add_row(*(str(result[key]) for key in keys))
     return table
 
@@ -69,6 +72,7 @@ def outcome(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any]:
     return {
         "known": known,
         "covered": all(known.values()),
+        "jointly_covered": _in_joint_region(result, truth),
         "outside": [name for name, found in inside.items() if not found],
         "verdicts": verdicts,
         "starts": len(result.fit.starts),
@@ -78,3 +82,12 @@ def outcome(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any]:
         "held_out_before": None if held_out is None else held_out.error(held_out.before),
         "held_out_after": None if held_out is None else held_out.error(held_out.after),
     }
+
+
+def _in_joint_region(result: Calibration, truth: Mapping[str, float]) -> bool:
+    """Whether the parameters in `truth` are in the 95 % region of the joint distribution that a training draws from."""
+    fitted = [e.parameter for e in result.estimates][: result.fit.count]
+    given = [i for i, p in enumerate(fitted) if p.name in truth]
+    mean, covariance = result.fit.joint_distribution
+    error = np.array([float(fitted[i].whitened(np.array(truth[fitted[i].name]))) - mean[i] for i in given])
+    return bool(error @ np.linalg.solve(covariance[np.ix_(given, given)], error) <= chi2.ppf(0.95, len(given)))

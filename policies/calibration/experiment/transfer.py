@@ -13,10 +13,10 @@ import numpy as np
 
 from gelflow.errors import GelflowError
 from gelflow.policies import recipes
+from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.experiment.worlds import record_insertions
 from gelflow.policies.calibration.fit import FitSettings
-from gelflow.policies.calibration.report import randomization_ranges
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint
 from gelflow.policies.episodes import run_episodes
 from gelflow.policies.evaluation import EvaluationResult
@@ -30,6 +30,7 @@ from gelflow.task import INSERTION, InsertionTask
 
 _SEED = 7  # of the evaluated insertions
 _ENVS = 128
+_TIGHT = (1e-3, 0.5e-3, 0.25e-3)  # gap beside the part on each side; that of training is 2.25 mm [m]
 
 # A lab like that of the mock robot: the pads of the scene, an industrial arm, the noise of image tracking.
 LAB: Mapping[str, float] = {
@@ -84,7 +85,7 @@ def worlds() -> tuple[World, ...]:
         size = (length + change, width + change, height)
         clearance = tuple(c - change for c in INSERTION.part.clearance)  # the hole stays
         rows.append(World(f"part {1e3 * change:+g} mm", part={"size": size, "clearance": clearance}))
-    rows += [World(f"clearance {1e3 * c:g} mm", part={"clearance": (c, c)}) for c in (2.25e-3, 1e-3, 0.5e-3)]
+    rows += [World(f"clearance {1e3 * c:g} mm a side", part={"clearance": (2 * c, 2 * c)}) for c in _TIGHT]
     both = {**{name: 0.5 * v for name, v in gel.items()}, "pad_mu": 0.5, "marker_mu": 0.5, "hole_mu": 0.3}
     both |= {"arm_stiffness": 1e4, "gain_ratio": 1.5, "turn_left": 0.05, "gel_creep": 0.3, "crosstalk": 0.2}
     rows.append(World("soft gel, low friction, soft arm, unequal pads, creep, crosstalk", both))
@@ -114,16 +115,23 @@ def measure_world(
         return row
     try:
         result = _calibrated(world, settings, processes)
-        ranges = randomization_ranges(result)
+        randomization = calibrated_randomization(result)
         trained = recipes.train(
             "insertion", folder, recipe=recipes.FINE_TUNING, start=default_checkpoint(), steps=attempts,
-            options={"task": world.task, **({"ranges": ranges} if ranges else {})},
+            options={"task": world.task, **randomization},
         )  # fmt: skip
     except GelflowError as error:
         return row | {"refused": str(error)}
     after = evaluate(trained.checkpoint, world, episodes)
     verdicts = {e.parameter.name: e.verdict for e in result.estimates}
-    return row | {"ranges": ranges, "verdicts": verdicts, "minutes": trained.minutes, "after": after.to_json()}
+    drawn = {name: [min(values), max(values)] for name, values in randomization["samples"].items()}
+    return row | {
+        "ranges": randomization["ranges"],
+        "drawn_between": drawn,
+        "verdicts": verdicts,
+        "minutes": trained.minutes,
+        "after": after.to_json(),
+    }
 
 
 def _calibrated(world: World, settings: FitSettings | None, processes: int) -> Calibration:

@@ -99,7 +99,7 @@ def record_insertions(
     if not rows:
         raise UsageError("no attempt in this world has contact")
     kept = sorted({row[0] for row in rows})
-    recordings = _recordings(rows, kept, task, inserted, fixed, rng)
+    recordings = _recordings(rows, kept, task, inserted, fixed, rng, planned=bool(plan))
     depth = float(np.mean([row[2] for row in rows]))
     truth = _truth(fixed, world.sensors.gain[0], world.sensors.turn[0], depth)
     heights = np.array([row[4] for row in rows])
@@ -167,6 +167,8 @@ def _recordings(
     inserted: Mapping[int, Array],
     fixed: Mapping[str, float],
     rng: np.random.Generator,
+    *,
+    planned: bool,
 ) -> Recordings:
     """Recordings of attempts; `kept` are the insertions."""
     new = {old: k for k, old in enumerate(kept)}
@@ -179,6 +181,7 @@ def _recordings(
         "N",
         tuple(f"insertion {row[0]}, pose {k}" for k, row in enumerate(rows)),
         {new[i]: pose for i, pose in inserted.items() if i in new},
+        planned=np.full(len(rows), planned),
         grasp_force=fixed["grasp_force"] * float(np.exp(COMMANDED_FORCE * rng.normal())),
         grasp_height=fixed["grasp_height"] + TAUGHT_HEIGHT * float(rng.normal()),
     )

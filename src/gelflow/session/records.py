@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import platform
+import re
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from gelflow.task import InsertionTask
 FORMAT = 1
 SENSORS = ("left", "right")  # topic names of sensor 0 and 1
 VERSIONED_PACKAGES = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
+_NUMBERS = re.compile(r"\[(\n[-+.,\deE\s]+)\]")  # a list of numbers in indented JSON
 Record = TypeVar("Record")
 
 
@@ -55,6 +57,12 @@ def to_plain(value: Any) -> Any:
 def to_json(value: Any) -> bytes:
     """`value` as UTF-8 JSON. Raises UsageError for unsupported types."""
     return json.dumps(to_plain(value), allow_nan=False, separators=(",", ":")).encode()
+
+
+def readable_json(value: Any) -> str:
+    """`value` as indented JSON for files that people open, with lists of numbers on one line."""
+    text = json.dumps(to_plain(value), allow_nan=False, indent=2)
+    return _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
 
 
 def from_plain(kind: type[Record], data: Any, *, what: str) -> Record:

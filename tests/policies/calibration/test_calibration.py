@@ -13,15 +13,14 @@ from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibrated_scene import write_scene
-from gelflow.policies.calibration.calibration import Calibration, calibrate
+from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.experiment.transfer import World, measure_world, worlds
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings, fit
 from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
-from gelflow.policies.calibration.ranges import read_ranges
-from gelflow.policies.calibration.report import error_lines, page, plain_report, randomization_ranges
+from gelflow.policies.calibration.report import error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint
 from gelflow.session import SessionRecorder
@@ -31,7 +30,6 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
 from gelflow.sim.tasks.insertion import InsertionAttempts
 from gelflow.sim.tasks.insertion_randomization import NOMINAL
-from gelflow.sim.tasks.registry import make_task
 from gelflow.task import INSERTION, PUBLISHED_INSERTION
 
 VALUES = {
@@ -39,11 +37,6 @@ VALUES = {
     **{"hole_kn": 5e3, "hole_mu": 1.5, "arm_stiffness": 1e5, "grasp_force": 12.0, "grasp_height": 0.0},
 }
 LAB = {"gripper": {"grasp_force": 12.0}, "part": {"grasp_height": 0.03}}
-
-
-@pytest.fixture(scope="module")
-def calibrated(world: RecordedWorld) -> Calibration:
-    return calibrate(world.recordings.of(np.array([0, 1])), settings=LITTLE)
 
 
 def test_the_model_gives_the_forces_of_the_training_environment() -> None:
@@ -134,23 +127,6 @@ def test_the_ratio_of_the_gains_is_known_better_than_each_gain(calibrated: Calib
     assert ratio.high / ratio.low < min(left.high / left.low, right.high / right.low)
 
 
-def test_ranges_of_the_randomization_are_those_of_quantities_it_has(calibrated: Calibration) -> None:
-    estimates = tuple(dataclasses.replace(e, relative_width=0.1, confirmed=True) for e in calibrated.estimates)
-    limits = {"gain_ratio": (1.2, 1.5), "turn_left": (-0.2, -0.1), "turn_right": (-0.1, 0.1), "crosstalk": (-0.1, 0.3)}
-    estimates = tuple(
-        dataclasses.replace(e, low=limits[e.parameter.name][0], high=limits[e.parameter.name][1])
-        if e.parameter.name in limits
-        else e
-        for e in estimates
-    )
-    ranges = randomization_ranges(dataclasses.replace(calibrated, estimates=estimates))
-    assert {"gain_ratio", "turn_left", "crosstalk", "pad_kn"} <= set(ranges)
-    assert "turn_right" not in ranges  # the cameras may be equal
-    assert "gain_left" not in ranges and ranges["crosstalk"][0] == 0
-    batch = make_task("insertion", 1, ranges=ranges, threads=1)
-    batch.reset(batch.all, np.random.default_rng(0))
-
-
 def test_calibrated_scene_has_the_known_values_and_no_others(calibrated: Calibration, tmp_path: Path) -> None:
     known = ("pad_ks", "marker_mu", "hole_kn", "arm_stiffness")
     estimates = tuple(
@@ -206,7 +182,9 @@ def test_a_row_that_is_calibrated_and_fine_tuned(tmp_path: Path) -> None:
     assert row["after"]["episodes"] == 32 and set(row["verdicts"].values()) <= {"known", "partly", "unknown"}
     stored = json.loads((tmp_path / "run.json").read_text())["configuration"]
     assert stored["start"] == load_checkpoint(default_checkpoint()).digest
-    assert stored["options"].get("ranges", {}) == row["ranges"]
+    assert stored["options"]["ranges"] == row["ranges"] != {}
+    drawn = {name: [min(values), max(values)] for name, values in stored["options"]["samples"].items()}
+    assert drawn == row["drawn_between"] and {"gain_ratio", "turn_left"} <= set(drawn)
 
 
 @pytest.mark.slow
@@ -234,45 +212,6 @@ def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: 
     )
     assert {e.verdict for e in result.estimates} == {"unknown"}
     assert any("does not reproduce" in line for line in error_lines(result))
-
-
-def test_training_randomizes_within_the_intervals_of_a_calibration(tmp_path: Path, calibrated: Calibration) -> None:
-    file = tmp_path / "report.json"
-    ranges = {"arm_stiffness": [8e3, 2e4], "grasp_height": [-1e-3, 1e-3]}
-    file.write_text(json.dumps({**plain_report(calibrated, []), "randomization": ranges}))
-    table = make_task("insertion", 1, threads=1, ranges=read_ranges(file)).attempts.randomization  # type: ignore[attr-defined]
-    drawn = table.sample(np.random.default_rng(0), 1000, friction="elastic")
-    for name, (low, high) in ranges.items():
-        assert low <= drawn[name].min() < drawn[name].max() <= high
-    usual = make_task("insertion", 1, threads=1).attempts.randomization  # type: ignore[attr-defined]
-    assert table["pad_kn"] == usual["pad_kn"]
-
-
-@pytest.mark.slow
-def test_training_with_a_calibration_stores_its_ranges(tmp_path: Path) -> None:
-    file, out = tmp_path / "report.json", tmp_path / "run"
-    file.write_text(json.dumps({"format": 1, "randomization": {"arm_stiffness": [8e3, 2e4]}}))
-    options = ["--attempts", "256", "--envs", "64", "--out", str(out)]
-    assert main(["train", "insertion", "--calibration", str(file), *options]) == 0
-    stored = json.loads((out / "run.json").read_text())
-    assert stored["configuration"]["options"]["ranges"] == {"arm_stiffness": [8e3, 2e4]}
-    assert str(file) in stored["command"]
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{}", "is not the report.json of gelflow calibrate"),
-        ('{"format": 2, "randomization": {}}', "format must be 1, got 2"),
-        ('{"format": 1, "randomization": {}}', "determine no quantity"),
-        ('{"format": 1, "randomization": {"arm": [1, 2]}}', "invalid range of arm"),
-        ('{"format": 1, "randomization": {"pad_mu": [2, 1]}}', "invalid range of pad_mu"),
-    ],
-)
-def test_files_that_are_no_calibration_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "report.json").write_text(text)
-    with pytest.raises(UsageError, match=message):
-        read_ranges(tmp_path / "report.json")
 
 
 def write_session(path: Path, world: RecordedWorld, *, contact: bool = True, **task: Any) -> Path:

@@ -56,6 +56,33 @@ def test_fixing_one_quantity_leaves_the_samples_of_the_others() -> None:
         np.testing.assert_array_equal(before[name], after[name])
 
 
+def test_quantities_with_samples_are_drawn_together() -> None:
+    table = DEFAULT_RANDOMIZATION.drawn_from({"pad_mu": [1.0, 2.0, 3.0], "pad_kn": [4e3, 5e3, 6e3]})
+    drawn = table.sample(np.random.default_rng(0), 200, friction="elastic")
+    np.testing.assert_allclose(drawn["pad_kn"], 1e3 * (drawn["pad_mu"] + 3))
+    assert set(drawn["pad_mu"]) == {1.0, 2.0, 3.0} and len(set(drawn["hole_kn"])) == 200
+    fixed = table.replace(pad_mu=1.5).sample(np.random.default_rng(0), 20, friction="elastic")
+    assert (fixed["pad_mu"] == 1.5).all() and set(fixed["pad_kn"]) <= {4e3, 5e3, 6e3}
+    described = {row["quantity"]: row for row in table.rows()}
+    assert (described["pad_mu"]["low"], described["pad_mu"]["high"]) == (1.0, 3.0)
+    assert described["hole_kn"] == {row["quantity"]: row for row in DEFAULT_RANDOMIZATION.rows()}["hole_kn"]
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        ({"pad_my": [1.0]}, "no quantity 'pad_my'; did you mean 'pad_mu'"),
+        ({"pad_mu": [1.0, np.nan]}, "pad_mu: samples must be finite numbers"),
+        ({"pad_mu": 1.0}, "pad_mu: samples must be finite numbers, got 1.0"),
+        ({"pad_mu": ["a"]}, "pad_mu: samples must be finite numbers"),
+        ({"pad_mu": [1.0], "pad_kn": [1.0, 2.0]}, "equally many samples"),
+    ],
+)
+def test_bad_samples_are_named(samples: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        DEFAULT_RANDOMIZATION.drawn_from(samples)
+
+
 def test_bad_tables_are_named() -> None:
     with pytest.raises(UsageError, match="no quantity 'pad_my'; did you mean 'pad_mu'"):
         NOMINAL.replace(pad_my=1.0)

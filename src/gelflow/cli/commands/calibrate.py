@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import json
 import math
 import os
 from pathlib import Path
@@ -23,6 +22,7 @@ from gelflow.policies.calibration.report import advice_lines, error_lines, page,
 from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.session.motion_plan import save_motion_plan
+from gelflow.session.records import readable_json
 
 _QUICK = FitSettings(starts=2, members=48, nearby=32, poses=8, steps=1)
 
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     report = plain_report(result, args.sessions)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
-        files[0].write_text(json.dumps(report, indent=2) + "\n")
+        files[0].write_text(readable_json(report))
         files[1].write_text(page(result, args.sessions, recordings.task.grid))
         scene = write_scene(result, args.out)
     except OSError as error:

@@ -55,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_part(parser)
     add_randomization(parser)
     parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: ranges that it determined"
+        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: what it leaves open"
     )
     parser.add_argument(
         "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
@@ -142,12 +142,12 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
 
 
 def _calibration_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Ranges of the randomization from `--calibration`."""
+    """Ranges and samples of the randomization from `--calibration`."""
     if args.calibration is None:
         return {}
-    from gelflow.policies.calibration.ranges import read_ranges  # deferred: loads the simulator
+    from gelflow.policies.calibration.calibrated_randomization import read_randomization  # deferred: loads PyTorch
 
-    return {"ranges": read_ranges(args.calibration)}
+    return read_randomization(args.calibration, part_task(args.part))
 
 
 def _command(args: argparse.Namespace, attempts: int) -> list[str]:

@@ -1,0 +1,113 @@
+"""The randomization of a training that follows a calibration: what its recordings leave open.
+
+Hardly any parameter of a lab is known alone: markers that are stiff on a sensor with low gain give the flow maps of
+soft ones on a sensor with high gain. Combinations are known far better. A training therefore draws all parameters
+together, from samples of the joint distribution in which the fit ends.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import UsageError
+from gelflow.policies.calibration.calibration import FORMAT, Calibration
+from gelflow.policies.calibration.model.parameters import gain_ratio
+from gelflow.policies.calibration.model.reading_model import displacement_scale
+from gelflow.session.records import to_plain
+from gelflow.sim.tasks.insertion import insertion_scene
+from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
+from gelflow.task import InsertionTask
+
+Array = NDArray[np.float64]
+
+SAMPLES = 256
+_LIMIT = 3**0.5  # of whitened parameters: three times the ranges of the randomization, which the priors stand for
+_NOISE = 2.0  # factor by which the estimate of the noise may be wrong
+_DIGITS = 5  # significant
+
+
+def calibrated_randomization(result: Calibration) -> dict[str, Any]:
+    """Options of `make_task`: `ranges` of noise and stop shear, and `samples` of the parameters that count.
+
+    Both are empty when the fit does not reproduce the recordings. When it does not predict the held-out insertion, the
+    samples are those of the sensors alone.
+    """
+    if not result.reproduced:
+        return {"ranges": {}, "samples": {}}
+    recordings = result.recordings
+    scale = 1.0 if recordings.unit == "N" else displacement_scale(insertion_scene(recordings.task))
+    ranges = {"noise": _rounded(np.array([1 / _NOISE, _NOISE]) * recordings.noise() / np.sqrt(2) / scale)}
+    if (stops := recordings.stop_shear()) is not None:
+        ranges["stop_shear"] = _rounded(np.array(stops) / scale)
+    samples = {name: _rounded(values) for name, values in _samples(result, np.random.default_rng(0)).items()}
+    return {"ranges": ranges, "samples": samples}
+
+
+def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
+    """Quantity of the randomization → samples (n,), of the parameters that the fit is good enough for.
+
+    The randomization has no gain of both pads: it multiplies the stiffnesses of their markers.
+    """
+    confirmed = {e.parameter.name for e in result.estimates if e.confirmed}
+    fitted = tuple(e.parameter for e in result.estimates)[: result.fit.count]
+    points = np.clip(result.fit.draw(rng, SAMPLES), -_LIMIT, _LIMIT)
+    values = {p.name: p.value(points[:, i]) for i, p in enumerate(fitted)}
+    ratio, direction = gain_ratio(fitted)
+    values[ratio.name] = ratio.value(points @ direction)
+    gain = np.sqrt(values["gain_left"] * values["gain_right"])
+    values |= {name: values[name] * gain for name in ("marker_kn", "marker_ks")}
+    values["crosstalk"] = np.maximum(values["crosstalk"], 0.0)
+    return {name: values[name] for name in DEFAULT_RANDOMIZATION if name in values and name in confirmed}
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.{_DIGITS}g}") for value in values]
+
+
+def plain_part(task: InsertionTask) -> dict[str, Any]:
+    """The part of a task as JSON data."""
+    part: dict[str, Any] = to_plain(task.part)
+    return part
+
+
+def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
+    """The options of `make_task` in the file `report.json` of a calibration, for a training of `task`.
+
+    Without the grasp height for another part than the calibrated one. Raises UsageError when the file is no such
+    report, has another format, or its recordings determine nothing.
+    """
+    try:
+        report: Any = json.loads(path.read_text())
+        number = report["format"]
+        if number == FORMAT:
+            part, found = report["part"], report["randomization"]
+            options = {
+                "ranges": {str(name): [float(low), float(high)] for name, (low, high) in found["ranges"].items()},
+                "samples": {str(name): [float(v) for v in values] for name, values in found["samples"].items()},
+            }
+    except OSError as error:
+        raise UsageError(f"cannot read the calibration {path}: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise UsageError(f"{path} is not the report.json of gelflow calibrate") from None
+    if number != FORMAT:
+        raise UsageError(f"{path}: format must be {FORMAT}, got {number!r}; repeat gelflow calibrate")
+    if not options["samples"]:
+        raise UsageError(f"{path}: the recordings determine nothing about the randomization; see record_next there")
+    if part != plain_part(task):
+        options["samples"].pop("grasp_height", None)
+    _check(path, options)
+    return options
+
+
+def _check(path: Path, options: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises UsageError when the randomization cannot have these ranges and samples."""
+    try:
+        DEFAULT_RANDOMIZATION.replace(**{name: tuple(pair) for name, pair in options["ranges"].items()}).drawn_from(
+            options["samples"]
+        )
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}") from None
