@@ -31,7 +31,7 @@ _DIGITS = 5  # significant
 
 
 def calibrated_randomization(result: Calibration) -> dict[str, Any]:
-    """Options of `make_task`: `ranges` of noise and stop shear, and `samples` of the parameters that count.
+    """Options of `make_task`: `ranges` of noise and stop shear, and `samples` of the confirmed parameters.
 
     Both are empty when the fit does not reproduce the recordings. When it does not predict the held-out insertion, the
     samples are those of the sensors alone.

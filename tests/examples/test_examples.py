@@ -15,6 +15,7 @@ LAST_LINE = {
     "film_of_an_insertion.py": r"insertion\.gif: \d attempts, inserted True",
     "fit_friction.py": r"iteration 6: mu = 0\.500\d, loss .* mm²",
     "gymnasium_loop.py": r"attempt \d+: reward -?\d+\.\d+, inserted (True|False)",
+    "images_to_policy.py": r"correction: -?\d\.\d\d mm, -?\d\.\d\d mm, -?\d\.\d°",
     "mock_gripper.py": r"width 25\.0 mm, force 20\.0 N, holding",
     "own_scene.py": r" \[  0\.    0\.    0\.    0\.    0\.    0\.    0\. \]\]",
     "randomize_parameters.py": r"mu 0\.3\d, mass .* g: the box moved .* mm",

@@ -26,6 +26,16 @@ from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names
 
 
+def test_the_help_of_train_states_the_default_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    steps = {task: recipe_for(task).steps for task in trained_tasks()}
+    assert all(f"{task} {count}" in text for task, count in steps.items())
+    assert f"with --start {recipe_for('insertion', 'fine-tuning').steps}, " in text
+    assert f"with --algorithm ppo {recipe_for('insertion', 'ppo').steps};" in text
+
+
 class Direct(OraclePolicy):
     """Moves to the target that it observes."""
 

@@ -57,7 +57,7 @@ def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the polic
     )
 
 
-def add_part(parser: argparse.ArgumentParser) -> None:
+def add_part(parser: argparse._ActionsContainer) -> None:
     """`--part`: the part to insert."""
     parser.add_argument(
         "--part",

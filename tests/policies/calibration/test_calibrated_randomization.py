@@ -1,4 +1,4 @@
-"""What a training draws after a calibration: samples of the joint distribution in which the fit ends."""
+"""The randomization of a training after a calibration: samples of the joint distribution in which the fit ends."""
 
 import dataclasses
 import json

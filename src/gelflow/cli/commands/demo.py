@@ -49,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--insertions", type=int, default=5, metavar="N", help="number of parts (default %(default)s)")
     parser.add_argument("--factor", type=float, default=5.0, metavar="X", help="robot time over wall time (default 5)")
-    parser.add_argument("--no-real-time", action="store_true", help="omit the last insertion, which runs at factor 1")
+    parser.add_argument("--no-real-time", action="store_true", help="omit the additional insertion in real time")
     add_part(parser)
     add_checkpoint(parser)
     add_view(parser)

@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 
 _DEFAULT = "imitation"
 _SHIPPED = Path("shipped")  # --start without a file
+_STEPS = (
+    "environment steps in total, for the insertion attempts (default: insertion 400000, with --start 80000, with "
+    "--algorithm ppo 200000; grasp 20480; cap 400000; pushing 480000)"
+)
 _ALGORITHMS = (_DEFAULT, "ppo")
 
 
@@ -43,28 +47,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=[*TASKS, *UNTRAINED], help="task to learn")
     parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
-    text = "environment steps in total, for the insertion attempts (default: docs/guide/training.md)"
-    parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=text)
+    parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=_STEPS)
     parser.add_argument(
         "--minutes", type=float, metavar="M", help="stop after this time; such a run is not reproducible"
     )
-    parser.add_argument(
-        "--algorithm", choices=_ALGORITHMS, default=_DEFAULT, help="learning algorithm (default %(default)s)"
-    )
     parser.add_argument("--envs", type=int, metavar="N", help="parallel environments (default: those of the recipe)")
-    add_part(parser)
     add_randomization(parser)
-    parser.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: what it leaves open"
-    )
-    parser.add_argument(
-        "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
-        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the shipped policy",
-    )  # fmt: skip
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the run (default runs/TASK); the same command resumes an unfinished run", folder=True)
     add_json(parser)
+    insertion = parser.add_argument_group("insertion only")
+    insertion.add_argument(
+        "--algorithm", choices=_ALGORITHMS, default=_DEFAULT, help="learning algorithm (default %(default)s)"
+    )
+    add_part(insertion)
+    insertion.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: what it leaves open"
+    )
+    insertion.add_argument(
+        "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
+        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the shipped policy",
+    )  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
