@@ -5,11 +5,10 @@ import sys
 import numpy as np
 from PIL import Image
 
-from gelflow.policies import load_policy
-from gelflow.policies.checkpoint import default_checkpoint
+from gelflow.policies import default_checkpoint, load_policy
 from gelflow.sim.drawing.annotations import force_scales
 from gelflow.sim.drawing.renderer import Renderer
-from gelflow.sim.tasks.environments import Insertion
+from gelflow.sim.tasks.insertion_environments import Insertion
 
 path = sys.argv[1] if len(sys.argv) > 1 else "insertion.gif"
 env, rng = Insertion(1), np.random.default_rng(3)

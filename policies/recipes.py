@@ -20,9 +20,9 @@ from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.run import POLICY, Progress, RunSettings, TrainingResult, TrainingRun
 from gelflow.sim.tasks.cap_rotation import CapRotationTask
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
-from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.grasp import GraspTask
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
+from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.pushing import Pushing, PushingTask
 from gelflow.sim.tasks.registry import make_task
 from gelflow.sim.tasks.task_batch import TaskBatch

@@ -14,13 +14,13 @@ from .scene.loader import scene_names as scene_names
 from .scene.scene import Scene as Scene
 from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
-from .tasks.environments import InsertionEnv as InsertionEnv
-from .tasks.environments import InsertionVectorEnv as InsertionVectorEnv
 from .tasks.gripper.flow_map_noise import FlowMapNoise as FlowMapNoise
 from .tasks.gymnasium_envs import TaskEnv as TaskEnv
 from .tasks.gymnasium_envs import TaskVectorEnv as TaskVectorEnv
 from .tasks.insertion import InsertionAttempts as InsertionAttempts
 from .tasks.insertion import insertion_scene as insertion_scene
+from .tasks.insertion_environments import InsertionEnv as InsertionEnv
+from .tasks.insertion_environments import InsertionVectorEnv as InsertionVectorEnv
 from .tasks.randomization import Fixed as Fixed
 from .tasks.randomization import LogUniform as LogUniform
 from .tasks.randomization import Normal as Normal

@@ -17,7 +17,7 @@ _TASKS: dict[str, tuple[str, str]] = {
     "grasp": ("gelflow.sim.tasks.grasp", "Grasp"),
     "pushing": ("gelflow.sim.tasks.pushing", "Pushing"),
     "cap": ("gelflow.sim.tasks.cap_rotation", "CapRotation"),
-    "insertion": ("gelflow.sim.tasks.environments", "Insertion"),
+    "insertion": ("gelflow.sim.tasks.insertion_environments", "Insertion"),
 }
 
 

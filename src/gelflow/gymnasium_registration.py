@@ -21,8 +21,8 @@ ENVIRONMENTS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "gelflow/Pushing-v0": (*_TASK_ENVS, {"batch": "pushing"}),
     "gelflow/CapRotation-v0": (*_TASK_ENVS, {"batch": "cap"}),
     "gelflow/Insertion-v0": (
-        "gelflow.sim.tasks.environments:InsertionEnv",
-        "gelflow.sim.tasks.environments:InsertionVectorEnv",
+        "gelflow.sim.tasks.insertion_environments:InsertionEnv",
+        "gelflow.sim.tasks.insertion_environments:InsertionVectorEnv",
         {},
     ),
 }

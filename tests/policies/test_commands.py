@@ -11,8 +11,8 @@ from gelflow.errors import UsageError
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.recipes import recipe_for
-from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
+from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
 

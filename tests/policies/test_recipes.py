@@ -19,8 +19,8 @@ from gelflow.policies.networks.torch_actor import TorchActor
 from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
 from gelflow.policies.reports.evaluation_report import evaluate_all
 from gelflow.policies.reports.failures import failure_ranges, worst_ranges
-from gelflow.sim.tasks.environments import Insertion
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
+from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.parts import load_part
 from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names

@@ -12,8 +12,8 @@ from gelflow.errors import UsageError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, preset_config
 from gelflow.sim.scene import DEFAULT_TOLERANCE, PRESET_NAMES, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion import InsertionAttempts, insertion_scene
+from gelflow.sim.tasks.insertion_environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.task import INSERTION
 

@@ -262,7 +262,7 @@ def _in_simulation(
     """Success in simulation without protocols and cameras, of the policy and of random corrections."""
     from gelflow.policies.episodes import RandomPolicy, evaluate_task
     from gelflow.policies.networks.base import BatchPolicy
-    from gelflow.sim.tasks.environments import Insertion
+    from gelflow.sim.tasks.insertion_environments import Insertion
 
     batch, network = Insertion(_EPISODES, task=task, preset=preset), policy.network
     reach = np.asarray(network.reach) / np.asarray(task.action_scale)

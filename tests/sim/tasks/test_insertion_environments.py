@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from gelflow.errors import UsageError
-from gelflow.sim.tasks.environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion import InsertionAttempts
+from gelflow.sim.tasks.insertion_environments import InsertionEnv, InsertionVectorEnv
 from gelflow.sim.tasks.insertion_randomization import NOMINAL
 from gelflow.task import INSERTION
 
