@@ -4,7 +4,7 @@ from .egm.controller import MockEgmReport as MockEgmReport
 from .egm.device import MockEgmArm as MockEgmArm
 from .faults.plan import Fault as Fault
 from .faults.plan import FaultPlan as FaultPlan
-from .faults.plan_file import load_plan as load_plan
+from .faults.plan_file import load_fault_plan as load_fault_plan
 from .faults.random_plan import random_plan as random_plan
 from .plant import ArmPlant as ArmPlant
 from .plant import GelPlant as GelPlant
@@ -42,7 +42,7 @@ __all__ = [
     "SimulatedCellConfig",
     "SimulatedCellProcess",
     "World",
-    "load_plan",
+    "load_fault_plan",
     "load_world",
     "preset_config",
     "random_plan",

@@ -15,7 +15,7 @@ _PARAMETERS = sorted({name for kind in KINDS.values() for name in kind.parameter
 _CHOICES = {"device": DEVICES, "kind": tuple(KINDS), "event": EVENTS, "direction": DIRECTIONS}
 
 
-def load_plan(path: Path) -> FaultPlan:
+def load_fault_plan(path: Path) -> FaultPlan:
     """Read a fault plan from TOML. Raises UsageError that names the file, the fault and the known names."""
     return plan_from_tables(read_toml(path), str(path))
 

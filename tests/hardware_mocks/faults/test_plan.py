@@ -9,7 +9,7 @@ import pytest
 from gelflow.errors import UsageError
 from gelflow.hardware_mocks.faults.injector import event_occurred
 from gelflow.hardware_mocks.faults.plan import DEVICES, EVENTS, KINDS, Fault, FaultPlan
-from gelflow.hardware_mocks.faults.plan_file import load_plan, plan_from_tables, plan_to_tables
+from gelflow.hardware_mocks.faults.plan_file import load_fault_plan, plan_from_tables, plan_to_tables
 from gelflow.hardware_mocks.faults.random_plan import random_plan
 from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress, ProgressMonitor
 from gelflow.task import INSERTION
@@ -23,7 +23,7 @@ def test_plan_file_gives_the_faults_that_it_names(tmp_path: Path) -> None:
         '[[fault]]\ndevice = "gripper"\nkind = "corrupt"\nrandom = { seed = 4, rate = 0.2 }\nduration = 1\n'
         "[random]\nseed = 7\n"
     )
-    plan = load_plan(path)
+    plan = load_fault_plan(path)
     assert plan.faults[:3] == (
         Fault("cameras", "freeze", event="lowering", below=0.015, parameters={"loop": 3.0}),
         Fault("arm", "drop", at=12.5, duration=0.3, direction="out", parameters={"share": 0.7}),
@@ -60,7 +60,7 @@ def test_a_wrong_fault_is_refused_with_its_place(tmp_path: Path, text: str, mess
     path = tmp_path / "plan.toml"
     path.write_text(f"[[fault]]\n{text}\n")
     with pytest.raises(UsageError) as error:
-        load_plan(path)
+        load_fault_plan(path)
     assert message in str(error.value) and f"{path}, fault 1" in str(error.value) and "\n" not in str(error.value)
 
 
@@ -71,7 +71,7 @@ def test_a_wrong_plan_file_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "plan.toml"
     path.write_text(text)
     with pytest.raises(UsageError, match=r"plan\.toml"):
-        load_plan(path)
+        load_fault_plan(path)
 
 
 def test_random_plans_are_reproducible_and_reach_every_kind_device_and_event() -> None:

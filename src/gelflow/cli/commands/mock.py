@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the mock robot until Ctrl-C, SIGTERM, or with --attached the end of standard input."""
     from gelflow.cli.mock_lab import lab_for
     from gelflow.hardware_mocks.faults.plan import FaultPlan
-    from gelflow.hardware_mocks.faults.plan_file import load_plan
+    from gelflow.hardware_mocks.faults.plan_file import load_fault_plan
     from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
     from gelflow.hardware_mocks.simulated_cell.cell import preset_config
     from gelflow.hardware_mocks.simulated_cell.world import load_world
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         egm_port=args.egm_port,
         tcp_port=args.tcp_port,
         truth_port=args.truth_port,
-        faults=load_plan(args.faults) if args.faults is not None else FaultPlan(),
+        faults=load_fault_plan(args.faults) if args.faults is not None else FaultPlan(),
         rotations=(cast("Rotation", args.turn_left), cast("Rotation", args.turn_right)),
     )
     # With the default of 5 ms one busy thread delays the 4 ms cycles of the others.
