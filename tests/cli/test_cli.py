@@ -81,7 +81,8 @@ def test_common_options_have_the_same_help_everywhere(capsys: pytest.CaptureFixt
     for command in COMMANDS:
         words = " ".join(help_text(command, capsys).split())
         for option in ("--json", "--preset", "--quick"):
-            if found := re.search(rf" {option}(?: NAME)? ([^-\]\[|]+?)(?= --|$)", words.split("options:")[1]):
+            end = r"(?= --| \w+ only:|$)"  # the next option, the next group of options
+            if found := re.search(rf" {option}(?: NAME)? ([^-\]\[|]+?){end}", words.split("options:")[1]):
                 texts.setdefault(option, set()).add(found[1])
     assert {option: len(found) for option, found in texts.items()} == {"--json": 1, "--preset": 1, "--quick": 1}
 
