@@ -6,7 +6,6 @@ together, from samples of the joint distribution in which the fit ends.
 """
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibration import FORMAT, Calibration
 from gelflow.policies.calibration.model.parameters import gain_ratio
-from gelflow.policies.calibration.model.reading_model import displacement_scale
-from gelflow.session.records import to_plain
+from gelflow.policies.calibration.model.reading_model import unit_per_newton
 from gelflow.sim.tasks.insertion import insertion_scene
 from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
 from gelflow.task import InsertionTask
@@ -39,7 +37,7 @@ def calibrated_randomization(result: Calibration) -> dict[str, Any]:
     if not result.reproduced:
         return {"ranges": {}, "samples": {}}
     recordings = result.recordings
-    scale = 1.0 if recordings.unit == "N" else displacement_scale(insertion_scene(recordings.task))
+    scale = unit_per_newton(recordings.unit, insertion_scene(recordings.task))
     ranges = {"noise": _rounded(np.array([1 / _NOISE, _NOISE]) * recordings.noise() / np.sqrt(2) / scale)}
     if (stops := recordings.stop_shear()) is not None:
         ranges["stop_shear"] = _rounded(np.array(stops) / scale)
@@ -50,10 +48,10 @@ def calibrated_randomization(result: Calibration) -> dict[str, Any]:
 def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     """Quantity of the randomization → samples (n,), of the parameters that the fit is good enough for.
 
-    The randomization has no gain of both pads: it multiplies the stiffnesses of their markers.
+    The gain of both pads, which the randomization does not have, multiplies the stiffnesses of their markers.
     """
     confirmed = {e.parameter.name for e in result.estimates if e.confirmed}
-    fitted = tuple(e.parameter for e in result.estimates)[: result.fit.count]
+    fitted = result.parameters
     points = np.clip(result.fit.draw(rng, SAMPLES), -_LIMIT, _LIMIT)
     values = {p.name: p.value(points[:, i]) for i, p in enumerate(fitted)}
     ratio, direction = gain_ratio(fitted)
@@ -68,24 +66,18 @@ def _rounded(values: Array) -> list[float]:
     return [float(f"{value:.{_DIGITS}g}") for value in values]
 
 
-def plain_part(task: InsertionTask) -> dict[str, Any]:
-    """The part of a task as JSON data."""
-    part: dict[str, Any] = to_plain(task.part)
-    return part
-
-
 def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
     """The options of `make_task` in the file `report.json` of a calibration, for a training of `task`.
 
-    Without the grasp height for another part than the calibrated one. Raises UsageError when the file is no such
-    report, has another format, or its recordings determine nothing.
+    The grasp height is omitted when the task has another part than the calibrated one. Raises UsageError when the file
+    is no such report, has another format, or its recordings determine nothing.
     """
     try:
         report: Any = json.loads(path.read_text())
         number = report["format"]
         if number == FORMAT:
             part, found = report["part"], report["randomization"]
-            options = {
+            options: dict[str, Any] = {
                 "ranges": {str(name): [float(low), float(high)] for name, (low, high) in found["ranges"].items()},
                 "samples": {str(name): [float(v) for v in values] for name, values in found["samples"].items()},
             }
@@ -97,17 +89,10 @@ def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
         raise UsageError(f"{path}: format must be {FORMAT}, got {number!r}; repeat gelflow calibrate")
     if not options["samples"]:
         raise UsageError(f"{path}: the recordings determine nothing about the randomization; see record_next there")
-    if part != plain_part(task):
+    if part != task.part.to_json():
         options["samples"].pop("grasp_height", None)
-    _check(path, options)
-    return options
-
-
-def _check(path: Path, options: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises UsageError when the randomization cannot have these ranges and samples."""
     try:
-        DEFAULT_RANDOMIZATION.replace(**{name: tuple(pair) for name, pair in options["ranges"].items()}).drawn_from(
-            options["samples"]
-        )
+        DEFAULT_RANDOMIZATION.replace(**options["ranges"]).drawn_from(options["samples"])
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
+    return options

@@ -73,6 +73,11 @@ class Calibration:
     fit: FitResult
 
     @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The fitted parameters, in the order of their whitened values; `estimates` has the ratio of the gains too."""
+        return tuple(estimate.parameter for estimate in self.estimates[: self.fit.count])
+
+    @property
     def noise(self) -> float:
         """Standard deviation of the difference of two readings of a marker."""
         return self.recordings.noise()

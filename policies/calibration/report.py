@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.observation import Grid
-from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization, plain_part
+from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, FORMAT, Calibration, Estimate, FlowMaps
 from gelflow.policies.calibration.comparison import noisy_markers_text
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
@@ -28,7 +28,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": 0 if held_out is None else len(held_out.recorded),
         },
         "parameters": {e.parameter.name: _plain_estimate(e) for e in result.estimates},
-        "part": plain_part(result.recordings.task),
+        "part": result.recordings.task.part.to_json(),
         "randomization": calibrated_randomization(result),
         "correlated": [{"parameters": [a, b], "correlation": r} for a, b, r in result.correlated],
         "flow_maps": {

@@ -106,8 +106,9 @@ class Quantity:
 class Randomization:
     """A randomization table: name → quantity, sampled in the order of the rows, once per episode.
 
-    Quantities in `samples`, of which all have the same number of values (k,), are not drawn from their distributions:
-    an episode takes the values at one random index, so that they keep their dependence on each other.
+    `samples` contains lists of equally many values (k,) for some quantities. An episode draws one index and takes the
+    value at this index from each list, so that the quantities keep their dependence on each other. The distributions of
+    these quantities are not used.
     """
 
     quantities: Mapping[str, Quantity] = field(default_factory=dict)

@@ -47,8 +47,7 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
     ranges, samples = options.pop("ranges", None) or {}, options.pop("samples", None) or {}
     if ranges or samples:
         table = options.get("randomization") or _named_randomization(name, "default", options.get("task"))
-        table = table.replace(**{key: tuple(limits) for key, limits in ranges.items()})
-        options["randomization"] = table.drawn_from(samples)
+        options["randomization"] = table.replace(**ranges).drawn_from(samples)
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch

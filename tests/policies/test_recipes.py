@@ -26,6 +26,13 @@ from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names
 
 
+class Direct(OraclePolicy):
+    """Moves to the target that it observes."""
+
+    def act(self, observations: NDArray[Any]) -> NDArray[np.float64]:
+        return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
+
+
 def test_the_help_of_train_states_the_default_steps(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["train", "--help"])
@@ -34,13 +41,6 @@ def test_the_help_of_train_states_the_default_steps(capsys: pytest.CaptureFixtur
     assert all(f"{task} {count}" in text for task, count in steps.items())
     assert f"with --start {recipe_for('insertion', 'fine-tuning').steps}, " in text
     assert f"with --algorithm ppo {recipe_for('insertion', 'ppo').steps};" in text
-
-
-class Direct(OraclePolicy):
-    """Moves to the target that it observes."""
-
-    def act(self, observations: NDArray[Any]) -> NDArray[np.float64]:
-        return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
 
 
 @pytest.mark.parametrize("task", task_names())

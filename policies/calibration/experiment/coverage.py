@@ -86,7 +86,7 @@ def outcome(result: Calibration, truth: Mapping[str, float]) -> dict[str, Any]:
 
 def _in_joint_region(result: Calibration, truth: Mapping[str, float]) -> bool:
     """Whether the parameters in `truth` are in the 95 % region of the joint distribution that a training draws from."""
-    fitted = [e.parameter for e in result.estimates][: result.fit.count]
+    fitted = result.parameters
     given = [i for i, p in enumerate(fitted) if p.name in truth]
     mean, covariance = result.fit.joint_distribution
     error = np.array([float(fitted[i].whitened(np.array(truth[fitted[i].name]))) - mean[i] for i in given])

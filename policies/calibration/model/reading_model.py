@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.observation import Unit
 from gelflow.policies.calibration.model.pad_model import PadModel
 from gelflow.policies.calibration.model.parameters import Parameter, parameters
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
@@ -31,7 +32,7 @@ class ReadingModel:
         self.pads = PadModel([pad.positions for pad in self.forces.scene.pads])
         self.height_spread = recordings.height_spread
         # Unit of the recordings per newton of a reading.
-        self.scale = 1.0 if recordings.unit == "N" else displacement_scale(self.forces.scene)
+        self.scale = unit_per_newton(recordings.unit, self.forces.scene)
 
     def values(self, point: Array) -> dict[str, Array]:
         """Values of the parameters from points (…, at least the parameters)."""
@@ -71,6 +72,11 @@ class ReadingModel:
             if parameter.name in slopes:
                 found[i] = parameter.slope(float(point[i])) * slopes[parameter.name]
         return found
+
+
+def unit_per_newton(unit: Unit, scene: Scene) -> float:
+    """Markers' vectors in `unit` per force of the scene's gel [1/N]."""
+    return 1.0 if unit == "N" else displacement_scale(scene)
 
 
 def displacement_scale(scene: Scene) -> float:

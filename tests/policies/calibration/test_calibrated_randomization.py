@@ -10,11 +10,7 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.policies.calibration.calibrated_randomization import (
-    calibrated_randomization,
-    plain_part,
-    read_randomization,
-)
+from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization, read_randomization
 from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.fit import FitResult, StartResult
@@ -78,9 +74,9 @@ def test_samples_stay_within_three_times_the_ranges(calibrated: Calibration) -> 
 
 
 def test_the_gain_of_both_pads_multiplies_the_stiffness_of_the_markers(calibrated: Calibration) -> None:
-    n, fitted = calibrated.fit.count, [e.parameter for e in calibrated.estimates]
+    n, fitted = calibrated.fit.count, calibrated.parameters
     point = np.zeros(n)
-    for i, p in enumerate(fitted[:n]):
+    for i, p in enumerate(fitted):
         if p.name.startswith("gain"):
             point[i] = p.whitened(np.array(1.5 if p.name == "gain_left" else 1.2))
     samples = calibrated_randomization(confirmed(calibrated, start(point, 1e-12 * np.eye(n))))["samples"]
@@ -117,7 +113,7 @@ def written(path: Path, **changes: Any) -> Path:
     """A report with little in it."""
     samples = {"arm_stiffness": [8e3, 9e3], "grasp_height": [-1e-3, 2e-3]}
     randomization = {"ranges": {"noise": [1e-4, 2e-4]}, "samples": samples, **changes}
-    values = {"format": 2, "part": plain_part(INSERTION), "randomization": randomization}
+    values = {"format": 2, "part": INSERTION.part.to_json(), "randomization": randomization}
     path.write_text(json.dumps(values))
     return path
 
@@ -144,6 +140,8 @@ def test_the_grasp_height_of_another_part_is_not_taken(tmp_path: Path) -> None:
     file = written(tmp_path / "report.json")
     assert set(read_randomization(file, INSERTION)["samples"]) == {"arm_stiffness", "grasp_height"}
     assert set(read_randomization(file, load_part("peg"))["samples"]) == {"arm_stiffness"}
+    moved = dataclasses.replace(INSERTION, part=dataclasses.replace(INSERTION.part, mesh_file="/elsewhere/part.stl"))
+    assert set(read_randomization(file, moved)["samples"]) == {"arm_stiffness", "grasp_height"}
 
 
 @pytest.mark.slow
