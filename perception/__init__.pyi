@@ -1,7 +1,7 @@
-from .calibration import Calibration as Calibration
-from .calibration import fit_calibration as fit_calibration
-from .calibration import load_calibration as load_calibration
-from .calibration import save_calibration as save_calibration
+from .camera_calibration import CameraCalibration as CameraCalibration
+from .camera_calibration import fit_calibration as fit_calibration
+from .camera_calibration import load_calibration as load_calibration
+from .camera_calibration import save_calibration as save_calibration
 from .errors import TrackerInitError as TrackerInitError
 from .force.estimator import ForceEstimate as ForceEstimate
 from .force.estimator import ForceEstimator as ForceEstimator
@@ -22,7 +22,7 @@ from .tracker import TrackerConfig as TrackerConfig
 from .tracker import TrackingResult as TrackingResult
 
 __all__ = [
-    "Calibration",
+    "CameraCalibration",
     "CameraMount",
     "ForceEstimate",
     "ForceEstimator",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import Grid, TactileFrame
-from gelflow.perception.calibration import Calibration
+from gelflow.perception.camera_calibration import CameraCalibration
 from gelflow.perception.tracker import TrackerConfig, TrackingResult
 
 Image = NDArray[np.uint8]
@@ -51,7 +51,7 @@ class CameraMount:
     rotation: Literal[0, 90, 180, 270] = 0  # of the image, clockwise [deg]
     mirrored: bool = True  # the camera views the gel from behind
     pixels_per_mm: float | None = None  # uniform scale
-    calibration: Calibration | None = None  # position-dependent scale; with neither, frames are in px
+    calibration: CameraCalibration | None = None  # position-dependent scale; with neither, frames are in px
     # First and last visible row and column, from 1 at the base of the finger and at the smallest y. None: those of the
     # calibration, without one all.
     visible_rows: tuple[int, int] | None = None

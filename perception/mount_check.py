@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import Calibration
+from gelflow.perception.camera_calibration import CameraCalibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.grid_detection.grid import find_extent
@@ -67,7 +67,7 @@ def check_scale(mount: CameraMount, rest: TrackingResult) -> None:
     )
 
 
-def check_calibrated_scale(calibration: Calibration, rest: TrackingResult) -> None:
+def check_calibrated_scale(calibration: CameraCalibration, rest: TrackingResult) -> None:
     """Raise UsageError when the calibration does not give its spacing, within 10 %, for the markers `rest`, at rest."""
     spacing = neighbour_spacing(calibration.to_mm(rest.position), rest.valid, rest.rows, rest.cols)
     if not all(_agree(one, calibration.spacing_mm) for one in spacing):
@@ -92,7 +92,7 @@ class VisiblePart:
     anchor: tuple[float, float]  # as in `GridRequest`
 
     @classmethod
-    def of_calibration(cls, calibration: Calibration) -> "VisiblePart":
+    def of_calibration(cls, calibration: CameraCalibration) -> "VisiblePart":
         """The part that a camera showed when it was calibrated."""
         above, _, left, _ = calibration.skipped
         right, down = calibration.marker_pixels(above + calibration.rows // 2, left + calibration.cols // 2).tolist()
@@ -182,7 +182,7 @@ def _advice(mount: CameraMount, extent: GridExtent) -> str:
     return text
 
 
-def _is_calibrated_part(calibration: Calibration, extent: GridExtent, skipped: Skipped) -> bool:
+def _is_calibrated_part(calibration: CameraCalibration, extent: GridExtent, skipped: Skipped) -> bool:
     """Whether the middle marker of a part is at its calibrated position."""
     position = calibration.marker_pixels(skipped[0] + extent.rows // 2, skipped[2] + extent.cols // 2)
     off = calibration.to_mm(np.array([extent.middle, position]))

@@ -19,7 +19,7 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.perception.calibration import load_calibration
+from gelflow.perception.camera_calibration import load_calibration
 from gelflow.perception.force.estimator import check_force_grid
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range

@@ -13,7 +13,7 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.observation import Grid
-from gelflow.perception.calibration import load_calibration
+from gelflow.perception.camera_calibration import load_calibration
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.sources import SourceImage

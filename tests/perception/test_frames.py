@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import Calibration
+from gelflow.perception.camera_calibration import CameraCalibration
 from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
@@ -52,7 +52,7 @@ def test_a_frame_without_scale_is_in_pixels() -> None:
 def test_a_calibration_gives_millimetres_for_a_tilted_camera() -> None:
     # A tilted camera: the scale grows from 12 to 18 px/mm over the image. The fingertip is at the right.
     matrix = ((13.5, 0.0, 0.0), (0.0, 13.5, 0.0), (0.2, 0.0, 1.0))
-    calibration = Calibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
+    calibration = CameraCalibration(427, 320, 14, 18, 1.4, matrix, (), (213.0, 159.5), 0.0, 0.0)
     mount = CameraMount(rotation=270, mirrored=True, calibration=calibration)
     rest_mm = calibration.marker_positions_mm()
     moved = np.tile([0.3, -0.2], (len(rest_mm), 1))

@@ -12,7 +12,7 @@ import gelflow.perception.synthetic as synthetic
 @pytest.mark.parametrize(
     ("package", "expected"),
     [
-        (gp, {"MarkerTracker", "TrackingResult", "TrackerInitError", "Calibration", "load_calibration", "CameraMount"}),
+        (gp, {"MarkerTracker", "TrackingResult", "TrackerInitError", "CameraCalibration", "CameraMount"}),
         (synthetic, {"FastGelRenderer", "AccurateGelRenderer", "GelSequence", "make_appearance"}),
     ],
 )

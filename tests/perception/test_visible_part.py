@@ -8,7 +8,7 @@ import pytest
 from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.observation import Grid, flow_map
 from gelflow.perception import CameraMount, MarkerTracker, TrackerConfig, fit_calibration, tactile_frame
-from gelflow.perception.calibration import Calibration
+from gelflow.perception.camera_calibration import CameraCalibration
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, start_at_rest, visible_text
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer, RenderedImage
 from gelflow.perception.synthetic.appearance import GELSLIM_GRID, PRESETS, DegradedGelAppearance
@@ -118,7 +118,7 @@ def test_without_a_calibration_the_image_must_show_the_end_of_the_grid() -> None
         MarkerTracker(TrackerConfig(18, 13, False, skipped=(0, 0, 0, 1))).start(near)
 
 
-def calibrated(appearance: View) -> tuple[Calibration, VisiblePart, RenderedImage]:
+def calibrated(appearance: View) -> tuple[CameraCalibration, VisiblePart, RenderedImage]:
     frame, *_ = shown(appearance)
     parts = find_visible_part(frame.image, 18, 14, either_way=False)
     tracker = MarkerTracker(parts[0].tracker_config())

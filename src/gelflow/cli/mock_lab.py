@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from gelflow.gel.gel_file import save_gel
-from gelflow.perception.calibration import fit_calibration, save_calibration
+from gelflow.perception.camera_calibration import fit_calibration, save_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.real.limits import LIMITS, MOCK_TIME_SCALE
 from gelflow.real.runner import lab

@@ -27,7 +27,7 @@ from gelflow.hardware_mocks.simulated_cell.world import (
     plain_world,
     world_from_tables,
 )
-from gelflow.perception.calibration import fit_calibration
+from gelflow.perception.camera_calibration import fit_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer

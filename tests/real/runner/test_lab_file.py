@@ -11,7 +11,7 @@ import gelflow.real
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, save_gel
 from gelflow.geometry import Pose, yaw_quaternion
-from gelflow.perception.calibration import Calibration, save_calibration
+from gelflow.perception.camera_calibration import CameraCalibration, save_calibration
 from gelflow.real.limits import LAB_RANGES
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
@@ -205,7 +205,7 @@ def test_uvc_devices_are_named_by_index_or_path(tmp_path: Path, example: str) ->
 
 def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: str) -> None:
     matrix = ((13.0, 0.0, 0.0), (0.0, 13.0, 0.0), (0.0, 0.0, 1.0))
-    calibration = Calibration(320, 427, 18, 14, 1.4, matrix, (-0.1,), (159.5, 213.0), 0.1, 0.2)
+    calibration = CameraCalibration(320, 427, 18, 14, 1.4, matrix, (-0.1,), (159.5, 213.0), 0.1, 0.2)
     save_calibration(calibration, tmp_path / "left.json")
     path = tmp_path / "lab.toml"
     path.write_text(example.replace("pixels_per_mm = 15.7", 'calibration = "left.json"', 1), encoding="utf-8")

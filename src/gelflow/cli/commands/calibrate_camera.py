@@ -12,11 +12,11 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_profile
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import Calibration, fit_calibration, save_calibration, scale_by_ruler
+from gelflow.perception.camera_calibration import CameraCalibration, fit_calibration, save_calibration, scale_by_ruler
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid_detection.grid import find_extent
 from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines_text
-from gelflow.perception.output.calibration_picture import draw_calibration
+from gelflow.perception.output.camera_calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.sensors.profile import load_sensor_profile
 from gelflow.perception.sources import ImageSource, image_source
@@ -171,13 +171,13 @@ def _visible_part(image: NDArray[np.uint8], args: argparse.Namespace, *, given: 
     raise UsageError(f"the image {reason}: look at the gel, and give {', or '.join(options)}")
 
 
-def _rejected(fit: Calibration, rest: Floats, measured: NDArray[np.bool_]) -> int:
+def _rejected(fit: CameraCalibration, rest: Floats, measured: NDArray[np.bool_]) -> int:
     """Number of measured markers that the fit rejected as outliers."""
     distance = np.linalg.norm(rest - fit.to_pixels(fit.marker_positions_mm()), axis=1)[measured]
     return int((distance > fit.largest_px * (1 + 1e-9)).sum())
 
 
-def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, ruler: bool, written: str) -> Table:
+def _table(fit: CameraCalibration, measured: NDArray[np.bool_], rejected: int, *, ruler: bool, written: str) -> Table:
     along, down = fit.pixels_per_mm()
     lens = ", ".join(f"k{i} {k:+.3f}" for i, k in enumerate(fit.radial, start=1)) or "no measurable distortion"
     offset = np.subtract(fit.center, ((fit.width - 1) / 2, (fit.height - 1) / 2))
@@ -207,7 +207,7 @@ def _table(fit: Calibration, measured: NDArray[np.bool_], rejected: int, *, rule
     return table
 
 
-def _scale(fit: Calibration, position: Floats) -> float:
+def _scale(fit: CameraCalibration, position: Floats) -> float:
     """Mean scale at a position on the gel [px/mm], from the area of a small square."""
     corners = fit.to_pixels(position + np.array([[0, 0], [0.1, 0], [0, 0.1]]))
     (right, down) = corners[1:] - corners[0]

@@ -18,7 +18,7 @@ from gelflow.cli.options import add_json, add_page_address, add_profile, check_a
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
-from gelflow.perception.calibration import Calibration, load_calibration
+from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces
 from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
@@ -154,7 +154,7 @@ def _page(args: argparse.Namespace, output: Output, *, live: bool) -> "Iterator[
 
 def _track(
     source: ImageSource,
-    calibration: Calibration | None,
+    calibration: CameraCalibration | None,
     summary: TrackingSummary,
     args: argparse.Namespace,
     page: "TrackingPage | None",
@@ -197,7 +197,7 @@ def _track(
 
 
 def _start(
-    image: NDArray[np.uint8], calibration: Calibration | None, args: argparse.Namespace
+    image: NDArray[np.uint8], calibration: CameraCalibration | None, args: argparse.Namespace
 ) -> tuple[MarkerTracker, TrackingResult, list[VisiblePart]]:
     """A tracker started on the first image, its result, and the possible visible parts of a partly visible grid."""
     polarity: Polarity = "dark" if args.dark else "bright" if args.bright else "auto"
@@ -237,7 +237,7 @@ def _zeroed(
 
 
 def _scale(
-    first: TrackingResult, source: ImageSource, calibration: Calibration | None, args: argparse.Namespace
+    first: TrackingResult, source: ImageSource, calibration: CameraCalibration | None, args: argparse.Namespace
 ) -> float | None:
     """The uniform scale [px/mm] where there is no calibration; None if it is not known."""
     if calibration is not None or args.pixels_per_mm is not None:
@@ -270,7 +270,7 @@ def _gel(args: argparse.Namespace, profile: SensorProfile, pad: RecordedPad | No
 
 
 def _forces(
-    first: TrackingResult, calibration: Calibration | None, scale: float | None, args: argparse.Namespace
+    first: TrackingResult, calibration: CameraCalibration | None, scale: float | None, args: argparse.Namespace
 ) -> ImageForces | None:
     """The estimator of forces, if there is a gel."""
     if args.gel is None:
@@ -284,7 +284,9 @@ def _forces(
     return ImageForces(args.gel, first.rows, first.cols, grid)
 
 
-def _writers(args: argparse.Namespace, calibration: Calibration | None, summary: TrackingSummary) -> list[TrackWriter]:
+def _writers(
+    args: argparse.Namespace, calibration: CameraCalibration | None, summary: TrackingSummary
+) -> list[TrackWriter]:
     description = {
         "source": args.source,
         "profile": args.profile,
@@ -307,7 +309,7 @@ def _writers(args: argparse.Namespace, calibration: Calibration | None, summary:
 
 
 def _tracked_image(
-    number: int, frame: SourceImage, tracked: TrackingResult, calibration: Calibration | None, scale: float | None
+    number: int, frame: SourceImage, tracked: TrackingResult, calibration: CameraCalibration | None, scale: float | None
 ) -> TrackedImage:
     """The result in millimetres too: by the calibration, or by `scale` [px/mm] from the centre of the image."""
     if calibration is not None:

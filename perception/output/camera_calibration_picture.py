@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.figures import VERMILION, save
-from gelflow.perception.calibration import Calibration
+from gelflow.perception.camera_calibration import CameraCalibration
 
 _MAGNIFICATION = 20  # of the residuals
 _SEGMENTS = 8  # of a grid line between two markers: the lens bends it
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 def draw_calibration(
-    image: NDArray[np.uint8], rest: Floats, measured: NDArray[np.bool_], fit: Calibration, path: Path
+    image: NDArray[np.uint8], rest: Floats, measured: NDArray[np.bool_], fit: CameraCalibration, path: Path
 ) -> None:
     """Draw the image with fitted grid and magnified residuals, and beside it the rectified image.
 
@@ -55,7 +55,7 @@ def draw_calibration(
     save(figure, path, dpi=110)
 
 
-def _grid_lines(fit: Calibration) -> list[Floats]:
+def _grid_lines(fit: CameraCalibration) -> list[Floats]:
     """Rows and columns of the grid [mm], each of shape (points, 2)."""
     markers = fit.marker_positions_mm().reshape(fit.rows, fit.cols, 2)
     ends = [(row[0], row[-1], fit.cols) for row in markers]
@@ -63,7 +63,7 @@ def _grid_lines(fit: Calibration) -> list[Floats]:
     return [np.asarray(np.linspace(first, last, _SEGMENTS * count)) for first, last, count in ends]
 
 
-def _extent(fit: Calibration) -> tuple[float, ...]:
+def _extent(fit: CameraCalibration) -> tuple[float, ...]:
     """Left, right, bottom and top of the rectified image [mm]."""
     across, down = (fit.cols + 1) * fit.spacing_mm / 2, (fit.rows + 1) * fit.spacing_mm / 2
     return -across, across, down, -down

@@ -48,7 +48,7 @@ Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """The mapping from image positions of one camera to positions on its gel, and its residuals."""
 
     width: int  # of the images [px]
@@ -151,7 +151,7 @@ class Calibration:
 
 def fit_calibration(
     rest: Floats, visible: NDArray[np.bool_], *, rows: int, cols: int, spacing_mm: float, size: tuple[int, int]
-) -> Calibration:
+) -> CameraCalibration:
     """Fits the calibration that maps the markers at rest to a regular grid.
 
     Parameters
@@ -173,7 +173,7 @@ def fit_calibration(
         )
     unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    initial = Calibration(*size, rows, cols, spacing_mm, unit, (), middle, 0.0, 0.0)
+    initial = CameraCalibration(*size, rows, cols, spacing_mm, unit, (), middle, 0.0, 0.0)
     # Outliers are markers with a large residual even under the largest model.
     distance = _distances(_fit(initial, rest, visible, *_MODELS[-1]), rest)
     inliers = visible & (distance <= max(_OUTLIER * float(np.median(distance[visible])), _EXACT))
@@ -188,7 +188,7 @@ def fit_calibration(
     return _checked(best, rest, visible, inliers)
 
 
-def scale_by_ruler(fit: Calibration, points: Floats, length_mm: float) -> Calibration:
+def scale_by_ruler(fit: CameraCalibration, points: Floats, length_mm: float) -> CameraCalibration:
     """The calibration whose scale is such that two image points (2, 2) [px] are `length_mm` apart on the gel.
 
     `scale_error` includes the error of reading the points, one pixel each. Raises UsageError for points outside the
@@ -216,7 +216,9 @@ def scale_by_ruler(fit: Calibration, points: Floats, length_mm: float) -> Calibr
     return replace(fit, spacing_mm=spacing, matrix=matrix, scale_error=error)
 
 
-def _checked(fit: Calibration, rest: Floats, visible: NDArray[np.bool_], inliers: NDArray[np.bool_]) -> Calibration:
+def _checked(
+    fit: CameraCalibration, rest: Floats, visible: NDArray[np.bool_], inliers: NDArray[np.bool_]
+) -> CameraCalibration:
     """`fit` with its residuals. Raises PeerError when they are too large."""
     distance, pixels = _distances(fit, rest)[inliers], fit.spacing_mm * min(fit.pixels_per_mm())
     nodes = fit.marker_positions_mm()[inliers]
@@ -238,8 +240,8 @@ def _checked(fit: Calibration, rest: Floats, visible: NDArray[np.bool_], inliers
 
 
 def _fit(
-    initial: Calibration, rest: Floats, inliers: NDArray[np.bool_], coefficients: int, off_center: bool
-) -> Calibration:
+    initial: CameraCalibration, rest: Floats, inliers: NDArray[np.bool_], coefficients: int, off_center: bool
+) -> CameraCalibration:
     """Least-squares fit of the image positions, with `coefficients` radial ones and optionally the lens centre."""
     nodes, measured = initial.marker_positions_mm()[inliers], rest[inliers]
     half = initial._half_diagonal
@@ -294,12 +296,12 @@ def _stretch(square: Floats, radial: Sequence[float] | Floats) -> Floats:
     return np.asarray(1.0 + sum((k * square ** (i + 1) for i, k in enumerate(radial)), np.zeros_like(square)))
 
 
-def _distances(fit: Calibration, rest: Floats) -> Floats:
+def _distances(fit: CameraCalibration, rest: Floats) -> Floats:
     """Distance of each marker from its grid node [px], shape (markers,)."""
     return np.asarray(np.linalg.norm(fit.to_pixels(fit.marker_positions_mm()) - rest, axis=1))
 
 
-def _criterion(fit: Calibration, distance: Floats) -> float:
+def _criterion(fit: CameraCalibration, distance: Floats) -> float:
     """Bayesian information criterion of a fit with the given residuals."""
     numbers = 2 * len(distance)
     middle = ((fit.width - 1) / 2, (fit.height - 1) / 2)
@@ -307,7 +309,7 @@ def _criterion(fit: Calibration, distance: Floats) -> float:
     return float(numbers * np.log(np.mean(distance**2) / 2 + _EXACT**2) + parameters * np.log(numbers))
 
 
-def _is_one_to_one(fit: Calibration) -> bool:
+def _is_one_to_one(fit: CameraCalibration) -> bool:
     """Whether the distortion is one-to-one in the image: r / stretch(r²) increases up to the corners."""
     corners = np.array([[0, 0], [0, fit.height], [fit.width, 0], [fit.width, fit.height]]) - fit.center
     radius = np.linspace(0, np.linalg.norm(corners, axis=1).max() / fit._half_diagonal, 200)
@@ -315,7 +317,7 @@ def _is_one_to_one(fit: Calibration) -> bool:
     return bool((stretch > 0).all() and (np.diff(radius / stretch) > 0).all())
 
 
-def save_calibration(calibration: Calibration, path: str | Path) -> None:
+def save_calibration(calibration: CameraCalibration, path: str | Path) -> None:
     """Writes `calibration` to a new JSON file. Raises UsageError when it exists or cannot be written."""
     text = json.dumps({"format": FORMAT, **to_plain(calibration)}, indent=1) + "\n"
     try:
@@ -327,7 +329,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> None:
         raise UsageError(f"cannot write {path}: {error.strerror}; name a writable file") from None
 
 
-def load_calibration(path: str | Path) -> Calibration:
+def load_calibration(path: str | Path) -> CameraCalibration:
     """Reads a file that `save_calibration` wrote. Raises UsageError for foreign, newer and damaged files."""
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -342,4 +344,4 @@ def load_calibration(path: str | Path) -> Calibration:
         raise UsageError(f"{path} is not a calibration: it has no format; gelflow calibrate-camera creates one")
     if written != FORMAT:
         raise UsageError(f"{path} has calibration format {written}; this gelflow reads format {FORMAT}: update gelflow")
-    return from_plain(Calibration, data, what=str(path))
+    return from_plain(CameraCalibration, data, what=str(path))

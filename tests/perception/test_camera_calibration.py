@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception.calibration import (
-    Calibration,
+from gelflow.perception.camera_calibration import (
+    CameraCalibration,
     fit_calibration,
     load_calibration,
     save_calibration,
@@ -35,11 +35,11 @@ def camera(positions_mm: np.ndarray, *, barrel: float, keystone: float, center: 
     return np.asarray(offset * (1 - barrel * square + 0.3 * barrel * square**2)[:, None] + center)
 
 
-def fitted(rest: np.ndarray, visible: np.ndarray = ALL) -> Calibration:
+def fitted(rest: np.ndarray, visible: np.ndarray = ALL) -> CameraCalibration:
     return fit_calibration(rest, visible, rows=ROWS, cols=COLS, spacing_mm=SPACING, size=SIZE)
 
 
-def fitted_first(tracker: MarkerTracker, image: np.ndarray) -> Calibration:
+def fitted_first(tracker: MarkerTracker, image: np.ndarray) -> CameraCalibration:
     first = tracker.start(image, rows=ROWS, cols=COLS)
     return fitted(tracker.rest, first.valid)
 
@@ -77,7 +77,7 @@ def test_displacements_in_millimetres_are_accurate_in_the_whole_image(
 @pytest.mark.parametrize("radial", [(), (-0.1,), (-0.1, -0.1)])
 def test_the_selected_lens_model_has_the_true_number_of_coefficients(radial: tuple[float, ...]) -> None:
     matrix = ((13.0, 0.2, 0.1), (-0.2, 13.0, 0.3), (0.0, 0.0, 1.0))
-    true = Calibration(*SIZE, ROWS, COLS, SPACING, matrix, radial, (159.5, 119.5), 0.0, 0.0)
+    true = CameraCalibration(*SIZE, ROWS, COLS, SPACING, matrix, radial, (159.5, 119.5), 0.0, 0.0)
     for seed in range(3):
         calibration = fitted(true.to_pixels(MARKERS) + np.random.default_rng(seed).normal(0, 0.05, MARKERS.shape))
         assert len(calibration.radial) == len(radial) and calibration.center == true.center
@@ -173,7 +173,7 @@ def test_a_ruler_that_gives_no_scale_is_refused(points: list[list[float]], lengt
         scale_by_ruler(fitted(camera(MARKERS, barrel=0, keystone=0, center=(159.5, 119.5))), np.array(points), length)
 
 
-def rms_length_error(calibration: Calibration, view: dict[str, Any]) -> float:
+def rms_length_error(calibration: CameraCalibration, view: dict[str, Any]) -> float:
     """Root mean square relative error of short lengths at the markers, against the camera that `view` describes."""
     columns = []
     for step in np.eye(2) * 0.05:
