@@ -31,10 +31,10 @@ _DIGITS = 5  # significant
 def calibrated_randomization(result: Calibration) -> dict[str, Any]:
     """Options of `make_task`: `ranges` of noise and stop shear, and `samples` of the confirmed parameters.
 
-    Both are empty when the fit does not reproduce the recordings. When it does not predict the held-out insertion, the
-    samples are those of the sensors alone.
+    Both are empty when the fit does not converge or does not reproduce the recordings. When it does not predict the
+    held-out insertion, the samples are those of the sensors alone.
     """
-    if not result.reproduced:
+    if not (result.converged and result.reproduced):
         return {"ranges": {}, "samples": {}}
     recordings = result.recordings
     scale = unit_per_newton(recordings.unit, insertion_scene(recordings.task))

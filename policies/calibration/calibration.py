@@ -93,6 +93,11 @@ class Calibration:
         return _reproduced(self.fit)
 
     @property
+    def converged(self) -> bool:
+        """Whether more than half of the starts of the fit end in fits about as good as the best one."""
+        return self.fit.converged
+
+    @property
     def predicted(self) -> bool | None:
         """Whether the residual of the held-out attempts is at most `PREDICTED`; None: none held out.
 
@@ -175,8 +180,9 @@ def _predicted(residual: float | None) -> bool | None:
 def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> tuple[Estimate, ...]:
     """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is.
 
-    The parameters of the simulator are confirmed only if the held-out insertion is predicted. Gains, rotations and
-    crosstalk are differences between pads and between markers, which a wrong force hardly changes.
+    None is confirmed unless the fit converged and reproduces the recordings. The parameters of the simulator are
+    confirmed only if the held-out insertion is predicted too: gains, rotations and crosstalk are differences between
+    pads and between markers, which a wrong force hardly changes.
     """
     ratio, of_ratio = gain_ratio(fitted)
     directions = np.vstack([np.eye(len(fitted)), of_ratio])
@@ -189,7 +195,7 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
             float(p.value(low[i])),
             float(p.value(high[i])),
             float((high[i] - low[i]) / (2 * 1.96)),
-            _reproduced(result) and (predicted or p.name not in QUANTITIES),
+            result.converged and _reproduced(result) and (predicted or p.name not in QUANTITIES),
         )
         for i, p in enumerate((*fitted, ratio))
     )

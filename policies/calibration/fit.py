@@ -64,11 +64,17 @@ class FitResult:
 
     starts: tuple[StartResult, ...]
     count: int  # number of parameters; the other unknowns are start heights
+    others: int = 0  # number of starts that ended in a worse fit, or could not be simulated
 
     @property
     def best(self) -> StartResult:
         """The start with the lowest cost."""
         return self.starts[0]
+
+    @property
+    def converged(self) -> bool:
+        """Whether more than half of the starts fit about equally well: otherwise another could fit still better."""
+        return len(self.starts) > self.others
 
     @property
     def covariance(self) -> Array:
@@ -147,7 +153,8 @@ def fit(
     if not ended:
         raise SimulationError("the recorded descents cannot be simulated with any start of the fit")
     limit = _AS_GOOD * ended[0].chi
-    return FitResult(tuple(result for result in ended if result.chi <= limit), count)
+    as_good = tuple(result for result in ended if result.chi <= limit)
+    return FitResult(as_good, count, len(jobs) - len(as_good))
 
 
 def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSettings) -> StartResult | None:

@@ -39,6 +39,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
             "not_modelled": result.not_modelled(),
+            "converged": result.converged,
             "reproduced": result.reproduced,
             "held_out_residual": result.held_out_residual,
             "predicted": result.predicted,
@@ -47,7 +48,11 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             {"text": s.text, "pose": list(s.pose), "depth": s.depth, "gain": s.gain, "narrowed": s.narrowed}
             for s in result.suggestions
         ],
-        "starts": {"used": len(result.fit.starts), "residual": [start.chi for start in result.fit.starts]},
+        "starts": {
+            "used": len(result.fit.starts),
+            "others": result.fit.others,
+            "residual": [start.chi for start in result.fit.starts],
+        },
     }
     plain: dict[str, Any] = to_plain(values)
     return plain
@@ -139,6 +144,12 @@ def error_lines(result: Calibration) -> list[str]:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "
             "from noise and model; no parameter counts as known, and the intervals are not reliable"
+        )
+    elif not result.converged:
+        used = len(result.fit.starts)
+        lines.append(
+            f"{used} of {used + result.fit.others} searches found this fit, the others worse ones: another could be "
+            "better still, and no parameter counts as known; record more attempts, or try another --seed"
         )
     elif result.predicted is False:
         lines.append(

@@ -8,6 +8,7 @@ import pytest
 from tests.policies.calibration.recorded_world import LITTLE
 
 from gelflow.policies.calibration import calibration
+from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.fit import FitResult, StartResult
@@ -54,6 +55,21 @@ def test_starts_that_end_at_different_costs_widen_the_intervals() -> None:
 
     assert width(7.0) == width(7.0, 7.0) == pytest.approx(1)
     assert width(7.0, 12.0) == width(7.0, 8.0, 12.0, 20.0) == pytest.approx(math.sqrt(2))
+
+
+def test_nothing_counts_as_known_unless_more_than_half_of_the_searches_agree(
+    calibrated: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
+    fitted = calibrated.parameters
+    for used, others in ((1, 0), (2, 1), (1, 1), (2, 2)):
+        fit = dataclasses.replace(calibrated.fit, starts=used * (calibrated.fit.best,), others=others)
+        estimates = calibration._estimates(fitted, fit, predicted=True)
+        result = dataclasses.replace(calibrated, fit=fit, estimates=estimates)
+        assert result.converged is bool(confirmed(result)) is bool(calibrated_randomization(result)["samples"])
+        assert result.converged is (used > others) is plain_report(result, [])["flow_maps"]["converged"]
+        line = f"{used} of {used + others} searches found this fit"
+        assert any(line in text for text in error_lines(result)) is not result.converged
 
 
 def test_one_insertion_holds_nothing_out(world: RecordedWorld) -> None:
