@@ -7,10 +7,10 @@ from gelflow.real.runner.touch.slip import SlipMonitor
 
 
 def descend(shear_at: "dict[float, float]", *, scale: float = 1.0) -> SlipMonitor:
-    """Descend 1.1 mm in steps of 17 µm with the shear interpolated between these depths [mm] → [mm]."""
+    """Descend in steps of 17 µm with the shear interpolated between these depths [mm] → [mm]."""
     monitor = SlipMonitor(0.04 * scale)
     depths, shears = zip(*sorted(shear_at.items()), strict=True)
-    for depth in np.arange(0.0, 1.1, 0.017):
+    for depth in np.arange(0.0, depths[-1], 0.017):
         if monitor.add(1e-3 * depth, scale * float(np.interp(depth, depths, shears))):
             break
     return monitor
@@ -31,3 +31,16 @@ def test_constant_shear_while_the_arm_moves_is_slip(scale: float) -> None:
 
 def test_motion_without_contact_is_no_slip() -> None:
     assert not descend({0.0: 0.01, 1.1: 0.01}).slipped
+
+
+@pytest.mark.parametrize("slope", [0.3, 0.1, 0.02])  # of the shear [mm/mm]; the weight of the part shears by 0.06 mm
+def test_slow_even_growth_with_a_soft_arm_is_no_slip(slope: float) -> None:
+    assert not descend({0.0: 0.0, 0.5: 0.0, 4.1: 3.6 * slope}).slipped
+
+
+@pytest.mark.parametrize("slope", [0.3, 0.1, 0.03])
+def test_slip_is_detected_with_a_soft_arm(slope: float) -> None:
+    begin = 0.5 + 0.06 / slope
+    monitor = descend({0.0: 0.0, 0.5: 0.0, begin: 0.06, 4.1: 0.06})
+    assert monitor.slipped
+    assert monitor.distance < 1e-3 * (begin - 0.5 - 0.04 / slope + 0.2)  # it is found within 0.2 mm
