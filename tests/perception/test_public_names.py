@@ -12,7 +12,17 @@ import gelflow.perception.synthetic as synthetic
 @pytest.mark.parametrize(
     ("package", "expected"),
     [
-        (gp, {"MarkerTracker", "TrackingResult", "TrackerInitError", "CameraCalibration", "CameraMount"}),
+        (
+            gp,
+            {
+                "MarkerTracker",
+                "TrackingResult",
+                "TrackerInitError",
+                "CameraCalibration",
+                "load_calibration",
+                "CameraMount",
+            },
+        ),
         (synthetic, {"FastGelRenderer", "AccurateGelRenderer", "GelSequence", "make_appearance"}),
     ],
 )
