@@ -22,7 +22,7 @@ from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
 from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside
 from gelflow.hardware_mocks.simulated_cell.progress import Progress, ProgressMonitor
 from gelflow.hardware_mocks.simulated_cell.world import Friction, World, training_world
-from gelflow.observation import Grid, resampling_weights
+from gelflow.observation import Grid, interpolation_weights
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.parts import part_geometry, with_part
@@ -117,7 +117,7 @@ class SimulatedCell:
         self._part = sim.joint_q("part")
         self._part_v = sim.joint_v("part")
         self._pads = [scene.marker_slice("left"), scene.marker_slice("right")]
-        self._weights = [resampling_weights(grid.positions(), config.grid) for grid in scene.grids]
+        self._weights = [interpolation_weights(grid, config.grid.positions()) for grid in scene.grids]
         self._u = np.zeros(sim.model.nu)
         self._arm_u = [scene.u(name) for name in ("arm_x", "arm_y", "arm_z", "arm_yaw")]
         self._gripper = GripperDrive(sim, scene, self._u, width=config.start_width, closed_on=part.grasp_width)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibration import FORMAT, Calibration
 from gelflow.policies.calibration.model.parameters import gain_ratio
-from gelflow.policies.calibration.model.reading_model import unit_per_newton
+from gelflow.policies.calibration.model.reading_model import ReadingModel, unit_per_newton
 from gelflow.sim.tasks.insertion import insertion_scene
 from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
 from gelflow.task import InsertionTask
@@ -48,7 +48,8 @@ def calibrated_randomization(result: Calibration) -> dict[str, Any]:
 def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     """Quantity of the randomization → samples (n,), of the parameters that the fit is good enough for.
 
-    The gain of both pads, which the randomization does not have, multiplies the stiffnesses of their markers.
+    The gain of both pads, which the randomization does not have, multiplies the stiffnesses of their markers. Its
+    crosstalk is that between the markers of the policy, not the printed ones.
     """
     confirmed = {e.parameter.name for e in result.estimates if e.confirmed}
     fitted = result.parameters
@@ -58,7 +59,8 @@ def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     values[ratio.name] = ratio.value(points @ direction)
     gain = np.sqrt(values["gain_left"] * values["gain_right"])
     values |= {name: values[name] * gain for name in ("marker_kn", "marker_ks")}
-    values["crosstalk"] = np.maximum(values["crosstalk"], 0.0)
+    pads = ReadingModel(result.recordings, threads=1).pads
+    values["crosstalk"] = np.maximum(pads.crosstalk_on_grid(values["crosstalk"]), 0.0)
     return {name: values[name] for name in DEFAULT_RANDOMIZATION if name in values and name in confirmed}
 
 

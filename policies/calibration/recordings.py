@@ -6,14 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
-from gelflow.observation import Unit
+from gelflow.observation import Grid, Unit, resampling_weights
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
 
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
+_MEDIAN_SIZE = 0.6745  # of a normal distribution, relative to its standard deviation
 _NOISY = 1.5  # median distance of a noisy marker from the range of its neighbours, relative to noise and model error
 
 
@@ -35,6 +37,7 @@ class Recordings:
     # Insertion → planar pose (3,) in which its part entered the hole.
     inserted: Mapping[int, Array] = field(default_factory=dict)
     settle: float = 0.0  # time between the end of the motion and the reading [s]
+    printed: Grid | None = None  # the markers on each gel; None: those of the flow maps
     grasp_force: float | None = None  # commanded [N]; None: not recorded
     grasp_height: float | None = None  # of the pad centres above the part's centre, by the lab file [m]
     height_spread: float = 0.2e-3 / math.sqrt(3)  # standard deviation of the start height of an attempt [m]
@@ -74,12 +77,23 @@ class Recordings:
         over the markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads, the maps of
         firm contacts, which are not smooth.
         """
-        f = self.flow
-        corner = f[:, :, 2:, 2:] + f[:, :, 2:, :-2] + f[:, :, :-2, 2:] + f[:, :, :-2, :-2]
-        edge = f[:, :, 2:, 1:-1] + f[:, :, :-2, 1:-1] + f[:, :, 1:-1, 2:] + f[:, :, 1:-1, :-2]
-        second = corner - 2 * edge + 4 * f[:, :, 1:-1, 1:-1]
-        of_pads = np.median(np.abs(second).reshape(f.shape[0] * f.shape[1], -1), axis=1)
-        return float(np.quantile(of_pads, 0.25) / 0.6745 / 6)
+        of_pads = np.median(np.abs(_second_differences(self.flow)).reshape(math.prod(self.flow.shape[:2]), -1), axis=1)
+        return float(np.quantile(of_pads, 0.25) / _MEDIAN_SIZE / self._roughness())
+
+    def _roughness(self) -> float:
+        """Standard deviation of the second differences of markers whose noise has standard deviation 1.
+
+        Markers that are interpolated between printed ones share part of their noise. Their second differences have
+        different spreads: the value is that of a normal distribution with the same median size.
+        """
+        grid = self.task.grid
+        if self.printed is None or self.printed == grid:
+            return 6.0
+        weights = resampling_weights(self.printed.positions(), grid)
+        fields = np.moveaxis(weights.reshape(grid.rows, grid.cols, -1), 2, 0)[:, None, :, :, None]
+        spread = np.sqrt((_second_differences(fields) ** 2).sum(0)).reshape(-1, 1)
+        sizes = spread * np.abs(scipy.special.ndtri((np.arange(400) + 0.5) / 400))
+        return float(np.median(sizes) / _MEDIAN_SIZE / np.sqrt((weights**2).sum(1).mean()))
 
     def stop_shear(self) -> tuple[float, float] | None:
         """Range of the shear along a finger at which descents stopped, in `unit`; None: all were motions of a plan.
@@ -108,3 +122,10 @@ class Recordings:
         expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * size + 1e-30)
         beyond = np.maximum(self.flow - np.nanmax(near, axis=0), np.nanmin(near, axis=0) - self.flow)
         return np.asarray(np.median(beyond / expected[:, None, None, None, None], axis=(0, 4)) > _NOISY).reshape(-1)
+
+
+def _second_differences(flow: Array) -> Array:
+    """Second differences of fields (n, pads, rows, cols, k) across rows and columns: two rows and columns fewer."""
+    corner = flow[:, :, 2:, 2:] + flow[:, :, 2:, :-2] + flow[:, :, :-2, 2:] + flow[:, :, :-2, :-2]
+    edge = flow[:, :, 2:, 1:-1] + flow[:, :, :-2, 1:-1] + flow[:, :, 1:-1, 2:] + flow[:, :, 1:-1, :-2]
+    return np.asarray(corner - 2 * edge + 4 * flow[:, :, 1:-1, 1:-1])

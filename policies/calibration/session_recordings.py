@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.errors import UsageError
+from gelflow.observation import Grid
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import Decision
@@ -20,12 +21,13 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     """Attempts with contact of one or several sessions of one task.
 
     Insertions are numbered over all sessions. Raises UsageError when a session is of another task or part, its flow
-    maps are not in millimetres, or there is no attempt with contact.
+    maps are not in millimetres, the printed markers differ, or there is no attempt with contact.
     """
     task: InsertionTask | None = None
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
     labs: list[tuple[float, float]] = []
+    prints: list[Grid | None] = []
     planned: list[bool] = []  # only a session of planned motions names no policy
     number = 0
     for path in paths:
@@ -36,6 +38,9 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
                 raise UsageError(f"{path}: the session has another part or task than {paths[0]}; calibrate it alone")
             task = own
             labs.append(_grasp(path, described, own))
+            prints.append(_printed(described))
+            if prints[-1] != prints[0]:
+                raise UsageError(f"{path}: the gels have other printed markers than in {paths[0]}; calibrate it alone")
             found, entered = _attempts(path, session, number)
         planned += [described.get("checkpoint") is None] * len(found)
         rows += found
@@ -58,6 +63,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         tuple(row["name"] for row in rows),
         {new[i]: pose for i, pose in inserted.items() if i in new},
         settle=AT_REST,
+        printed=prints[0],
         grasp_force=float(np.mean([force for force, _ in labs])),
         grasp_height=float(np.mean([height for _, height in labs])),
         planned=np.array(planned),
@@ -65,18 +71,21 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     )
 
 
-def nothing_recorded(task: InsertionTask, *, grasp_force: float | None, grasp_height: float | None) -> Recordings:
+def nothing_recorded(
+    task: InsertionTask, *, grasp_force: float | None, grasp_height: float | None, printed: Grid | None = None
+) -> Recordings:
     """Recordings of a lab without an attempt, for a plan.
 
     Parameters
     ----------
     grasp_force: commanded [N]; None: any of the randomization
     grasp_height: of the pad centres above the part's centre [m]; None: any of the randomization
+    printed: the markers on each gel; None: those of the task
     """
     flow = np.zeros((0, task.sensors, task.grid.rows, task.grid.cols, 2))
     return Recordings(
         task, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), flow, "mm", (),
-        settle=AT_REST, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
+        settle=AT_REST, printed=printed, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
     )  # fmt: skip
 
 
@@ -86,6 +95,14 @@ def _task(path: Path, described: dict[str, Any]) -> InsertionTask:
         name = data.get("name") if isinstance(data, dict) else data
         raise UsageError(f"{path}: a calibration needs a session of the task insertion, got {name!r}")
     return InsertionTask.from_json(dict(data))
+
+
+def _printed(described: dict[str, Any]) -> Grid | None:
+    """The markers on the gels, which all cameras of a session share; None in a session that does not name them."""
+    mount = described["mounts"][0]
+    if "pitch" not in mount:
+        return None
+    return Grid(mount["rows"], mount["cols"], mount["pitch"], tuple(mount["center"]))
 
 
 def _grasp(path: Path, described: dict[str, Any], task: InsertionTask) -> tuple[float, float]:

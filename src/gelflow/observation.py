@@ -135,6 +135,28 @@ def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
     return weights
 
 
+def interpolation_weights(grid: Grid, positions: ArrayLike) -> NDArray[np.float64]:
+    """Weights of the interpolation of values on `grid` to `positions` [mm], shape (n, 2): bilinear.
+
+    The outermost cells continue linearly for one pitch beyond the border, and the values there are constant further
+    out. Returns shape (n, rows * cols); every row sums to 1.
+    """
+    points = np.asarray(positions, dtype=float).reshape(-1, 2)
+    by_axis = []
+    for axis, count in enumerate((grid.rows, grid.cols)):
+        at = (points[:, axis] - grid.center[axis]) / grid.pitch + (count - 1) / 2
+        at = np.clip(at, -1, count)
+        weights = np.zeros((len(points), count))
+        if count == 1:
+            weights[:] = 1.0
+        else:
+            rows, lower = np.arange(len(points)), np.clip(np.floor(at), 0, count - 2).astype(int)
+            weights[rows, lower] = lower + 1 - at
+            weights[rows, lower + 1] = at - lower
+        by_axis.append(weights)
+    return np.asarray((by_axis[0][:, :, None] * by_axis[1][:, None, :]).reshape(len(points), -1))
+
+
 def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
     """Shear of a frame, with invalid markers replaced by the inverse-distance mean of the 6 nearest valid markers.
 

@@ -21,7 +21,7 @@ _SENSOR = (  # name, unit, meaning, logarithmic, centre, standard deviation
     ("gain_right", "", "gain of the right pad relative to the scene's gel, including its lag", True, 1.0, 0.5),
     ("turn_left", "rad", "rotation of the left camera about its pad's normal", False, 0.0, 0.1),
     ("turn_right", "rad", "rotation of the right camera about its pad's normal", False, 0.0, 0.1),
-    ("crosstalk", "", "part of a marker's motion that is the mean of its neighbours", False, 0.15, 0.26),
+    ("crosstalk", "", "part of a printed marker's motion that is the mean of its neighbours", False, 0.15, 0.26),
 )
 _GEL_GAIN = 1.5  # standard deviation of the logarithm of a pad's gain [mm/N], whose gel is not that of the scene
 COMMANDED_FORCE = 0.1  # relative standard deviation of the grasp force around the commanded one

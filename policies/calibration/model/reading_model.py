@@ -21,7 +21,8 @@ class ReadingModel:
 
     Parameters
     ----------
-    recordings: give task, grasp, unit, settling time and the spread of start heights; they may have no attempt
+    recordings: give task, grasp, unit, printed markers, settling time and the spread of start heights; they may have
+        no attempt
     threads: of the simulator
     preset: accuracy of the simulation; None: the scene's own settings
     """
@@ -29,10 +30,11 @@ class ReadingModel:
     def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
         self.fitted: tuple[Parameter, ...] = parameters(recordings)
         self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, preset=preset)
-        self.pads = PadModel([pad.positions for pad in self.forces.scene.pads])
+        scene = self.forces.scene
+        self.pads = PadModel(scene.grids, [pad.positions for pad in scene.pads], printed=recordings.printed)
         self.height_spread = recordings.height_spread
         # Unit of the recordings per newton of a reading.
-        self.scale = unit_per_newton(recordings.unit, self.forces.scene)
+        self.scale = unit_per_newton(recordings.unit, scene)
 
     def values(self, point: Array) -> dict[str, Array]:
         """Values of the parameters from points (…, at least the parameters)."""

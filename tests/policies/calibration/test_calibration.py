@@ -12,6 +12,7 @@ from tests.policies.calibration.recorded_world import LITTLE, WORLD
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
+from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
 from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.experiment.transfer import World, measure_world, worlds
@@ -214,10 +215,12 @@ def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: 
     assert any("does not reproduce" in line for line in error_lines(result))
 
 
-def write_session(path: Path, world: RecordedWorld, *, contact: bool = True, **task: Any) -> Path:
+def write_session(
+    path: Path, world: RecordedWorld, *, contact: bool = True, mount: CameraMount | None = None, **task: Any
+) -> Path:
     """A session with the attempts of the first two insertions of a world."""
     recordings = world.recordings.of(np.array([0, 1]))
-    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab=LAB)
+    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[mount or {}] * 2, lab=LAB)
     described["task"] = {**described["task"], **task}
     with SessionRecorder(path, ScaledClock()) as recorder:
         recorder.metadata(described)
@@ -270,6 +273,15 @@ def test_recordings_are_read_from_sessions(tmp_path: Path, world: RecordedWorld)
     assert sorted(read.inserted) == [0, 1, 2, 3]
     assert read.grasp_force == 12.0
     assert read.grasp_height == pytest.approx(0.0)
+
+
+def test_the_printed_markers_are_those_of_the_session(tmp_path: Path, world: RecordedWorld) -> None:
+    mounts = CameraMount(), CameraMount(rows=9, cols=7, pitch=2.0)
+    paths = [write_session(tmp_path / f"{mount.rows}.mcap", world, mount=mount) for mount in mounts]
+    assert [read_recordings([path]).printed for path in paths] == [mount.grid for mount in mounts]
+    with pytest.raises(UsageError, match=r"9\.mcap: the gels have other printed markers than in .*18\.mcap"):
+        read_recordings(paths)
+    assert read_recordings([write_session(tmp_path / "old.mcap", world)]).printed is None
 
 
 def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: RecordedWorld) -> None:

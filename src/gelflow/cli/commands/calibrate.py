@@ -113,7 +113,8 @@ def _lab_recordings(args: argparse.Namespace) -> Recordings:
         return nothing_recorded(task, grasp_force=None, grasp_height=None)
     lab = load_lab(args.lab)
     height = lab.part.grasp_height - task.part.size[2] / 2
-    return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height)
+    printed = lab.cameras.left.mount.grid
+    return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height, printed=printed)
 
 
 def _write_plan(
