@@ -2,7 +2,7 @@
 
 The markers that are printed on a gel are rarely those of a policy's grid. The gel then shows the forces at the printed
 markers, which mix with their neighbours, and the runner interpolates what it tracks to the policy's grid. Both
-interpolations are linear and smooth the edges of a contact, as a crosstalk of about 0.2 would.
+interpolations are linear and smooth the edges of a contact, as crosstalk would.
 """
 
 from collections.abc import Mapping, Sequence
