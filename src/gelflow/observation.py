@@ -141,20 +141,14 @@ def interpolation_weights(grid: Grid, positions: ArrayLike) -> NDArray[np.float6
     The outermost cells continue linearly for one pitch beyond the border, and the values there are constant further
     out. Returns shape (n, rows * cols); every row sums to 1.
     """
-    points = np.asarray(positions, dtype=float).reshape(-1, 2)
-    by_axis = []
-    for axis, count in enumerate((grid.rows, grid.cols)):
-        at = (points[:, axis] - grid.center[axis]) / grid.pitch + (count - 1) / 2
-        at = np.clip(at, -1, count)
-        weights = np.zeros((len(points), count))
-        if count == 1:
-            weights[:] = 1.0
-        else:
-            rows, lower = np.arange(len(points)), np.clip(np.floor(at), 0, count - 2).astype(int)
-            weights[rows, lower] = lower + 1 - at
-            weights[rows, lower + 1] = at - lower
-        by_axis.append(weights)
-    return np.asarray((by_axis[0][:, :, None] * by_axis[1][:, None, :]).reshape(len(points), -1))
+    from scipy.interpolate import RegularGridInterpolator  # deferred: only different grids need it
+
+    nodes = grid.positions()
+    rows, cols = nodes[:: grid.cols, 0], nodes[: grid.cols, 1]
+    each = np.eye(len(nodes)).reshape(grid.rows, grid.cols, -1)
+    weights = RegularGridInterpolator((rows, cols), each, bounds_error=False, fill_value=None)
+    within = np.clip(positions, nodes.min(0) - grid.pitch, nodes.max(0) + grid.pitch)
+    return np.asarray(weights(within))
 
 
 def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:

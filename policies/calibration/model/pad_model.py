@@ -32,33 +32,26 @@ class PadModel:
     """
 
     def __init__(self, grids: Sequence[Grid], positions: Sequence[Array], *, printed: Grid | None = None) -> None:
+        self._grids = grids
         self._pad = np.repeat(np.arange(len(grids)), [len(pad) for pad in positions])
+        self._neighbours = self._neighbours_on_grid = _nearest(positions)
         self._to_printed: Array | None = None
         self._to_grid: Array | None = None
-        # On the grid: without crosstalk of the print, and the increase per crosstalk of the print.
-        self._crosstalk_of_smooth_fields = 0.0, 1.0
         if printed is not None and any(grid != printed for grid in grids):
             self._to_printed = block_diag(*(interpolation_weights(grid, printed.positions()) for grid in grids))
             self._to_grid = block_diag(*(resampling_weights(printed.positions(), grid) for grid in grids))
             self._neighbours = _nearest([printed.positions()] * len(grids))
-            self._crosstalk_of_smooth_fields = self._measured_on_smooth_field(grids, positions)
-        else:
-            self._neighbours = _nearest(positions)
 
     def crosstalk_on_grid(self, crosstalk: Array) -> Array:
-        """The crosstalk between markers of the grid that smooth fields cannot tell from this one of the print."""
-        constant, factor = self._crosstalk_of_smooth_fields
-        return np.asarray(constant + factor * np.asarray(crosstalk))
+        """The crosstalk between markers of the grid that changes a field of constant curvature like that of the print.
 
-    def _measured_on_smooth_field(self, grids: Sequence[Grid], positions: Sequence[Array]) -> tuple[float, float]:
-        """Crosstalk on the grid that changes a field of constant curvature like resampling, and its increase.
-
-        Changes are medians, because neighbours are missing at the borders of the grid.
+        The interpolation between both is part of it. Changes are medians, because neighbours are missing at the borders
+        of the grid.
         """
-        field = np.concatenate([(grid.positions() ** 2).sum(1) for grid in grids])[:, None]
-        on_grid = np.median(field[_nearest(positions)].mean(1) - field)
-        changes = [np.median(self._mixed(field, np.asarray(c)) - field) / on_grid for c in (0.0, 1.0)]
-        return float(changes[0]), float(changes[1] - changes[0])
+        field = np.concatenate([(grid.positions() ** 2).sum(1) for grid in self._grids])[:, None]
+        on_grid = np.median(field[self._neighbours_on_grid].mean(1) - field)
+        least, full = (np.median(self._mixed(field, np.asarray(c)) - field) / on_grid for c in (0.0, 1.0))
+        return np.asarray(least + (full - least) * np.asarray(crosstalk))
 
     def _on_print(self, shear: Array) -> Array:
         return shear if self._to_printed is None else np.asarray(self._to_printed @ shear)

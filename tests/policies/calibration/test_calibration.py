@@ -12,6 +12,7 @@ from tests.policies.calibration.recorded_world import LITTLE, WORLD
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
+from gelflow.observation import Grid
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
 from gelflow.policies.calibration.calibration import Calibration
@@ -78,8 +79,11 @@ def test_derivatives_of_the_forces_agree_with_finite_differences() -> None:
         assert np.abs(difference - slopes[:, k]).max() < 1e-5 * np.abs(slopes[:, k]).max() + floor, name
 
 
-def test_the_jacobian_of_the_whole_fit_agrees_with_finite_differences(world: RecordedWorld) -> None:
-    recordings = world.recordings.of(np.array([0]))
+@pytest.mark.parametrize("printed", [None, CameraMount().grid])
+def test_the_jacobian_of_the_whole_fit_agrees_with_finite_differences(
+    world: RecordedWorld, printed: Grid | None
+) -> None:
+    recordings = dataclasses.replace(world.recordings.of(np.array([0])), printed=printed)
     problem = Problem(recordings, threads=1)
     point = np.random.default_rng(1).normal(size=problem.size) * 0.3
     poses = world.misalignment[:1]

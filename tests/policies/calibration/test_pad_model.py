@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from gelflow.observation import Grid, resampling_weights
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.model.pad_model import SIDES, PadModel
-from gelflow.policies.calibration.problem import Problem
 from gelflow.task import INSERTION
 
 GRID = INSERTION.grid
@@ -50,28 +49,16 @@ def test_derivatives_on_other_printed_markers_agree_with_finite_differences() ->
         np.testing.assert_allclose(slope, (up - down) / 2e-5, rtol=1e-6, atol=1e-8)
 
 
-def test_crosstalk_of_the_print_is_converted_to_that_of_the_grid() -> None:
+# Exact without crosstalk and with full crosstalk; between them, medians of the changes are not quite linear.
+@pytest.mark.parametrize(("printed", "error"), [(0.0, 1e-9), (0.3, 0.02), (1.0, 1e-9)])
+def test_crosstalk_of_the_print_is_converted_to_that_of_the_grid(printed: float, error: float) -> None:
     field = np.tile((GRID.positions() ** 2).sum(1)[:, None], (2, 2))
-    printed, converted = 0.3, float(pads(PRINTED).crosstalk_on_grid(np.asarray(0.3)))
+    converted = float(pads(PRINTED).crosstalk_on_grid(np.asarray(printed)))
     changes = [
         np.median(read(pads(grid), field, {**IDEAL, "crosstalk": level}) - field)
         for grid, level in ((PRINTED, printed), (None, converted))
     ]
-    assert changes[0] == pytest.approx(changes[1], rel=0.02)
-
-
-def test_the_jacobian_with_other_printed_markers_agrees_with_finite_differences(world: RecordedWorld) -> None:
-    recordings = dataclasses.replace(world.recordings.of(np.array([0])), printed=PRINTED)
-    problem = Problem(recordings, threads=1)
-    point, poses = np.random.default_rng(1).normal(size=problem.size) * 0.3, world.misalignment[:1]
-    jacobian = problem.linearize(point, poses).jacobian
-    for i in range(problem.size):
-        agreements = []
-        for step in (1e-4, 1e-5):
-            shift = step * np.eye(problem.size)[i]
-            up, down = (problem.residuals(point + sign * shift, poses)[0] for sign in (1, -1))
-            agreements.append(np.abs((up - down) / (2 * step) - jacobian[:, :, i]).max())
-        assert min(agreements) < 1e-5 * np.abs(jacobian[:, :, i]).max() + 1e-6, i
+    assert changes[0] == pytest.approx(changes[1], rel=error)
 
 
 def test_the_noise_of_interpolated_markers_is_that_of_one_marker(world: RecordedWorld) -> None:
