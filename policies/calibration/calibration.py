@@ -22,6 +22,7 @@ KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the
 REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
 ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
 PREDICTED = 1.5  # largest residual of the held-out attempts relative to noise and model error
+_HEIGHT_OFFSET = 1.5  # largest mean of the fitted start heights relative to their expected standard deviation
 _CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
 
 
@@ -111,6 +112,16 @@ class Calibration:
         """Whether the errors of held-out flow maps are at most `ALLOWED_ERROR` times the noise; None: none held out."""
         maps = self.held_out
         return None if maps is None else maps.error(maps.after) <= ALLOWED_ERROR * self.noise
+
+    @property
+    def height_offset(self) -> float:
+        """Mean of the fitted start heights of the attempts, above that by the lab file [m]."""
+        return float(self.recordings.height_spread * self.fit.best.point[self.fit.count :].mean())
+
+    @property
+    def height_plausible(self) -> bool:
+        """Whether `height_offset` is within what is expected of single attempts."""
+        return abs(self.height_offset) <= _HEIGHT_OFFSET * self.recordings.height_spread
 
     def not_modelled(self) -> str:
         """One line about the difference between held-out and simulated flow maps beyond the noise."""

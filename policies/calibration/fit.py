@@ -7,16 +7,15 @@ It is repeated from several independent starts. The forces have kinks and steps 
 hole, so that starts can end in different minima; their spread is part of the intervals.
 """
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
-from gelflow.helper_process import end_with_parent
+from gelflow.helper_process import worker_pool
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally, search_nearby
 from gelflow.policies.calibration.pose_search import better_poses
 from gelflow.policies.calibration.poses import prior_cost_of_all, refined_poses
@@ -143,8 +142,7 @@ def fit(
             results.append(_fit_start(*job))
             progress(len(results))
     else:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=end_with_parent) as pool:
+        with worker_pool(min(processes, len(jobs))) as pool:
             futures = [pool.submit(_fit_start, *job) for job in jobs]
             for done, _ in enumerate(as_completed(futures)):
                 progress(done + 1)

@@ -34,6 +34,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
         "flow_maps": {
             "unit": result.unit,
             "noise": result.noise,
+            "height_offset": result.height_offset,
             "noisy_markers": int((~result.fitted.used).sum()),
             "fitted": _errors(result.fitted),
             "held_out": None if held_out is None else _errors(held_out),
@@ -140,6 +141,12 @@ def error_lines(result: Calibration) -> list[str]:
         )
     if text := noisy_markers_text(result.fitted.used):
         lines.append(text)
+    if not result.height_plausible:
+        lines.append(
+            f"in the fit the attempts start {abs(1e3 * result.height_offset):.1f} mm "
+            f"{'higher' if result.height_offset > 0 else 'lower'} than by the lab file: check the taught height of the "
+            "hole and part.grasp_height, since stiffnesses depend on them"
+        )
     if not result.reproduced:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "

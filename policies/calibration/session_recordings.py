@@ -1,6 +1,7 @@
 """Recordings for a calibration, from the sessions of the insertion runner."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import Decision
+from gelflow.session.records import Decision, file_digest
 from gelflow.task import InsertionTask
 
 AT_REST = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
@@ -20,14 +21,14 @@ _HEIGHT = 0.3e-3  # standard deviation of a part's height in the gripper, per at
 def read_recordings(paths: Sequence[Path]) -> Recordings:
     """Attempts with contact of one or several sessions of one task.
 
-    Insertions are numbered over all sessions. Raises UsageError when a session is of another task or part, its flow
-    maps are not in millimetres, the printed markers differ, or there is no attempt with contact.
+    Insertions are numbered over all sessions. Raises UsageError when a session is given twice or is of another part or
+    set-up (printed markers, cameras, grasp), its flow maps are not in millimetres, or there is no attempt with contact.
     """
+    _check_different(paths)
     task: InsertionTask | None = None
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
-    labs: list[tuple[float, float]] = []
-    prints: list[Grid | None] = []
+    setup: _Setup | None = None
     planned: list[bool] = []  # only a session of planned motions names no policy
     number = 0
     for path in paths:
@@ -37,16 +38,15 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
             if task is not None and own.to_json() != task.to_json():
                 raise UsageError(f"{path}: the session has another part or task than {paths[0]}; calibrate it alone")
             task = own
-            labs.append(_grasp(path, described, own))
-            prints.append(_printed(described))
-            if prints[-1] != prints[0]:
-                raise UsageError(f"{path}: the gels have other printed markers than in {paths[0]}; calibrate it alone")
+            present = _Setup.of(path, described, own)
+            setup = setup or present
+            present.check(path, setup, paths[0])
             found, entered = _attempts(path, session, number)
         planned += [described.get("checkpoint") is None] * len(found)
         rows += found
         inserted |= entered
         number = max([number, *(row["insertion"] + 1 for row in found), *(i + 1 for i in entered)])
-    if task is None or not rows:
+    if task is None or setup is None or not rows:
         raise UsageError(
             f"{', '.join(map(str, paths))}: no attempt with contact is recorded, so nothing can be fitted; record "
             "insertions in which the part touches the rim"
@@ -63,9 +63,9 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         tuple(row["name"] for row in rows),
         {new[i]: pose for i, pose in inserted.items() if i in new},
         settle=AT_REST,
-        printed=prints[0],
-        grasp_force=float(np.mean([force for force, _ in labs])),
-        grasp_height=float(np.mean([height for _, height in labs])),
+        printed=setup.printed,
+        grasp_force=setup.grasp_force,
+        grasp_height=setup.grasp_height,
         planned=np.array(planned),
         height_spread=_HEIGHT,
     )
@@ -89,30 +89,60 @@ def nothing_recorded(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class _Setup:
+    """The set-up of a session, which all sessions of a calibration share."""
+
+    printed: Grid | None  # the markers on each gel; None in a session that does not name them
+    mounts: Any  # of the cameras, as recorded
+    grasp_force: float  # commanded [N]
+    grasp_height: float  # of the pad centres above the part's centre [m]
+
+    @classmethod
+    def of(cls, path: Path, described: dict[str, Any], task: InsertionTask) -> "_Setup":
+        """The set-up in the description of a session. Raises UsageError without a grasp."""
+        mounts = described["mounts"]
+        try:
+            lab = described["lab"]
+            force = float(lab["gripper"]["grasp_force"])
+            height = float(lab["part"]["grasp_height"]) - task.part.size[2] / 2
+        except (KeyError, TypeError):
+            raise UsageError(f"{path}: the session has no lab file with grasp_force and grasp_height") from None
+        one = mounts[0]
+        printed = Grid(one["rows"], one["cols"], one["pitch"], tuple(one["center"])) if "pitch" in one else None
+        return cls(printed, mounts, force, height)
+
+    def check(self, path: Path, first: "_Setup", of_first: Path) -> None:
+        """Raise UsageError when the set-up of the session `path` is not that of the first one."""
+        for other, text in (
+            (self.printed != first.printed, f"the gels have other printed markers than in {of_first}"),
+            (self.mounts != first.mounts, f"the cameras are mounted or calibrated differently than in {of_first}"),
+            (
+                self.grasp_force != first.grasp_force,
+                f"the grasp force is {self.grasp_force:g} N, in {of_first} {first.grasp_force:g} N",
+            ),
+            (self.grasp_height != first.grasp_height, f"the part is grasped at another height than in {of_first}"),
+        ):
+            if other:
+                raise UsageError(f"{path}: {text}; calibrate it alone")
+
+
+def _check_different(paths: Sequence[Path]) -> None:
+    """Raise UsageError when two files have the same content: a copy of a fitted insertion would be held out."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        digest = file_digest(path)
+        if digest in found:
+            raise UsageError(f"{path}: the same session as {found[digest]}; name it once")
+        found[digest] = path
+
+
 def _task(path: Path, described: dict[str, Any]) -> InsertionTask:
     data = described.get("task")
     if not isinstance(data, dict) or data.get("name") != "insertion":
         name = data.get("name") if isinstance(data, dict) else data
         raise UsageError(f"{path}: a calibration needs a session of the task insertion, got {name!r}")
     return InsertionTask.from_json(dict(data))
-
-
-def _printed(described: dict[str, Any]) -> Grid | None:
-    """The markers on the gels, which all cameras of a session share; None in a session that does not name them."""
-    mount = described["mounts"][0]
-    if "pitch" not in mount:
-        return None
-    return Grid(mount["rows"], mount["cols"], mount["pitch"], tuple(mount["center"]))
-
-
-def _grasp(path: Path, described: dict[str, Any], task: InsertionTask) -> tuple[float, float]:
-    """Commanded grasp force [N], and height of the pad centres above the part's centre [m]."""
-    try:
-        lab = described["lab"]
-        above_face = float(lab["part"]["grasp_height"])
-        return float(lab["gripper"]["grasp_force"]), above_face - task.part.size[2] / 2
-    except (KeyError, TypeError):
-        raise UsageError(f"{path}: the session has no lab file with grasp_force and grasp_height") from None
 
 
 def _attempts(

@@ -4,6 +4,7 @@ A helper is a fresh interpreter that runs one module: it imports nothing of the 
 its global interpreter lock. It ends when the parent's end of the socket pair closes.
 """
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -15,12 +16,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import IO, Any
 
 from gelflow.interrupts import SIGNALS
 
+_WORKER_PERIOD = 0.2  # between two checks of a worker whether it has to end [s, wall]
 _EXIT_LIMIT = 1.0  # time from the closed link to the helper's exit [s, wall]
 
 
@@ -177,16 +181,33 @@ def memory_file(size: int) -> int:
     return descriptor
 
 
-def end_with_parent() -> None:
-    """Initializer of the workers of a `ProcessPoolExecutor`: they end when their parent ends, also if it is killed.
+@contextlib.contextmanager
+def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
+    """`count` fresh interpreters for computations; they end with their parent, also if it is killed.
 
-    Without it they would wait for work for ever.
+    An exception in the body, such as that of Ctrl-C, ends the running computations at once, and no other one starts.
     """
+    context = multiprocessing.get_context("spawn")
+    ending = context.Event()
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_end_with_parent, initargs=(ending,)) as pool:
+        try:
+            yield pool
+        except BaseException:
+            ending.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _end_with_parent(ending: Event) -> None:
+    """Let this worker end when its parent ends, or sets `ending`; the signals of a terminal are the parent's."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "for worker processes"
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
     def wait() -> None:
-        parent.join()
+        while not ending.wait(_WORKER_PERIOD) and parent.is_alive():
+            pass
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()

@@ -74,19 +74,18 @@ def test_exit_reason_of_a_helper_that_fails() -> None:
 
 
 POOL = """
-import multiprocessing, os, time
-from concurrent.futures import ProcessPoolExecutor
-from gelflow.helper_process import end_with_parent
+import os, time
+from gelflow.helper_process import worker_pool
 
 if __name__ == "__main__":
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context, initializer=end_with_parent) as pool:
+    with worker_pool(1) as pool:
         print(pool.submit(os.getpid).result(), flush=True)
-        pool.submit(time.sleep, 600).result()
+        jobs = [pool.submit(time.sleep, 600) for _ in range(3)]
+        jobs[0].result()
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_their_parent(number: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "pool.py").write_text(POOL)
     parent = subprocess.Popen(

@@ -25,6 +25,7 @@ from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.grasp_check import GraspCheck, TouchImplausible, check_grasp
 from gelflow.real.runner.touch.observer import MarkersUnreadable, TactileObserver, TactileReading
 from gelflow.real.runner.touch.pad_forces import ForceRecord, PadForces
+from gelflow.real.wsg.checks import holds_part
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
@@ -84,12 +85,12 @@ class InsertionRunner:
         self._planar_pose = self._motions[0].planar_pose if self._motions else (0.0, 0.0, 0.0)
         self._policy.reset()
         self._recorder.event("insertion", {"number": number})
+        part: HeldPart | None = None
         try:
             part = self._load(number)
             outcome = self._insert_held(number, part, attempts)
-        except PartLost:
-            outcome = "part lost"
-            self._retreat_empty()
+        except PartLost as error:
+            outcome = self._end_lost(number, part, str(error))
         except NotGrasped as error:
             outcome = str(error)
             self._retreat_empty()
@@ -115,6 +116,21 @@ class InsertionRunner:
             outcome = str(error)
         self._hand_back(number, part)
         return outcome
+
+    def _end_lost(self, number: int, part: HeldPart | None, evidence: str) -> str:
+        """End an insertion whose part was lost, or moved in the grip; returns the outcome.
+
+        A part that the gripper still reports is raised while both pads are observed, then handed back; `part` is None
+        at the hand-over. Raises PartLost when it moves again.
+        """
+        if not holds_part(self._cell.gripper.state(), grasped=True):
+            self._retreat_empty()
+            return "part lost"
+        self._motion.expect_part(True)  # with its present width
+        if part is not None:
+            part.retreat(self._lab.part.load_height)
+        self._give_back(number)
+        return evidence
 
     def check_plan(self, supervisor: Supervisor) -> list[str]:
         """Check the first targets of a run, each relative to the one before; returns them as text. Nothing moves."""
@@ -308,6 +324,10 @@ class InsertionRunner:
     def _hand_back(self, number: int, part: HeldPart) -> None:
         """Raise the part and release it to the operator."""
         part.retreat(self._lab.part.load_height)
+        self._give_back(number)
+
+    def _give_back(self, number: int) -> None:
+        """Release the part to the operator."""
         self._operator.take(number)
         self._motion.supervisor.phases.enter(Phase.RELEASE)
         self._open()

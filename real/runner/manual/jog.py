@@ -28,7 +28,6 @@ from gelflow.real.wsg.checks import may_hold_part
 from gelflow.real.wsg.driver import WsgGripper
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import SENSORS
-from gelflow.task import INSERTION
 
 Axis = Literal["x", "y", "z", "yaw", "load"]
 _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
@@ -71,7 +70,8 @@ class _Devices:
 
 
 def jog(session: Session, wanted: Jog) -> Result:
-    """Move the gripper. A motion that is not upward starts above the hole: the gripper is raised first.
+    """Move the gripper. A motion that is not along z starts at the height of the hand-over or above it: the gripper is
+    raised first.
 
     A part that may be held is moved only while both pads are observed, and stops at contact; without an image it can
     only be raised. Raises SafetyError when a target is refused or the gripper reports a fault, PeerError when a device
@@ -166,10 +166,10 @@ def _steps(session: Session, supervisor: Supervisor, here: Pose, wanted: Jog) ->
             ("lower it to the hand-over", session.lab.gripper_at(0.0, 0.0, 0.0, load)),
         ]
     else:
-        sideways = wanted.axis != "z" and height < INSERTION.start_height
-        raised = _moved(here, z=INSERTION.start_height - height) if sideways else here
+        sideways = wanted.axis != "z" and height < load - _CLOSE[0]
+        raised = _moved(here, z=load - height) if sideways else here
         if sideways:
-            poses.append(("raise the gripper above the hole first", raised))
+            poses.append(("raise the gripper to the hand-over first", raised))
         amount = f"{math.degrees(wanted.amount):+g}°" if wanted.axis == "yaw" else f"{1e3 * wanted.amount:+g} mm"
         poses.append((f"jog {wanted.axis} {amount}", _moved(raised, **{wanted.axis: wanted.amount})))
     steps, before = [], here

@@ -3,6 +3,7 @@
 import os
 import select
 import sys
+import termios
 from collections.abc import Callable
 
 from rich.console import Console
@@ -13,13 +14,16 @@ _PERIOD = 0.02  # of the check [s]
 
 
 def read_line(console: Console, text: str, *, check: Callable[[], object] = lambda: None) -> str:
-    """Show `text` and return the line that is typed. Calls `check` every 20 ms, and raises what it raises.
+    """Show `text` and return the line that is typed after it. Calls `check` every 20 ms, and raises what it raises.
 
-    Raises UsageError when standard input is closed.
+    What was typed at a terminal before the question is discarded: it confirms nothing. Raises UsageError when standard
+    input is closed.
     """
     console.print(f"[bold]{text}[/] ", end="")
     console.file.flush()
     descriptor = _standard_input()
+    if os.isatty(descriptor):
+        termios.tcflush(descriptor, termios.TCIFLUSH)
     line = b""
     while not line.endswith(b"\n"):
         check()

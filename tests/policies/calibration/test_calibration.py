@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -219,12 +220,32 @@ def test_a_fit_that_does_not_reproduce_the_recordings_knows_nothing(calibrated: 
     assert any("does not reproduce" in line for line in error_lines(result))
 
 
+@pytest.mark.parametrize(("offset", "text"), [(0.4e-3, "0.4 mm higher than"), (-0.3e-3, "0.3 mm lower than")])
+def test_a_common_offset_of_all_start_heights_is_reported(calibrated: Calibration, offset: float, text: str) -> None:
+    """The prior of single attempts does not expect it; a hole taught too high causes it."""
+
+    def lines(height: float) -> str:
+        point = calibrated.fit.best.point.copy()
+        point[calibrated.fit.count :] = height / calibrated.recordings.height_spread
+        start = dataclasses.replace(calibrated.fit.best, point=point)
+        fit = dataclasses.replace(calibrated.fit, starts=(start,))
+        return "\n".join(error_lines(dataclasses.replace(calibrated, fit=fit)))
+
+    assert text in lines(offset) and "the lab file" not in lines(0.1 * offset)
+
+
 def write_session(
-    path: Path, world: RecordedWorld, *, contact: bool = True, mount: CameraMount | None = None, **task: Any
+    path: Path,
+    world: RecordedWorld,
+    *,
+    contact: bool = True,
+    mount: CameraMount | None = None,
+    lab: Any = None,
+    **task: Any,
 ) -> Path:
     """A session with the attempts of the first two insertions of a world."""
     recordings = world.recordings.of(np.array([0, 1]))
-    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[mount or {}] * 2, lab=LAB)
+    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[mount or {}] * 2, lab=lab or LAB)
     described["task"] = {**described["task"], **task}
     with SessionRecorder(path, ScaledClock()) as recorder:
         recorder.metadata(described)
@@ -288,6 +309,31 @@ def test_the_printed_markers_are_those_of_the_session(tmp_path: Path, world: Rec
     assert read_recordings([write_session(tmp_path / "old.mcap", world)]).printed is None
 
 
+def test_sessions_of_different_set_ups_are_not_calibrated_together(tmp_path: Path, world: RecordedWorld) -> None:
+    usual = write_session(tmp_path / "usual.mcap", world, mount=CameraMount())
+    part = LAB["part"]
+    for name, changed, expected in (
+        (
+            "turned",
+            {"mount": CameraMount(pixels_per_mm=12.0)},
+            "the cameras are mounted or calibrated differently than",
+        ),
+        ("force", {"lab": LAB | {"gripper": {"grasp_force": 40.0}}}, "the grasp force is 40 N, in .*usual.mcap 12 N"),
+        ("height", {"lab": LAB | {"part": part | {"grasp_height": 0.031}}}, "the part is grasped at another height"),
+    ):
+        other = write_session(tmp_path / f"{name}.mcap", world, **{"mount": CameraMount()} | changed)
+        with pytest.raises(UsageError, match=rf"{name}\.mcap: {expected}.*; calibrate it alone"):
+            read_recordings([usual, other])
+
+
+def test_a_session_is_not_calibrated_together_with_its_copy(tmp_path: Path, world: RecordedWorld) -> None:
+    path = write_session(tmp_path / "a.mcap", world)
+    copy = Path(shutil.copy(path, tmp_path / "copy.mcap"))
+    for other in (path, copy):
+        with pytest.raises(UsageError, match=r"the same session as .*a\.mcap; name it once"):
+            read_recordings([path, other])
+
+
 def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
     with pytest.raises(UsageError, match="needs a session of the task insertion, got 'pushing'"):
         read_recordings([write_session(tmp_path / "pushing.mcap", world, name="pushing")])
@@ -328,6 +374,19 @@ def test_no_file_of_the_folder_is_overwritten(tmp_path: Path, capsys: pytest.Cap
     assert main(["calibrate", "missing.mcap", "--out", str(tmp_path)]) == 2
     assert f"{name} exists; name a new folder with --out" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_the_fit(
+    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, file = write_session(tmp_path / "a.mcap", world), tmp_path / "file"
+    file.touch()
+    plan = file / "plan.toml"
+    for options in (["--out", str(file)], ["--out", str(tmp_path / "out"), "--plan", str(plan)]):
+        assert main(["calibrate", str(session), *options]) == 2
+        assert f"cannot write to {file}" in capsys.readouterr().err
+    assert main(["calibrate", str(session), "--plan", str(tmp_path / "plan.toml"), "--lab", "missing.toml"]) == 2
+    assert "missing.toml" in capsys.readouterr().err
 
 
 @pytest.mark.slow

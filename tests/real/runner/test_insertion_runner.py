@@ -95,6 +95,25 @@ def test_lost_part_ends_its_insertion_and_the_next_one_starts(robot: MockRobot, 
     assert "part lost" in dict(events(tmp_path / "session.mcap"))
 
 
+def test_part_that_moves_in_the_grip_is_raised_and_handed_back(
+    robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gripper still reports it: the pads are observed until it is released, and the next insertion starts."""
+    measured, moved = robot.cell.gripper_state, threading.Event()
+
+    def with_wider_grip() -> tuple[float, float, float]:
+        width, speed, force = measured()
+        return width + (0.7e-3 if moved.is_set() and width < 0.055 else 0.0), speed, force
+
+    monkeypatch.setattr(robot.cell, "gripper_state", with_wider_grip)
+    results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot, answer=moved.set)))
+    assert [result.outcome for result in results] == [
+        "the grip width changed by +0.70 mm since the grasp: the part moved"
+    ]
+    assert phases_of_moves_with_a_part(tmp_path / "session.mcap") >= {"descend", "retreat"}
+    assert robot.cell.truth()["part"] is None or robot.cell.truth()["part"]["phase"] != "gripped"
+
+
 class InterruptedGripper:
     """A gripper whose state calls `on_read` once: another thread runs between two steps of the caller."""
 

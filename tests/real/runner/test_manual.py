@@ -100,7 +100,8 @@ def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_pat
     assert code == 0, operator.errors
     before = height(robot)
     code, printed = operator.run("jog", "x", "2", answers="n\n")
-    assert code == 1 and "raise the gripper above the hole first" in printed and "jog: not agreed" in printed
+    assert code == 1 and "raise the gripper to the hand-over first: to x" in printed and "jog: not agreed" in printed
+    assert f"height {1e3 * lab_for(robot).part.load_height:.1f} mm" in printed  # above the rim of any hole
     assert height(robot) == pytest.approx(before, abs=1e-5)
 
     code, printed = operator.run("jog", "z", "+3", answers="y\n")

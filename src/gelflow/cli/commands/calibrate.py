@@ -10,7 +10,16 @@ from typing import Any
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_part, add_quick, add_seed, check_at_least, part_task
+from gelflow.cli.options import (
+    add_json,
+    add_out,
+    add_part,
+    add_quick,
+    add_seed,
+    check_at_least,
+    create_folder,
+    part_task,
+)
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
@@ -65,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
         if file.exists():
             raise UsageError(f"{file} exists; name a new folder with --out")
     recordings = read_recordings(args.sessions)
+    create_folder(args.out)
     settings = _QUICK if args.quick else FitSettings()
     with progress_bar(count=True) as progress:
         bar = progress.add_task("fitting", total=settings.starts)
@@ -77,7 +87,6 @@ def run(args: argparse.Namespace) -> int:
         )
     report = plain_report(result, args.sessions)
     try:
-        args.out.mkdir(parents=True, exist_ok=True)
         files[0].write_text(readable_json(report))
         files[1].write_text(page(result, args.sessions, recordings.task.grid))
         scene = write_scene(result, args.out)
@@ -104,6 +113,10 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("a session contains its part; leave --part out")
     if args.plan is not None and args.plan.exists():
         raise UsageError(f"{args.plan} exists; name a new file with --plan")
+    if args.lab is not None:
+        load_lab(args.lab)  # a wrong file is refused before minutes of computing
+    if args.plan is not None:
+        create_folder(args.plan.parent)
 
 
 def _lab_recordings(args: argparse.Namespace) -> Recordings:
