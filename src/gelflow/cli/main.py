@@ -29,7 +29,7 @@ COMMANDS = {
     "calibrate-camera": "calibrate a camera in millimetres from one image of the gel at rest",
     "calibrate-gel": "calibrate the stiffness of a gel with measured forces",
     "run": "run the insertion policy on the robot or on the mock robot",
-    "robot": "after a stop: state of the devices; home, open, acknowledge, jog",
+    "robot": "at set-up and after a stop: state of the devices; home, open, acknowledge, jog",
     "calibrate": "fit the simulator to recorded insertions: parameters with intervals, and a report",
     "replay": "recompute the decisions of a recorded session and compare them",
     "recover": "copy the complete records of an unfinished or damaged session",
