@@ -22,7 +22,7 @@ from gelflow.interrupts import Interrupted
 COMMANDS = {
     "train": "train a policy in simulation",
     "sweep": "train many configurations and seeds on this machine, a Ray cluster or SLURM",
-    "eval": "measure the success of a policy in simulation, and that of random actions",
+    "eval": "measure the success of a policy in simulation, of an oracle and of random actions",
     "reproduce": "train and evaluate the experiments of the paper again, beside its figures",
     "export": "export a policy as an ONNX model",
     "track": "track markers in tactile images: a folder, a video, a stream or a camera",
