@@ -18,9 +18,7 @@ extensions = [
     "external_links",
     "phases",
     "plain_docstrings",
-    "promises",
     "public_names",
-    "randomization",
 ]
 exclude_patterns = ["extensions", "**/.ipynb_checkpoints"]
 root_doc = "index"

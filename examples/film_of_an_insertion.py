@@ -1,4 +1,4 @@
-"""A film of the shipped policy inserting a part: the scene, the contact forces and the readings of both pads."""
+"""A film of the included policy inserting a part: the scene, the contact forces and the readings of both pads."""
 
 import sys
 

@@ -1,8 +1,8 @@
 """Limits of motion: the single table of numbers that the drivers, the supervisor and the lab file share.
 
-The limits are checked independently in four layers (lab file, supervisor, driver, EGM process), so that an error in
-one layer does not pass. The table in docs/guide/robot.md shows which layer checks which limit. `LIMITS` contains the
-hardware ranges and the defaults, `LAB_RANGES` the widest value that a lab file may give to each of its numbers.
+The limits are checked independently in four layers (lab file, supervisor, driver, EGM process), so that an error in one
+layer does not pass. The table in docs/reference/robot_limits.md shows which layer checks which limit. `LIMITS` contains
+the hardware ranges and the defaults, `LAB_RANGES` the widest value that a lab file may give to each of its numbers.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Markdown text of a table, for directives on Markdown pages."""
+"""Markdown text of a table."""
 
 from collections.abc import Sequence
 

@@ -29,7 +29,7 @@ def test_configurations_use_the_table() -> None:
 
 
 def test_documentation_shows_the_same_numbers() -> None:
-    page = (ROOT / "docs" / "guide" / "robot.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "robot_limits.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| [^|]+ \| `(\w+)` \| ([^|]+) \|", page, flags=re.M))
     assert set(rows) == {field.name for field in dataclasses.fields(LIMITS)}
     for name, text in rows.items():
@@ -42,7 +42,7 @@ def test_documentation_shows_the_same_numbers() -> None:
 
 
 def test_documentation_shows_the_ranges_of_the_lab_file() -> None:
-    page = (ROOT / "docs" / "guide" / "robot.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "robot_limits.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `([\w.]+)` \| ([^|]+) \| ?(yes)? ?\|$", page, flags=re.M)
     shown = {key: (text, time_limit == "yes") for key, text, time_limit in rows}
     assert shown == {key: (str(allowed), allowed.time_limit) for key, allowed in LAB_RANGES.items()}

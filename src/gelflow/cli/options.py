@@ -51,7 +51,7 @@ def add_repeats(parser: argparse.ArgumentParser, text: str, *, default: int | No
     parser.add_argument("--repeats", type=int, default=default, metavar="N", help=text)
 
 
-def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the policy shipped with gelflow") -> None:
+def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the included policy") -> None:
     """`--checkpoint`: the policy."""
     parser.add_argument(
         "--checkpoint", type=Path, metavar="FILE", help=f"checkpoint of the policy (default: {default})"

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a shipped scene, or a TOML, MJCF or URDF file")
+    parser.add_argument("scene", metavar="SCENE", help="name of an included scene, or a TOML, MJCF or URDF file")
     parser.add_argument("--friction", choices=["viscous", "elastic"], help="friction law (default: that of the scene)")
     parser.add_argument("--no-timing", action="store_true", help="omit the measured times")
     add_repeats(parser, "timed repeats (%(default)s)", default=60)

@@ -24,7 +24,7 @@ _FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("--plans", type=int, default=20, metavar="N", help="number of plans (default %(default)s)")
-    parser.add_argument("--promises", action="store_true", help="measure the runner's promises instead, in real time")
+    parser.add_argument("--promises", action="store_true", help="measure bounds on the runner's reactions instead")
     parser.add_argument("--egm", type=float, metavar="MINUTES", help="run EGM, cameras, tracking and recording instead")
     parser.add_argument("--only", metavar="WHICH", help="the plan of this seed alone, or this promise alone")
     parser.add_argument("--factor", type=float, default=2.0, metavar="X", help="robot time over wall time (default 2)")

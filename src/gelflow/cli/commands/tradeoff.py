@@ -26,7 +26,7 @@ _EXPLANATION = (
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a scene shipped with gelflow")
+    parser.add_argument("scene", metavar="SCENE", help="name of an included scene")
     add_quick(parser)
     add_repeats(parser, "timed runs of each setting (9; quick: 3)")
     add_out(parser, "the picture (default out/tradeoff_SCENE.png; none with --json)")

@@ -22,7 +22,7 @@ _MAX_FRAMES = 100_000
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("scene", metavar="SCENE", help="name of a shipped scene, or a TOML, MJCF or URDF file")
+    parser.add_argument("scene", metavar="SCENE", help="name of an included scene, or a TOML, MJCF or URDF file")
     add_out(parser, "film (.mp4, .mkv, .avi), or picture (.png, .jpg) of the last state", default=Path("scene.mp4"))
     parser.add_argument(
         "--controls",

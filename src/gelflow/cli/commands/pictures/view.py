@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument(
         "shown", metavar="SCENE|SESSION|RUN", nargs="+",
-        help="name of a shipped scene, or a TOML, MJCF or URDF file; one or two recorded sessions (.mcap); or the "
+        help="name of an included scene, or a TOML, MJCF or URDF file; one or two recorded sessions (.mcap); or the "
         "folder of a training or of gelflow eval --out",
     )  # fmt: skip
     parser.add_argument("--num-envs", type=int, default=1, metavar="N", help="environments (default %(default)s)")

@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", choices=list(TASKS), help="task of the policy")
     add_part(parser)
     add_randomization(parser)
-    add_checkpoint(parser, default="the insertion policy shipped with gelflow")
+    add_checkpoint(parser, default="the included insertion policy")
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
     add_seed(parser, default=1)

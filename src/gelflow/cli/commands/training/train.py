@@ -67,7 +67,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     insertion.add_argument(
         "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
-        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the shipped policy",
+        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the included policy",
     )  # fmt: skip
 
 
