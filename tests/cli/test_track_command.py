@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 import time
@@ -12,8 +13,10 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
+from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.perception.camera_calibration import load_calibration
+from gelflow.perception.frames import CameraMount
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.sources import SourceImage
@@ -210,10 +213,19 @@ def test_a_ruler_replaces_the_spacing(tmp_path: Path, capsys: pytest.CaptureFixt
     length = 200 / LOOK.pixels_per_mm  # [mm]
     words = ["calibrate-camera", str(tmp_path / "rest.png"), "--out", str(tmp_path / "fit.json")]
     assert main([*words, "--ruler", "20", "160", "220", "160", f"{length}"]) == 0
-    assert "by the ruler" in capsys.readouterr().out
-    assert load_calibration(tmp_path / "fit.json").spacing_mm == pytest.approx(LOOK.grid.pitch, rel=2e-3)
+    printed = re.search(r"([0-9.]+) mm between neighbouring markers, by the ruler", capsys.readouterr().out)
+    assert printed is not None
+    calibration = load_calibration(tmp_path / "fit.json")
+    assert calibration.spacing_mm == pytest.approx(LOOK.grid.pitch, rel=2e-3)
+    # The printed spacing serves as the pitch of a lab file.
+    assert CameraMount(8, 6, float(printed[1]), calibration=calibration).unit == "mm"
+    with pytest.raises(UsageError, match="correct the mount, or calibrate again"):
+        CameraMount(8, 6, 1.002 * calibration.spacing_mm, calibration=calibration)
     assert main([*words[:2], "--out", str(tmp_path / "other.json")]) == 2
     assert "give --ruler" in capsys.readouterr().err
+    assert main([*words[:2], "--spacing-mm", "2.2", "--out", str(tmp_path / "new.PNG")]) == 2
+    assert "new.PNG: the picture beside the result gets this name" in capsys.readouterr().err
+    assert not list(tmp_path.glob("new.*"))
 
 
 def test_a_new_zero_from_the_page_is_the_new_state_of_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

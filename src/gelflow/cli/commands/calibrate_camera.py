@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_profile
+from gelflow.cli.options import add_json, add_out, add_profile, picture_beside
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.camera_calibration import CameraCalibration, fit_calibration, save_calibration, scale_by_ruler
@@ -61,12 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Detect the grid, fit the calibration, and write the file and a picture of the fit."""
     output = Output(args.json)
-    picture = args.out.with_suffix(".png")
-    for file in (args.out, picture):
-        if file.exists():
-            raise UsageError(f"{file} exists; name a new file with --out")
-    if not args.out.parent.is_dir():
-        raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
+    picture = picture_beside(args.out)
     profile = load_sensor_profile(args.profile)
     spacing = args.spacing_mm or profile.markers.pitch_mm
     if not spacing and args.ruler is None:
@@ -192,7 +187,7 @@ def _table(fit: CameraCalibration, measured: NDArray[np.bool_], rejected: int, *
         lines = VisiblePart.of_calibration(fit).lines
         table.add_row("visible", f"{lines_text(lines, *fit.printed_grid)} of the printed grid, counted in the image")
     if ruler:
-        table.add_row("spacing", f"{fit.spacing_mm:.3f} mm between neighbouring markers, by the ruler")
+        table.add_row("spacing", f"{fit.spacing_mm:.4g} mm between neighbouring markers, by the ruler")
     table.add_row("scale", f"{along:.2f} px/mm along rows, {down:.2f} along columns (centre)")
     table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid")
     table.add_row("lens", lens)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least
+from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
@@ -130,10 +130,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
     for file in args.out:
         check_suffix(file)
-        if file.exists():
-            raise UsageError(f"{file} exists; name a new file")
-        if not file.parent.is_dir():
-            raise UsageError(f"{file}: the folder {file.parent} does not exist")
+        check_new_file(file)
 
 
 @contextmanager
