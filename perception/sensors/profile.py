@@ -90,6 +90,19 @@ class SensorProfile:
             image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         return self._cropped(image, *(math.ceil(size / self.image.reduce) for size in self._size))
 
+    def used_positions(self, positions: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+        """Positions in the used part of an image, of positions in the image as sent; (right, down) [px], shape (n, 2).
+
+        `size` is the width and height of the used part [px].
+        """
+        left, top, right, bottom = self.image.crop
+        whole = [
+            math.ceil(sent / self.image.reduce) if sent else round(used / share)
+            for sent, used, share in zip(self._size, size, (1 - left - right, 1 - top - bottom), strict=True)
+        ]
+        corner = self.crop_pixels(whole[0], whole[1])[:2]
+        return np.asarray((positions + 0.5) / self.image.reduce - 0.5 - corner)
+
     @property
     def _size(self) -> tuple[int, int]:
         return self.image.width, self.image.height

@@ -95,6 +95,19 @@ def test_a_profile_tracks_and_scales_images_of_its_camera(tmp_path: Path, capsys
     assert again["largest_displacement_px"] == result["largest_displacement_px"]
     assert main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "c.json")]) == 0
     assert json.loads((tmp_path / "c.json").read_text())["spacing_mm"] == 1.4
+    # The points of a ruler are those of the image as sent, which has twice the scale.
+    ruler = [*map(str, (100, 300, 600, 300, 500 / 31.4))]
+    assert (
+        main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "r.json"), "--ruler", *ruler])
+        == 0
+    )
+    assert json.loads((tmp_path / "r.json").read_text())["spacing_mm"] == pytest.approx(1.4, rel=3e-3)
+    ruler[0] = "20"
+    assert (
+        main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "s.json"), "--ruler", *ruler])
+        == 2
+    )
+    assert "in the part of the image that the profile uses" in capsys.readouterr().err
     assert main(["calibrate-camera", source, "--out", str(tmp_path / "d.json")]) == 2
     assert "--spacing-mm is missing" in capsys.readouterr().err
     assert main(["track", source, "--pixels-per-mm", "0"]) == 2

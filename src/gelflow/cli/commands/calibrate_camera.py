@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=5,
         metavar=("X1", "Y1", "X2", "Y2", "MM"),
-        help="instead: two points in images of this camera [px], and their distance on the gel, such as on a ruler",
+        help="instead: two points in an image as the camera sends it [px], and their distance on the gel",
     )
     add_profile(parser)
     parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
@@ -79,7 +79,10 @@ def run(args: argparse.Namespace) -> int:
         rest, measured, rows=first.rows, cols=first.cols, spacing_mm=1.0 if args.ruler else spacing, size=size
     )
     if args.ruler:
-        fit = scale_by_ruler(fit, np.reshape(args.ruler[:4], (2, 2)), args.ruler[4])
+        points = profile.used_positions(np.reshape(args.ruler[:4], (2, 2)), size)
+        if not profile.image.is_plain and not ((points >= -0.5) & (points <= np.array(size) - 0.5)).all():
+            raise UsageError("the points of the ruler must be in the part of the image that the profile uses")
+        fit = scale_by_ruler(fit, points, args.ruler[4], pixel=1 / profile.image.reduce)
     fit = replace(fit, skipped=part.skipped) if part else fit
     save_calibration(fit, args.out)
     draw_calibration(image, rest, measured, fit, picture)
