@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     pad = recorded_pad(source.text, args.sensor) if source.kind == "session" else None
     gel = _gel(args, profile, pad)
     if gel is not None and pad is not None and calibration is None and args.pixels_per_mm is None:
-        calibration, args.pixels_per_mm = pad.mount.calibration, pad.mount.pixels_per_mm
+        calibration, args.pixels_per_mm = _pad_scale(pad, profile)
     args.gel = None if gel is None else gel.gel
     for file in args.out:
         if file.name.endswith(SUFFIX) and args.gel is None:
@@ -264,6 +264,17 @@ def _gel(args: argparse.Namespace, profile: SensorProfile, pad: RecordedPad | No
         return None
     values = f"{pad.gel.youngs_modulus:g} Pa, {1e3 * pad.gel.thickness:g} mm thick"
     return _Gel(pad.gel, f"of the {args.sensor} pad in the session's lab, {values}")
+
+
+def _pad_scale(pad: RecordedPad, profile: SensorProfile) -> tuple[CameraCalibration | None, float | None]:
+    """The calibration or the scale [px/mm] of a recorded pad, for the part of its images that the profile uses."""
+    calibration, scale = pad.mount.calibration, pad.mount.pixels_per_mm
+    if calibration is not None and not profile.image.is_plain:
+        raise UsageError(
+            f"the calibration in the session's lab is for whole images, and the profile {profile.title!r} crops or "
+            "reduces them: leave --profile out, or give --calibration"
+        )
+    return calibration, None if scale is None else scale / profile.image.reduce
 
 
 def _forces(
