@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -127,6 +128,38 @@ def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
     recover(session, tmp_path / "whole.mcap")
     with SessionReader(tmp_path / "whole.mcap") as reader:
         assert reader.counts()["/left/markers"] >= images // 50 * 50  # the recorder waits for the disk every 50 images
+
+
+@pytest.mark.parametrize("name", ["t.csv", "o.mkv", "o.avi", "o.mp4", "s.mcap"])
+def test_a_full_disk_is_an_error(name: str, tmp_path: Path) -> None:
+    full = [*MAIN[:2], f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000)); {MAIN[2]}"]
+    words = ["track", str(draw(tmp_path / "images", 40)), "--out", str(tmp_path / name)]
+    run = subprocess.run([*full, *words], capture_output=True, text=True)
+    assert run.returncode == 2 and "Traceback" not in run.stderr
+    assert name in run.stderr.splitlines()[-1]  # OpenCV writes warnings before
+
+
+def test_a_recording_waits_for_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored = os.fsync
+
+    def wait_for_disk(file: int) -> None:
+        time.sleep(1.3)  # longer than a run of a robot allows
+        stored(file)
+
+    folder = draw(tmp_path / "images", 60)
+    monkeypatch.setattr(os, "fsync", wait_for_disk)
+    assert main(["track", str(folder), "--out", str(tmp_path / "s.mcap")]) == 0
+    with SessionReader(tmp_path / "s.mcap") as reader:
+        assert reader.counts()["/left/markers"] == 60
+
+
+@pytest.mark.parametrize(("rate", "expected"), [(99.9985, 100.0), (0.0151, 0.015), (1000.0, 240.0)])
+def test_a_video_has_the_nearest_rate_that_its_file_can_have(rate: float, expected: float, tmp_path: Path) -> None:
+    video = tmp_path / "o.mkv"
+    assert main(["track", str(draw(tmp_path / "images", 28)), "--rate", str(rate), "--out", str(video)]) == 0
+    film = cv2.VideoCapture(str(video))
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(expected, rel=0.01)
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 28
 
 
 def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
