@@ -70,7 +70,7 @@ class ImageSource:
     def __iter__(self) -> Iterator[SourceImage]:
         """Iterates over the images; those that cannot be decoded are skipped and counted in `skipped`.
 
-        Raises PeerError when no image can be read, a video ends early, or the image size of a stream changes.
+        Raises PeerError when no image can be read, a video ends early, or the image size changes.
         """
         if self.kind == "session":
             images = self._from_session()
@@ -78,11 +78,17 @@ class ImageSource:
             images = self._from_files()
         else:
             images = self._from_capture()
-        empty = True
+        size = None
         for image in images:
-            empty = False
+            height, width = image.image.shape[:2]
+            size = size or (width, height)
+            if (width, height) != size:
+                raise PeerError(
+                    f"{self.kind} {self.text}: image {image.name} has {width} × {height} px, those before have "
+                    f"{size[0]} × {size[1]}: the camera's settings changed"
+                )
             yield image
-        if empty:
+        if size is None:
             raise PeerError(self._why_empty())
 
     def count(self) -> int | None:
@@ -139,7 +145,7 @@ class ImageSource:
                     yield SourceImage(name, image, record.stamp, self._original(record.value.data))
 
     def _from_capture(self) -> Iterator[SourceImage]:
-        capture, size = self._capture(), None
+        capture = self._capture()
         for number, captured in enumerate(capture):
             self.skipped.dropped = capture.dropped
             name, content = f"{number:06d}", captured.content
@@ -151,12 +157,6 @@ class ImageSource:
             except UnreadableImage as error:
                 self.skipped.add(f"image {name}", error)
                 continue
-            size = size or image.shape[:2]
-            if image.shape[:2] != size:
-                raise PeerError(
-                    f"{self.kind} {self.text}: image {name} has {image.shape[1]} × {image.shape[0]} px, those before "
-                    f"have {size[1]} × {size[0]}: the camera's settings changed"
-                )
             yield SourceImage(name, image, captured.stamp, self._original(data))
 
     def _capture(self) -> Capture:

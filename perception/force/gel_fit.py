@@ -124,7 +124,7 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
     shear = _factor(samples, samples.shear, _lagging(samples, samples.measured_shear, creep, creep_time), "shear")
     found = [factor for factor in (normal, shear) if factor is not None]
     if not found:
-        raise UsageError("no measured force is above 0: press harder, or check the units (N)")
+        raise UsageError("no image has a measured and an estimated force above 0: press harder, or check the units (N)")
     weights = np.array([factor.deviation for factor in found]) ** -2.0
     scale = float(weights @ [factor.value for factor in found] / weights.sum())
     deviation = math.hypot(float(weights.sum() ** -0.5) / scale, _LAG_ERROR * creep)

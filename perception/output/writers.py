@@ -162,6 +162,11 @@ class OverlayWriter:
         self._last: TrackedImage | None = None
         self._video: cv2.VideoWriter | None = None
         self._written = 0  # pictures of the video
+        try:  # before the images are tracked
+            path.open("xb").close()
+            path.unlink()
+        except OSError as error:
+            raise UsageError(f"cannot create {path}: {error.strerror}") from None
 
     def add(self, step: TrackedImage) -> None:
         if self._path.suffix.lower() in PICTURE_SUFFIXES:
@@ -190,12 +195,13 @@ class OverlayWriter:
         pictures = [self._draw(step) for step in waiting]
         size = (pictures[0].shape[1], pictures[0].shape[0])
         code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix.lower()])
-        self._video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
-        if not self._video.isOpened():
+        video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
+        if not video.isOpened():
             raise UsageError(
                 f"cannot write the video {self._path} of {size[0]} × {size[1]} px at {rate:g} images/s: use another "
                 "suffix, or a writable folder"
             )
+        self._video = video
         for picture in pictures:
             self._write(picture)
 
@@ -208,7 +214,7 @@ class OverlayWriter:
         """Raise PeerError when the file does not announce its pictures: OpenCV reports no error of a full disk."""
         try:
             count = image_source(str(self._path)).count() or 0
-        except PeerError:
+        except (PeerError, UsageError):
             count = 0
         if count < 0.98 * self._written - 2:
             raise PeerError(f"the video {self._path} is incomplete; is the disk full?")

@@ -204,6 +204,8 @@ def test_unreadable_images_are_skipped_and_shown(tmp_path: Path, capsys: pytest.
     [
         (["--out", "notes.csv"], "notes.csv exists; name a new file"),
         (["--out", "film.gif"], "suffix must be one of .csv, .mcap, .mp4, .mkv, .avi"),
+        (["--out", "t.mkv", "--out", "./t.mkv"], "--out names t.mkv twice"),
+        (["--out", "/proc/t.mkv"], "/proc/t.mkv: "),  # no user can write there
         (["--out", "none/t.csv"], "the folder none does not exist"),
         (["--calibration", "none.json"], "cannot read none.json"),
         (["--calibration", "other.json"], "for images of 320 × 427 px, this one has 240 × 320"),

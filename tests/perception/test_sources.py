@@ -41,6 +41,13 @@ def test_unreadable_images_of_a_folder_are_skipped_and_counted(tmp_path: Path) -
     assert source.skipped.first.startswith(f"{tmp_path / '1.jpg'}: ") and "truncated" in source.skipped.first
 
 
+def test_a_folder_whose_image_size_changes_is_an_error(tmp_path: Path) -> None:
+    for number, size in enumerate([(96, 64), (96, 64), (128, 96)]):
+        (tmp_path / f"{number}.jpg").write_bytes(jpeg(number, size))
+    with pytest.raises(PeerError, match=r"image 2\.jpg has 128 × 96 px, those before have 96 × 64"):
+        names(image_source(str(tmp_path)))
+
+
 def test_images_of_12_bits_are_reduced_alike(tmp_path: Path) -> None:
     for number, share in enumerate((1.0, 0.2)):  # the second image alone would count as one of 10 bits
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((48, 64), round(share * 4095), dtype=np.uint16))

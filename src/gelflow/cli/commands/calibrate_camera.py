@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json)
     picture = picture_beside(args.out)
     profile = load_sensor_profile(args.profile)
-    spacing = args.spacing_mm or profile.markers.pitch_mm
-    if not spacing and args.ruler is None:
+    spacing = profile.markers.pitch_mm if args.spacing_mm is None else args.spacing_mm
+    if args.spacing_mm is None and not spacing and args.ruler is None:
         raise UsageError(
             "--spacing-mm is missing: the distance of neighbouring markers; measure it on the gel, or give --ruler"
         )

@@ -128,9 +128,11 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
-    for file in args.out:
+    for number, file in enumerate(args.out):
         check_suffix(file)
         check_new_file(file)
+        if file.resolve() in (other.resolve() for other in args.out[:number]):
+            raise UsageError(f"--out names {file} twice")
 
 
 @contextmanager
