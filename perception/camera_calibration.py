@@ -188,22 +188,25 @@ def fit_calibration(
     return _checked(best, rest, visible, inliers)
 
 
-def scale_by_ruler(fit: CameraCalibration, points: Floats, length_mm: float) -> CameraCalibration:
+def scale_by_ruler(
+    fit: CameraCalibration, points: Floats, length_mm: float, *, pixel: float = 1.0
+) -> CameraCalibration:
     """The calibration whose scale is such that two image points (2, 2) [px] are `length_mm` apart on the gel.
 
-    `scale_error` includes the error of reading the points, one pixel each. Raises UsageError for points outside the
+    `scale_error` includes the error of reading the points, one pixel each, in an image whose pixels have the size
+    `pixel` [px]: below 1 where the image of `fit` is a reduced one. Raises UsageError for points outside the
     image or too close to each other, and for an invalid length or spacing.
     """
-    if not (np.isfinite(points).all() and (points >= 0).all() and (points <= [fit.width - 1, fit.height - 1]).all()):
+    if not ((points >= -0.5) & (points <= np.array([fit.width, fit.height]) - 0.5)).all():
         raise UsageError(f"the points of the ruler must be in the image of {fit.width} × {fit.height} px")
     if not 0 < length_mm < np.inf:
         raise UsageError(f"the length on the ruler must be above 0 mm, got {length_mm:g}")
     pixels = float(np.linalg.norm(points[1] - points[0]))
-    reading = np.sqrt(2) * _READING / max(pixels, 1e-9)
+    reading = np.sqrt(2) * _READING * pixel / max(pixels, 1e-9)
     error = float(np.hypot(fit.scale_error or 0.0, reading))
     if error > _MAX_SCALE_ERROR:
         raise UsageError(
-            f"the points of the ruler are {pixels:.0f} px apart, and reading them makes the scale uncertain by "
+            f"the points of the ruler are {pixels / pixel:.0f} px apart, and reading them makes the scale uncertain by "
             f"{100 * error:.1f} %, limit {100 * _MAX_SCALE_ERROR:g} %: choose points further apart"
         )
     (first, last) = fit.to_mm(points)

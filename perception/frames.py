@@ -3,6 +3,7 @@
 `gelflow.observation.flow_map` computes the observation of a policy from these frames.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,7 +33,12 @@ _DECODING: dict[int, int] = {
     8: cv2.IMREAD_REDUCED_COLOR_8,
 }
 
-ENCODED = (b"\xff\xd8\xff", b"\x89PNG")  # first bytes of JPEG and PNG files
+_JPEG = b"\xff\xd8\xff"
+_BIT_DEPTHS = (8, 10, 12, 14, 16)  # of cameras whose images have 16 bits per value
+
+_SAME_SPACING = 1e-3  # relative difference of two spacings, such as one by a ruler and its rounded value
+
+ENCODED = (_JPEG, b"\x89PNG")  # first bytes of JPEG and PNG files
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ class CameraMount:
 
     rows: int = 18  # markers from the base to the tip of the finger
     cols: int = 14  # markers across
-    pitch: float = 1.4  # marker spacing on the gel at rest [mm]
+    pitch: float = 1.4  # marker spacing on the gel at rest [mm]; with a calibration its spacing within 0.1 %
     center: tuple[float, float] = (2.0, 0.0)  # (x, y) of the grid centre on the pad [mm]
     rotation: Literal[0, 90, 180, 270] = 0  # of the image, clockwise [deg]
     mirrored: bool = True  # the camera views the gel from behind
@@ -70,9 +76,12 @@ class CameraMount:
 
     def _check_calibration(self) -> None:
         c = self.calibration
-        if c is not None and (*c.printed_grid, c.spacing_mm) != (*self.printed_grid, self.pitch):
+        if c is None:
+            return
+        same_spacing = abs(c.spacing_mm - self.pitch) <= _SAME_SPACING * self.pitch
+        if c.printed_grid != self.printed_grid or not same_spacing:
             (rows, cols), (fitted_rows, fitted_cols) = self.printed_grid, c.printed_grid
-            advice = "calibrate again" if c.spacing_mm != self.pitch else f"calibrate with --rows {rows} --cols {cols}"
+            advice = f"calibrate with --rows {rows} --cols {cols}" if same_spacing else "calibrate again"
             raise UsageError(
                 f"the calibration is for {fitted_rows} rows of {fitted_cols} markers with spacing {c.spacing_mm:g} mm; "
                 f"the mount has {rows} rows of {cols} with spacing {self.pitch:g} mm: correct the mount, or {advice}"
@@ -202,20 +211,56 @@ def skipped_lines(seen: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     return counts[0], counts[1], counts[2], counts[3]
 
 
-def decode_image(data: bytes, *, reduce: Reduction = 1) -> Image:
-    """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3), at 1 / `reduce` of its size.
+class ImageDecoder:
+    """Decodes the images of one source.
 
-    The JPEG decoder computes the smaller image only, which takes less than half the time at a quarter of the size.
+    Values of 16 bits are reduced to 8 by the bit depth that the first such image uses (8, 10, 12, 14 or 16), because
+    cameras of 10 to 14 bits store small numbers. Larger values of later images become white.
+    """
+
+    def __init__(self) -> None:
+        self._bits = 0  # 0: no image of 16 bits yet
+
+    def __call__(self, data: bytes, *, reduce: Reduction = 1) -> Image:
+        """The image B G R, uint8, shape (height, width, 3); see `decode_image`."""
+        if data.startswith(_JPEG):
+            return np.asarray(_decoded(data, _DECODING[reduce]), dtype=np.uint8)
+        image = _decoded(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if image.dtype == np.uint16:
+            self._bits = self._bits or next(bits for bits in _BIT_DEPTHS if image.max() < 1 << bits)
+            image = np.minimum(image >> (self._bits - 8), 255)
+        return reduce_image(np.asarray(image, dtype=np.uint8), reduce)
+
+
+def decode_image(data: bytes, *, reduce: Reduction = 1) -> Image:
+    """Decodes JPEG or PNG `data` to B G R, uint8, shape (height, width, 3), at 1 / `reduce` of its size, rounded up.
+
+    The JPEG decoder computes the smaller image only, which takes less than half the time at a quarter of the size;
+    other images are decoded and then averaged. Values of 16 bits: see `ImageDecoder`.
     The runner and replay both use this function, so that they process identical images. Raises UnreadableImage when
     the bytes are not an image.
     """
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _DECODING[reduce]) if data else None
-    if image is None:
+    return ImageDecoder()(data, reduce=reduce)
+
+
+def reduce_image(image: Image, reduce: Reduction) -> Image:
+    """`image` at 1 / `reduce` of its size, rounded up, by averaging."""
+    if reduce == 1:
+        return image
+    height, width = image.shape[:2]
+    size = (math.ceil(width / reduce), math.ceil(height / reduce))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _decoded(data: bytes, flags: int) -> NDArray[np.uint8 | np.uint16]:
+    """The decoded image. Raises UnreadableImage when there is none."""
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    if image is None or image.dtype not in (np.uint8, np.uint16):
         problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
         if data.startswith(ENCODED):
             problem = "cannot be decoded: truncated or damaged"
         raise UnreadableImage(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
-    return np.asarray(image, dtype=np.uint8)
+    return np.asarray(image)
 
 
 def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:

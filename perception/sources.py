@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.capture import Capture
-from gelflow.perception.frames import ENCODED, UnreadableImage
+from gelflow.perception.frames import ENCODED, ImageDecoder, UnreadableImage
 from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS
@@ -70,7 +70,7 @@ class ImageSource:
     def __iter__(self) -> Iterator[SourceImage]:
         """Iterates over the images; those that cannot be decoded are skipped and counted in `skipped`.
 
-        Raises PeerError when no image can be read, a video ends early, or the image size of a stream changes.
+        Raises PeerError when no image can be read, a video ends early, or the image size changes.
         """
         if self.kind == "session":
             images = self._from_session()
@@ -78,11 +78,17 @@ class ImageSource:
             images = self._from_files()
         else:
             images = self._from_capture()
-        empty = True
+        size = None
         for image in images:
-            empty = False
+            height, width = image.image.shape[:2]
+            size = size or (width, height)
+            if (width, height) != size:
+                raise PeerError(
+                    f"{self.kind} {self.text}: image {image.name} has {width} × {height} px, those before have "
+                    f"{size[0]} × {size[1]}: the camera's settings changed"
+                )
             yield image
-        if empty:
+        if size is None:
             raise PeerError(self._why_empty())
 
     def count(self) -> int | None:
@@ -111,10 +117,11 @@ class ImageSource:
         return f"{self.kind} {self.text} was opened but gave no image"
 
     def _from_files(self) -> Iterator[SourceImage]:
+        decoder = ImageDecoder()
         for number, file in enumerate(self.files):
             try:
                 data = file.read_bytes()
-                image = self.profile.decode(data)
+                image = self.profile.decode(data, decoder)
             except UnreadableImage as error:
                 self.skipped.add(str(file), error)
             except PeerError as error:
@@ -126,18 +133,19 @@ class ImageSource:
                 yield SourceImage(file.name, image, number / self.rate, self._original(kept))
 
     def _from_session(self) -> Iterator[SourceImage]:
+        decoder = ImageDecoder()
         with SessionReader(self.text) as session:
             for record in session.records([f"/{self.sensor}/image"]):
                 name = f"{record.value.sequence:06d}"
                 try:
-                    image = self.profile.decode(record.value.data)
+                    image = self.profile.decode(record.value.data, decoder)
                 except UnreadableImage as error:
                     self.skipped.add(f"image {name} of the {self.sensor} sensor", error)
                 else:
                     yield SourceImage(name, image, record.stamp, self._original(record.value.data))
 
     def _from_capture(self) -> Iterator[SourceImage]:
-        capture, size = self._capture(), None
+        capture = self._capture()
         for number, captured in enumerate(capture):
             self.skipped.dropped = capture.dropped
             name, content = f"{number:06d}", captured.content
@@ -149,12 +157,6 @@ class ImageSource:
             except UnreadableImage as error:
                 self.skipped.add(f"image {name}", error)
                 continue
-            size = size or image.shape[:2]
-            if image.shape[:2] != size:
-                raise PeerError(
-                    f"{self.kind} {self.text}: image {name} has {image.shape[1]} × {image.shape[0]} px, those before "
-                    f"have {size[1]} × {size[0]}: the camera's settings changed"
-                )
             yield SourceImage(name, image, captured.stamp, self._original(data))
 
     def _capture(self) -> Capture:
@@ -167,6 +169,7 @@ def image_source(
 ) -> ImageSource:
     """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
+    Where a file or folder has the number of a camera as its name, ./7 is the file and 07 the camera.
     `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder; `profile` is that of the
     sensor, whose part of each image is used. Raises UsageError when the file or folder does not exist, or the folder
     contains no images.
@@ -179,6 +182,10 @@ def image_source(
         raise UsageError(f"rate must be within 0.01 to 10000 Hz, got {rate}")
     profile = profile or load_sensor_profile("generic")
     if text.isascii() and text.isdigit():
+        if Path(text).exists():
+            raise UsageError(
+                f"{text} is a camera and a file or folder: write ./{text} for this, 0{text} for the camera"
+            )
         return ImageSource(text, "camera", rate=rate, profile=profile)
     if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
         return ImageSource(text, "stream", rate=rate, profile=profile)

@@ -76,6 +76,8 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
             f"{measured} needs the column stamp or image, and normal_n or shear_n [N]; it has {', '.join(columns)}"
         )
     in_time = "stamp" in columns
+    if in_time and (np.diff([_number(row, "stamp", estimates) for row in rows]) < 0).any():
+        raise UsageError(f"{estimates}: stamps must not decrease: track one recording without a jump of its time")
     known = {name: _measurements(table, name, measured, in_time=in_time) for name in ("normal_n", "shear_n")}
     kept: list[tuple[float, ...]] = []
     contact, touching = -1, False
@@ -91,6 +93,9 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
         kept.append((stamp, contact, _number(row, "normal_n", estimates), shear, *values))
     data = np.array(kept).reshape(-1, 6)
     data = data[np.isfinite(data[:, 4:]).any(1)]
+    for name, forces in (("normal_n", data[:, 4]), ("shear_n", data[:, 5])):
+        if np.nansum(forces) < 0:
+            raise UsageError(f"{measured}: {name} is negative during contact; forces count positive: change its sign")
     if len(data) < _FEWEST:
         raise UsageError(
             f"{len(data)} images have both a contact and a measured force; at least {_FEWEST} are needed: do stamps or "
@@ -119,7 +124,7 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
     shear = _factor(samples, samples.shear, _lagging(samples, samples.measured_shear, creep, creep_time), "shear")
     found = [factor for factor in (normal, shear) if factor is not None]
     if not found:
-        raise UsageError("no measured force is above 0: press harder, or check the units (N)")
+        raise UsageError("no image has a measured and an estimated force above 0: press harder, or check the units (N)")
     weights = np.array([factor.deviation for factor in found]) ** -2.0
     scale = float(weights @ [factor.value for factor in found] / weights.sum())
     deviation = math.hypot(float(weights.sum() ** -0.5) / scale, _LAG_ERROR * creep)
@@ -246,10 +251,13 @@ class _Measurements:
 
 def _read(path: Path, needed: tuple[str, ...]) -> list[dict[str, str]]:
     try:
-        with path.open(encoding="utf-8", newline="") as text:
+        with path.open(encoding="utf-8-sig", newline="") as text:  # spreadsheets write a byte-order mark
             rows = list(csv.DictReader(text))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"cannot read {path}: {error}") from None
+    for number, row in enumerate(rows, start=1):
+        if any(row.pop(None, ())):
+            raise UsageError(f"{path}: row {number} has more cells than the header; a number has a decimal point")
     missing = [name for name in needed if rows and name not in rows[0]]
     if not rows or missing:
         raise UsageError(f"{path} is not a table of forces: {'it has no rows' if not rows else f'no {missing[0]}'}")

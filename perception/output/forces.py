@@ -1,15 +1,14 @@
 """Tables and drawings of the forces on the gel."""
 
-import csv
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import UsageError
 from gelflow.perception.force.estimator import ForceEstimate
 from gelflow.perception.force.slip import SlipEstimate
+from gelflow.perception.output.csv_file import CsvFile
 
 SUFFIX = ".forces.csv"
 
@@ -29,12 +28,7 @@ class ForceTable:
     """Table with one row per image. The cells of an image without an estimate are empty."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            self._file = path.open("x", encoding="utf-8", newline="")
-        except OSError as error:
-            raise UsageError(f"cannot create {path}: {error.strerror}") from None
-        self._writer = csv.writer(self._file)
-        self._writer.writerow(_COLUMNS)
+        self._file = CsvFile(path, _COLUMNS)
 
     def add(
         self, number: int, name: str, stamp: float, force: ForceEstimate | None, slip: SlipEstimate | None = None
@@ -42,7 +36,7 @@ class ForceTable:
         """Write the row of one image."""
         first = [number, name, f"{stamp:.6f}"]
         if force is None:
-            self._writer.writerow([*first, *[""] * (len(_COLUMNS) - len(first))])
+            self._file.write([[*first, *[""] * (len(_COLUMNS) - len(first))]])
         else:
             centre = ["", ""] if force.centre_of_pressure is None else 1e3 * force.centre_of_pressure
             values = [
@@ -51,8 +45,7 @@ class ForceTable:
                 *(*centre, 1e6 * force.contact_area, force.unexplained),
             ]
             cells = [value if isinstance(value, str) else f"{value:.5f}" for value in values]
-            self._writer.writerow([*first, int(force.contact), *cells, *_slip_cells(slip)])
-        self._file.flush()
+            self._file.write([[*first, int(force.contact), *cells, *_slip_cells(slip)]])
 
     def close(self) -> None:
         self._file.close()

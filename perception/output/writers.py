@@ -4,7 +4,7 @@ Every image is written at once, so the files of a killed run are readable: .csv,
 `gelflow recover`. Only .mp4 needs its end.
 """
 
-import csv
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,13 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import UsageError
+from gelflow.errors import PeerError, UsageError
 from gelflow.perception.force.estimator import ForceEstimate
 from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.force.slip import SlipEstimate
+from gelflow.perception.output.csv_file import CsvFile
 from gelflow.perception.output.forces import SUFFIX, ForceTable, draw_force
 from gelflow.perception.overlay import draw_overlay
-from gelflow.perception.sources import SourceImage
+from gelflow.perception.sources import SourceImage, image_source
 from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
 from gelflow.session.recorder import SessionRecorder
@@ -64,12 +65,7 @@ class CsvWriter:
     def __init__(self, path: Path, *, millimetres: bool) -> None:
         columns = ["frame", "image", "stamp", "marker", "row", "col", "x_px", "y_px", "dx_px", "dy_px"]
         columns += ["x_mm", "y_mm", "dx_mm", "dy_mm"] if millimetres else []
-        try:
-            self._file = path.open("x", encoding="utf-8", newline="")
-        except OSError as error:
-            raise UsageError(f"cannot create {path}: {error.strerror}") from None
-        self._writer = csv.writer(self._file)
-        self._writer.writerow([*columns, "valid", "inferred", "quality"])
+        self._file = CsvFile(path, [*columns, "valid", "inferred", "quality"])
 
     def add(self, step: TrackedImage) -> None:
         tracked = step.tracked
@@ -78,15 +74,14 @@ class CsvWriter:
             numbers += [step.position_mm, step.displacement_mm]
         first = (step.number, step.frame.name, f"{step.frame.stamp:.6f}")
         flags = zip(tracked.valid.tolist(), tracked.inferred.tolist(), tracked.quality.tolist(), strict=True)
+        rows: list[list[object]] = []
         for marker, (row, (valid, inferred, quality)) in enumerate(
             zip(np.column_stack(numbers).tolist(), flags, strict=True)
         ):
             cells = ["" if value != value else f"{value:.5f}" for value in row]
             row_and_column = divmod(marker, tracked.cols)
-            self._writer.writerow(
-                [*first, marker, *row_and_column, *cells, int(valid), int(inferred), f"{quality:.3f}"]
-            )
-        self._file.flush()
+            rows.append([*first, marker, *row_and_column, *cells, int(valid), int(inferred), f"{quality:.3f}"])
+        self._file.write(rows)
 
     def close(self) -> None:
         self._file.close()
@@ -111,7 +106,8 @@ class McapWriter:
     def __init__(self, path: Path, sensor: str, description: Mapping[str, Any]) -> None:
         self._clock = _StampClock()
         self._sensor = SENSORS.index(sensor)
-        self._recorder = SessionRecorder(path, self._clock, epoch=0.0).open()  # the images have no date
+        # The images have no date. Nothing moves: a slow disk delays the tracking and does not end it.
+        self._recorder = SessionRecorder(path, self._clock, epoch=0.0, max_delay=math.inf).open()
         self._recorder.metadata(description)
 
     def add(self, step: TrackedImage) -> None:
@@ -165,12 +161,18 @@ class OverlayWriter:
         self._waiting: list[TrackedImage] = []  # until the frame interval is known
         self._last: TrackedImage | None = None
         self._video: cv2.VideoWriter | None = None
+        self._written = 0  # pictures of the video
+        try:  # before the images are tracked
+            path.open("xb").close()
+            path.unlink()
+        except OSError as error:
+            raise UsageError(f"cannot create {path}: {error.strerror}") from None
 
     def add(self, step: TrackedImage) -> None:
         if self._path.suffix.lower() in PICTURE_SUFFIXES:
             self._last = step
         elif self._video is not None:
-            self._video.write(self._draw(step))
+            self._write(self._draw(step))
         else:
             self._waiting.append(step)
             if len(self._waiting) > _INTERVALS:
@@ -183,23 +185,50 @@ class OverlayWriter:
             self._begin()
         if self._video is not None:
             self._video.release()
+            self._check_complete()
 
     def _begin(self) -> None:
         waiting, self._waiting = self._waiting, []
         intervals = np.diff([step.frame.stamp for step in waiting])
         interval = float(np.median(intervals)) if len(intervals) else 0.0
-        rate = min(1 / interval, 240.0) if interval > 0 else 25.0
+        rate = video_rate(1 / interval) if interval > 0 else 25.0
         pictures = [self._draw(step) for step in waiting]
         size = (pictures[0].shape[1], pictures[0].shape[0])
         code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix.lower()])
-        self._video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
-        if not self._video.isOpened():
-            raise UsageError(f"cannot write the video {self._path}; is its folder writable?")
+        video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
+        if not video.isOpened():
+            raise UsageError(
+                f"cannot write the video {self._path} of {size[0]} × {size[1]} px at {rate:g} images/s: use another "
+                "suffix, or a writable folder"
+            )
+        self._video = video
         for picture in pictures:
+            self._write(picture)
+
+    def _write(self, picture: NDArray[np.uint8]) -> None:
+        if self._video is not None:
             self._video.write(picture)
+            self._written += 1
+
+    def _check_complete(self) -> None:
+        """Raise PeerError when the file does not announce its pictures: OpenCV reports no error of a full disk."""
+        try:
+            count = image_source(str(self._path)).count() or 0
+        except (PeerError, UsageError):
+            count = 0
+        if count < 0.98 * self._written - 2:
+            raise PeerError(f"the video {self._path} is incomplete; is the disk full?")
 
     def _draw(self, step: TrackedImage) -> NDArray[np.uint8]:
         return overlay(step, magnify=self._magnify, forces=self._forces)
+
+
+def video_rate(rate: float) -> float:
+    """The nearest rate [images/s] of 0.01 to 240 that video files can have.
+
+    MPEG-4 counts time in up to 65535 parts of a second, which OpenCV chooses by the decimals of the rate.
+    """
+    return round(min(max(rate, 0.01), 240.0), 3 if rate < 60 else 2)
 
 
 def overlay(step: TrackedImage, *, magnify: float, forces: bool) -> NDArray[np.uint8]:

@@ -5,13 +5,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import get_args
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.gel.gel_file import ElasticGel
-from gelflow.perception.frames import Reduction, decode_image
+from gelflow.perception.frames import ImageDecoder, Reduction, reduce_image
 from gelflow.toml_tables import TomlTable, read_toml, suggestion
 
 Image = NDArray[np.uint8]
@@ -74,21 +73,32 @@ class SensorProfile:
     image: SensorImage = field(default_factory=SensorImage)
     gel: ElasticGel | None = None  # a first guess
 
-    def decode(self, data: bytes) -> Image:
+    def decode(self, data: bytes, decoder: ImageDecoder | None = None) -> Image:
         """The used part of a JPEG or PNG image, B G R, uint8. JPEG data are decoded at the reduced size.
 
-        Raises PeerError when the data are not an image, or the image does not have the size of the profile.
+        `decoder` is that of the other images of the source. Raises PeerError when the data are not an image, or the
+        image does not have the size of the profile.
         """
-        image = decode_image(data, reduce=self.image.reduce)
+        image = (decoder or ImageDecoder())(data, reduce=self.image.reduce)
         return self._cropped(image, *(math.ceil(size / self.image.reduce) for size in self._size))
 
     def prepare(self, image: Image) -> Image:
         """The used part of a decoded image, reduced by averaging. Raises PeerError as `decode` does."""
-        height, width = image.shape[:2]
-        if self.image.reduce > 1:
-            size = (math.ceil(width / self.image.reduce), math.ceil(height / self.image.reduce))
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        image = reduce_image(image, self.image.reduce)
         return self._cropped(image, *(math.ceil(size / self.image.reduce) for size in self._size))
+
+    def used_positions(self, positions: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+        """Positions in the used part of an image, of positions in the image as sent; (right, down) [px], shape (n, 2).
+
+        `size` is the width and height of the used part [px].
+        """
+        left, top, right, bottom = self.image.crop
+        whole = [
+            math.ceil(sent / self.image.reduce) if sent else round(used / share)
+            for sent, used, share in zip(self._size, size, (1 - left - right, 1 - top - bottom), strict=True)
+        ]
+        corner = self.crop_pixels(whole[0], whole[1])[:2]
+        return np.asarray((positions + 0.5) / self.image.reduce - 0.5 - corner)
 
     @property
     def _size(self) -> tuple[int, int]:

@@ -49,7 +49,7 @@ def _check_range(name: str, value: Any, allowed: Range) -> None:
     numbers = value if isinstance(value, tuple) else (value,)
     # The comparison is false for NaN.
     valid = all(allowed.low <= number <= allowed.high * (1 + 1e-9) for number in numbers)
-    _require(valid, f"{name} must be {allowed}, got {list(value) if isinstance(value, tuple) else value}")
+    _require(valid, f"{name} must be {allowed}, got {_toml(value)}")
 
 
 @dataclass(frozen=True)
@@ -160,6 +160,14 @@ class CamerasSettings:
     def __post_init__(self) -> None:
         same = _camera_identity(self.left.source) == _camera_identity(self.right.source)
         _require(not same, f"left and right must be two cameras, got the same source {self.right.source!r} for both")
+        for key in ("rows", "cols", "pitch_mm", "center_mm"):
+            left, right = getattr(self.left, key), getattr(self.right, key)
+            text = f"left and right must have the same grid of markers, got {key} = {_toml(left)} and {_toml(right)}"
+            _require(left == right, text)
+
+
+def _toml(value: Any) -> str:
+    return str(list(value) if isinstance(value, tuple) else value)
 
 
 def _camera_identity(source: str) -> str:

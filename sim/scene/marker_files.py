@@ -71,7 +71,7 @@ def _read_file(path: Path, location: str) -> Mapping[str, Any]:
         else:
             with path.open("rb") as lines:
                 check_memory(location, sum(1 for _ in lines))
-            columns = np.loadtxt(path, delimiter=",", ndmin=2)
+            columns = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
     except UsageError:
         raise
     except FileNotFoundError:

@@ -12,6 +12,7 @@ from gelflow.observation import Grid
 BLUE, VERMILION, GREEN, PURPLE, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"  # Okabe and Ito
 SKY_BLUE = "#56B4E9"  # the same
 SERIES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), ("black", "D"), (PURPLE, "v"), (ORANGE, "P"))  # colour, marker
+PICTURE_FORMATS = (".png", ".jpg", ".jpeg", ".pdf", ".svg")  # suffixes of files that `save` writes
 _ARROW = 1.4  # length of the longest arrow of a flow map, in grid pitches
 
 

@@ -19,7 +19,7 @@ T = TypeVar("T")
 def read_toml(path: Path) -> dict[str, Any]:
     """The content of a TOML file. Raises UsageError if the file is missing, unreadable or not valid TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise UsageError(f"no such file: {path}") from None
     except OSError as error:

@@ -54,6 +54,8 @@ def test_the_summary_fits_a_terminal(
         (["--gel", "none.toml"], "none.toml"),
         (["--measured", "a.forces.png"], "a.forces.png"),
         (["--out", "x/gel.toml"], "x"),
+        (["--out", "gel.png"], "gel.png: the picture beside the result gets this name"),
+        (["--out", "."], ". exists"),
     ],
 )
 def test_wrong_files_are_refused(

@@ -19,7 +19,7 @@ MODEL = """
 
 def test_film_has_the_pictures_of_the_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     controls = np.zeros((20, load_scene("pushing").nu))
-    np.savetxt(tmp_path / "u.csv", controls, delimiter=",")
+    np.savetxt(tmp_path / "u.csv", controls, delimiter=",", encoding="utf-8-sig")
     film = tmp_path / "film.mp4"
     arguments = ["--out", str(film), "--controls", str(tmp_path / "u.csv"), "--size", "160x120"]
     assert main(["render-scene", "pushing", *arguments, "--json"]) == 0

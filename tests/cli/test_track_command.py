@@ -2,6 +2,8 @@
 
 import csv
 import json
+import os
+import re
 import subprocess
 import sys
 import time
@@ -12,8 +14,10 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
+from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.perception.camera_calibration import load_calibration
+from gelflow.perception.frames import CameraMount
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage
 from gelflow.perception.sources import SourceImage
@@ -126,6 +130,38 @@ def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
         assert reader.counts()["/left/markers"] >= images // 50 * 50  # the recorder waits for the disk every 50 images
 
 
+@pytest.mark.parametrize("name", ["t.csv", "o.mkv", "o.avi", "o.mp4", "s.mcap"])
+def test_a_full_disk_is_an_error(name: str, tmp_path: Path) -> None:
+    full = [*MAIN[:2], f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000)); {MAIN[2]}"]
+    words = ["track", str(draw(tmp_path / "images", 40)), "--out", str(tmp_path / name)]
+    run = subprocess.run([*full, *words], capture_output=True, text=True)
+    assert run.returncode == 2 and "Traceback" not in run.stderr
+    assert name in run.stderr.splitlines()[-1]  # OpenCV writes warnings before
+
+
+def test_a_recording_waits_for_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stored = os.fsync
+
+    def wait_for_disk(file: int) -> None:
+        time.sleep(1.3)  # longer than a run of a robot allows
+        stored(file)
+
+    folder = draw(tmp_path / "images", 60)
+    monkeypatch.setattr(os, "fsync", wait_for_disk)
+    assert main(["track", str(folder), "--out", str(tmp_path / "s.mcap")]) == 0
+    with SessionReader(tmp_path / "s.mcap") as reader:
+        assert reader.counts()["/left/markers"] == 60
+
+
+@pytest.mark.parametrize(("rate", "expected"), [(99.9985, 100.0), (0.0151, 0.015), (1000.0, 240.0)])
+def test_a_video_has_the_nearest_rate_that_its_file_can_have(rate: float, expected: float, tmp_path: Path) -> None:
+    video = tmp_path / "o.mkv"
+    assert main(["track", str(draw(tmp_path / "images", 28)), "--rate", str(rate), "--out", str(video)]) == 0
+    film = cv2.VideoCapture(str(video))
+    assert film.get(cv2.CAP_PROP_FPS) == pytest.approx(expected, rel=0.01)
+    assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 28
+
+
 def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
     table, fit = tmp_path / "t.csv", tmp_path / "gel.json"
@@ -168,6 +204,8 @@ def test_unreadable_images_are_skipped_and_shown(tmp_path: Path, capsys: pytest.
     [
         (["--out", "notes.csv"], "notes.csv exists; name a new file"),
         (["--out", "film.gif"], "suffix must be one of .csv, .mcap, .mp4, .mkv, .avi"),
+        (["--out", "t.mkv", "--out", "./t.mkv"], "--out names t.mkv twice"),
+        (["--out", "/proc/t.mkv"], "/proc/t.mkv: "),  # no user can write there
         (["--out", "none/t.csv"], "the folder none does not exist"),
         (["--calibration", "none.json"], "cannot read none.json"),
         (["--calibration", "other.json"], "for images of 320 × 427 px, this one has 240 × 320"),
@@ -210,10 +248,19 @@ def test_a_ruler_replaces_the_spacing(tmp_path: Path, capsys: pytest.CaptureFixt
     length = 200 / LOOK.pixels_per_mm  # [mm]
     words = ["calibrate-camera", str(tmp_path / "rest.png"), "--out", str(tmp_path / "fit.json")]
     assert main([*words, "--ruler", "20", "160", "220", "160", f"{length}"]) == 0
-    assert "by the ruler" in capsys.readouterr().out
-    assert load_calibration(tmp_path / "fit.json").spacing_mm == pytest.approx(LOOK.grid.pitch, rel=2e-3)
+    printed = re.search(r"([0-9.]+) mm between neighbouring markers, by the ruler", capsys.readouterr().out)
+    assert printed is not None
+    calibration = load_calibration(tmp_path / "fit.json")
+    assert calibration.spacing_mm == pytest.approx(LOOK.grid.pitch, rel=2e-3)
+    # The printed spacing serves as the pitch of a lab file.
+    assert CameraMount(8, 6, float(printed[1]), calibration=calibration).unit == "mm"
+    with pytest.raises(UsageError, match="correct the mount, or calibrate again"):
+        CameraMount(8, 6, 1.002 * calibration.spacing_mm, calibration=calibration)
     assert main([*words[:2], "--out", str(tmp_path / "other.json")]) == 2
     assert "give --ruler" in capsys.readouterr().err
+    assert main([*words[:2], "--spacing-mm", "2.2", "--out", str(tmp_path / "new.PNG")]) == 2
+    assert "new.PNG: the picture beside the result gets this name" in capsys.readouterr().err
+    assert not list(tmp_path.glob("new.*"))
 
 
 def test_a_new_zero_from_the_page_is_the_new_state_of_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -189,6 +189,17 @@ def test_gel_and_scale_of_a_recorded_lab_are_used(
     assert without["gel"] is None and without["force"] is None
 
 
+def test_the_scale_of_a_recorded_lab_holds_for_reduced_images(
+    session: Path, images: Path, pressed: PressedGel, capsys: pytest.CaptureFixture[str]
+) -> None:
+    half = images / "half.toml"
+    half.write_text('format = 1\ntitle = "half"\n[image]\nreduce = 2\n')
+    assert main(["track", str(session), "--profile", str(half), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["pixels_per_mm"] == pytest.approx(LOOK.pixels_per_mm / 2)
+    assert summary["force"]["normal"] == pytest.approx(pressed.normal, rel=0.15)
+
+
 def test_a_stated_gel_of_a_session_needs_no_scale(
     session: Path, images: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

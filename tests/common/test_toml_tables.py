@@ -101,6 +101,11 @@ def test_values_are_set_by_dotted_path() -> None:
         set_by_path(tables, "pads.lft.rows", 2)
 
 
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("n = 3\n", encoding="utf-8-sig")
+    assert read_toml(tmp_path / "a.toml") == {"n": 3}
+
+
 def test_unreadable_files_are_errors(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such file"):
         read_toml(tmp_path / "none.toml")

@@ -2,12 +2,13 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.camera_calibration import CameraCalibration
-from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.frames import CameraMount, ImageDecoder, decode_image, tactile_frame
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
@@ -100,6 +101,19 @@ def test_a_truncated_image_is_reported_as_truncated() -> None:
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
     with pytest.raises(PeerError, match="truncated or damaged"):
         decode_image(data[: len(data) // 2])
+
+
+@pytest.mark.parametrize(("bits", "suffix"), [(10, ".png"), (12, ".png"), (12, ".tiff"), (12, ".pgm"), (16, ".png")])
+def test_images_of_16_bits_are_reduced_by_the_bits_that_the_first_one_uses(bits: int, suffix: str) -> None:
+    bright = np.linspace(0, (1 << bits) - 1, 3072).reshape(48, 64)
+    decoder = ImageDecoder()
+    for share, expected in ((1.0, 255), (0.5, 127), (1.0, 255)):
+        data = bytes(cv2.imencode(suffix, (share * bright).astype(np.uint16))[1])
+        decoded = decoder(data)
+        assert decoded.dtype == np.uint8 and decoded.shape == (48, 64, 3) and decoded.max() == expected
+    assert decode_image(data).max() == 255
+    if bits < 16:
+        assert decoder(bytes(cv2.imencode(suffix, np.full((48, 64), 60000, np.uint16))[1])).min() == 255
 
 
 def test_decoding_is_repeatable() -> None:

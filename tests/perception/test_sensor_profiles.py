@@ -66,6 +66,14 @@ def test_decoded_and_prepared_images_agree() -> None:
     decoded, prepared = profile.decode(data), profile.prepare(image)
     assert decoded.shape == prepared.shape == (440, 586, 3)
     assert np.abs(decoded.astype(int) - prepared).mean() < 3
+    np.testing.assert_array_equal(profile.decode(bytes(cv2.imencode(".png", image)[1])), prepared)
+
+
+def test_sizes_that_are_no_multiple_of_the_reduction_are_rounded_up(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text("format = 1\ntitle = 's'\n[image]\nwidth = 203\nheight = 151\nreduce = 4\n")
+    profile, image = load_sensor_profile(str(tmp_path / "s.toml")), np.zeros((151, 203, 3), dtype=np.uint8)
+    for suffix in (".jpg", ".png", ".bmp"):
+        assert profile.decode(bytes(cv2.imencode(suffix, image)[1])).shape == (38, 51, 3)
 
 
 def test_a_profile_tracks_and_scales_images_of_its_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,6 +103,19 @@ def test_a_profile_tracks_and_scales_images_of_its_camera(tmp_path: Path, capsys
     assert again["largest_displacement_px"] == result["largest_displacement_px"]
     assert main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "c.json")]) == 0
     assert json.loads((tmp_path / "c.json").read_text())["spacing_mm"] == 1.4
+    # The points of a ruler are those of the image as sent, which has twice the scale.
+    ruler = [*map(str, (100, 300, 600, 300, 500 / 31.4))]
+    assert (
+        main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "r.json"), "--ruler", *ruler])
+        == 0
+    )
+    assert json.loads((tmp_path / "r.json").read_text())["spacing_mm"] == pytest.approx(1.4, rel=3e-3)
+    ruler[0] = "20"
+    assert (
+        main(["calibrate-camera", source, "--profile", profile, "--out", str(tmp_path / "s.json"), "--ruler", *ruler])
+        == 2
+    )
+    assert "in the part of the image that the profile uses" in capsys.readouterr().err
     assert main(["calibrate-camera", source, "--out", str(tmp_path / "d.json")]) == 2
     assert "--spacing-mm is missing" in capsys.readouterr().err
     assert main(["track", source, "--pixels-per-mm", "0"]) == 2

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gelflow.errors import PeerError, PeerTimeout
+from gelflow.errors import PeerError, PeerTimeout, UsageError
 from gelflow.perception.sensors.profile import load_sensor_profile
 from gelflow.perception.sources import ImageSource, SourceImage, image_source
 
@@ -39,6 +39,29 @@ def test_unreadable_images_of_a_folder_are_skipped_and_counted(tmp_path: Path) -
     assert [image.stamp for image in images] == [0 / 25, 2 / 25, 3 / 25, 5 / 25]
     assert source.skipped.unreadable == 2
     assert source.skipped.first.startswith(f"{tmp_path / '1.jpg'}: ") and "truncated" in source.skipped.first
+
+
+def test_a_folder_whose_image_size_changes_is_an_error(tmp_path: Path) -> None:
+    for number, size in enumerate([(96, 64), (96, 64), (128, 96)]):
+        (tmp_path / f"{number}.jpg").write_bytes(jpeg(number, size))
+    with pytest.raises(PeerError, match=r"image 2\.jpg has 128 × 96 px, those before have 96 × 64"):
+        names(image_source(str(tmp_path)))
+
+
+def test_images_of_12_bits_are_reduced_alike(tmp_path: Path) -> None:
+    for number, share in enumerate((1.0, 0.2)):  # the second image alone would count as one of 10 bits
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((48, 64), round(share * 4095), dtype=np.uint16))
+    assert [int(image.image.max()) for image in image_source(str(tmp_path))] == [255, 51]
+
+
+def test_a_folder_with_the_number_of_a_camera_is_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7" / "0.jpg").write_bytes(jpeg(0))
+    with pytest.raises(UsageError, match=r"write \./7 for this, 07 for the camera"):
+        image_source("7")
+    assert image_source("./7").kind == "folder"
+    assert image_source("07").kind == image_source("6").kind == "camera"
 
 
 def test_a_folder_without_a_readable_image_is_an_error(tmp_path: Path) -> None:

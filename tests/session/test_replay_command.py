@@ -270,6 +270,8 @@ def test_the_command_rejects_wrong_input_with_one_line(
         recorder.metadata({})
     with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
         recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
+    mine = tmp_path / "mine.png"
+    mine.write_bytes(b"mine")
     for arguments, message in [
         ([str(tmp_path / "none.mcap")], "No such file"),
         ([str(cut)], f"recover it with: gelflow recover {cut}"),
@@ -278,8 +280,12 @@ def test_the_command_rejects_wrong_input_with_one_line(
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
         ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
         ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
-        ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "cannot write the picture"),
+        ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "no folder does not exist"),
+        ([str(real_session), "--out", str(tmp_path / "a.foo")], "a.foo: the suffix must be one of .png"),
+        ([str(real_session), "--simulate", "--out", str(tmp_path / "a.foo")], "a.foo: the suffix must be one of"),
+        ([str(real_session), "--out", str(mine)], "mine.png exists; name a new file"),
     ]:
         assert main(["replay", *arguments]) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1, error
+    assert mine.read_bytes() == b"mine"

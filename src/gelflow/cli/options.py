@@ -1,6 +1,7 @@
 """Command-line options that several commands share. An option has the same meaning in every command."""
 
 import argparse
+import os
 import re
 import tempfile
 from pathlib import Path
@@ -23,6 +24,29 @@ def add_out(parser: argparse.ArgumentParser, text: str, *, default: Path | None 
     """`--out`: the file or folder that the command writes."""
     shown = "" if default is None else f" (default {default})"
     parser.add_argument("--out", type=Path, default=default, metavar="DIR" if folder else "FILE", help=text + shown)
+
+
+def check_new_file(file: Path, *, suffixes: tuple[str, ...] = ()) -> None:
+    """Raise UsageError where no new file can be `file`: it exists, its folder does not, or its suffix is another one.
+
+    `suffixes` are in lower case; without them any suffix is allowed.
+    """
+    if suffixes and file.suffix.lower() not in suffixes:
+        raise UsageError(f"--out {file}: the suffix must be one of {', '.join(suffixes)}")
+    if os.path.lexists(file):
+        raise UsageError(f"{file} exists; name a new file with --out")
+    if not file.parent.is_dir():
+        raise UsageError(f"{file}: the folder {file.parent} does not exist")
+
+
+def picture_beside(file: Path) -> Path:
+    """The new picture beside the new file of `--out`. Raises UsageError where one of them cannot be a new file."""
+    check_new_file(file)
+    picture = file.with_suffix(".png")
+    if file.suffix.lower() == picture.suffix:
+        raise UsageError(f"--out {file}: the picture beside the result gets this name; give the result another suffix")
+    check_new_file(picture)
+    return picture
 
 
 def add_seed(parser: argparse.ArgumentParser, *, default: int = 0) -> None:

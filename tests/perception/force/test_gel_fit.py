@@ -99,6 +99,8 @@ def test_a_wrong_thickness_shows(layer: PressedLayer, tmp_path: Path) -> None:
         ("stamp,normal_n\n0,1\n0,2\n", "increase"),
         ("stamp,normal_n\n0,one\n", "number"),
         ("stamp,normal_n\n0,0\n9,0\n", "above 0"),
+        ("stamp,normal_n\n0,-2\n9,-2\n", "normal_n is negative during contact"),
+        ("stamp,normal_n\n0,1\n9,5,3\n", "row 2 has more cells"),
     ],
 )
 def test_wrong_measurements_are_refused(layer: PressedLayer, tmp_path: Path, text: str, named: str) -> None:
@@ -106,6 +108,25 @@ def test_wrong_measurements_are_refused(layer: PressedLayer, tmp_path: Path, tex
     scale.write_text(text)
     with pytest.raises(UsageError, match=named):
         fit_gel(read_samples(estimates, scale), GUESS)
+
+
+def test_tables_of_a_spreadsheet_are_read(layer: PressedLayer, tmp_path: Path) -> None:
+    """With a byte-order mark, and an empty cell at the end of a row."""
+    estimates, scale = record(layer, tmp_path)
+    expected = read_samples(estimates, scale)
+    scale.write_text("\n".join(f"{line}," for line in scale.read_text().splitlines()), encoding="utf-8-sig")
+    estimates.write_text(estimates.read_text(), encoding="utf-8-sig")
+    np.testing.assert_array_equal(read_samples(estimates, scale).measured_normal, expected.measured_normal)
+    scale.write_text("stamp,normal_n\n0,1,\n9,5,\n")
+    assert len(read_samples(estimates, scale).stamp) == len(expected.stamp)
+
+
+def test_estimates_whose_time_jumps_back_are_refused(layer: PressedLayer, tmp_path: Path) -> None:
+    estimates, scale = record(layer, tmp_path)
+    head, *rows = estimates.read_text().splitlines()
+    estimates.write_text("\n".join([head, *rows[60:], *rows[:60]]))
+    with pytest.raises(UsageError, match=r"a\.forces\.csv: stamps must not decrease"):
+        read_samples(estimates, scale)
 
 
 def test_estimates_with_a_lag_are_refused(layer: PressedLayer, tmp_path: Path) -> None:

@@ -193,6 +193,20 @@ def test_one_camera_for_both_fingers_is_refused(tmp_path: Path, example: str, le
     assert "lab.toml, cameras: left and right must be two cameras" in refused(tmp_path, text)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("rows = 18", "rows = 17", "rows = 17 and 18"),
+        ("cols = 14", "cols = 13", "cols = 13 and 14"),
+        ("pitch_mm = 1.4", "pitch_mm = 1.5", "pitch_mm = 1.5 and 1.4"),
+        ("center_mm = [2.0, 0.0]", "center_mm = [1.5, 0.0]", "center_mm = [1.5, 0.0] and [2.0, 0.0]"),
+    ],
+)
+def test_different_grids_of_both_pads_are_refused(tmp_path: Path, example: str, old: str, new: str, named: str) -> None:
+    message = refused(tmp_path, example.replace(old, new, 1))
+    assert f"lab.toml, cameras: left and right must have the same grid of markers, got {named}" in message
+
+
 def test_uvc_devices_are_named_by_index_or_path(tmp_path: Path, example: str) -> None:
     text = example.replace("http://192.168.1.30:8080/?action=stream", "uvc:/dev/video2")
     path = tmp_path / "lab.toml"
@@ -213,7 +227,7 @@ def test_calibration_path_is_relative_to_the_lab_file(tmp_path: Path, example: s
     assert lab.cameras.left.mount.calibration == calibration and lab.cameras.right.mount.pixels_per_mm == 15.7
     save_lab(lab, tmp_path / "elsewhere" / "lab.toml", title="the same calibration")
     assert load_lab(tmp_path / "elsewhere" / "lab.toml") == lab
-    path.write_text(path.read_text().replace("rows = 18", "rows = 17", 1))
+    path.write_text(path.read_text().replace("\nrows = 18", "\nrows = 17"))
     assert "lab.toml, cameras.left: the calibration is for 18 rows of 14" in refused(tmp_path, path.read_text())
 
 
@@ -234,7 +248,7 @@ def test_wrong_gel_is_refused_in_one_line(tmp_path: Path, example: str) -> None:
     assert "left_gel.toml, gel: poisson_ratio is missing" in refused(tmp_path, text)
     (tmp_path / "left_gel.toml").unlink()
     save_gel(ElasticGel(1.5e5, 0.48, 3e-3), tmp_path / "left_gel.toml")
-    fine = text.replace("rows = 18\ncols = 14", "rows = 40\ncols = 30", 1)
+    fine = text.replace("rows = 18\ncols = 14", "rows = 40\ncols = 30")
     assert "cameras.left: forces need a grid of" in refused(tmp_path, fine)
 
 

@@ -97,7 +97,8 @@ def test_listed_points(tmp_path: Path, source: str) -> None:
     else:
         text = f'file = "markers.{source}"'
         if source == "csv":
-            np.savetxt(tmp_path / "markers.csv", np.hstack([POINTS, NORMALS, x_axes]), delimiter=",", header="x, y, z")
+            columns = np.hstack([POINTS, NORMALS, x_axes])
+            np.savetxt(tmp_path / "markers.csv", columns, delimiter=",", header="x, y, z", encoding="utf-8-sig")
         else:
             np.savez(tmp_path / "markers.npz", positions=POINTS, normals=NORMALS, x_axes=x_axes)
     pad = loaded(tmp_path, f'shape = "points"\n{text}').pads[0]

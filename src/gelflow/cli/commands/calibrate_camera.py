@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_profile
+from gelflow.cli.options import add_json, add_out, add_profile, picture_beside
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.camera_calibration import CameraCalibration, fit_calibration, save_calibration, scale_by_ruler
@@ -40,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=5,
         metavar=("X1", "Y1", "X2", "Y2", "MM"),
-        help="instead: two points in images of this camera [px], and their distance on the gel, such as on a ruler",
+        help="instead: two points in an image as the camera sends it [px], and their distance on the gel",
     )
     add_profile(parser)
     parser.add_argument("--rows", type=int, metavar="N", help="printed rows of markers (default: detected)")
@@ -61,15 +61,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Detect the grid, fit the calibration, and write the file and a picture of the fit."""
     output = Output(args.json)
-    picture = args.out.with_suffix(".png")
-    for file in (args.out, picture):
-        if file.exists():
-            raise UsageError(f"{file} exists; name a new file with --out")
-    if not args.out.parent.is_dir():
-        raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
+    picture = picture_beside(args.out)
     profile = load_sensor_profile(args.profile)
-    spacing = args.spacing_mm or profile.markers.pitch_mm
-    if not spacing and args.ruler is None:
+    spacing = profile.markers.pitch_mm if args.spacing_mm is None else args.spacing_mm
+    if args.spacing_mm is None and not spacing and args.ruler is None:
         raise UsageError(
             "--spacing-mm is missing: the distance of neighbouring markers; measure it on the gel, or give --ruler"
         )
@@ -84,7 +79,10 @@ def run(args: argparse.Namespace) -> int:
         rest, measured, rows=first.rows, cols=first.cols, spacing_mm=1.0 if args.ruler else spacing, size=size
     )
     if args.ruler:
-        fit = scale_by_ruler(fit, np.reshape(args.ruler[:4], (2, 2)), args.ruler[4])
+        points = profile.used_positions(np.reshape(args.ruler[:4], (2, 2)), size)
+        if not profile.image.is_plain and not ((points >= -0.5) & (points <= np.array(size) - 0.5)).all():
+            raise UsageError("the points of the ruler must be in the part of the image that the profile uses")
+        fit = scale_by_ruler(fit, points, args.ruler[4], pixel=1 / profile.image.reduce)
     fit = replace(fit, skipped=part.skipped) if part else fit
     save_calibration(fit, args.out)
     draw_calibration(image, rest, measured, fit, picture)
@@ -192,7 +190,7 @@ def _table(fit: CameraCalibration, measured: NDArray[np.bool_], rejected: int, *
         lines = VisiblePart.of_calibration(fit).lines
         table.add_row("visible", f"{lines_text(lines, *fit.printed_grid)} of the printed grid, counted in the image")
     if ruler:
-        table.add_row("spacing", f"{fit.spacing_mm:.3f} mm between neighbouring markers, by the ruler")
+        table.add_row("spacing", f"{fit.spacing_mm:.4g} mm between neighbouring markers, by the ruler")
     table.add_row("scale", f"{along:.2f} px/mm along rows, {down:.2f} along columns (centre)")
     table.add_row("", f"{min(scales):.2f} to {max(scales):.2f} px/mm over the grid")
     table.add_row("lens", lens)

@@ -7,9 +7,8 @@ from pathlib import Path
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out
+from gelflow.cli.options import add_json, add_out, picture_beside
 from gelflow.cli.output import Output
-from gelflow.errors import UsageError
 from gelflow.gel.gel_file import load_gel, save_gel
 from gelflow.perception.force.gel_fit import Factor, GelFit, fit_gel, read_samples
 from gelflow.perception.output.gel_fit_picture import draw_gel_fit
@@ -33,12 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit the gel, and write its file and a picture of the fit."""
     output = Output(args.json)
-    picture = args.out.with_suffix(".png")
-    for file in (args.out, picture):
-        if file.exists():
-            raise UsageError(f"{file} exists; name a new file with --out")
-    if not args.out.parent.is_dir():
-        raise UsageError(f"{args.out}: the folder {args.out.parent} does not exist")
+    picture = picture_beside(args.out)
     guess = load_gel(args.gel)
     samples = read_samples(args.estimates, args.measured)
     fit = fit_gel(samples, guess)

@@ -12,10 +12,11 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_out
+from gelflow.cli.options import add_checkpoint, add_json, add_out, check_new_file
 from gelflow.cli.output import Output
 from gelflow.cli.session_replay import recorded_pipeline, replay_with_progress
 from gelflow.errors import UsageError
+from gelflow.figures import PICTURE_FORMATS
 from gelflow.real.camera.latency import LatencyEstimate, combine_latencies
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.messages import Damage
@@ -39,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
 
     A negative result: a decision differs, could not be recomputed or is lost, or there is none.
     """
+    if args.out:
+        check_new_file(args.out, suffixes=PICTURE_FORMATS)
     if args.simulate:
         return _replay_in_simulation(args)
     output = Output(args.json)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least
+from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     pad = recorded_pad(source.text, args.sensor) if source.kind == "session" else None
     gel = _gel(args, profile, pad)
     if gel is not None and pad is not None and calibration is None and args.pixels_per_mm is None:
-        calibration, args.pixels_per_mm = pad.mount.calibration, pad.mount.pixels_per_mm
+        calibration, args.pixels_per_mm = _pad_scale(pad, profile)
     args.gel = None if gel is None else gel.gel
     for file in args.out:
         if file.name.endswith(SUFFIX) and args.gel is None:
@@ -128,12 +128,11 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
-    for file in args.out:
+    for number, file in enumerate(args.out):
         check_suffix(file)
-        if file.exists():
-            raise UsageError(f"{file} exists; name a new file")
-        if not file.parent.is_dir():
-            raise UsageError(f"{file}: the folder {file.parent} does not exist")
+        check_new_file(file)
+        if file.resolve() in (other.resolve() for other in args.out[:number]):
+            raise UsageError(f"--out names {file} twice")
 
 
 @contextmanager
@@ -267,6 +266,17 @@ def _gel(args: argparse.Namespace, profile: SensorProfile, pad: RecordedPad | No
         return None
     values = f"{pad.gel.youngs_modulus:g} Pa, {1e3 * pad.gel.thickness:g} mm thick"
     return _Gel(pad.gel, f"of the {args.sensor} pad in the session's lab, {values}")
+
+
+def _pad_scale(pad: RecordedPad, profile: SensorProfile) -> tuple[CameraCalibration | None, float | None]:
+    """The calibration or the scale [px/mm] of a recorded pad, for the part of its images that the profile uses."""
+    calibration, scale = pad.mount.calibration, pad.mount.pixels_per_mm
+    if calibration is not None and not profile.image.is_plain:
+        raise UsageError(
+            f"the calibration in the session's lab is for whole images, and the profile {profile.title!r} crops or "
+            "reduces them: leave --profile out, or give --calibration"
+        )
+    return calibration, None if scale is None else scale / profile.image.reduce
 
 
 def _forces(

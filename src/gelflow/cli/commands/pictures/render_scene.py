@@ -88,7 +88,10 @@ def _controls(scene: "Scene", file: Path | None) -> NDArray[np.float64]:
 
         return start_controls(scene)[None]
     try:
-        read = np.load(file, allow_pickle=False) if file.suffix == ".npy" else np.loadtxt(file, delimiter=",", ndmin=2)
+        if file.suffix == ".npy":
+            read = np.load(file, allow_pickle=False)
+        else:
+            read = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8-sig")
         controls = np.asarray(read, dtype=np.float64)
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"--controls: cannot read {file}: {' '.join(str(error).split())}") from None
