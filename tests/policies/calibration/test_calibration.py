@@ -1,18 +1,13 @@
-"""Calibration: exact derivatives, the training environment as a world with known truth, sessions, reports."""
+"""Calibration: exact derivatives, the training environment as a world with known truth, the transfer matrix, reports."""
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from tests.policies.calibration.recorded_world import LITTLE, WORLD
 
-from gelflow.cli.main import main
-from gelflow.clock import ScaledClock
-from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
@@ -24,10 +19,7 @@ from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Des
 from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.report import error_lines, page, plain_report
-from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint
-from gelflow.session import SessionRecorder
-from gelflow.session.records import Decision, describe_session
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
@@ -39,7 +31,6 @@ VALUES = {
     **{name: value for name, value in NOMINAL_PAD_VALUES.items() if name in QUANTITIES},
     **{"hole_kn": 5e3, "hole_mu": 1.5, "arm_stiffness": 1e5, "grasp_force": 12.0, "grasp_height": 0.0},
 }
-LAB = {"gripper": {"grasp_force": 12.0}, "part": {"grasp_height": 0.03}}
 
 
 def test_the_model_gives_the_forces_of_the_training_environment() -> None:
@@ -232,176 +223,3 @@ def test_a_common_offset_of_all_start_heights_is_reported(calibrated: Calibratio
         return "\n".join(error_lines(dataclasses.replace(calibrated, fit=fit)))
 
     assert text in lines(offset) and "the lab file" not in lines(0.1 * offset)
-
-
-def write_session(
-    path: Path,
-    world: RecordedWorld,
-    *,
-    contact: bool = True,
-    mount: CameraMount | None = None,
-    lab: Any = None,
-    **task: Any,
-) -> Path:
-    """A session with the attempts of the first two insertions of a world."""
-    recordings = world.recordings.of(np.array([0, 1]))
-    described = describe_session(task=INSERTION, trackers=[{}, {}], mounts=[mount or {}] * 2, lab=lab or LAB)
-    described["task"] = {**described["task"], **task}
-    with SessionRecorder(path, ScaledClock()) as recorder:
-        recorder.metadata(described)
-        attempts = {0: 0, 1: 0}
-        for i, flow in enumerate(recordings.flow):
-            insertion = int(recordings.insertion[i])
-            attempt = attempts[insertion]
-            attempts[insertion] += 1
-            divisor = 10 * float(np.linalg.norm(flow, axis=-1).max())
-            image = (10 * flow / divisor).transpose(0, 3, 1, 2).reshape(-1, *flow.shape[1:3]).astype(np.float32)
-            decision = Decision(
-                insertion=insertion,
-                attempt=attempt,
-                tracked=((1, 2), (1, 2)),
-                reference=(1, 1),
-                frames=((2, 2),),
-                flow=image,
-                divisor=divisor,
-                unit="mm",
-                action=np.zeros(3),
-                correction=np.zeros(3),
-                depths=(0.0, float(recordings.depth[i])),
-            )
-            recorder.decision(decision.to_json())
-            recorder.attempt_end(
-                {
-                    "insertion": insertion,
-                    "attempt": attempt,
-                    "outcome": "not inserted",
-                    "planar_pose": recordings.planar_pose[i].tolist(),
-                    "depth": float(recordings.depth[i]),
-                    "contact": contact,
-                    "slipped": False,
-                }
-            )
-        for insertion, planar in recordings.inserted.items():
-            values = {"insertion": insertion, "attempt": attempts[insertion], "outcome": "inserted"}
-            recorder.attempt_end({**values, "planar_pose": planar.tolist(), "depth": 1e-3, "contact": False})
-    return path
-
-
-def test_recordings_are_read_from_sessions(tmp_path: Path, world: RecordedWorld) -> None:
-    path, other = (write_session(tmp_path / name, world) for name in ("a.mcap", "b.mcap"))
-    expected = world.recordings.of(np.array([0, 1]))
-    read = read_recordings([path, other])
-    n = len(expected)
-    assert read.insertion.tolist() == [*expected.insertion, *(expected.insertion + 2)]
-    np.testing.assert_allclose(read.flow[:n], 10 * expected.flow, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(read.depth[n:], expected.depth)
-    assert sorted(read.inserted) == [0, 1, 2, 3]
-    assert read.grasp_force == 12.0
-    assert read.grasp_height == pytest.approx(0.0)
-
-
-def test_the_printed_markers_are_those_of_the_session(tmp_path: Path, world: RecordedWorld) -> None:
-    mounts = CameraMount(), CameraMount(rows=9, cols=7, pitch=2.0)
-    paths = [write_session(tmp_path / f"{mount.rows}.mcap", world, mount=mount) for mount in mounts]
-    assert [read_recordings([path]).printed for path in paths] == [mount.grid for mount in mounts]
-    with pytest.raises(UsageError, match=r"9\.mcap: the gels have other printed markers than in .*18\.mcap"):
-        read_recordings(paths)
-    assert read_recordings([write_session(tmp_path / "old.mcap", world)]).printed is None
-
-
-def test_sessions_of_different_set_ups_are_not_calibrated_together(tmp_path: Path, world: RecordedWorld) -> None:
-    usual = write_session(tmp_path / "usual.mcap", world, mount=CameraMount())
-    part = LAB["part"]
-    for name, changed, expected in (
-        (
-            "turned",
-            {"mount": CameraMount(pixels_per_mm=12.0)},
-            "the cameras are mounted or calibrated differently than",
-        ),
-        ("force", {"lab": LAB | {"gripper": {"grasp_force": 40.0}}}, "the grasp force is 40 N, in .*usual.mcap 12 N"),
-        ("height", {"lab": LAB | {"part": part | {"grasp_height": 0.031}}}, "the part is grasped at another height"),
-    ):
-        other = write_session(tmp_path / f"{name}.mcap", world, **{"mount": CameraMount()} | changed)
-        with pytest.raises(UsageError, match=rf"{name}\.mcap: {expected}.*; calibrate it alone"):
-            read_recordings([usual, other])
-
-
-def test_a_session_is_not_calibrated_together_with_its_copy(tmp_path: Path, world: RecordedWorld) -> None:
-    path = write_session(tmp_path / "a.mcap", world)
-    copy = Path(shutil.copy(path, tmp_path / "copy.mcap"))
-    for other in (path, copy):
-        with pytest.raises(UsageError, match=r"the same session as .*a\.mcap; name it once"):
-            read_recordings([path, other])
-
-
-def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
-    with pytest.raises(UsageError, match="needs a session of the task insertion, got 'pushing'"):
-        read_recordings([write_session(tmp_path / "pushing.mcap", world, name="pushing")])
-    with pytest.raises(UsageError, match="no attempt with contact"):
-        read_recordings([write_session(tmp_path / "free.mcap", world, contact=False)])
-    usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
-    with pytest.raises(UsageError, match="another part or task"):
-        read_recordings([usual, deeper])
-
-
-def test_replay_compares_flow_maps_with_the_simulation(
-    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session, picture = write_session(tmp_path / "a.mcap", world), tmp_path / "maps.png"
-    assert main(["replay", str(session), "--simulate", "--out", str(picture), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    names = [a["name"] for a in printed["attempts"]]
-    assert names[0] == "insertion 0, attempt 0"
-    assert len(names) == len(world.recordings.of(np.array([0, 1])))
-    assert all(0 <= a["relative_error"] < 2 and -1 <= a["cosine"] <= 1.000001 for a in printed["attempts"])
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert main(["replay", str(session), "--simulate", "--checkpoint", "x.safetensors"]) == 2
-    assert "leave one of them out" in capsys.readouterr().err
-
-
-def test_replay_warns_of_flow_maps_with_nothing_in_common(
-    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
-) -> None:
-    flow = np.random.default_rng(0).normal(size=world.recordings.flow.shape)
-    noise = dataclasses.replace(world, recordings=dataclasses.replace(world.recordings, flow=flow))
-    assert main(["replay", str(write_session(tmp_path / "a.mcap", noise)), "--simulate"]) == 0
-    assert "insertion 0, attempt 0: recorded and simulated flow map have nothing in common" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", ["report.json", "report.html", "scene.toml", "insertion.xml"])
-def test_no_file_of_the_folder_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
-    (tmp_path / name).write_text("mine")
-    assert main(["calibrate", "missing.mcap", "--out", str(tmp_path)]) == 2
-    assert f"{name} exists; name a new folder with --out" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
-
-
-def test_a_folder_that_cannot_be_written_to_is_refused_before_the_fit(
-    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session, file = write_session(tmp_path / "a.mcap", world), tmp_path / "file"
-    file.touch()
-    plan = file / "plan.toml"
-    for options in (["--out", str(file)], ["--out", str(tmp_path / "out"), "--plan", str(plan)]):
-        assert main(["calibrate", str(session), *options]) == 2
-        assert f"cannot write to {file}" in capsys.readouterr().err
-    assert main(["calibrate", str(session), "--plan", str(tmp_path / "plan.toml"), "--lab", "missing.toml"]) == 2
-    assert "missing.toml" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_command_writes_a_report_and_overwrites_nothing(
-    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
-) -> None:
-    session, out = write_session(tmp_path / "a.mcap", world), tmp_path / "out"
-    assert main(["calibrate", str(session), "--quick", "--out", str(out), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed == json.loads((out / "report.json").read_text())
-    assert printed["attempts"]["held_out"] > 0
-    before = (out / "report.html").read_bytes()
-    assert main(["calibrate", str(session), "--quick", "--out", str(out)]) == 2
-    assert "exists; name a new folder with --out" in capsys.readouterr().err
-    assert (out / "report.html").read_bytes() == before
-    assert main(["calibrate", str(tmp_path / "missing.mcap"), "--out", str(tmp_path / "other")]) == 2
-    assert len(capsys.readouterr().err.strip().splitlines()) == 1
-    assert not (tmp_path / "other").exists()
