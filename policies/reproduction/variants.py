@@ -66,10 +66,10 @@ _REPRODUCTIONS = (
     Reproduction(
         "cap",
         (
-            Variant("paper's observation, touch", "paper-observation", paper=Published(0.873)),
-            Variant("paper's observation, no touch", "paper-observation-no-touch", paper=Published(0.597)),
-            Variant("our observation, touch"),
-            Variant("our observation, no touch", "no-touch"),
+            Variant("as published, touch", "paper-observation", paper=Published(0.873)),
+            Variant("as published, no touch", "paper-observation-no-touch", paper=Published(0.597)),
+            Variant("ours, touch"),
+            Variant("ours, no touch", "no-touch"),
         ),
     ),
     Reproduction(

@@ -1,6 +1,7 @@
 """Cap rotation: three fingers turn a cap of unknown position, size and resistance by touch (paper, B.4).
 
-Action (9): change of the commanded joint angles, ±1 is `action_scale`. The fingers are position controlled.
+Action (9): change of the commanded joint angles, or with `use_target=False` of the measured ones, from which the next
+command then starts; ±1 is `action_scale`. The fingers are position controlled.
 Observation: joint angles, fingertip positions; with touch the force, contact and centre of pressure of each fingertip;
 and, if the task has them, the commanded minus the measured angles. The last are a sense of touch too, because a servo
 lags where its finger is blocked.
@@ -45,7 +46,8 @@ class CapRotationTask(ControlDescription):
     commanded: bool = False  # the observation has the commanded minus the measured joint angles
     goal_angle: float = np.pi / 4
     reward: str = "paper"  # "paper", eq. 26, or "progress", see `CapRotationTask.rewards`
-    action_scale: float = 0.06  # change of the commanded joint angles for an action of ±1
+    use_target: bool = True  # an action changes the commanded joint angles; False: the measured ones
+    action_scale: float = 0.06  # change of the joint angles for an action of ±1
     # Joint angles (swing, bend, curl) of each finger at the start: the fingertips are 122 mm from the axis of the hand,
     # outside of the largest cap at its largest distance from that axis, at half the height of the cap.
     start_angles: tuple[float, float, float] = (0.0, -0.88568, 1.01035)
@@ -196,11 +198,15 @@ class CapRotation(ControlTask):
 
     def _controls(self, actions: Array, rng: np.random.Generator, active: Mask) -> Array:
         self._action[active] = actions[active]
-        change = self.description.action_scale * actions[active]
-        self._commanded[active] = np.clip(self._commanded[active] + change, self._lower, self._upper)
+        change = self.description.action_scale * actions
+        self._commanded[active] = np.clip(self._changed_angles() + change, self._lower, self._upper)[active]
         controls = np.zeros((self.num_envs, self.scene.nu))
         controls[:, self._joint_u] = self._commanded
         return controls
+
+    def _changed_angles(self) -> Array:
+        """Joint angles that an action changes, (N, 9)."""
+        return self._commanded if self.description.use_target else self.sim.q[:, self._joint_q]
 
     def _observe(self, active: Mask, rng: np.random.Generator) -> None:
         task, info = self.description, self.info
@@ -261,7 +267,8 @@ class CapRotation(ControlTask):
         """Actions of a hand that knows centre and radius of the cap: its fingertips close on it and push along it.
 
         Each fingertip first goes to a point beside the wall. Then its commanded position is inside of the wall and
-        ahead of the fingertip, so that the servo presses and pushes.
+        ahead of the fingertip, so that the servo presses and pushes. Where actions change the measured angles a
+        fingertip presses less, and caps that are small and hard to turn remain.
         """
         task, privileged = self.description, self.info["privileged"]
         center, radius = privileged[:, None, :2], privileged[:, None, 2]
@@ -286,8 +293,10 @@ class CapRotation(ControlTask):
         commanded = self._tips(self._commanded)
         step = target - commanded
         step *= np.minimum(1, _TIP_STEP / np.maximum(np.linalg.norm(step, axis=2, keepdims=True), 1e-9))
-        change = self._joint_angles(commanded + step) - self._commanded
-        return np.asarray(np.clip(change / task.action_scale, -1, 1))
+        change = self._joint_angles(commanded + step) - self._changed_angles()
+        actions = change.reshape(self.num_envs, len(FINGERS), -1) / task.action_scale
+        actions /= np.maximum(np.abs(actions).max(2, keepdims=True), 1)  # a finger keeps its direction
+        return np.asarray(actions.reshape(self.num_envs, -1))
 
     def _tips(self, angles: Array) -> Array:
         """Positions (n, 3, 3) [m] of the fingertips at joint angles (n, 9)."""

@@ -140,18 +140,18 @@ class Insertion(AttemptTask):
 
 
 class InsertionEnv(TaskEnv):
-    """The insertion task with one gripper; options are those of `Insertion`."""
+    """The insertion task with one gripper; options are those of `make_task`."""
 
     batch: Insertion
 
     def __init__(self, *, render_mode: str | None = None, threads: int | None = 1, **options: Any) -> None:
-        super().__init__(Insertion(1, threads=threads, **options), render_mode=render_mode)
+        super().__init__("insertion", render_mode=render_mode, threads=threads, **options)
 
 
 class InsertionVectorEnv(TaskVectorEnv):
-    """The insertion task with `num_envs` grippers in one simulation batch, on all cores; options as `Insertion`."""
+    """The insertion task with `num_envs` grippers in one simulation batch, on all cores; options as `make_task`."""
 
     batch: Insertion
 
     def __init__(self, num_envs: int, *, render_mode: str | None = None, **options: Any) -> None:
-        super().__init__(Insertion(num_envs, **options), render_mode=render_mode)
+        super().__init__("insertion", num_envs, render_mode=render_mode, **options)

@@ -52,6 +52,17 @@ def test_the_oracle_turns_caps_with_its_fingers(friction: str, success: float) -
     assert batch.metrics["turned without touch [°]"].max() < 1
 
 
+def test_actions_change_the_commanded_or_the_measured_angles() -> None:
+    for use_target in (True, False):
+        batch, rng = started(task=CapRotationTask(use_target=use_target, commanded=True))
+        for _ in range(20):
+            batch.step(np.tile(CLOSE, (2, 1)), rng)
+        before = batch.sim.q[:, batch._joint_q].copy()
+        batch.step(np.full((2, 9), 0.5), rng)
+        ahead = np.abs(batch._commanded - before - 0.5 * batch.description.action_scale).max()
+        assert ahead > 0.01 if use_target else ahead < 1e-12  # a finger that is blocked is pressed harder, or not
+
+
 def test_joint_angles_of_the_oracle_are_the_inverse_of_its_fingertips() -> None:
     batch, rng = CapRotation(8, threads=1), np.random.default_rng(0)
     batch.reset(batch.all, rng)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from gelflow.errors import UsageError
 from gelflow.gymnasium_registration import ENVIRONMENTS
 from gelflow.sim.tasks.registry import make_task, task_names
 
@@ -21,6 +22,13 @@ def test_environment_passes_gymnasium_check(name: str) -> None:
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*observation space (minimum|maximum) value is.*infinity")
         check_env(env.unwrapped)
+
+
+@ids
+def test_a_randomization_is_chosen_by_its_name(name: str) -> None:
+    gymnasium.make(name, randomization="default", threads=1)
+    with pytest.raises(UsageError, match="randomization"):
+        gymnasium.make(name, randomization="broad", threads=1)
 
 
 @ids
