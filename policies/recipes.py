@@ -167,8 +167,10 @@ _RECIPES: dict[str, dict[str, Recipe]] = {
     "cap": {
         DEFAULT: _cap(_LONG_ROLLOUTS, 64, commanded=True, reward="progress"),
         "no-touch": _cap(_LONG_ROLLOUTS, 64, commanded=True, touch=False, reward="progress"),
-        "paper-observation": _cap(_CAP_AS_PUBLISHED, 64, steps=2_400_000, use_target=False, reward="progress"),
-        "paper-observation-no-touch": _cap(
+        "paper-observation": _cap(_LONG_ROLLOUTS, 64, reward="progress"),
+        "paper-observation-no-touch": _cap(_LONG_ROLLOUTS, 64, touch=False, reward="progress"),
+        "published": _cap(_CAP_AS_PUBLISHED, 64, steps=2_400_000, use_target=False, reward="progress"),
+        "published-no-touch": _cap(
             _CAP_AS_PUBLISHED, 64, steps=2_400_000, use_target=False, touch=False, reward="progress"
         ),
         PAPER: _cap(_TABLE_6, 32, use_target=False),

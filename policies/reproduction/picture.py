@@ -5,8 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from gelflow.figures import SERIES, save
+
+_SMOOTHED = 5  # rows of a training curve in a running median
 
 
 def draw(record: Mapping[str, Any], path: Path) -> None:
@@ -45,6 +48,9 @@ def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str)
             if (values := variant["curves"][name]) is None:
                 continue
             x, median, low, high = (np.array(values[key]) for key in ("x", "median", "low", "high"))
+            if name == "training":
+                # After a validation new episodes start, and the first row has only those that ended early.
+                median, low, high = (median_filter(values, _SMOOTHED, mode="nearest") for values in (median, low, high))
             every, marks = max(1, len(x) // 10), marker if name == "validation" else None
             label = variant["name"] if name == "validation" else None
             axes.plot(
@@ -54,7 +60,7 @@ def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str)
     axes.set(xlabel="environment steps [thousands]", ylabel="success [%]" if factor == 100 else "return [-]")
     if factor == 100:
         axes.set_ylim(0, 103)
-    title = "Validation (solid) and training with exploration (dotted):\nmedian and range over the seeds"
+    title = "Validation (solid) and training with exploration (dotted, smoothed):\nmedian and range over the seeds"
     axes.set_title(title, fontsize="medium")
     axes.legend(fontsize="small")
     axes.grid(alpha=0.3)

@@ -66,8 +66,10 @@ _REPRODUCTIONS = (
     Reproduction(
         "cap",
         (
-            Variant("as published, touch", "paper-observation", paper=Published(0.873)),
-            Variant("as published, no touch", "paper-observation-no-touch", paper=Published(0.597)),
+            Variant("as published, touch", "published", paper=Published(0.873)),
+            Variant("as published, no touch", "published-no-touch", paper=Published(0.597)),
+            Variant("target actions, touch", "paper-observation"),
+            Variant("target actions, no touch", "paper-observation-no-touch"),
             Variant("ours, touch"),
             Variant("ours, no touch", "no-touch"),
         ),
