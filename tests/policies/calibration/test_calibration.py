@@ -1,4 +1,4 @@
-"""Calibration: exact derivatives, the training environment as a world with known truth, the transfer matrix, reports."""
+"""Calibration: exact derivatives, the training environment as a world with known truth, transfer matrix, reports."""
 
 import dataclasses
 import json
