@@ -70,8 +70,7 @@ class _Devices:
 
 
 def jog(session: Session, wanted: Jog) -> Result:
-    """Move the gripper. A motion that is not along z starts at the height of the hand-over or above it: the gripper is
-    raised first.
+    """Move the gripper. Below the height of the hand-over it is first raised to it, unless the motion is along z.
 
     A part that may be held is moved only while both pads are observed, and stops at contact; without an image it can
     only be raised. Raises SafetyError when a target is refused or the gripper reports a fault, PeerError when a device
