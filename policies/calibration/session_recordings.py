@@ -1,5 +1,6 @@
 """Recordings for a calibration, from the sessions of the insertion runner."""
 
+import filecmp
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import Decision, file_digest
+from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
 AT_REST = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
@@ -24,21 +25,18 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     Insertions are numbered over all sessions. Raises UsageError when a session is given twice or is of another part or
     set-up (printed markers, cameras, grasp), its flow maps are not in millimetres, or there is no attempt with contact.
     """
-    _check_different(paths)
-    task: InsertionTask | None = None
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
     setup: _Setup | None = None
     planned: list[bool] = []  # only a session of planned motions names no policy
     number = 0
-    for path in paths:
+    for k, path in enumerate(paths):
         with SessionReader(path) as session:
+            for other in paths[:k]:
+                if filecmp.cmp(path, other, shallow=False):  # a copy of a fitted insertion would be held out
+                    raise UsageError(f"{path}: the same session as {other}; name it once")
             described = session.description()
-            own = _task(path, described)
-            if task is not None and own.to_json() != task.to_json():
-                raise UsageError(f"{path}: the session has another part or task than {paths[0]}; calibrate it alone")
-            task = own
-            present = _Setup.of(path, described, own)
+            present = _Setup.of(path, described)
             setup = setup or present
             present.check(path, setup, paths[0])
             found, entered = _attempts(path, session, number)
@@ -46,7 +44,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         rows += found
         inserted |= entered
         number = max([number, *(row["insertion"] + 1 for row in found), *(i + 1 for i in entered)])
-    if task is None or setup is None or not rows:
+    if setup is None or not rows:
         raise UsageError(
             f"{', '.join(map(str, paths))}: no attempt with contact is recorded, so nothing can be fitted; record "
             "insertions in which the part touches the rim"
@@ -54,7 +52,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
     keep = sorted({row["insertion"] for row in rows})
     new = {old: k for k, old in enumerate(keep)}
     return Recordings(
-        task,
+        setup.task,
         np.array([new[row["insertion"]] for row in rows], dtype=np.int64),
         np.array([row["planar_pose"] for row in rows], dtype=float),
         np.array([row["depth"] for row in rows], dtype=float),
@@ -93,15 +91,16 @@ def nothing_recorded(
 class _Setup:
     """The set-up of a session, which all sessions of a calibration share."""
 
+    task: InsertionTask
     printed: Grid | None  # the markers on each gel; None in a session that does not name them
     mounts: Any  # of the cameras, as recorded
     grasp_force: float  # commanded [N]
     grasp_height: float  # of the pad centres above the part's centre [m]
 
     @classmethod
-    def of(cls, path: Path, described: dict[str, Any], task: InsertionTask) -> "_Setup":
-        """The set-up in the description of a session. Raises UsageError without a grasp."""
-        mounts = described["mounts"]
+    def of(cls, path: Path, described: dict[str, Any]) -> "_Setup":
+        """The set-up in the description of a session. Raises UsageError for another task, and without a grasp."""
+        task, mounts = _task(path, described), described["mounts"]
         try:
             lab = described["lab"]
             force = float(lab["gripper"]["grasp_force"])
@@ -110,11 +109,15 @@ class _Setup:
             raise UsageError(f"{path}: the session has no lab file with grasp_force and grasp_height") from None
         one = mounts[0]
         printed = Grid(one["rows"], one["cols"], one["pitch"], tuple(one["center"])) if "pitch" in one else None
-        return cls(printed, mounts, force, height)
+        return cls(task, printed, mounts, force, height)
 
     def check(self, path: Path, first: "_Setup", of_first: Path) -> None:
         """Raise UsageError when the set-up of the session `path` is not that of the first one."""
         for other, text in (
+            (
+                self.task.to_json() != first.task.to_json(),
+                f"the session has another part or task than {of_first}",
+            ),
             (self.printed != first.printed, f"the gels have other printed markers than in {of_first}"),
             (self.mounts != first.mounts, f"the cameras are mounted or calibrated differently than in {of_first}"),
             (
@@ -125,16 +128,6 @@ class _Setup:
         ):
             if other:
                 raise UsageError(f"{path}: {text}; calibrate it alone")
-
-
-def _check_different(paths: Sequence[Path]) -> None:
-    """Raise UsageError when two files have the same content: a copy of a fitted insertion would be held out."""
-    found: dict[str, Path] = {}
-    for path in paths:
-        digest = file_digest(path)
-        if digest in found:
-            raise UsageError(f"{path}: the same session as {found[digest]}; name it once")
-        found[digest] = path
 
 
 def _task(path: Path, described: dict[str, Any]) -> InsertionTask:

@@ -3,7 +3,6 @@
 import argparse
 import os
 import re
-import tempfile
 from pathlib import Path
 
 from gelflow.errors import UsageError
@@ -126,16 +125,6 @@ def checkpoint_for(task: InsertionTask, given: Path | None) -> Path:
             "then give --checkpoint"
         )
     return path
-
-
-def create_folder(folder: Path) -> None:
-    """Create `folder` for files that a long computation will write. Raises UsageError when it cannot be written to."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise UsageError(f"cannot write to {folder}: {error.strerror}; name another folder") from error
 
 
 def add_profile(parser: argparse.ArgumentParser) -> None:

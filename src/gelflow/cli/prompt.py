@@ -16,8 +16,8 @@ _PERIOD = 0.02  # of the check [s]
 def read_line(console: Console, text: str, *, check: Callable[[], object] = lambda: None) -> str:
     """Show `text` and return the line that is typed after it. Calls `check` every 20 ms, and raises what it raises.
 
-    What was typed at a terminal before the question is discarded: it confirms nothing. Raises UsageError when standard
-    input is closed.
+    Keys that were typed at a terminal before the question are discarded. Raises UsageError when standard input is
+    closed.
     """
     console.print(f"[bold]{text}[/] ", end="")
     console.file.flush()

@@ -171,10 +171,9 @@ class Decision:
 
 
 def file_digest(path: str | Path) -> str:
-    """SHA-256 of a file, in hex; identifies it by its content. Raises UsageError if unreadable."""
+    """SHA-256 of a file, in hex; identifies the checkpoint of a session. Raises UsageError if unreadable."""
     try:
-        with Path(path).open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}; name an existing file") from error
 

@@ -172,7 +172,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_the_fit(
     plan = file / "plan.toml"
     for options in (["--out", str(file)], ["--out", str(tmp_path / "out"), "--plan", str(plan)]):
         assert main(["calibrate", str(session), *options]) == 2
-        assert f"cannot write to {file}" in capsys.readouterr().err
+        assert f"cannot write into {file}" in capsys.readouterr().err
     assert main(["calibrate", str(session), "--plan", str(tmp_path / "plan.toml"), "--lab", "missing.toml"]) == 2
     assert "missing.toml" in capsys.readouterr().err
 

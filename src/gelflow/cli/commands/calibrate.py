@@ -10,16 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import (
-    add_json,
-    add_out,
-    add_part,
-    add_quick,
-    add_seed,
-    check_at_least,
-    create_folder,
-    part_task,
-)
+from gelflow.cli.options import add_json, add_out, add_part, add_quick, add_seed, check_at_least, part_task
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
@@ -29,6 +20,8 @@ from gelflow.policies.calibration.planning.motions import MOTIONS, SCENARIOS, ST
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
+from gelflow.policies.training.folder import create_folder
+from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.session.motion_plan import save_motion_plan
 from gelflow.session.records import readable_json
@@ -65,9 +58,13 @@ def run(args: argparse.Namespace) -> int:
     """Fit, print the parameters, and write the report; write the plan."""
     output = Output(args.json)
     _check(args)
+    # A wrong file or folder is refused before minutes of computing.
+    lab = None if args.lab is None else load_lab(args.lab)
+    if args.plan is not None:
+        create_folder(args.plan.parent)
     if not args.sessions:
-        recordings = _lab_recordings(args)
-        output.result({"plan": _write_plan(args, output, recordings, None)})
+        recordings = _lab_recordings(args, lab)
+        output.result({"plan": _write_plan(args, lab, output, recordings, None)})
         return SUCCESS
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
@@ -97,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         output.text(f"the report is {files[1]}")
         if scene:
             output.text(f"the scene with the known values is {scene[0]}")
-    plan = {} if args.plan is None else {"plan": _write_plan(args, output, recordings, result.fit)}
+    plan = {} if args.plan is None else {"plan": _write_plan(args, lab, output, recordings, result.fit)}
     output.result(report | plan)
     return SUCCESS
 
@@ -113,30 +110,24 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("a session contains its part; leave --part out")
     if args.plan is not None and args.plan.exists():
         raise UsageError(f"{args.plan} exists; name a new file with --plan")
-    if args.lab is not None:
-        load_lab(args.lab)  # a wrong file is refused before minutes of computing
-    if args.plan is not None:
-        create_folder(args.plan.parent)
 
 
-def _lab_recordings(args: argparse.Namespace) -> Recordings:
+def _lab_recordings(args: argparse.Namespace, lab: Lab | None) -> Recordings:
     """No attempts, with the part of --part and the grasp of --lab."""
     task = part_task(args.part)
-    if args.lab is None:
+    if lab is None:
         return nothing_recorded(task, grasp_force=None, grasp_height=None)
-    lab = load_lab(args.lab)
     height = lab.part.grasp_height - task.part.size[2] / 2
     printed = lab.cameras.left.mount.grid
     return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height, printed=printed)
 
 
 def _write_plan(
-    args: argparse.Namespace, output: Output, recordings: Recordings, fitted: FitResult | None
+    args: argparse.Namespace, lab: Lab | None, output: Output, recordings: Recordings, fitted: FitResult | None
 ) -> list[dict[str, Any]]:
     """Make, write and print a plan; returns its motions as plain data."""
     workspace, stop = None, STOP_SHEAR_MM
-    if args.lab is not None:
-        lab = load_lab(args.lab)
+    if lab is not None:
         workspace = (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
         stop = lab.descent.largest_stop_shear_mm
     with progress_bar(count=True) as progress:
