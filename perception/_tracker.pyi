@@ -2,6 +2,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 PROFILE_STEPS: int
+MASK_CELLS: int
+MASK_REACH: float
 
 class StartResult:
     @property
@@ -43,6 +45,8 @@ class Tracker:
         shape: NDArray[np.float64],
         contrast: NDArray[np.float64],
         tolerated: NDArray[np.float64],
+        mask_of: NDArray[np.intp],
+        masks: NDArray[np.float32],
     ) -> None: ...
     def start(self, image: NDArray[np.uint8]) -> StartResult: ...
     def rest(self) -> NDArray[np.float64]: ...

@@ -9,6 +9,7 @@ of that cell would know. The same command continues a run that was killed; anoth
 """
 
 import json
+import math
 import tempfile
 import time
 from collections.abc import Mapping
@@ -97,14 +98,17 @@ def main() -> int:
 def inserted(world: Mapping[str, Any], parts: int, args: Any) -> dict[str, Any]:
     """Counts of one world: parts inserted in truth, and parts whose outcome the robot measured correctly.
 
-    Each series of up to `SERIES` parts has a mock robot of its own: a stop, which a busy computer may cause, ends one.
+    Each series of up to `SERIES` parts has a mock robot of its own: a stop, which a busy computer may cause, ends one,
+    and a further one inserts the other parts. Twice the planned number of series end the world.
     """
     rows: list[dict[str, Any]] = []
     stops, begun = [], time.monotonic()
-    for number, first in enumerate(range(0, parts, SERIES)):
-        found, stop = series(world, min(SERIES, parts - first), args, args.seed + 1000 * number)
+    for number in range(2 * math.ceil(parts / SERIES)):
+        found, stop = series(world, min(SERIES, parts - len(rows)), args, args.seed + 1000 * number)
         rows += found
         stops += [stop] if stop else []
+        if len(rows) == parts:
+            break
     tries = [row["attempts"] - 1 for row in rows if row["truth"]]
     return {
         "world": world,

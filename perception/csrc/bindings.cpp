@@ -64,10 +64,30 @@ void check_marker(const TrackerSetup& setup, std::size_t m) {
     throw std::invalid_argument("position, shape, contrast or tolerated residual of a marker is out of range");
 }
 
+void set_masks(TrackerSetup& setup, const Array<int>& mask_of, const Array<float>& masks) {
+  constexpr py::ssize_t cells = DotMask::cells;
+  if (masks.ndim() != 3 || masks.shape(1) != cells || masks.shape(2) != cells)
+    throw std::invalid_argument("masks must have shape (masked dots, 32, 32)");
+  for (py::ssize_t i = 0; i < masks.shape(0); ++i) {
+    DotMask& mask = setup.masks.emplace_back();
+    for (py::ssize_t cell = 0; cell < cells * cells; ++cell) {
+      const float weight = masks.at(i, cell / cells, cell % cells);
+      if (!(weight >= 0 && weight <= 1)) throw std::invalid_argument("a mask has a weight outside 0 to 1");
+      mask.weight[std::size_t(cell)] = weight;
+    }
+  }
+  for (py::ssize_t m = 0; m < mask_of.shape(0); ++m) {
+    if (mask_of.at(m) < -1 || mask_of.at(m) >= masks.shape(0))
+      throw std::invalid_argument("mask_of refers to a mask that does not exist");
+    setup.mask_of.push_back(mask_of.at(m));
+  }
+}
+
 TrackerSetup make_setup(int width, int height, int channel, bool bright, int rows, int cols, double spacing,
                         double radius, double noise, const Array<float>& profile, float profile_reach,
                         const Array<double>& rest, const Array<bool>& visible, const Array<double>& shape,
-                        const Array<double>& contrast, const Array<double>& tolerated) {
+                        const Array<double>& contrast, const Array<double>& tolerated, const Array<int>& mask_of,
+                        const Array<float>& masks) {
   const bool in_range = width > 0 && height > 0 && rows > 0 && cols > 0 && channel >= 0 && channel <= 5 &&
                         radius > 0.5 && radius < 16 && spacing > 2 * radius && spacing < 1e4 && noise >= 0 &&
                         profile_reach > 0;
@@ -75,9 +95,9 @@ TrackerSetup make_setup(int width, int height, int channel, bool bright, int row
   const py::ssize_t n = py::ssize_t(rows) * cols;
   check_shape(rest, n, 2, "rest"), check_shape(shape, n, 8, "shape"), check_shape(visible, n, 0, "visible");
   check_shape(contrast, n, 0, "contrast"), check_shape(tolerated, n, 0, "tolerated"),
-      check_shape(profile, DotProfile::steps + 1, 0, "profile");
+      check_shape(profile, DotProfile::steps + 1, 0, "profile"), check_shape(mask_of, n, 0, "mask_of");
   TrackerSetup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {},
-                     {},    {}};
+                     {},    {},     {},           {}};
   for (py::ssize_t i = 0; i <= DotProfile::steps; ++i) setup.profile.value[std::size_t(i)] = profile.at(i);
   setup.profile.reach = profile_reach;
   for (py::ssize_t m = 0; m < n; ++m) {
@@ -88,6 +108,7 @@ TrackerSetup make_setup(int width, int height, int channel, bool bright, int row
     setup.contrast.push_back(contrast.at(m)), setup.tolerated.push_back(tolerated.at(m));
     check_marker(setup, std::size_t(m));
   }
+  set_masks(setup, mask_of, masks);
   return setup;
 }
 
@@ -151,6 +172,8 @@ TrackResult track(SharedTracker& shared, const Image& image) {
 PYBIND11_MODULE(_tracker, module) {
   module.doc() = "The native part of the marker tracker.";
   module.attr("PROFILE_STEPS") = DotProfile::steps;
+  module.attr("MASK_CELLS") = DotMask::cells;
+  module.attr("MASK_REACH") = DotMask::reach;
   py::class_<StartResult>(module, "StartResult")
       .def_readonly("position", &StartResult::position)
       .def_readonly("contrast", &StartResult::contrast)
@@ -165,15 +188,16 @@ PYBIND11_MODULE(_tracker, module) {
       .def(py::init([](int width, int height, int channel, bool bright, int rows, int cols, double spacing,
                        double radius, double noise, const Array<float>& profile, float profile_reach,
                        const Array<double>& rest, const Array<bool>& visible, const Array<double>& shape,
-                       const Array<double>& contrast, const Array<double>& tolerated) {
+                       const Array<double>& contrast, const Array<double>& tolerated, const Array<int>& mask_of,
+                       const Array<float>& masks) {
              return std::make_unique<SharedTracker>(make_setup(width, height, channel, bright, rows, cols, spacing,
                                                                radius, noise, profile, profile_reach, rest, visible,
-                                                               shape, contrast, tolerated));
+                                                               shape, contrast, tolerated, mask_of, masks));
            }),
            py::kw_only(), py::arg("width"), py::arg("height"), py::arg("channel"), py::arg("bright"), py::arg("rows"),
            py::arg("cols"), py::arg("spacing"), py::arg("radius"), py::arg("noise"), py::arg("profile"),
            py::arg("profile_reach"), py::arg("rest"), py::arg("visible"), py::arg("shape"), py::arg("contrast"),
-           py::arg("tolerated"))
+           py::arg("tolerated"), py::arg("mask_of"), py::arg("masks"))
       .def("start", &start, py::arg("image").noconvert())
       .def("rest", &rest)
       .def("track", &track, py::arg("image").noconvert());

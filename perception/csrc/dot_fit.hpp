@@ -6,8 +6,8 @@
 //
 // with the window centre w, the profile s of all dots (1 inside, 0 outside; a table over q), and the shape of the
 // marker's dot: the frame F, in which the dot is a disc of radius 1, and the waves e of its ragged outline, with three
-// and four periods around the dot. The unknowns are the centre p, the contrast a, the background b and its slope β. The slope is required:
-// an unmodelled slope of 1 % per pixel shifts the centre by a quarter of a pixel.
+// and four periods around the dot. The unknowns are the centre p, the contrast a, the background b and its slope β. The
+// slope is required: an unmodelled slope of 1 % per pixel shifts the centre by a quarter of a pixel.
 //
 // The residual r = I − m enters through ψ(r) = r / (1 + (r/k)²), which limits the influence of scratches, highlights,
 // bridges and neighbouring dots. With J = ∂m/∂(p, a, b, bβ) / b, the Gauss-Newton step is
@@ -43,6 +43,14 @@ struct DotShape {
   std::array<float, 4> waves{};  // coefficients of Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴, z = d₁ + i d₂
 };
 
+// Which part of a dot its shape describes: weight 1 where it does, 0 where ink is missing or another dot is joined. A
+// table over the frame of the dot; pixels beyond it take the weight of the nearest cell.
+struct DotMask {
+  static constexpr int cells = 32;      // along an axis
+  static constexpr float reach = 2.0f;  // the table extends from -reach to reach [radii]
+  std::array<float, cells * cells> weight;
+};
+
 struct DotFit {
   Point position;
   double contrast = 0;  // a
@@ -70,11 +78,12 @@ struct FitState {
   float k;                       // scale of the robust weight [grey levels]
   double sums[6];                // Σ Jᵀψ, in the order of the unknowns
   double edge, edge_weighted;    // Σ|∇s|², unweighted and with the robust weights
-  double weight;                 // sum of the robust weights
+  double weight, mask;           // sums of the robust weights and of the mask
 };
 
 struct ProfileSample {
   FloatPack s, gx, gy;  // profile and its derivative by p in window coordinates
+  FloatPack x, y;       // d
 };
 
 // e at d = (x, y); its denominator is limited, for d = 0.
@@ -101,7 +110,19 @@ GELFLOW_INLINE ProfileSample sample_profile(const DotProfile& profile, const Dot
     high[l] = profile.value[std::size_t(index[l]) + 1];
   }
   const FloatPack slope = (high - low) * (-2 * scale);
-  return {low + part * (high - low), slope * (shape.xx * x + shape.yx * y), slope * (shape.xy * x + shape.yy * y)};
+  const FloatPack gx = slope * (shape.xx * x + shape.yx * y), gy = slope * (shape.xy * x + shape.yy * y);
+  return {low + part * (high - low), gx, gy, x, y};
+}
+
+GELFLOW_INLINE FloatPack sample_mask(const DotMask& mask, FloatPack x, FloatPack y) {
+  constexpr float scale = 0.5f * DotMask::cells / DotMask::reach, last = DotMask::cells - 1;
+  FloatPack column = scale * (x + DotMask::reach), row = scale * (y + DotMask::reach);
+  column = column > 0 ? column : FloatPack{}, row = row > 0 ? row : FloatPack{};
+  column = column < last ? column : FloatPack{} + last, row = row < last ? row : FloatPack{} + last;
+  const IntPack right = __builtin_convertvector(column, IntPack), down = __builtin_convertvector(row, IntPack);
+  FloatPack weight;
+  for (int l = 0; l < pack_size; ++l) weight[l] = mask.weight[std::size_t(DotMask::cells * down[l] + right[l])];
+  return weight;
 }
 
 GELFLOW_INLINE double sum_lanes(FloatPack v) {
@@ -111,9 +132,9 @@ GELFLOW_INLINE double sum_lanes(FloatPack v) {
 }
 
 GELFLOW_CLONES inline void accumulate(const Window& window, int width, int height, const DotProfile& profile,
-                                      const DotShape& shape, FitState& state) {
+                                      const DotShape& shape, const DotMask* mask, FitState& state) {
   const float middle = 0.5f * float(window.size - 1), k2 = 1 / (state.k * state.k);
-  FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{};
+  FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{}, masked{};
   const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
   for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); row += state.row_step) {
     const float y = float(row) - middle;
@@ -129,7 +150,12 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
       FloatPack w = 1 / (1 + r * r * k2);
       const auto outside = (column < 0) | (column > float(width - 1));
       w = outside ? FloatPack{} : w;
-      const FloatPack psi = w * r, square = dot.gx * dot.gx + dot.gy * dot.gy, lit = psi * ink;
+      FloatPack square = dot.gx * dot.gx + dot.gy * dot.gy;
+      if (mask) {
+        const FloatPack described = sample_mask(*mask, dot.x, dot.y);
+        w *= described, square *= described, masked += described;
+      }
+      const FloatPack psi = w * r, lit = psi * ink;
       px += psi * dot.gx;
       py += psi * dot.gy;
       pa += psi * dot.s;
@@ -148,6 +174,7 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
   for (int i = 0; i < 6; ++i) state.sums[i] = share * sums[std::size_t(i)];
   state.edge = sum_lanes(edge), state.edge_weighted = sum_lanes(edge_weighted);
   state.weight = sum_lanes(weight);
+  state.mask = mask ? state.row_step * sum_lanes(masked) : double(window.size * window.size);
 }
 
 // H⁻¹ of a marker, row-major.
@@ -173,8 +200,8 @@ inline bool invert(std::array<double, 36>& matrix, InverseHessian& inverse) {
   return true;
 }
 
-GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotShape& shape, double contrast, int size,
-                                           InverseHessian& inverse) {
+GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotShape& shape, const DotMask* mask,
+                                           double contrast, int size, InverseHessian& inverse) {
   std::array<FloatPack, 36> sums{};
   const float middle = 0.5f * float(size - 1);
   const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
@@ -184,7 +211,9 @@ GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotS
       const float y = float(row) - middle, a = float(contrast);
       const ProfileSample dot = sample_profile(profile, shape, x, y);
       const FloatPack ink = 1 + a * dot.s;
-      const std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
+      std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
+      if (mask)
+        for (FloatPack& term : j) term *= sample_mask(*mask, dot.x, dot.y);
       for (std::size_t i = 0; i < 6; ++i)
         for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += j[i] * j[l];
     }
@@ -202,9 +231,10 @@ struct FitSettings {
 };
 
 // Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
-// scale of the robust weight k relative to background times contrast. The quality is 0 when the fit leaves the central
+// scale of the robust weight k relative to background times contrast. Without a `mask`, the shape describes the whole
+// dot. The quality is 0 when the fit leaves the central
 // part of the window or the contrast changes sign.
-inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape,
+inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape, const DotMask* mask,
                       const InverseHessian& inverse, double rest_contrast, double tolerated, Point position,
                       int max_iterations) {
   const int size = settings.window;
@@ -227,9 +257,9 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
   for (int number = 0; number < max_iterations; ++number) {
     state.k = state.b * float(std::max(tolerated * std::abs(double(state.a)), 3 * settings.noise));
     state.row_step = coarse ? 2 : 1;
-    accumulate(window, plane.width, plane.height, settings.profile, shape, state);
+    accumulate(window, plane.width, plane.height, settings.profile, shape, mask, state);
     // H includes all pixels, the sums only those with weight.
-    const double scale = std::min(4.0, double(size * size) / std::max(state.weight, 1.0));
+    const double scale = std::min(4.0, state.mask / std::max(state.weight, 1.0));
     std::array<double, 6> step{};
     for (std::size_t i = 0; i < 6; ++i)
       for (std::size_t j = 0; j < 6; ++j) step[i] += scale * inverse[6 * i + j] * state.sums[j];

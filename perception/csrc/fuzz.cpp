@@ -38,6 +38,12 @@ TrackerSetup random_setup() {
     setup.shape.push_back(
         {entry(0.5, 2), entry(-0.4, 0.4), entry(-0.4, 0.4), entry(0.5, 2), {wave(), wave(), wave(), wave()}});
     setup.contrast.push_back((setup.bright ? 1 : -1) * real(0.01, 2)), setup.tolerated.push_back(real(0.05, 1));
+    setup.mask_of.push_back(whole(0, 3) ? -1 : int(setup.masks.size()));
+    if (setup.mask_of.back() < 0) continue;
+    const int hidden = whole(0, DotMask::cells / 2);  // columns
+    std::array<float, DotMask::cells * DotMask::cells>& weight = setup.masks.emplace_back().weight;
+    for (std::size_t cell = 0; cell < weight.size(); ++cell)
+      weight[cell] = int(cell % DotMask::cells) < hidden ? 0.0f : 1.0f;
   }
   return setup;
 }

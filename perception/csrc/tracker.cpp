@@ -35,7 +35,8 @@ Tracker::Tracker(TrackerSetup setup)
       assignment_(setup_.grid, setup_.spacing) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m)
-    if (!inverse_hessian(setup_.profile, setup_.shape[m], setup_.contrast[m], settings_.window, inverse_hessian_[m]))
+    if (!inverse_hessian(setup_.profile, setup_.shape[m], mask(m), setup_.contrast[m], settings_.window,
+                         inverse_hessian_[m]))
       throw std::invalid_argument("the dot profile does not determine the centre of a dot");
   for (const DotShape& f : setup_.shape) {  // half width and half height, reduced by 10 % for a blurred edge
     const double area = std::abs(double(f.xx) * f.yy - double(f.xy) * f.yx);
@@ -161,8 +162,8 @@ void Tracker::accept(std::size_t marker, const DotFit& found, double threshold) 
   positions_[marker] = found.position, quality_[marker] = quality, measured_[marker] = 1;
 }
 
-// The shape of a dot on the deformed gel: its frame is F G with G = L₀ L⁻¹, where the columns of L are the vectors between the
-// opposite neighbours of the marker, and L₀ are those at rest.
+// The shape of a dot on the deformed gel: its frame is F G with G = L₀ L⁻¹, where the columns of L are the vectors
+// between the opposite neighbours of the marker, and L₀ are those at rest.
 DotShape Tracker::deformed_shape(std::size_t marker) const {
   Point now[2], rest[2];
   for (int axis = 0; axis < 2; ++axis) {
@@ -194,11 +195,16 @@ bool Tracker::differ(const DotShape& one, const DotShape& two) {
          std::abs(one.yy - two.yy) > limit;
 }
 
+const DotMask* Tracker::mask(std::size_t marker) const {
+  const int index = setup_.mask_of[marker];
+  return index < 0 ? nullptr : &setup_.masks[std::size_t(index)];
+}
+
 DotFit Tracker::fit(std::size_t marker, Point position, int iterations) const {
   if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
         position.y < setup_.height + setup_.radius))
     return {position, 0, 0};
-  return fit_dot(plane_, settings_, shape_[marker], inverse_hessian_[marker], setup_.contrast[marker],
+  return fit_dot(plane_, settings_, shape_[marker], mask(marker), inverse_hessian_[marker], setup_.contrast[marker],
                  setup_.tolerated[marker], position, iterations);
 }
 

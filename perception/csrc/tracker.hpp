@@ -20,6 +20,8 @@ struct TrackerSetup {
   std::vector<DotShape> shape;    // of its dot
   std::vector<double> contrast;   // of its dot, negative for dark dots
   std::vector<double> tolerated;  // residual / contrast at which a pixel of its dot has half the weight
+  std::vector<int> mask_of;       // index of the mask of its dot; -1 for a dot that its shape describes entirely
+  std::vector<DotMask> masks;
 };
 
 class Tracker {
@@ -45,6 +47,7 @@ class Tracker {
   void accept(std::size_t marker, const DotFit& found, double threshold);
   DotShape deformed_shape(std::size_t marker) const;
   static bool differ(const DotShape& one, const DotShape& two);
+  const DotMask* mask(std::size_t marker) const;
   DotFit fit(std::size_t marker, Point position, int iterations) const;
   double accepted_quality(std::size_t marker, const DotFit& fit) const;
   bool is_inside(std::size_t marker, Point position) const;
