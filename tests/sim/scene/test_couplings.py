@@ -100,6 +100,13 @@ def test_weld_makes_a_loop_rigid(tmp_path: Path) -> None:
     assert np.abs(sim.q).max() < 1e-3
 
 
+def test_weld_with_torquescale_0_is_a_connect(tmp_path: Path) -> None:
+    weld = WELD.replace("anchor", 'torquescale="0" anchor')
+    sims = [moved(load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", e)), 0.3, 200) for e in (weld, CONNECT)]
+    np.testing.assert_allclose(sims[0].q, sims[1].q, atol=1e-9)
+    assert np.abs(sims[0].q).max() > 0.1
+
+
 def test_loop_closes_to_the_stated_compliance(tmp_path: Path) -> None:
     """The gap is the force over 1e7 N/m."""
     scene = load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", CONNECT))
