@@ -6,7 +6,10 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import shown
 from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points, warn_of_gaps
 from gelflow.sim.scene.joint_limits import read_limits
 from gelflow.sim.scene.mjcf.mechanics import SiteDef, read_mechanics
@@ -62,7 +65,9 @@ def load_scene(
     if not isinstance(overrides, Mapping):
         raise UsageError(f"overrides must be a mapping of dotted keys to values, got {type(overrides).__name__}")
     for key, value in overrides.items():
-        set_by_path(data, key, value)
+        if not isinstance(key, str):
+            raise UsageError(f"overrides must have dotted keys, such as 'pads.pad.rows', got {shown(key)}")
+        set_by_path(data, key, value.tolist() if isinstance(value, np.generic | np.ndarray) else value)
     if friction is not None:
         data["friction"] = friction
     return _read_scene(path, TomlTable(data, str(path)), presets)
