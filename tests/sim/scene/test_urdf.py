@@ -155,6 +155,20 @@ def test_joints_of_a_transmission_have_actuators_of_their_own(actuators: str, na
     assert Simulator(scene).model.nu == 2
 
 
+def test_continuous_joint_has_no_range(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace("revolute", "continuous", 1))
+    assert [joint.range for joint in load_scene(path).joints] == [None, (-1.0, 1.0)]
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1, -1), (0.5, 0.5)])
+def test_range_without_extent_is_refused(lower: float, upper: float, tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace('lower="-1" upper="1"', f'lower="{lower}" upper="{upper}"', 1))
+    with pytest.raises(UsageError, match=f"joint 'ja': lower limit {lower:g} must be below upper limit {upper:g}"):
+        load_scene(path)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
