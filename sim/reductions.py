@@ -64,7 +64,10 @@ class TactileReduction:
     @cached_property
     def core(self) -> _core.TactileReduction:
         """The matrix in the layout of the core."""
-        return _core.TactileReduction(np.ascontiguousarray(self.matrix, dtype=float))
+        return _core.TactileReduction(np.ascontiguousarray(self.matrix))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.matrix, self.names)  # without `core`, which cannot be pickled
 
     @classmethod
     def concatenate(cls, reductions: Sequence["TactileReduction"]) -> "TactileReduction":
