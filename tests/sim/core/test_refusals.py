@@ -62,6 +62,9 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     ),
     (lambda s: EnergyGauge(3), "scene must be a Scene"),  # type: ignore[arg-type]
     (lambda s: EnergyGauge(s.scene).read(3), "sim must be a Simulator, got 3"),  # type: ignore[arg-type]
+    (lambda s: EnergyGauge(s.scene).read(s), "num_envs is 1 of the gauge and 2 of the simulator"),
+    (lambda s: EnergyGauge(load_scene("rolling"), num_envs=2).read(s), "the simulator must be one of the scene"),
+    (lambda s: Simulator(load_scene("insertion")).displacement("a"), "forces must be numeric"),
     (lambda s: insertion_scene(3), "task must be an InsertionTask, got 3"),  # type: ignore[arg-type]
     (lambda s: Randomization(3), "quantities must be a mapping of names to quantities, got 3"),  # type: ignore[arg-type]
     (lambda s: Randomization({"mass": 3}), "quantity 'mass' must be a Quantity, got 3"),  # type: ignore[dict-item]
