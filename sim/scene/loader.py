@@ -21,7 +21,7 @@ from gelflow.sim.scene.sites import add_sites
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 INTEGRATORS = ("bdf1", "bdf2")
-MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")  # of model files that are loaded without a TOML file
+MODEL_SUFFIXES = (".xml", ".urdf")  # of model files that are loaded without a TOML file
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
@@ -75,7 +75,15 @@ def load_scene(
 
 def scene_tables(path: Path) -> dict[str, Any]:
     """The tables of a scene file; for a model file those of a scene that has nothing but the model."""
-    return {"format": 1, "model": path.name} if path.suffix in MODEL_SUFFIXES else read_toml(path)
+    if path.suffix in MODEL_SUFFIXES:
+        return {"format": 1, "model": path.name}
+    try:
+        return read_toml(path)
+    except UsageError as error:
+        if path.suffix == ".toml" or not path.is_file():
+            raise
+        xacro = "; run xacro and load its output" if path.suffix == ".xacro" else ""
+        raise UsageError(f"{error}; a scene is a .toml file, or a model file: .xml (MJCF) or .urdf{xacro}") from None
 
 
 def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:

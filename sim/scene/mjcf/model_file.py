@@ -110,7 +110,9 @@ def element_names(model: Any, kind: str, count: int) -> list[str]:
 
 
 def _clarified(message: str, spec: Any) -> str:
-    """MuJoCo's message, or a clearer one for a mesh that is missing or of an unsupported format."""
+    """MuJoCo's message, or a clearer one for a file of an unsupported format and for a mesh that is missing."""
+    if match := re.search(r"find decoder for resource '([^']*)'", message):
+        return f"{Path(match[1]).name} must have the suffix .xml (MJCF) or .urdf"
     match = re.search(r"(?:rror opening|decoder found for mesh) file '([^']*)'", message)
     if match is None or spec is None:
         return message

@@ -182,6 +182,16 @@ def test_model_without_a_joint_is_refused(name: str, text: str, tmp_path: Path) 
         load_scene(tmp_path / name)
 
 
+def test_file_that_is_no_scene_is_refused_with_the_valid_suffixes(tmp_path: Path) -> None:
+    xacro = robot(tmp_path / "arm.urdf.xacro")
+    with pytest.raises(UsageError, match=r"a scene is a \.toml file, .*; run xacro and load its output"):
+        load_scene(xacro)
+    scene = tmp_path / "s.toml"
+    scene.write_text('format = 1\nmodel = "arm.urdf.xacro"\nstep = 1e-3\n')
+    with pytest.raises(UsageError, match=r": arm.urdf.xacro must have the suffix \.xml \(MJCF\) or \.urdf"):
+        load_scene(scene)
+
+
 def test_model_file_is_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "robot.xml"
     body = '<body><joint name="j"/><geom size="0.1"/></body>'
