@@ -109,8 +109,9 @@ def _correct_ranges(spec: Any, robot: ElementTree.Element, path: Path) -> None:
         if limit is None or kind not in ("continuous", "revolute", "prismatic"):
             continue
         if kind == "continuous":
-            if (found := spec.joint(name)) is not None:
-                found.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            for found in spec.joints:
+                if found.name == name:
+                    found.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             continue
         lower, upper = float(limit.get("lower", 0)), float(limit.get("upper", 0))
         if lower > upper or lower == upper != 0:
