@@ -22,7 +22,7 @@ def checked(function: Callable[..., Any], *arguments: Any) -> Any:
 
 def shown(value: Any) -> str:
     """A value in one short line of an error message."""
-    if shape := getattr(value, "shape", None):
+    if (shape := getattr(value, "shape", None)) and isinstance(shape, tuple):
         return f"{type(value).__name__} of shape {tuple(shape)}"
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
@@ -43,7 +43,7 @@ def check_optional(**named: tuple[Any, type[Any]]) -> None:
 def integers(name: str, values: ArrayLike) -> NDArray[np.int32]:
     """A sequence of integers."""
     array: NDArray[np.int32] = number_array(name, values, np.int32)
-    if array.ndim != 1:
+    if array.ndim != 1 or (array.size and not np.issubdtype(np.asarray(values).dtype, np.integer)):
         raise UsageError(f"{name} must be a sequence of integers, got {shown(values)}")
     return array
 

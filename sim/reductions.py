@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.arguments import number_array, shown
+from gelflow.sim.arguments import check_type, number_array, shown
 
 if TYPE_CHECKING:  # loading a scene needs MuJoCo, which a simulator of a core model does not
     from gelflow.sim.scene.pads import PadDef
@@ -38,14 +38,19 @@ class TactileReduction:
     names: tuple[str, ...]  # of the rows
 
     def __post_init__(self) -> None:
-        if self.matrix.ndim != 3 or self.matrix.shape[2] != 3 or not np.isfinite(self.matrix).all():
-            raise UsageError(f"matrix must be finite, of shape (rows, markers, 3), got {self.matrix.shape}")
-        if len(self.names) != len(self.matrix):
-            raise UsageError(f"expected {len(self.matrix)} names of rows, got {len(self.names)}")
+        matrix = number_array("matrix", self.matrix, float)
+        if matrix.ndim != 3 or matrix.shape[2] != 3 or not np.isfinite(matrix).all():
+            raise UsageError(f"matrix must be finite, of shape (rows, markers, 3), got {matrix.shape}")
+        if len(self.names) != len(matrix):
+            raise UsageError(f"expected {len(matrix)} names of rows, got {len(self.names)}")
+        object.__setattr__(self, "matrix", matrix)
+        object.__setattr__(self, "names", tuple(self.names))
 
     def __call__(self, forces: Any) -> Any:
         """The rows, (…, rows), of marker forces (…, markers, 3): an array or a tensor."""
         rows, markers, _ = self.matrix.shape
+        if not (isinstance(forces, np.ndarray) or hasattr(forces, "requires_grad")):
+            forces = number_array("forces", forces, float)
         if tuple(forces.shape[-2:]) != (markers, 3):
             raise UsageError(f"forces must have shape (…, {markers}, 3), got {tuple(forces.shape)}")
         flat = forces.reshape((*forces.shape[:-2], markers * 3))
@@ -59,11 +64,18 @@ class TactileReduction:
     @cached_property
     def core(self) -> _core.TactileReduction:
         """The matrix in the layout of the core."""
-        return _core.TactileReduction(np.ascontiguousarray(self.matrix, dtype=float))
+        return _core.TactileReduction(np.ascontiguousarray(self.matrix))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.matrix, self.names)  # without `core`, which cannot be pickled
 
     @classmethod
     def concatenate(cls, reductions: Sequence["TactileReduction"]) -> "TactileReduction":
-        """The rows of all `reductions`, one after the other."""
+        """The rows of all `reductions`, one after the other. Raises UsageError for different numbers of markers."""
+        for reduction in reductions:
+            check_type("each of reductions", reduction, cls, "a TactileReduction")
+        if len(markers := {reduction.matrix.shape[1] for reduction in reductions}) != 1:
+            raise UsageError(f"reductions must be of one number of markers, got {sorted(markers)}")
         return cls(
             np.concatenate([reduction.matrix for reduction in reductions]),
             tuple(name for reduction in reductions for name in reduction.names),

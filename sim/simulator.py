@@ -15,6 +15,7 @@ from gelflow.sim.displacement import marker_displacement
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator_copy import contents, rebuilt
 from gelflow.sim.site_poses import site_poses
+from gelflow.sim.state_arrays import StateArrays
 from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
 
 STATUS_MESSAGES = {
@@ -30,7 +31,7 @@ class Buildable(Protocol):
     def build(self) -> Any: ...
 
 
-class Simulator:
+class Simulator(StateArrays):
     """A batch of N environments of one scene.
 
     Parameters
@@ -42,8 +43,8 @@ class Simulator:
 
     Attributes
     ----------
-    q, v: positions (N, nq), at first the scene's `q0`, and velocities (N, nv); writable views, like all state arrays.
-        After writing them call `clear_history`, or anchors and BDF2 history belong to the state before
+    q, v: positions (N, nq), at first the scene's `q0`, and velocities (N, nv); like all state arrays writable views,
+        whose elements are set (`sim.q[:] = …`). Then call `clear_history`, or anchors and history are those before
     params: physical parameters (N, parameters), writable; see `param`
     anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
@@ -92,7 +93,8 @@ class Simulator:
         self.halved: NDArray[np.int64] = self._batch.halved
         self._tactile: NDArray[Any] | None = None  # created by the first call of `tactile`
         if (start := getattr(scene, "q0", None)) is not None:
-            self.q[:] = start
+            fill("q0 of the scene", self.q[0], start)
+            self.q[:] = self.q[0]
             self.step(np.zeros(self.model.nu), 0)  # no step: it sets the positions of coupled joints
         self._start: NDArray[Any] = self.q[0].copy()
 
@@ -127,9 +129,7 @@ class Simulator:
 
     def _mask(self, name: str, mask: ArrayLike | None) -> NDArray[np.uint8] | None:
         """Flags of the environments in `mask` for the core; None: all of them."""
-        if mask is None:
-            return None
-        return flags(name, mask, self.num_envs).view(np.uint8)
+        return None if mask is None else flags(name, mask, self.num_envs).view(np.uint8)
 
     def clear_history(self, which: ArrayLike | None = None) -> None:
         """Clear friction anchors and the BDF2 history; required after `q` or `v` were written directly."""
@@ -304,7 +304,7 @@ class Simulator:
 
         Raises UsageError for wrong shapes and for values that are not finite.
         """
-        controls = np.ascontiguousarray(number_array("u", u, self.dtype))
+        controls = np.array(number_array("u", u, self.dtype), order="C")  # a copy: the caller may change u afterwards
         if controls.ndim != 3 or controls.shape[1:] != (self.num_envs, self.model.nu):
             raise UsageError(f"u must have shape (steps, {self.num_envs}, {self.model.nu}), got {controls.shape}")
         arguments.check_optional(stop=(stop, TouchStop), reduction=(reduction, TactileReduction), out=(out, Trajectory))
@@ -373,10 +373,9 @@ class Simulator:
         anchors_end, history_end: gradients with respect to the final `anchors` and `history`
         params: also compute the gradient with respect to all physical parameters, at many times the cost
 
-        An environment that stopped is differentiated as the steps that it took: the number of steps is a constant.
-        Failed environments have gradient zero.
+        The simulator must have the parameters of the rollout. An environment that stopped is differentiated as the
+        steps that it took: the number of steps is a constant. Failed environments have gradient zero.
         """
-
         arguments.check_type("trajectory", trajectory, Trajectory, "a Trajectory")
 
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-
-_ARRAYS = ("q", "v", "params", "anchors", "anchored", "history", "status", "iterations", "halved")
+from gelflow.sim.state_arrays import STATE_ARRAYS
 
 
 def contents(sim: Any, threads: int | None) -> tuple[Callable[..., Any], Any, dict[str, Any], dict[str, NDArray[Any]]]:
@@ -18,7 +17,7 @@ def contents(sim: Any, threads: int | None) -> tuple[Callable[..., Any], Any, di
         raise UsageError("a simulator of a core model cannot be pickled or copied; build it from a Scene")
     precision = "double" if sim.dtype is np.float64 else "single"
     options = {"num_envs": sim.num_envs, "threads": threads, "precision": precision}
-    return type(sim), sim.scene, options, {name: getattr(sim, name).copy() for name in _ARRAYS}
+    return type(sim), sim.scene, options, {name: getattr(sim, name).copy() for name in STATE_ARRAYS}
 
 
 def rebuilt(build: Callable[..., Any], scene: Any, options: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Any:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch.autograd.function import once_differentiable
 
 from gelflow.errors import UsageError
-from gelflow.sim.arguments import check_type, number_array
+from gelflow.sim.arguments import check_type
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.site_poses import site_poses, site_poses_vjp
@@ -88,6 +88,7 @@ def torch_rollout(
     """
     check_type("sim", sim, Simulator, "a Simulator")
     check_type("state", state, TorchState, "a TorchState (see torch_state)")
+    check_type("state.anchored", state.anchored, torch.Tensor, "a tensor")
     check_type("params", params, (Mapping, type(None)), "a mapping of parameter names to tensors")
     expected = torch.float64 if sim.dtype is np.float64 else torch.float32
     named = {"u": u, "q": state.q, "v": state.v, "anchors": state.anchors, "history": state.history, **(params or {})}
@@ -98,13 +99,7 @@ def torch_rollout(
             raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
     numbers = None if params is None else _all_params(sim, params)
     inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
-    reads = number_array("read_after", read_after, np.int32)
-    options = {
-        "read_after": reads,
-        "reduction": reduction,
-        "active": active,
-        "stop": stop,
-    }
+    options = {"read_after": read_after, "reduction": reduction, "active": active, "stop": stop}
     outputs = _Rollout.apply(*inputs, sim, options)  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, history, anchored, ok, stopped_at = outputs
     return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok, stopped_at)

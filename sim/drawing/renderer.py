@@ -113,9 +113,11 @@ def render(
     title: a line at the top
     marks: lines in the world
 
-    Raises UsageError for a wrong environment, size or view, and for a simulator of a core model.
+    Raises UsageError for a wrong environment, size, view or mark, and for a simulator of a core model.
     """
     arguments.check_type("sim", sim, Simulator, "a Simulator")
+    if not isinstance(marks, Sequence) or not all(isinstance(mark, Mark) for mark in marks):
+        raise UsageError(f"marks must be a list of Mark, got {arguments.shown(marks)}")
     return _renderers.setdefault(sim, Renderer(sim)).picture(env, size, camera, title=title, marks=marks)
 
 

@@ -76,6 +76,10 @@ def read_points(
     Raises UsageError on an unknown or unsupported geometry.
     """
     geoms = {geom.name: geom for geom in mechanics.geoms}
+    for table in contacts.values():  # a wrong name leaves points without partner and without default density
+        table.lookup(tables, table.string("points"), "points")
+        for shape in table.strings("against"):
+            table.lookup(geoms, shape, "geometry")
     spacings = _default_spacings(tables, contacts, geoms)
     return {name: _sample(name, table, geoms, spacings.get(name)) for name, table in tables.items()}
 
@@ -177,13 +181,11 @@ def _default_spacings(
 ) -> dict[str, float]:
     """The spacing of each point set that is in a contact and whose table gives no density [m].
 
-    Names that do not exist are left to the readers of points and contacts.
+    Names of geometries that do not exist are left to the reader of points.
     """
     partners: dict[str, list[GeomDef]] = {}
     for table in contacts.values():
-        against, name = table.data.get("against"), table.data.get("points")
-        names = [against] if isinstance(against, str) else against if isinstance(against, list) else []
-        partners.setdefault(str(name), []).extend(geoms[shape] for shape in names if shape in geoms)
+        partners.setdefault(table.string("points"), []).extend(geoms[shape] for shape in table.strings("against"))
     sampled = {name: geoms.get(str(table.data.get("geom"))) for name, table in tables.items()}
     default = {
         name: geom
@@ -220,6 +222,8 @@ def _surface(table: TomlTable, geom: GeomDef) -> tuple[Array, Array]:
     size = geom.size.tolist()
     if geom.kind == "box":
         table.check_keys(("geom", "resolution", "faces", "stiffness"))
+        if not table.data.keys() & {"resolution", "faces"}:
+            raise UsageError(f"{table.location}: in no contact, so without default density; give resolution")
         return box_surface(size, table.integers("resolution", 3), faces=table.strings("faces", FACES))
     if geom.kind == "cylinder":
         table.check_keys(("geom", "angles", "radii", "heights", "faces", "stiffness"))

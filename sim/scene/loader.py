@@ -6,7 +6,10 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
+
 from gelflow.errors import UsageError
+from gelflow.sim.arguments import shown
 from gelflow.sim.scene.contacts import FRICTION_LAWS, read_contacts, read_points, warn_of_gaps
 from gelflow.sim.scene.joint_limits import read_limits
 from gelflow.sim.scene.mjcf.mechanics import SiteDef, read_mechanics
@@ -18,7 +21,7 @@ from gelflow.sim.scene.sites import add_sites
 from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
 
 INTEGRATORS = ("bdf1", "bdf2")
-MODEL_SUFFIXES = (".xml", ".mjcf", ".urdf")  # of model files that are loaded without a TOML file
+MODEL_SUFFIXES = (".xml", ".urdf")  # of model files that are loaded without a TOML file
 PRECISIONS: tuple[Precision, ...] = ("double", "single")
 
 _SOLVER_KEYS = ("step", "integrator", "tolerance", "precision")
@@ -62,7 +65,9 @@ def load_scene(
     if not isinstance(overrides, Mapping):
         raise UsageError(f"overrides must be a mapping of dotted keys to values, got {type(overrides).__name__}")
     for key, value in overrides.items():
-        set_by_path(data, key, value)
+        if not isinstance(key, str):
+            raise UsageError(f"overrides must have dotted keys, such as 'pads.pad.rows', got {shown(key)}")
+        set_by_path(data, key, value.tolist() if isinstance(value, np.generic | np.ndarray) else value)
     if friction is not None:
         data["friction"] = friction
     return _read_scene(path, TomlTable(data, str(path)), presets)
@@ -70,7 +75,15 @@ def load_scene(
 
 def scene_tables(path: Path) -> dict[str, Any]:
     """The tables of a scene file; for a model file those of a scene that has nothing but the model."""
-    return {"format": 1, "model": path.name} if path.suffix in MODEL_SUFFIXES else read_toml(path)
+    if path.suffix in MODEL_SUFFIXES:
+        return {"format": 1, "model": path.name}
+    try:
+        return read_toml(path)
+    except UsageError as error:
+        if path.suffix == ".toml" or not path.is_file():
+            raise
+        xacro = "; run xacro and load its output" if path.suffix == ".xacro" else ""
+        raise UsageError(f"{error}; a scene is a .toml file, or a model file: .xml (MJCF) or .urdf{xacro}") from None
 
 
 def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:

@@ -103,12 +103,23 @@ def _read_pad(
         axes=site.matrix() @ markers.axes,
         weights=np.full(len(markers.positions), weight),
         grid=markers.grid,
-        against=tuple(shape_geom(geoms, other, table).name for other in table.strings("against")),
+        against=_against(table, geoms, body),
         law=law,
         params=read_contact_params(table, law),
         collides=table.boolean("collides", default=False),
         gel=_gel(table, markers, folder),
     )
+
+
+def _against(table: TomlTable, geoms: Mapping[str, GeomDef], body: int) -> tuple[str, ...]:
+    """Names of the shapes that the markers of a pad on `body` touch."""
+    names = table.strings("against")
+    for i, name in enumerate(names):
+        if shape_geom(geoms, name, table).body == body:
+            raise UsageError(f"{table.location}: {name!r} is on the body of the pad and cannot touch it")
+        if name in names[:i]:
+            raise UsageError(f"{table.location}: against names {name!r} twice")
+    return names
 
 
 def _gel(table: TomlTable, markers: _Markers, folder: Path) -> Gel | None:
@@ -152,6 +163,8 @@ def _grid(table: TomlTable) -> Grid:
         pitch = table.number("pitch", minimum=1e-9)
     else:
         size = table.numbers("size", 2)
+        if min(size) <= 0:
+            raise UsageError(f"{table.location}: size must be two positive numbers, got {list(size)}")
         pitch = size[0] / rows
         if not np.isclose(pitch, size[1] / cols):
             raise UsageError(

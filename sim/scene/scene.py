@@ -159,6 +159,8 @@ class Scene:
             return _core.Model(self.model_spec())
         except UsageError:
             raise
+        except KeyError as error:
+            raise UsageError(f"{self.path}: a contact or pad refers to {error}, which the scene lacks") from None
         except ValueError as error:
             raise UsageError(f"{self.path}: {error}") from None
 

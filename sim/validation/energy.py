@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gelflow.errors import UsageError
 from gelflow.geometry import rotate
 from gelflow.sim import _core
 from gelflow.sim.arguments import check_type
@@ -62,8 +63,12 @@ class EnergyGauge:
         self._probe = Simulator(_core.Model(spec), num_envs=num_envs)
 
     def read(self, sim: Simulator) -> Energy:
-        """Energy of the present state of a simulator."""
+        """Energy of the present state of a simulator. Raises UsageError for another number of environments or scene."""
         check_type("sim", sim, Simulator, "a Simulator")
+        if sim.num_envs != self._probe.num_envs:
+            raise UsageError(f"num_envs is {self._probe.num_envs} of the gauge and {sim.num_envs} of the simulator")
+        if sim.model.joint_names != self._probe.model.joint_names:
+            raise UsageError("the simulator must be one of the scene of the gauge")
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
         contact, friction = self._stored(sim, *self.points(sim))
         springs, limits = _joints(sim)

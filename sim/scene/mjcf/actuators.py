@@ -98,13 +98,17 @@ def _range(limited: Any, bounds: Any) -> tuple[float, float]:
 
 
 def _force_range(model: Any, a: int, gear: float, location: str) -> tuple[float, float]:
-    """The intersection of the force range of the actuator and of its joint or tendon (actuatorfrcrange)."""
+    """The intersection of the force range of the actuator and of its joint or tendon (actuatorfrcrange).
+
+    As in MuJoCo, the range of a joint limits the force on the joint, and that of a tendon the force before the gear.
+    """
     low, high = _range(model.actuator_forcelimited[a], model.actuator_forcerange[a])
     what = "tendon" if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON else "jnt"
     target = int(model.actuator_trnid[a, 0])
     limited = getattr(model, f"{what}_actfrclimited", None)
     if gear != 0 and limited is not None and limited[target]:
-        ends = sorted(float(end) / gear for end in getattr(model, f"{what}_actfrcrange")[target])
+        ratio = gear if what == "jnt" else 1.0
+        ends = sorted(float(end) / ratio for end in getattr(model, f"{what}_actfrcrange")[target])
         low, high = max(low, ends[0]), min(high, ends[1])
     if not low < high:
         raise UsageError(f"{location}: forcerange and the actuatorfrcrange that it acts on are disjoint; change one")

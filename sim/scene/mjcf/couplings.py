@@ -124,7 +124,9 @@ def read_loop_closures(model: Any, moving_body: NDArray[np.int64], poses: Sequen
         if bodies[0] == bodies[1]:
             continue  # fixed to each other already
         turn = np.array(multiply(second.quaternion, conjugate(first.quaternion)))
-        closures.append(LoopClosureDef(name, bodies, (first.position, second.position), weld, turn if weld else None))
+        keeps_turn = weld and data[10] != 0  # torquescale; with 0 a weld keeps the points together only, as a connect
+        points = (first.position, second.position)
+        closures.append(LoopClosureDef(name, bodies, points, keeps_turn, turn if keeps_turn else None))
     return tuple(closures)
 
 

@@ -41,9 +41,9 @@ def compile_model(path: Path) -> CompiledModel:
         with _no_log_file():
             spec = mujoco.MjSpec.from_file(str(path))
             if robot is None:
-                return _compiled(spec, spec.compile(), urdf=False)
+                return _compiled(spec, spec.compile(), path, urdf=False)
             complete_urdf(spec, robot, path)
-            return _compiled(spec, compile_urdf(spec, path), urdf=True)
+            return _compiled(spec, compile_urdf(spec, path), path, urdf=True)
     except UsageError:
         raise
     except (ValueError, mujoco.FatalError) as error:
@@ -61,7 +61,7 @@ def _no_log_file() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _compiled(spec: Any, model: Any, *, urdf: bool) -> CompiledModel:
+def _compiled(spec: Any, model: Any, path: Path, *, urdf: bool) -> CompiledModel:
     keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in ("start", "home"))
     key = next((k for k in keys if k >= 0), None)
     controls = None if key is None or not model.key_ctrl[key].any() else np.array(model.key_ctrl[key])
@@ -69,6 +69,12 @@ def _compiled(spec: Any, model: Any, *, urdf: bool) -> CompiledModel:
         return CompiledModel(model, urdf, np.array(model.qpos0 if key is None else model.key_qpos[key]), controls, ())
     names = element_names(model, "body", model.nbody)
     mocap = [body for body in spec.bodies if body.mocap]
+    joints = {model.joint(j).name for j in range(model.njnt)}
+    if taken := [names[body.id] for body in mocap if names[body.id] in joints]:
+        raise UsageError(
+            f"{path}: mocap body {taken[0]!r} gets a free joint of its name, but the model has a joint "
+            f"{taken[0]!r}; rename one of them"
+        )
     for keyframe in list(spec.keys):  # which have no positions of the new joints
         spec.delete(keyframe)
     for body in mocap:
@@ -104,7 +110,9 @@ def element_names(model: Any, kind: str, count: int) -> list[str]:
 
 
 def _clarified(message: str, spec: Any) -> str:
-    """MuJoCo's message, or a clearer one for a mesh that is missing or of an unsupported format."""
+    """MuJoCo's message, or a clearer one for a file of an unsupported format and for a mesh that is missing."""
+    if match := re.search(r"find decoder for resource '([^']*)'", message):
+        return f"{Path(match[1]).name} must have the suffix .xml (MJCF) or .urdf"
     match = re.search(r"(?:rror opening|decoder found for mesh) file '([^']*)'", message)
     if match is None or spec is None:
         return message

@@ -8,6 +8,7 @@ import numpy as np
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene.mjcf.actuators import is_fixed
+from gelflow.sim.scene.mjcf.couplings import tendon_terms
 from gelflow.sim.scene.mjcf.model_file import element_names
 from gelflow.sim.scene.mjcf.tendon_equalities import unsupported_equality
 
@@ -107,6 +108,9 @@ def _elements(model: Any) -> Iterator[Unsupported]:
             yield f"range of springlength of tendon {tendons[t]!r}", "give one length"
     for t in _nonzero(model, "tendon_", "stiffnesspoly", "dampingpoly"):
         yield f"polynomial stiffness or damping of tendon {tendons[t]!r}", "give one coefficient"
+    for t in _nonzero(model, "tendon_", "actfrclimited"):
+        if (count := actuated.count(t)) > 1:
+            yield f"actuatorfrcrange of tendon {tendons[t]!r} with {count} actuators", "give each actuator a forcerange"
     for e in _nonzero(model, "eq_", "active0"):
         if model.eq_type[e] not in _EQUALITIES or (model.eq_type[e] == _TENDON and unsupported_equality(model, e)):
             yield f"equality {_equality(model, e)}", "remove it, or make it inactive"
@@ -140,6 +144,7 @@ def _joints(model: Any) -> Iterator[Unsupported]:
     driven = np.bincount(model.actuator_trnid[_on_joint(model), 0], minlength=model.njnt)
     polynomial_stiffness = _nonzero(model, "jnt_", "stiffnesspoly")
     polynomial_damping = _nonzero(model, "dof_", "dampingpoly")
+    by_tendon = _driven_by_tendons(model)
     for j, joint in enumerate(element_names(model, "joint", model.njnt)):
         rotating = _ROTATING_JOINTS.get(int(model.jnt_type[j]))
         if rotating == "ball" and model.jnt_limited[j]:
@@ -152,8 +157,16 @@ def _joints(model: Any) -> Iterator[Unsupported]:
             yield f"polynomial damping of joint {joint!r}", "give one coefficient"
         if model.jnt_actgravcomp[j] and model.jnt_actfrclimited[j]:
             yield f"actuatorgravcomp of joint {joint!r} with an actuatorfrcrange", "remove one of them"
+        if model.jnt_actfrclimited[j] and j in by_tendon:
+            yield f"actuatorfrcrange of joint {joint!r}, which a tendon drives", "use a forcerange instead"
         if model.jnt_actfrclimited[j] and driven[j] > 1:
             yield f"actuatorfrcrange of joint {joint!r} with {driven[j]} actuators", "give each actuator a forcerange"
+
+
+def _driven_by_tendons(model: Any) -> set[int]:
+    """The joints that actuators drive by fixed tendons."""
+    actuated = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
+    return {j for t in actuated for j in (tendon_terms(model, t) if is_fixed(model, t) else ())}
 
 
 def _on_joint(model: Any) -> Any:

@@ -49,6 +49,7 @@ def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     for body, moves in _links(spec.worldbody):
         if body.explicitinertial and np.isfinite(body.fullinertia).all():
             _repair_inertia(body, f"{path.name}: link {body.name!r}", moves=moves)
+    _correct_ranges(spec, robot, path)
     mimics = _mimic_joints(robot, path)
     _couple(spec, mimics)
     _add_motors(spec, robot, without=mimics)
@@ -96,6 +97,25 @@ def _mimic_joints(robot: ElementTree.Element, path: Path) -> dict[str, tuple[str
         except ValueError:
             raise UsageError(f"{path}: joint {name!r}: multiplier and offset of <mimic> must be numbers") from None
     return mimics
+
+
+def _correct_ranges(spec: Any, robot: ElementTree.Element, path: Path) -> None:
+    """Remove the ranges of continuous joints, which have none. Raises UsageError for a range without extent.
+
+    MuJoCo limits a continuous joint with bounds, and does not limit a joint whose bounds are equal or interchanged.
+    """
+    for joint in robot.findall("joint"):
+        name, kind, limit = joint.get("name", ""), joint.get("type"), joint.find("limit")
+        if limit is None or kind not in ("continuous", "revolute", "prismatic"):
+            continue
+        if kind == "continuous":
+            for found in spec.joints:
+                if found.name == name:
+                    found.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+            continue
+        lower, upper = float(limit.get("lower", 0)), float(limit.get("upper", 0))
+        if lower > upper or lower == upper != 0:
+            raise UsageError(f"{path}: joint {name!r}: lower limit {lower:g} must be below upper limit {upper:g}")
 
 
 def _couple(spec: Any, mimics: dict[str, tuple[str, float, float]]) -> None:

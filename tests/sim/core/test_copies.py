@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
+from gelflow.sim.reductions import pad_forces
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 
@@ -44,6 +45,14 @@ def test_copy_of_a_simulator_continues_like_the_original(how: str, scene: Scene)
 def test_copy_of_a_scene_builds_the_same_model(how: str, scene: Scene) -> None:
     other = COPIES[how](scene)
     np.testing.assert_array_equal(Simulator(other).params, Simulator(scene).params)
+
+
+@pytest.mark.parametrize("how", COPIES)
+def test_copy_of_a_rollout_with_a_reduction_has_its_gradient(how: str, scene: Scene) -> None:
+    sim = Simulator(scene)
+    run = sim.rollout(np.full((20, 1, scene.nu), 0.1), read_after=(20,), reduction=pad_forces(scene))
+    gradient, other = (sim.rollout_gradient(r, tactile=1.0).u for r in (run, COPIES[how](run)))
+    np.testing.assert_array_equal(other, gradient)
 
 
 @pytest.mark.parametrize("how", COPIES)

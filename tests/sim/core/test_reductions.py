@@ -134,6 +134,12 @@ def test_shear_features_are_projections_of_the_shear_maps() -> None:
     assert one.names[:2] == ("right.shear_x.0", "right.shear_x.1") and one.names[6] == "right.shear_y.0"
 
 
+def test_nested_lists_are_a_matrix() -> None:
+    reduction = TactileReduction([[[1, 0, 0], [2, 0, 0]]], ["sum"])  # type: ignore[arg-type]
+    assert reduction.names == ("sum",)
+    assert reduction([[3, 0, 0], [4, 0, 0]]).tolist() == [11.0]
+
+
 def test_invalid_reductions_raise() -> None:
     scene = load_scene("insertion")
     sim = Simulator(scene)
@@ -143,7 +149,13 @@ def test_invalid_reductions_raise() -> None:
         TactileReduction(np.full((1, 3, 3), np.nan), ("a",))
     with pytest.raises(UsageError, match="expected 1 names of rows, got 2"):
         TactileReduction(np.ones((1, 3, 3)), ("a", "b"))
+    with pytest.raises(UsageError, match="matrix must be real"):
+        TactileReduction(np.ones((1, 3, 3)) + 1j, ("a",))  # type: ignore[arg-type]
     other = TactileReduction(np.ones((1, 3, 3)), ("a",))
+    with pytest.raises(UsageError, match=re.escape("reductions must be of one number of markers, got [3, 260]")):
+        TactileReduction.concatenate([other, reductions.pad_forces(scene)])
+    with pytest.raises(UsageError, match="reductions must be of one number of markers"):
+        TactileReduction.concatenate([])
     for call in (
         lambda: sim.tactile(reduction=other),
         lambda: sim.rollout(np.zeros((2, 1, sim.model.nu)), reduction=other),

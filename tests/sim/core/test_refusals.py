@@ -1,6 +1,7 @@
 """Wrong arguments of a simulator are refused by a UsageError of one line that names them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,9 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     ),
     (lambda s: EnergyGauge(3), "scene must be a Scene"),  # type: ignore[arg-type]
     (lambda s: EnergyGauge(s.scene).read(3), "sim must be a Simulator, got 3"),  # type: ignore[arg-type]
+    (lambda s: EnergyGauge(s.scene).read(s), "num_envs is 1 of the gauge and 2 of the simulator"),
+    (lambda s: EnergyGauge(load_scene("rolling"), num_envs=2).read(s), "the simulator must be one of the scene"),
+    (lambda s: Simulator(load_scene("insertion")).displacement("a"), "forces must be numeric"),
     (lambda s: insertion_scene(3), "task must be an InsertionTask, got 3"),  # type: ignore[arg-type]
     (lambda s: Randomization(3), "quantities must be a mapping of names to quantities, got 3"),  # type: ignore[arg-type]
     (lambda s: Randomization({"mass": 3}), "quantity 'mass' must be a Quantity, got 3"),  # type: ignore[dict-item]
@@ -75,6 +79,17 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
         lambda s: s.rollout_gradient(s.rollout(U), q=np.zeros(77)),
         r"a gradient must have shape \(3, 2, 7\), got \(77,\)",
     ),
+    (lambda s: s.rollout(U, read_after=[0.5]), r"read_after must be a sequence of integers, got \[0.5\]"),
+    (
+        lambda s: torch_rollout(s, torch_state(s), torch.from_numpy(U), read_after=(FLOAT,)),
+        "read_after must be a sequence of integers",
+    ),
+    (lambda s: torch_rollout(s, replace(torch_state(s), anchored=FLOAT), torch.from_numpy(U)), "state.anchored must"),
+    (lambda s: setattr(s, "q", s.q + 1), "q is a view of the simulator's state; write its elements: sim.q"),
+    (lambda s: type(s)(s.scene, precision=np.float32), "precision must be 'double' or 'single', got <class"),
+    (lambda s: type(s)(replace(s.scene, q0=np.zeros(3))), r"q0 of the scene must have shape \(7,\), got \(3,\)"),
+    (lambda s: replace(s.scene, points=()).build(), ".*a contact or pad refers to 'pad', which the scene lacks"),
+    (lambda s: load_scene("pushing", overrides={3: 1}), "overrides must have dotted keys"),  # type: ignore[dict-item]
     (lambda s: s.param(3), "no parameter 3"),
     (lambda s: type(s)("pushing"), "scene must be a Scene"),
     (lambda s: type(s)(s.scene, num_envs=1.5), "num_envs must be an integer"),

@@ -102,6 +102,15 @@ def test_camera_frames_marks_as_well() -> None:
     assert inside == [False, True]
 
 
+def test_marks_are_lists_of_points() -> None:
+    assert Mark([[0, 0, 0], [0, 0, 1]], "goal").points.shape == (2, 3)  # type: ignore[arg-type]
+    for points in ([], np.zeros(3), [[0, 0]], [[0, 0, np.nan]]):
+        with pytest.raises(UsageError, match="points of a mark must be a list of"):
+            Mark(points, "goal")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="marks must be a list of Mark"):
+        gs.render(gs.Simulator(gs.load_scene("pushing")), marks=[3])  # type: ignore[list-item]
+
+
 def test_film_has_one_camera_and_the_pictures_of_the_rollout() -> None:
     scene = gs.load_scene("pushing")
     controls = np.zeros((1, scene.nu))

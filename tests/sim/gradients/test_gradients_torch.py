@@ -66,6 +66,18 @@ def test_gradient_over_a_hundred_steps(name: str, law: str) -> None:
         assert gradient_check.compare_to_dual_numbers(case, rng, directions=1, groups=False).error < 1e-6
 
 
+def test_gradient_is_that_of_the_controls_of_the_rollout() -> None:
+    """Controls that change after the forward pass, here to values that are clipped, do not change the gradient."""
+    sim, u = scene_in_contact("insertion", "elastic", "bdf1", np.random.default_rng(3))
+    controls = torch.tensor(u[:3, None], requires_grad=True)
+    positions = torch_layer.torch_rollout(sim, torch_layer.torch_state(sim), controls).q.sum()
+    before = torch.autograd.grad(positions, controls, retain_graph=True)[0]
+    with torch.no_grad():
+        controls.fill_(1e6)
+    assert before.abs().max() > 0
+    assert torch.equal(torch.autograd.grad(positions, controls)[0], before)
+
+
 def test_single_steps_equal_the_rollout() -> None:
     sim, u = scene_in_contact("insertion", "elastic", "bdf1", np.random.default_rng(3))
     controls = torch.tensor(np.repeat(u[:, None], 4, axis=0), requires_grad=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from tests.sim.scene.test_mjcf import JOINT, check_against_mujoco
 
 from gelflow.geometry import Pose
 from gelflow.sim.benchmark.describe import describe
@@ -98,6 +99,21 @@ def test_closed_four_bar_moves_as_in_mujoco(equality: str, tmp_path: Path) -> No
 def test_weld_makes_a_loop_rigid(tmp_path: Path) -> None:
     sim = moved(load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", WELD)), 0.3, 200)
     assert np.abs(sim.q).max() < 1e-3
+
+
+@pytest.mark.parametrize("gear", [2, -0.5])
+def test_force_range_of_a_tendon_limits_the_force_before_the_gear(gear: float, tmp_path: Path) -> None:
+    tendon = '<tendon><fixed name="t" actuatorfrcrange="-0.5 1"><joint joint="j" coef="3"/></fixed></tendon>'
+    actuators = f'<motor tendon="t" gear="{gear}"/></actuator>{tendon}<actuator>'
+    scene = load(tmp_path, "joint.xml", JOINT.format(joint="", actuators=actuators))
+    check_against_mujoco(scene, mujoco.MjModel.from_xml_path(str(tmp_path / "joint.xml")))
+
+
+def test_weld_with_torquescale_0_is_a_connect(tmp_path: Path) -> None:
+    weld = WELD.replace("anchor", 'torquescale="0" anchor')
+    sims = [moved(load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", e)), 0.3, 200) for e in (weld, CONNECT)]
+    np.testing.assert_allclose(sims[0].q, sims[1].q, atol=1e-9)
+    assert np.abs(sims[0].q).max() > 0.1
 
 
 def test_loop_closes_to_the_stated_compliance(tmp_path: Path) -> None:

@@ -207,6 +207,8 @@ def test_overrides_replace_values_and_are_checked() -> None:
     assert scene.step == 1e-3
     assert scene.grids[0].pitch == pytest.approx(1.0)
     assert np.abs(scene.pads[0].positions[:, :2]).max() == pytest.approx(0.0245)
+    counted = {"pads.pad.rows": np.int64(50), "pads.pad.cols": np.int64(50), "step": np.float32(0.5)}
+    assert load_scene("rolling", overrides=counted).num_markers == 2500
     both = load_scene("insertion", overrides={"pads.*.rows": 18, "pads.*.cols": 14})
     assert both.num_markers == 2 * 18 * 14
     for key, message in [

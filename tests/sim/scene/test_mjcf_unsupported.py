@@ -206,6 +206,25 @@ def test_joint_force_range_with_several_actuators_is_an_error(tmp_path: Path) ->
     )
 
 
+TENDON = """<tendon><fixed name="t" {}><joint joint="swing" coef="2"/></fixed></tendon>
+  <actuator><motor tendon="t"/>{}</actuator>"""
+
+
+@pytest.mark.parametrize(
+    ("joint", "tendon", "actuator", "message"),
+    [
+        ("", 'actuatorfrcrange="-1 2"', '<motor tendon="t"/>', "actuatorfrcrange of tendon 't' with 2 actuators"),
+        ('actuatorfrcrange="1 2"', "", "", "actuatorfrcrange of joint 'swing', which a tendon drives"),
+    ],
+)
+def test_force_range_of_several_actuators_on_a_tendon_is_an_error(
+    joint: str, tendon: str, actuator: str, message: str, tmp_path: Path
+) -> None:
+    model = MODEL.replace('axis="0 1 0"', f'axis="0 1 0" {joint}')
+    (tmp_path / "robot.xml").write_text(model.replace("</mujoco>", TENDON.format(tendon, actuator) + "</mujoco>"))
+    check_error(tmp_path, "robot.xml", message)
+
+
 LINK = """<link name="{}"><inertial><mass value="1"/>
   <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>{}</link>"""
 URDF = f"""<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="base"/>

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gelflow.errors import UsageError
 from gelflow.sim.benchmark.describe import describe
 from gelflow.sim.scene import FRICTION_LAWS, INTEGRATORS, Scene, load_scene
 from gelflow.sim.simulator import Simulator
@@ -88,6 +89,12 @@ def test_body_is_moved_between_steps(tmp_path: Path) -> None:
         sim.step(np.zeros((1, 0)))
     assert sim.status[0] == 0 and not sim.v[0, scene.v("paddle")].any()
     assert sim.q[0, sim.joint_q("part") + 2] == pytest.approx(0.05 - 0.0099, abs=2e-3)
+
+
+def test_joint_with_the_name_of_a_mocap_body_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mocap.xml").write_text(MODEL.replace('joint name="before"', 'joint name="paddle"'))
+    with pytest.raises(UsageError, match="mocap body 'paddle' gets a free joint of its name, but the model has"):
+        load_scene(tmp_path / "mocap.xml")
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -207,6 +207,7 @@ def test_contact_points_on_round_geometries(kind: str, text: str, message: str, 
         ('shape = "points"\nfile = "cut.npz"', "cut.npz cannot be read"),
         ('shape = "points"\nfile = "bad.npz"', "bad.npz cannot be read"),
         ('shape = "points"\nfile = "other.npz"', "unknown array 'points'; valid names: positions, normals, x_axes"),
+        ("rows = 2\ncols = 2\nsize = [-1, -1]", "pads.pad: size must be two positive numbers, got [-1.0, -1.0]"),
         ('shape = "points"\npositions = [[0, 0]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = [[0, 0, nan]]', "positions must be a list of [x, y, z], all finite"),
         ('shape = "points"\npositions = "tip"', "positions must be a list of [x, y, z], all finite"),
@@ -234,3 +235,15 @@ def test_invalid_pad_gives_a_one_line_error(text: str, message: str, tmp_path: P
         loaded(tmp_path, text)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("against", "message"),
+    [
+        (["ground", "ground"], "pads.pad: against names 'ground' twice"),
+        (["cap", "finger"], "pads.pad: 'finger' is on the body of the pad and cannot touch it"),
+    ],
+)
+def test_shapes_that_a_pad_cannot_touch(against: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=message):
+        loaded(tmp_path, "rows = 1\ncols = 1\npitch = 1e-3", overrides={"pads.pad.against": against})

@@ -137,5 +137,15 @@ def test_default_density_follows_the_sizes_of_both_partners(tmp_path: Path) -> N
 
 
 def test_points_in_no_contact_have_no_default_density(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"points.lower: resolution is missing"):
+    with pytest.raises(UsageError, match=r"points.lower: in no contact, so without default density; give resolution"):
         stack(tmp_path, "equal cubes", more='[points.lower]\ngeom = "lower"\n')
+
+
+def test_wrong_names_of_a_contact_are_reported_before_the_density_of_its_points(tmp_path: Path) -> None:
+    contact = "[contacts.wrong]\n{}\nkn = 1\nkt = 1\nkd = 1\nmu = 1\n"
+    for names, message in (
+        ('points = "lowr"\nagainst = "upper"', "contacts.wrong: no points 'lowr'; did you mean 'lower'"),
+        ('points = "lower"\nagainst = "uper"', "contacts.wrong: no geometry 'uper'; did you mean 'upper'"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            stack(tmp_path, "equal cubes", more='[points.lower]\ngeom = "lower"\n' + contact.format(names))

@@ -155,6 +155,20 @@ def test_joints_of_a_transmission_have_actuators_of_their_own(actuators: str, na
     assert Simulator(scene).model.nu == 2
 
 
+def test_continuous_joint_has_no_range(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace("revolute", "continuous", 1))
+    assert [joint.range for joint in load_scene(path).joints] == [None, (-1.0, 1.0)]
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(1, -1), (0.5, 0.5)])
+def test_range_without_extent_is_refused(lower: float, upper: float, tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace('lower="-1" upper="1"', f'lower="{lower}" upper="{upper}"', 1))
+    with pytest.raises(UsageError, match=f"joint 'ja': lower limit {lower:g} must be below upper limit {upper:g}"):
+        load_scene(path)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -166,6 +180,16 @@ def test_model_without_a_joint_is_refused(name: str, text: str, tmp_path: Path) 
     (tmp_path / name).write_text(text)
     with pytest.raises(UsageError, match="the model has no joint"):
         load_scene(tmp_path / name)
+
+
+def test_file_that_is_no_scene_is_refused_with_the_valid_suffixes(tmp_path: Path) -> None:
+    xacro = robot(tmp_path / "arm.urdf.xacro")
+    with pytest.raises(UsageError, match=r"a scene is a \.toml file, .*; run xacro and load its output"):
+        load_scene(xacro)
+    scene = tmp_path / "s.toml"
+    scene.write_text('format = 1\nmodel = "arm.urdf.xacro"\nstep = 1e-3\n')
+    with pytest.raises(UsageError, match=r": arm.urdf.xacro must have the suffix \.xml \(MJCF\) or \.urdf"):
+        load_scene(scene)
 
 
 def test_model_file_is_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
