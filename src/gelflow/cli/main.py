@@ -6,6 +6,7 @@ requested one is imported, so that `gelflow --help` loads neither torch nor Open
 
 import argparse
 import contextlib
+import errno
 import importlib
 import os
 import sys
@@ -43,6 +44,8 @@ COMMANDS = {
     "soak": "insert parts with the mock robot under random faults, and count violated rules",
     "demo": "insert five parts with the mock robot, with pictures and a recorded session",
 }
+
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 # Commands whose modules are in a folder of gelflow.cli.commands.
 _FOLDERS = {
@@ -89,6 +92,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Notes are later errors and hints; the error stays one line.
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         print(f"gelflow {args.command}: {text}", file=sys.stderr)
+        return ERROR
+    except OSError as error:
+        if error.errno not in _DISK_FULL:
+            raise
+        name = "" if error.filename is None else f" {error.filename}"
+        print(f"gelflow {args.command}: cannot write{name}: {error.strerror}", file=sys.stderr)
         return ERROR
     except Interrupted as interrupt:
         with contextlib.suppress(OSError):  # after SIGHUP the terminal is gone
