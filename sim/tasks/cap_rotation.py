@@ -173,6 +173,8 @@ class CapRotation(ControlTask):
         center = option_rows("center", options["center"], which, (2,)) if "center" in options else center
         radius = option_rows("radius", options["radius"], which) if "radius" in options else drawn["radius"]
         damping = option_rows("damping", options["damping"], which) if "damping" in options else drawn["damping"]
+        if (radius <= 0).any() or (damping < 0).any():
+            raise UsageError("reset: radius must be above 0, and damping at least 0")
         drawn |= {"center_x": center[:, 0], "center_y": center[:, 1], "radius": radius, "damping": damping}
         self._record(which, drawn, self.randomization)
         mass = self._density * np.pi * radius**2 * self._thickness

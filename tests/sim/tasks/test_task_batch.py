@@ -137,6 +137,8 @@ def test_bad_input_is_named() -> None:
         batch.step(np.zeros(3), rng)
     with pytest.raises(UsageError, match="actions must be finite, got nan"):
         batch.step(np.full((3, 1), np.nan), rng)
+    with pytest.raises(UsageError, match="line: reset the environments before their first step"):
+        batch.step(np.zeros((3, 1)), rng)
     with pytest.raises(UsageError, match=r"must be \(3,\) bool, got \(2,\) bool"):
         batch.reset(np.ones(2, dtype=bool), rng)
     with pytest.raises(UsageError, match="line: reset has no option 'y'; there are 'x': start"):
