@@ -118,6 +118,19 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     assert "no randomization 'fall'" in capsys.readouterr().err
 
 
+def test_an_evaluation_has_the_randomization_of_the_training_or_the_given_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--steps", "8", "--envs", "2", "--preset", "fast", "--randomization", "full", "--out", str(tmp_path)]
+    assert main(["train", "grasp", *options]) == 0
+    arguments = ["--checkpoint", str(tmp_path / "policy.safetensors"), "--episodes", "8", "--envs", "8", "--json"]
+    for given, has_pad in (([], True), (["--randomization", "default"], False)):
+        capsys.readouterr()
+        assert main(["eval", "grasp", *arguments, *given]) == 0
+        quantities = {row["quantity"] for row in json.loads(capsys.readouterr().out)["failures"]}
+        assert "mass" in quantities and ("pad_kn" in quantities) == has_pad
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -10,6 +10,7 @@ from rich.table import Table
 from gelflow.cli.commands.training.task_training import TASKS, refuse, task_options
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
+    DEFAULT_RANDOMIZATION,
     add_checkpoint,
     add_json,
     add_out,
@@ -34,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=list(TASKS), help="task of the policy")
     add_part(parser)
-    add_randomization(parser)
+    add_randomization(parser, default=None, text="of the training; of the insertion: default")
     add_checkpoint(parser, default="the included insertion policy")
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
@@ -87,7 +88,7 @@ def _insertion(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
     network = load_policy(path, task=task).network
     from gelflow.sim.tasks.registry import make_task
 
-    options = {"preset": args.preset, "randomization": args.randomization}
+    options = {"preset": args.preset, "randomization": args.randomization or DEFAULT_RANDOMIZATION}
     return path, network, make_task("insertion", min(args.envs, args.episodes), task=task, **options)
 
 
@@ -100,6 +101,8 @@ def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
 
     training = load_checkpoint(args.checkpoint).training
     options = {**training.get("options", {}), **task_options(args)}
+    if args.randomization is not None:  # "default" too
+        options["randomization"] = args.randomization
     recipe = recipes.recipe_for(args.task, training.get("recipe", recipes.DEFAULT))
     batch = recipe.make_task(min(args.envs, args.episodes), **options)
     return args.checkpoint, load_network(args.checkpoint, task=batch.description), batch
