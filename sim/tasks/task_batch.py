@@ -112,9 +112,10 @@ class TaskBatch(ABC):
             if not ended.any():
                 return
             self._reset(ended, rng, {})
+        succeeded = int((ended & self.info["success"]).sum())
         raise SimulationError(
-            f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode succeeded or failed "
-            "at once"
+            f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode ended at once; in "
+            f"the last round {succeeded} succeeded and {int(ended.sum()) - succeeded} failed"
         )
 
     def step(self, actions: ArrayLike, rng: np.random.Generator, *, active: ArrayLike | None = None) -> None:

@@ -115,7 +115,7 @@ def test_episodes_that_end_at_once_are_drawn_again_unless_kept() -> None:
     np.testing.assert_array_equal(batch.terminated, batch.info["success"])
     batch.reset(batch.all, rng, options={"x": 0.1})
     assert batch.terminated.all()
-    with pytest.raises(SimulationError, match="line: no valid start in 100 rounds"):
+    with pytest.raises(SimulationError, match=r"line: no valid start in 100 rounds: .* 2 succeeded and 0 failed"):
         Line(2, tolerance=2.0).reset(np.ones(2, dtype=bool), rng)
 
 
