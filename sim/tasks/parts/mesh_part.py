@@ -80,7 +80,7 @@ def _samples(mesh: TriangleMesh) -> Array:
 def _turned(points: Array, parts: int) -> Array:
     """Points after 1/parts of a turn about z."""
     cos, sin = np.cos(2 * np.pi / parts), np.sin(2 * np.pi / parts)
-    return points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    return np.asarray(points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
 
 
 def _largest_distance(mesh: TriangleMesh, points: Array, name: str) -> float:
