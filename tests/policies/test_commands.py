@@ -1,15 +1,19 @@
 """The commands `gelflow train` and `gelflow eval`, and the shipped policy in simulation."""
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from gelflow.cli.commands.training.eval import result_table
 from gelflow.cli.main import main
 from gelflow.cli.options import checkpoint_for
 from gelflow.errors import UsageError
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
 from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.recipes import recipe_for
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.insertion_environments import Insertion
@@ -121,6 +125,15 @@ def test_an_invalid_option_gives_a_message_of_one_line(
     assert main(arguments) == 2
     error = capsys.readouterr().err.strip()
     assert message in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error
+
+
+def test_the_table_of_an_evaluation_cuts_no_number_in_a_terminal_of_60_columns() -> None:
+    metrics = {"position error [mm]": 176.83, "yaw error [°]": 49.12}
+    result = EvaluationResult("policy", 200, 0, float("nan"), -1343.64, "steps", metrics)
+    console = Console(width=60, record=True, file=io.StringIO())
+    console.print(result_table([result], "pushing", Path("policy.safetensors"), 200))
+    text = console.export_text()
+    assert all(number in text.split() for number in ("0.0%", "-1343.6", "176.83", "49.12"))
 
 
 def test_a_checkpoint_of_another_task_or_part_is_refused_in_few_words(

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
             {"task": args.task, "checkpoint": path, "results": rows, "failures": failures, "files": report.files}
         )
         return SUCCESS
-    output.console.print(_table(report.results, args.task, path, args.episodes))
+    output.console.print(result_table(report.results, args.task, path, args.episodes))
     for line in report.worst_ranges():
         output.text(line)
     for file in report.files:
@@ -108,14 +109,24 @@ def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
     return args.checkpoint, load_network(args.checkpoint, task=batch.description), batch
 
 
-def _table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
+def result_table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
+    """The results as a table, one row each; `episodes` is their number, `path` the checkpoint."""
     unit = results[0].length_unit
-    table = Table(title=f"{task} in simulation: {episodes} episodes, {path.name}")
-    for heading in ("actions", "success", "95 % interval", unit, "return", *results[0].metrics):
-        table.add_column(escape(heading), justify="left" if heading == "actions" else "right")
-    for result in results:
-        low, high = result.confidence_interval()
-        length = f"{result.length:.2f}" if result.successes else "none"
-        row = (f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", length, f"{result.reward:.1f}")
-        table.add_row(result.name, *row, *(f"{value:.2f}" for value in result.metrics.values()))
+    title = f"{task} in simulation: {episodes} episodes, {path.name}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    headings = ("actions", "success", "95 % interval", unit, "return", *results[0].metrics)
+    rows = [_cells(result) for result in results]
+    for column, heading in enumerate(headings):
+        word = max(len(text) for row in rows for text in row[column].split())  # numbers are never cut off
+        table.add_column(escape(heading), justify="left" if column == 0 else "right", min_width=word)
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _cells(result: "EvaluationResult") -> list[str]:
+    low, high = result.confidence_interval()
+    length = f"{result.length:.2f}" if result.successes else "none"
+    metrics = [f"{value:.2f}" for value in result.metrics.values()]
+    interval = f"{low:.1%} to {high:.1%}"
+    return [result.name, f"{result.success:.1%}", interval, length, f"{result.reward:.1f}", *metrics]

@@ -1,6 +1,7 @@
 """`gelflow train` for the tasks that recipes train; the insertion has options and an output of its own."""
 
 import argparse
+import math
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,7 +51,8 @@ def train_task(args: argparse.Namespace) -> int:
         bar = progress.add_task("training", total=steps)
 
         def report(point: "Progress") -> None:
-            numbers = "  ".join(f"{name} {value:.3g}" for name, value in list(point.numbers.items())[:2])
+            first = [(name, value) for name, value in list(point.numbers.items())[:2] if math.isfinite(value)]
+            numbers = "  ".join(f"{name} {value:.3g}" for name, value in first)
             progress.update(bar, completed=point.steps, description=numbers)
             if point.evaluation is not None:
                 progress.console.print(

@@ -1,6 +1,7 @@
 """`gelflow train TASK`: train a policy in simulation; the insertion by imitation of the true pose or with PPO."""
 
 import argparse
+import math
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,7 +143,8 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     bar = progress.add_task("training", total=attempts)
 
     def report(point: "RunProgress") -> None:
-        text = f"reward {point.numbers['reward']:6.2f}  inserted {point.numbers['success']:4.0%}"
+        reward, success = point.numbers["reward"], point.numbers["success"]
+        text = f"reward {reward:6.2f}" + (f"  inserted {success:4.0%}" if math.isfinite(success) else "")
         progress.update(bar, completed=point.steps, description=text)
         if evaluation := point.evaluation:
             progress.console.print(
