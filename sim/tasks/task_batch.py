@@ -122,9 +122,9 @@ class TaskBatch(ABC):
         """One attempt or one control period with `actions` (N, k), which are clipped to ±1.
 
         Environments that are not `active` (N,) keep their state and results, and cost nothing; None steps all. Raises
-        UsageError when an action has the wrong shape or is not finite, and before the first `reset`.
+        UsageError when an action has the wrong shape or is no finite number, and before the first `reset`.
         """
-        wanted = np.asarray(actions, dtype=float)
+        wanted = number_array("actions", actions, float)
         shape = (self.num_envs, *self.action_space.shape)
         if wanted.shape != shape:
             raise UsageError(f"actions must have shape {shape}, got {wanted.shape}")

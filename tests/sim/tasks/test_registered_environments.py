@@ -1,5 +1,6 @@
 """Every registered environment: Gymnasium's checker, and results that are determined by the seed bit for bit."""
 
+import copy
 import pickle
 import warnings
 from typing import Any
@@ -49,6 +50,22 @@ def test_a_changed_table_is_kept_in_the_specification_of_the_environment(name: s
     assert env.spec is not None and env.spec.kwargs["randomization"]["noise"] == table["noise"]
     sampled = table.drawn_from({"noise": [1e-5, 1e-4]})
     assert pickle.loads(pickle.dumps(sampled)).samples["noise"].tolist() == [1e-5, 1e-4]
+
+
+@ids
+def test_a_copy_continues_as_the_environment_does(name: str) -> None:
+    env = gymnasium.make(name, randomization="full", threads=1, preset="fast")
+    env.reset(seed=4)
+    env.action_space.seed(0)
+    env.step(env.action_space.sample())
+    others = [copy.deepcopy(env.unwrapped), pickle.loads(pickle.dumps(env.unwrapped))]
+    for _ in range(3):
+        action = env.action_space.sample()
+        observation, reward, *_ = env.unwrapped.step(action)
+        for other in others:
+            observed = other.step(action)
+            np.testing.assert_array_equal(observed[0], observation)
+            assert observed[1] == reward
 
 
 @pytest.mark.parametrize(

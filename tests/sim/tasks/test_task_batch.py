@@ -135,6 +135,8 @@ def test_bad_input_is_named() -> None:
     batch, rng = Line(3), np.random.default_rng(0)
     with pytest.raises(UsageError, match=r"actions must have shape \(3, 1\), got \(3,\)"):
         batch.step(np.zeros(3), rng)
+    with pytest.raises(UsageError, match="actions must be numeric"):
+        TaskEnv(Line(1)).step("left")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="actions must be finite, got nan"):
         batch.step(np.full((3, 1), np.nan), rng)
     with pytest.raises(UsageError, match="line: reset the environments before their first step"):
