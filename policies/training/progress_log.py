@@ -1,12 +1,14 @@
 """The progress of a training run as a CSV table and as TensorBoard logs, both continued by a resumed run."""
 
 import csv
+import io
 import math
 import time
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gelflow.policies.checkpoint import replace_file
 from gelflow.policies.evaluation import EvaluationResult
 
 TABLE, LOGS = "progress.csv", "tensorboard"
@@ -20,11 +22,13 @@ class ProgressLog:
     def __init__(self, folder: Path, columns: Sequence[str], steps: int) -> None:
         self._columns = (*_TIMES, *columns, *EVALUATION)
         kept = [row for row in read_table(folder / TABLE) if float(row["steps"]) <= steps] if steps else []
-        self._file = (folder / TABLE).open("w", newline="")
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, self._columns)
+        writer.writeheader()
+        writer.writerows(kept)
+        replace_file(folder / TABLE, table.getvalue().encode())  # as a whole: a full disk must not empty the table
+        self._file = (folder / TABLE).open("a", newline="")
         self._writer = csv.DictWriter(self._file, self._columns, restval="")
-        self._writer.writeheader()
-        self._writer.writerows(kept)
-        self._file.flush()
         self._board = _tensorboard(folder / LOGS, steps)
 
     def add(

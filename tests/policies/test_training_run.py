@@ -135,6 +135,20 @@ def test_a_full_disk_ends_a_run_whose_logs_cannot_be_written(tmp_path: Path, mon
         run.train()
 
 
+def test_a_full_disk_does_not_empty_the_table_of_a_resumed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Killed):
+        make_run(tmp_path, report=killed_after(1100)).train()
+    before = read_table(tmp_path / "progress.csv")
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched, pytest.raises(OSError, match="No space left"):
+        patched.setattr("os.fsync", full)
+        make_run(tmp_path).train()
+    assert read_table(tmp_path / "progress.csv") == before and len(before) >= 4
+
+
 def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
     make_run(tmp_path / "done", settings=RunSettings(steps=256, evaluate_episodes=4)).train()
     with pytest.raises(UsageError, match="already holds a trained policy"):
