@@ -150,6 +150,17 @@ def test_a_closed_pipe_ends_the_command_silently(form: list[str]) -> None:
     assert command.wait() == 1
 
 
+def test_an_interrupt_during_the_imports_is_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gelflow.cli.main.command_module", interrupted)
+    assert main(["train", "grasp"]) == 130
+    assert capsys.readouterr().err == "gelflow train: interrupted\n"
+
+
 def test_a_full_disk_is_an_error_of_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

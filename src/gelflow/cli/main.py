@@ -68,7 +68,16 @@ def _one_line(message: Warning | str, *_: object, **__: object) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    requested = next((a for a in arguments if not a.startswith("-")), None)
+    requested = next((a for a in arguments if not a.startswith("-")), "")
+    try:
+        return _run(arguments, requested)
+    except KeyboardInterrupt:  # also during the imports of a command
+        print(f"gelflow {requested}".rstrip() + ": interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(arguments: Sequence[str], requested: str) -> int:
+    """Run the sub-command `requested` and print any gelflow error as one line."""
     parser = argparse.ArgumentParser(prog="gelflow", description="Sim-to-real for tactile manipulation.")
     parser.add_argument("--version", action="version", version=f"gelflow {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -103,6 +112,3 @@ def main(argv: Sequence[str] | None = None) -> int:
         with contextlib.suppress(OSError):  # after SIGHUP the terminal is gone
             print(f"gelflow {args.command}: ended by {interrupt}", file=sys.stderr)
         return SIGNALLED + interrupt.number
-    except KeyboardInterrupt:
-        print(f"gelflow {args.command}: interrupted", file=sys.stderr)
-        return INTERRUPTED
