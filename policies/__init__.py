@@ -1,4 +1,4 @@
-"""Insertion policies: networks, PPO training, checkpoints and evaluation."""
+"""Policies: networks, training, checkpoints and evaluation."""
 
 import lazy_loader as _lazy
 

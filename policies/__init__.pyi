@@ -1,6 +1,7 @@
 from .checkpoint import Checkpoint as Checkpoint
 from .checkpoint import default_checkpoint as default_checkpoint
 from .checkpoint import load_checkpoint as load_checkpoint
+from .checkpoint import load_network as load_network
 from .checkpoint import load_policy as load_policy
 from .checkpoint import save_checkpoint as save_checkpoint
 from .checkpoint import shipped_checkpoints as shipped_checkpoints
@@ -18,6 +19,7 @@ from .networks.polynomial_gru import PolynomialGRUNetwork as PolynomialGRUNetwor
 from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
 from .networks.polynomial_mlp import PolynomialNetwork as PolynomialNetwork
 from .ppo import PPOSettings as PPOSettings
+from .recipes import recipe_for as recipe_for
 from .recipes import train as train
 from .training.run import Progress as Progress
 from .training.run import TrainingResult as TrainingResult
@@ -42,7 +44,9 @@ __all__ = [
     "default_checkpoint",
     "evaluate_task",
     "load_checkpoint",
+    "load_network",
     "load_policy",
+    "recipe_for",
     "save_checkpoint",
     "shipped_checkpoints",
     "train",

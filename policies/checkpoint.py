@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -147,14 +147,29 @@ def load_network(path: str | Path, *, task: TaskDescription) -> Network:
 
 
 def task_differences(trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """The fields in which two task descriptions differ, with both values; empty if they are equal."""
-    absent = "absent"
-    names = [*wanted, *(name for name in trained if name not in wanted)]
-    pairs = [(name, trained.get(name, absent), wanted.get(name, absent)) for name in names]
-    return ", ".join(f"{name} {_short(old)} (here {_short(new)})" for name, old, new in pairs if old != new)
+    """The fields in which two task descriptions differ, with both values; empty if they are equal.
+
+    Fields of descriptions within them, such as that of the part, are compared one by one. Only the names of the tasks
+    are given where these differ.
+    """
+    for name in ("name", "task.name"):
+        if name in trained and trained[name] != wanted.get(name):
+            trained, wanted = ({name: given.get(name)} for given in (trained, wanted))
+    return ", ".join(_differences(trained, wanted))
+
+
+def _differences(trained: Mapping[str, Any], wanted: Mapping[str, Any]) -> Iterator[str]:
+    for name in [*wanted, *(name for name in trained if name not in wanted)]:
+        old, new = trained.get(name, "absent"), wanted.get(name, "absent")
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from (f"{name}.{text}" for text in _differences(old, new))
+        elif old != new:
+            yield f"{name} {_short(old)} (here {_short(new)})"
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, Mapping) and "name" in value:
+        return repr(value["name"])
     return f"{len(value)} values" if isinstance(value, list) and len(value) > _SHOWN else repr(value)
 
 
@@ -163,7 +178,7 @@ def _read(path: Path) -> bytes:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except FileNotFoundError as error:
-        raise UsageError(f"no checkpoint at {path}; create one with: gelflow train insertion --out DIR") from error
+        raise UsageError(f"no checkpoint at {path}; create one with: gelflow train") from error
     except OSError as error:
         raise UsageError(f"cannot read checkpoint {path}: {error.strerror}") from error
     if len(data) > MAX_BYTES:

@@ -5,6 +5,7 @@ are `action` (n, k) in ±1 of the task's environments and `next_memory`. The num
 """
 
 import json
+import logging
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gelflow.errors import UsageError
-from gelflow.policies.checkpoint import Checkpoint, load_checkpoint
+from gelflow.policies.checkpoint import Checkpoint, load_checkpoint, replace_file
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.base import Architecture
 from gelflow.policies.networks.mirror_symmetry import reflections
@@ -25,6 +26,7 @@ from gelflow.policies.networks.torch_actor import TorchActor
 from gelflow.task import InsertionTask
 
 _EXAMPLES = 2  # environments of the example from which the model is traced; any number but 1, which would stay fixed
+_SUFFIX = ".onnx"
 METADATA = "gelflow"  # key of the metadata: task, architecture, versions and digest of the checkpoint
 
 
@@ -110,8 +112,12 @@ def export(checkpoint: Path, out: Path) -> None:
     """Writes the policy of a checkpoint as an ONNX model.
 
     Raises UsageError when the checkpoint cannot be read, its network has no export, the packages of the extra "onnx"
-    are not installed, or the file cannot be written.
+    are not installed, `out` has another suffix than .onnx or is the checkpoint, or the file cannot be written.
     """
+    if out.suffix.lower() != _SUFFIX:
+        raise UsageError(f"{out}: the suffix of the model must be {_SUFFIX}")
+    if out.exists() and checkpoint.exists() and out.samefile(checkpoint):
+        raise UsageError(f"{out} is the checkpoint; give the model another name")
     read = load_checkpoint(checkpoint)
     step = step_module(read.architecture, read)
     onnx = _onnx()
@@ -123,6 +129,7 @@ def export(checkpoint: Path, out: Path) -> None:
     else:
         step = _Memoryless(step)
     count = torch.export.Dim("n", min=1)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of packages that no policy needs
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter, about its own parts
         program: Any = torch.onnx.export(
@@ -139,7 +146,7 @@ def export(checkpoint: Path, out: Path) -> None:
     onnx.helper.set_model_props(model, {METADATA: json.dumps({**header, "versions": dict(read.versions)})})
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        onnx.save_model(model, str(out))
+        replace_file(out, model.SerializeToString())
     except OSError as error:
         raise UsageError(f"cannot write {out}: {error.strerror}") from error
 

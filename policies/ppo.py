@@ -102,6 +102,8 @@ class PPO(Learner):
         self._starts = torch.ones(n, dtype=torch.bool)
         self._actor_memory, self._critic_memory = self._actor.initial_memory(n), self._critic.initial_memory(n)
         self._return[:] = 0
+        self._in_first = np.ones(n, dtype=bool)  # environments whose first episode since then goes on
+        self._successes: list[bool] = []  # of the episodes that ended since then and are in no row yet
 
     def update(self) -> dict[str, float]:
         """Collects one rollout and learns from it."""
@@ -132,7 +134,6 @@ class PPO(Learner):
         task, s = self.task, self._settings
         rows: list[tuple[Tensor, ...]] = []
         rewards, final_values, mean_rewards = [], [], []
-        successes: list[bool] = []
         memories = self._actor_memory, self._critic_memory
         deviation = self._log_deviation.exp()
         for _ in range(s.rollout):
@@ -144,7 +145,8 @@ class PPO(Learner):
             task.step(action.clamp(-1, 1).numpy(), self._rng)
             done = task.terminated | task.truncated
             mean_rewards.append(task.reward.mean())
-            successes.extend(task.info["success"][done])
+            self._successes.extend(task.info["success"][done])
+            self._in_first &= ~done
             rewards.append(self._scaled_reward(done))
             final_values.append(self._value_after_truncation())
             self._begin(done)
@@ -156,10 +158,21 @@ class PPO(Learner):
         advantages = _advantages(torch.stack(rewards), columns[5], next_values, ends, s)
         numbers = {
             "reward": float(np.mean(mean_rewards)),
-            "success": float(np.mean(successes)) if successes else float("nan"),
+            "success": self._success_rate(),
             "deviation": float(deviation.mean()),
         }
         return Rollout(*columns, advantages, *memories), numbers  # type: ignore[call-arg]
+
+    def _success_rate(self) -> float:
+        """Success rate of the episodes that ended since the last rate; nan while a first episode goes on.
+
+        After a restart all episodes start together, so the first ones to end are the short ones: their rate is biased.
+        """
+        if self._in_first.any() or not self._successes:
+            return float("nan")
+        rate = float(np.mean(self._successes))
+        self._successes.clear()
+        return rate
 
     def _value_after_truncation(self) -> Tensor:
         """Values (N,) of the last observations: a truncated episode would have continued, other ends have value 0."""

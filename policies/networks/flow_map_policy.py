@@ -70,8 +70,14 @@ class NetworkPolicy:
     def act(self, observation: FlowMap) -> Array:
         """The correction (dx [m], dy [m], dyaw [rad]) in the gripper frame; deterministic.
 
-        Raises UsageError when the flow map does not have the shape of the task or has values that are not finite.
+        Raises UsageError when the observation is no flow map, does not have the shape of the task, or has values that
+        are not finite.
         """
+        if not isinstance(observation, FlowMap):
+            raise UsageError(
+                f"the policy takes a FlowMap, got {type(observation).__name__}; for observations of environments use "
+                "load_network(…).batch_policy(n)"
+            )
         image, shape = observation.image, self.network.task.observation_shape
         if image.shape != shape:
             raise UsageError(f"flow map has shape {image.shape}; the policy takes {shape}")

@@ -84,6 +84,7 @@ def evaluate_all(
     report.failures = failure_ranges(own)
     if out is None:
         return report
+    _remove_files(out)
     report.files += _write_tables(out, own, report)
     started("films of a success and a failure")
     report.files += _write_films(out, own, network, task, seed=seed)
@@ -118,6 +119,13 @@ def has_oracle(task: TaskBatch) -> bool:
     except UsageError:
         return False
     return True
+
+
+def _remove_files(out: Path) -> None:
+    """Removes the files of an earlier report; the new one need not have a failure, or a success."""
+    films = (f"{name}.{suffix}" for name in ("success", "failure") for suffix in ("gif", "png"))
+    for name in (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE, *films):
+        (out / name).unlink(missing_ok=True)
 
 
 def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:

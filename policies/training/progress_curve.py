@@ -33,7 +33,8 @@ def figure_of(table: Path, *, title: str) -> Any:
     figure = Figure(figsize=(8, 6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True)
     if "success" in curve:
-        top.plot(steps, 100 * curve["success"], "--", color="0.45", label="training, with exploration")
+        rated = np.isfinite(curve["success"])  # the line goes on over rows without a rate
+        top.plot(steps[rated], 100 * curve["success"][rated], "--", color="0.45", label="training, with exploration")
     done = np.isfinite(curve["evaluated_success"])
     x, success = steps[done], 100 * curve["evaluated_success"][done]
     top.plot(x, success, "o-", color=BLUE, label="evaluation, 95 % confidence interval")

@@ -31,6 +31,7 @@ from gelflow.sim.tasks.task_batch import TaskBatch
 
 FORMAT = 1
 BEST_BY = ("success", "return")
+_LARGEST_SEED = 2**64 - 1  # of the generators of torch
 POLICY, STATE, CONFIGURATION = "policy.safetensors", "state.safetensors", "run.json"
 PROGRESS, PICTURE, TENSORBOARD = "progress.csv", "learning_curve.png", "tensorboard"
 
@@ -47,8 +48,11 @@ class RunSettings:
     best_by: str = "success"  # of the evaluations: "success", then return, or "return" alone
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.evaluate_every < 1 or self.evaluate_episodes < 1 or not self.minutes > 0:
-            raise UsageError(f"training requires steps, minutes and evaluations above 0, got {self}")
+        for name in ("steps", "minutes", "evaluate_every", "evaluate_episodes"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} of a training must be above 0, got {getattr(self, name)}")
+        if not 0 <= self.seed <= _LARGEST_SEED:
+            raise UsageError(f"the seed of a training must be 0 to 2^64 - 1, got {self.seed}")
         if self.best_by not in BEST_BY:
             raise UsageError(f"best_by must be one of {', '.join(BEST_BY)}, got {self.best_by!r}")
 

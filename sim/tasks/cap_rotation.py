@@ -145,6 +145,14 @@ class CapRotation(ControlTask):
         }
         self.metrics = {"largest rate [rad/s]": np.zeros(num_envs), "turned without touch [°]": np.zeros(num_envs)}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and pickles: all but the reduction of the core, which follows from the scene."""
+        return {name: value for name, value in vars(self).items() if name != "_reduction"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._reduction = _fingertip_rows(self.scene)
+
     def _find_indices(self) -> None:
         """Indices, limits and sizes of the scene's elements."""
         scene = self.scene
@@ -173,6 +181,8 @@ class CapRotation(ControlTask):
         center = option_rows("center", options["center"], which, (2,)) if "center" in options else center
         radius = option_rows("radius", options["radius"], which) if "radius" in options else drawn["radius"]
         damping = option_rows("damping", options["damping"], which) if "damping" in options else drawn["damping"]
+        if (radius <= 0).any() or (damping < 0).any():
+            raise UsageError("reset: radius must be above 0, and damping at least 0")
         drawn |= {"center_x": center[:, 0], "center_y": center[:, 1], "radius": radius, "damping": damping}
         self._record(which, drawn, self.randomization)
         mass = self._density * np.pi * radius**2 * self._thickness

@@ -21,7 +21,14 @@ from gelflow.sim.tasks.gripper.bar import BLOCK, SCENE_BLOCKS, Bar, with_load
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PADS, PAD_QUANTITIES, PADS, pad_parameters
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization, Uniform
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES, SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, check_options, option_rows
+from gelflow.sim.tasks.task_batch import (
+    Array,
+    Mask,
+    SceneOptions,
+    check_options,
+    check_scene_options,
+    option_rows,
+)
 from gelflow.sim.trajectory import Trajectory
 from gelflow.task import TaskDescription
 
@@ -127,6 +134,7 @@ class Grasp(AttemptTask):
             privileged=2,
             attempts=task.attempts,
         )
+        check_scene_options(self, options)
         self.randomization = randomization
         self.bar = Bar(blocks)
         self.scene = _scene(task, options, moving_load)

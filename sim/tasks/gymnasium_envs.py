@@ -65,7 +65,7 @@ class TaskEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step with `action` in ±1."""
         batch = self.batch
-        batch.step(np.asarray(action, dtype=float)[None], self.np_random)
+        batch.step(np.asarray(action)[None], self.np_random)
         ended = bool(batch.terminated[0]), bool(batch.truncated[0])
         return batch.observation[0].copy(), float(batch.reward[0]), *ended, self._info()
 

@@ -115,6 +115,9 @@ class Insertion(AttemptTask):
         check_options(self.description.name, options, _RESET_OPTIONS)
         given = options.get("misalignment")
         misalignment = None if given is None else option_rows("misalignment", given, which, (3,))
+        limits = np.asarray(self.description.workspace)
+        if misalignment is not None and (np.abs(misalignment) > limits + 1e-9).any():
+            raise UsageError(f"reset: misalignment must be within the workspace ±{limits.tolist()} [m, m, rad]")
         self.attempts.draw(rng, which=which, misalignment=misalignment)
         start = dict(zip(("x", "y", "yaw"), self.attempts.pose[which].T, strict=True))
         if self._noise is not None:

@@ -252,6 +252,8 @@ class Pushing(ControlTask):
         }
         for name, given in options.items():
             values[name] = option_rows(name, given, which, values[name].shape[1:])
+        if (values["half_size"] <= 0).any() or (values["mass"] <= 0).any():
+            raise UsageError("reset: half_size and mass must be above 0")
         drawn |= dict(zip(_START_UNITS, (*values["goal"].T, values["offset"]), strict=True))
         drawn |= dict(
             zip(("half_size_x", "half_size_y", "mass"), (*values["half_size"].T, values["mass"]), strict=True)

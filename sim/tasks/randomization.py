@@ -121,6 +121,10 @@ class Randomization:
         object.__setattr__(self, "quantities", MappingProxyType(dict(self.quantities)))
         object.__setattr__(self, "samples", MappingProxyType(self._checked(self.samples)))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For copies and pickles, as Gymnasium makes of the arguments of an environment."""
+        return Randomization, (dict(self.quantities), dict(self.samples))
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.quantities)
 

@@ -1,11 +1,12 @@
 """The tasks of gelflow by name: the environments, trainings and evaluations of a task start from its name."""
 
 import importlib
+import inspect
 from types import ModuleType
 from typing import Any
 
 from gelflow.errors import UsageError
-from gelflow.sim.arguments import shown
+from gelflow.sim.arguments import check_type, shown
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.task import INSERTION, InsertionTask, TaskDescription
@@ -42,12 +43,18 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
     name, an invalid range and invalid samples.
     """
     batch_class = getattr(_module(name), _TASKS[name][1])
+    description = inspect.signature(batch_class).parameters["task"].default
+    check_type("task", options.get("task", description), type(description), f"of type {type(description).__name__}")
     if isinstance(table := options.get("randomization"), str):
         options["randomization"] = _named_randomization(name, table, options.get("task"))
     ranges, samples = options.pop("ranges", None) or {}, options.pop("samples", None) or {}
     if ranges or samples:
         table = options.get("randomization") or _named_randomization(name, "default", options.get("task"))
         options["randomization"] = table.replace(**ranges).drawn_from(samples)
+    if options.get("randomization") is None:
+        options.pop("randomization", None)
+    else:
+        check_type("randomization", options["randomization"], Randomization, "the name of a table or a Randomization")
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch

@@ -1,5 +1,6 @@
 """A batch of environments of one task, stepped together; base of the attempt tasks and the control tasks."""
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypedDict
@@ -9,9 +10,10 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.sim.arguments import integer
+from gelflow.sim.arguments import integer, number_array
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import TaskDescription
+from gelflow.toml_tables import suggestion
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,6 +78,7 @@ class TaskBatch(ABC):
             "failed": np.zeros(num_envs, dtype=bool),
             "privileged": np.zeros((num_envs, privileged)),
         }
+        self._started: Mask = np.zeros(num_envs, dtype=bool)  # environments with a first reset
         self.quantities: dict[str, Array] = {}
         self.quantity_units: dict[str, str] = {}
         self.metrics: dict[str, Array] = {}
@@ -101,6 +104,7 @@ class TaskBatch(ABC):
         """
         rows = self._mask(which)
         self._reset(rows, rng, options or {})
+        self._started |= rows
         if options or keep_ended:
             return
         for _ in range(_MAX_RESET_ROUNDS):
@@ -108,24 +112,28 @@ class TaskBatch(ABC):
             if not ended.any():
                 return
             self._reset(ended, rng, {})
+        succeeded = int((ended & self.info["success"]).sum())
         raise SimulationError(
-            f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode succeeded or failed "
-            "at once"
+            f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode ended at once; in "
+            f"the last round {succeeded} succeeded and {int(ended.sum()) - succeeded} failed"
         )
 
     def step(self, actions: ArrayLike, rng: np.random.Generator, *, active: ArrayLike | None = None) -> None:
         """One attempt or one control period with `actions` (N, k), which are clipped to ±1.
 
         Environments that are not `active` (N,) keep their state and results, and cost nothing; None steps all. Raises
-        UsageError when an action has the wrong shape or is not finite.
+        UsageError when an action has the wrong shape or is no finite number, and before the first `reset`.
         """
-        wanted = np.asarray(actions, dtype=float)
+        wanted = number_array("actions", actions, float)
         shape = (self.num_envs, *self.action_space.shape)
         if wanted.shape != shape:
             raise UsageError(f"actions must have shape {shape}, got {wanted.shape}")
         if not np.isfinite(wanted).all():
             raise UsageError(f"actions must be finite, got {wanted[~np.isfinite(wanted)][0]}")
-        self._step(np.clip(wanted, -1, 1), rng, self.all if active is None else self._mask(active))
+        rows = self.all if active is None else self._mask(active)
+        if not self._started[rows].all():
+            raise UsageError(f"{self.description.name}: reset the environments before their first step")
+        self._step(np.clip(wanted, -1, 1), rng, rows)
 
     def _record(self, which: Mask, drawn: Mapping[str, Array], table: Randomization, **units: str) -> None:
         """Keep quantities (n,) of new episodes in `which` for reports; `units` are those that `table` does not have."""
@@ -156,6 +164,15 @@ class TaskBatch(ABC):
         return mask
 
 
+def check_scene_options(batch: TaskBatch, options: Mapping[str, Any]) -> None:
+    """Raises UsageError for a name in `options`, the `SceneOptions` of a batch, that is not one of them."""
+    parameters = inspect.signature(type(batch)).parameters.values()
+    valid = {given.name for given in parameters if given.default is not given.empty} | {*SceneOptions.__annotations__}
+    for name in options:
+        if name not in SceneOptions.__annotations__:
+            raise UsageError(f"{batch.description.name} has no option {name!r}; {suggestion(name, valid)}")
+
+
 def check_options(task: str, options: Mapping[str, Any], known: Mapping[str, str]) -> None:
     """Raises UsageError when `options` of `reset` has a key that is not in `known` (name → meaning)."""
     for name in options:
@@ -169,7 +186,7 @@ def option_rows(name: str, value: Any, which: Mask, shape: tuple[int, ...] = ())
 
     `value` is one value of `shape`, or one for each environment of the batch, (N, *shape). Raises UsageError otherwise.
     """
-    given = np.asarray(value, dtype=float)
+    given = number_array(f"reset: {name}", value, float)
     full = (len(which), *shape)
     if given.shape not in (shape, full) or not np.isfinite(given).all():
         raise UsageError(f"reset: {name} must be finite, of shape {shape} or {full}, got {given.tolist()}")

@@ -51,17 +51,14 @@ class Part:
         """Raises UsageError, in one line, for values that no gripper and no hole can have."""
         if self.shape not in SHAPES:
             raise UsageError(f"shape must be one of {', '.join(SHAPES)}, got {self.shape!r}")
-        positive = [*self.size, self.grasp_width, self.density, *self.clearance, self.depth]
-        positive += [self.mesh_scale, self.hole_scale]
-        if not all(0 < value < np.inf for value in positive):
-            raise UsageError(
-                "size, grasp_width, density, clearance, depth, mesh_scale and hole_scale must be above 0, got "
-                f"{list(self.size)}, {self.grasp_width}, {self.density}, {list(self.clearance)}, {self.depth}, "
-                f"{self.mesh_scale}, {self.hole_scale}"
-            )
+        for name in ("size", "grasp_width", "density", "clearance", "depth", "mesh_scale", "hole_scale"):
+            value = getattr(self, name)
+            if not all(0 < v < np.inf for v in (value if isinstance(value, tuple) else (value,))):
+                raise UsageError(f"{name} must be above 0, got {list(value) if isinstance(value, tuple) else value}")
         if self.grasp_width > _FITS_FINGERS:
             raise UsageError(
-                f"grasp_width must be at most {_FITS_FINGERS} m, the gripper's stroke, got {self.grasp_width}"
+                f"the part is {self.grasp_width:g} m wide between the pads (grasp_width), which may be at most "
+                f"{_FITS_FINGERS:g} m, the gripper's stroke; lengths are in metres"
             )
         low, high = self.grasp_height
         if not -self.size[2] / 2 < low <= high < self.size[2] / 2:

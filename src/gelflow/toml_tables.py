@@ -50,7 +50,7 @@ def _has_tables(value: Any) -> bool:
 def suggestion(name: str, valid: Collection[str]) -> str:
     """A hint for an error message about an unknown name: the nearest valid name, or all valid names."""
     close = difflib.get_close_matches(str(name), list(valid), n=1, cutoff=0.6)
-    return f"did you mean {close[0]!r}?" if close else f"valid names: {', '.join(sorted(valid)) or 'none'}"
+    return f"did you mean {close[0]!r}?" if close else f"valid names: {', '.join(sorted(set(valid))) or 'none'}"
 
 
 def set_by_path(tables: dict[str, Any], dotted_key: str, value: Any) -> None:

@@ -1,5 +1,6 @@
 """The `gelflow` command as a whole: help, common options, JSON output, closed pipes."""
 
+import errno
 import json
 import re
 import socket
@@ -147,6 +148,28 @@ def test_a_closed_pipe_ends_the_command_silently(form: list[str]) -> None:
     command.stdout.close()
     assert command.stderr.read() == b""
     assert command.wait() == 1
+
+
+def test_an_interrupt_during_the_imports_is_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gelflow.cli.main.command_module", interrupted)
+    assert main(["train", "grasp"]) == 130
+    assert capsys.readouterr().err == "gelflow train: interrupted\n"
+
+
+def test_a_full_disk_is_an_error_of_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(args: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device", "runs/x")
+
+    monkeypatch.setattr("gelflow.cli.commands.recover.run", full)
+    assert main(["recover", "session.mcap"]) == 2
+    assert capsys.readouterr().err == "gelflow recover: cannot write runs/x: No space left on device\n"
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,19 @@
 """The commands `gelflow train` and `gelflow eval`, and the shipped policy in simulation."""
 
+import io
 import json
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from gelflow.cli.commands.training.eval import result_table
 from gelflow.cli.main import main
 from gelflow.cli.options import checkpoint_for
 from gelflow.errors import UsageError
 from gelflow.policies.checkpoint import default_checkpoint, load_checkpoint, load_policy
 from gelflow.policies.episodes import evaluate_task
+from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.recipes import recipe_for
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.insertion_environments import Insertion
@@ -104,6 +108,8 @@ def test_the_evaluation_of_the_insertion_writes_a_report(tmp_path: Path, capsys:
         (["train", "insertion", "--minutes", "nan"], "above 0"),
         (["train", "insertion", "--seed", "-1"], "--seed"),
         (["train", "insertion", "--algorithm", "ppo", "--attempts", "0"], "above 0"),
+        (["train", "grasp", "--steps", "0"], "--steps must be above 0, got 0"),
+        (["train", "grasp", "--seed", str(2**64), "--envs", "1"], "seed of a training must be 0 to 2^64 - 1"),
         (
             ["train", "insertion", "--start", "nowhere.safetensors", "--out", "OUT"],
             "no checkpoint at nowhere.safetensors",
@@ -119,6 +125,40 @@ def test_an_invalid_option_gives_a_message_of_one_line(
     assert main(arguments) == 2
     error = capsys.readouterr().err.strip()
     assert message in error and error.startswith(f"gelflow {arguments[0]}: ") and "\n" not in error
+
+
+def test_the_table_of_an_evaluation_cuts_no_number_in_a_terminal_of_60_columns() -> None:
+    metrics = {"position error [mm]": 176.83, "yaw error [°]": 49.12}
+    result = EvaluationResult("policy", 200, 0, float("nan"), -1343.64, "steps", metrics)
+    console = Console(width=60, record=True, file=io.StringIO())
+    console.print(result_table([result], "pushing", Path("policy.safetensors"), 200))
+    text = console.export_text()
+    assert all(number in text.split() for number in ("0.0%", "-1343.6", "176.83", "49.12"))
+
+
+def test_a_checkpoint_of_another_task_or_part_is_refused_in_few_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "part.toml"
+    text = (Path(__file__).parents[2] / "sim/tasks/parts/shipped/peg.toml").read_text()
+    part.write_text(text.replace("clearance = 0.001", "clearance = 0.002").replace("[part]", 'name = "a/b"\n[part]'))
+    peg = str(default_checkpoint().with_name("peg.safetensors"))
+    assert main(["eval", "insertion", "--part", str(part), "--checkpoint", peg]) == 2
+    assert (
+        "another task: part.name 'peg' (here 'a/b'), part.clearance [0.001, 0.001] (here [0.002, 0.002]); "
+        in capsys.readouterr().err
+    )
+    assert main(["eval", "cap", "--checkpoint", peg]) == 2
+    assert "another task: name 'insertion' (here 'cap'); " in capsys.readouterr().err
+    assert main(["eval", "insertion", "--part", str(part)]) == 2
+    assert "no policy for part 'a/b'" in capsys.readouterr().err
+
+
+def test_a_training_without_success_has_no_mean_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    limits = ["--envs", "2", "--preset", "fast", "--out", str(tmp_path)]
+    assert main(["train", "cap", "--recipe", "no-touch", "--steps", "8", *limits]) == 0
+    output = capsys.readouterr()
+    assert "success 0.0%" in output.out and "nan" not in output.out + output.err
 
 
 def test_fine_tuning_starts_from_the_shipped_policy(tmp_path: Path) -> None:

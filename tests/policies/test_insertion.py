@@ -86,6 +86,8 @@ def test_an_invalid_flow_map_is_rejected(stored: Path) -> None:
         policy.act(flow(images(1)[0].transpose(0, 2, 1)))
     with pytest.raises(UsageError, match="not finite"):
         policy.act(flow(images(1)[0] * np.nan))
+    with pytest.raises(UsageError, match="takes a FlowMap, got ndarray; for observations of environments use load_net"):
+        policy.act(images(1)[0])
 
 
 def test_a_checkpoint_of_another_task_is_rejected_with_the_differing_fields(stored: Path) -> None:

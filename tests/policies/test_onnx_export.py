@@ -89,6 +89,15 @@ def test_the_command_exports_the_shipped_policy(tmp_path: Path, capsys: pytest.C
     np.testing.assert_allclose(action, policy.act(one[None]), atol=2e-5)
 
 
+def test_a_checkpoint_is_never_overwritten_by_its_model(tmp_path: Path) -> None:
+    for name in ("policy.safetensors", "policy.onnx"):
+        checkpoint = tmp_path / name
+        checkpoint.write_bytes(default_checkpoint().read_bytes())
+        with pytest.raises(UsageError, match=r"must be \.onnx|is the checkpoint"):
+            export(checkpoint, checkpoint)
+        assert checkpoint.read_bytes() == default_checkpoint().read_bytes()
+
+
 def test_what_cannot_be_exported_gives_a_message_of_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

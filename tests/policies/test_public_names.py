@@ -7,7 +7,7 @@ import gelflow.policies as policies
 
 
 def test_every_public_name_is_listed_and_resolves() -> None:
-    expected = {"load_policy", "load_checkpoint", "Network", "train", "evaluate_task"}
+    expected = {"load_policy", "load_network", "recipe_for", "load_checkpoint", "Network", "train", "evaluate_task"}
     assert expected <= set(policies.__all__) <= set(dir(policies))
     assert [name for name in policies.__all__ if not hasattr(policies, name)] == []
 

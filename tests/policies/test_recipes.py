@@ -13,6 +13,7 @@ from tests.policies.toy_tasks import PointTask
 from gelflow.cli.commands.training.task_training import TASKS
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
@@ -114,8 +115,26 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     printed = json.loads(capsys.readouterr().out)
     assert [row["name"] for row in printed["results"]] == ["policy", "oracle", "random"]
     assert all("steps" in row and "attempts" not in row for row in printed["results"])
+    batch, rng = recipe_for("cap", "paper").make_task(4), np.random.default_rng(0)
+    policy = load_network(made["checkpoint"], task=batch.description).batch_policy(4)
+    batch.reset(batch.all, rng)
+    policy.reset(batch.all)
+    assert policy.act(batch.observation).shape == (4, 9)
     assert main(["eval", "cap", *arguments, "--randomization", "fall"]) == 2
     assert "no randomization 'fall'" in capsys.readouterr().err
+
+
+def test_an_evaluation_has_the_randomization_of_the_training_or_the_given_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--steps", "8", "--envs", "2", "--preset", "fast", "--randomization", "full", "--out", str(tmp_path)]
+    assert main(["train", "grasp", *options]) == 0
+    arguments = ["--checkpoint", str(tmp_path / "policy.safetensors"), "--episodes", "8", "--envs", "8", "--json"]
+    for given, has_pad in (([], True), (["--randomization", "default"], False)):
+        capsys.readouterr()
+        assert main(["eval", "grasp", *arguments, *given]) == 0
+        quantities = {row["quantity"] for row in json.loads(capsys.readouterr().out)["failures"]}
+        assert "mass" in quantities and ("pad_kn" in quantities) == has_pad
 
 
 @pytest.mark.parametrize(

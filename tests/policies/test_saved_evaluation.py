@@ -59,3 +59,12 @@ def test_damaged_results_are_refused(tmp_path: Path, results: str) -> None:
 @needs_browser
 def test_page_shows_the_evaluation(folder: Path) -> None:
     check_page(SavedEvaluation(folder), texts=("some report", "oracle of 8 episodes"), film="success")
+
+
+def test_a_report_without_failures_has_no_film_of_an_earlier_one(tmp_path: Path) -> None:
+    for name in ("success.gif", "failure.gif", "failure.png", "of a user.gif"):
+        (tmp_path / name).touch()
+    arguments = ["--randomization", "nominal", "--preset", "fast", "--episodes", "2", "--envs", "2"]
+    assert main(["eval", "insertion", *arguments, "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.glob("*.gif")} == {"success.gif", "of a user.gif"}
+    assert (tmp_path / "success.gif").stat().st_size > 0

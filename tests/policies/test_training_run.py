@@ -1,5 +1,6 @@
 """Training runs: one folder, resumed after a kill at any moment, on analytic tasks."""
 
+import errno
 import json
 import sys
 from collections.abc import Callable
@@ -91,6 +92,61 @@ def test_a_missing_tensorboard_is_said_and_the_run_goes_on(tmp_path: Path, monke
     ) as seen:
         make_run(tmp_path, settings=RunSettings(steps=256, evaluate_episodes=4)).train()
     assert len(seen) == 1 and "\n" not in str(seen[0].message)
+
+
+def test_success_is_logged_once_every_environment_has_ended_an_episode(tmp_path: Path) -> None:
+    # An episode may last 24 steps, an update 16: the first episodes to end after a restart are all successes.
+    task = PointTask(16, steps=24)
+    learner = PPO(task, MLP(observation_shape=(4,), actions=2, hidden=(16,)), PPO_SETTINGS, seed=0, steps=2048)
+    rates = [learner.update()["success"] for _ in range(4)]
+    learner.restart_episodes()
+    rates += [learner.update()["success"] for _ in range(2)]
+    assert [np.isnan(rate) for rate in rates] == [True, False, False, False, True, False]
+    assert rates[1] < 1 and rates[5] < 1
+    TrainingRun(learner, task, tmp_path, SHORT, {}).train()
+    assert "nan" not in (tmp_path / "progress.csv").read_text()
+
+
+def test_tensorboard_logs_hold_every_finite_number(tmp_path: Path) -> None:
+    from tensorboardX.proto.event_pb2 import Event
+
+    make_run(tmp_path, settings=RunSettings(steps=256, evaluate_episodes=4)).train()
+    (path,) = (tmp_path / "tensorboard").iterdir()
+    data, events = path.read_bytes(), []
+    while data:  # length, its checksum, event, its checksum
+        size = int.from_bytes(data[:8], "little")
+        events.append(Event.FromString(data[12 : 12 + size]))
+        data = data[16 + size :]
+    logged = {value.tag: value.simple_value for event in events for value in event.summary.value}
+    (row,) = read_table(tmp_path / "progress.csv")
+    assert logged["training/reward"] == pytest.approx(float(row["reward"]), rel=1e-5)
+    assert logged["evaluation/evaluated_success"] == pytest.approx(float(row["evaluated_success"]), rel=1e-5)
+    assert events[-1].step == int(row["steps"]) and all(np.isfinite(value) for value in logged.values())
+
+
+def test_a_full_disk_ends_a_run_whose_logs_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tensorboardX.record_writer import RecordWriter
+
+    def full(self: RecordWriter, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    run = make_run(tmp_path, report=lambda progress: monkeypatch.setattr(RecordWriter, "write", full))
+    with pytest.raises(OSError, match="No space left"):
+        run.train()
+
+
+def test_a_full_disk_does_not_empty_the_table_of_a_resumed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Killed):
+        make_run(tmp_path, report=killed_after(1100)).train()
+    before = read_table(tmp_path / "progress.csv")
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched, pytest.raises(OSError, match="No space left"):
+        patched.setattr("os.fsync", full)
+        make_run(tmp_path).train()
+    assert read_table(tmp_path / "progress.csv") == before and len(before) >= 4
 
 
 def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.part import Part
-from gelflow.sim.scene.geometry.distance_grid import MAX_RESOLUTION, DistanceGrid, distance_grid
+from gelflow.sim.scene.geometry.distance_grid import DistanceGrid, distance_grid
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.tasks.parts.mesh_file import described_mesh
 from gelflow.sim.tasks.parts.mesh_picture import OUTLINE_PIXEL, Picture, picture, region_outline
@@ -30,17 +30,9 @@ def mesh_hole(part: Part) -> TriangleMesh:
 
 
 def mesh_hole_grid(part: Part, spacing: float) -> DistanceGrid:
-    """Signed distances of the mesh around the hole; the cells have at most `spacing` [m].
-
-    Raises UsageError when the mesh is too large for such cells.
-    """
+    """Signed distances of the mesh around the hole; the cells have at most `spacing` [m]."""
     mesh = mesh_hole(part)
     length = float(np.ptp(mesh.vertices, axis=0).max())
-    if length > MAX_RESOLUTION * spacing:
-        raise UsageError(
-            f"the mesh of the hole of part {part.name!r} must be at most {MAX_RESOLUTION * spacing:g} m long, got "
-            f"{length:g}; cut off what the part cannot reach"
-        )
     return distance_grid(mesh, f"{part.name} hole", resolution=max(64, int(np.ceil(length / spacing))))
 
 

@@ -3,18 +3,29 @@
 import hashlib
 from pathlib import Path
 
+import numpy as np
+
 from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.mesh import TriangleMesh, closed_mesh, read_mesh
+
+_LONGEST = 0.256  # [m]; the largest grid of distances, 512 cells of 0.5 mm
 
 
 def load_mesh(path: Path, scale: float) -> TriangleMesh:
     """A closed mesh in metres.
 
-    Raises UsageError when the file cannot be read, or the mesh is not watertight (the message has the number of open
-    edges).
+    Raises UsageError when the file cannot be read, or the mesh is too long or not watertight (the message has the
+    number of open edges).
     """
     raw = read_mesh(path)
-    return closed_mesh(TriangleMesh(raw.vertices * scale, raw.faces), path.name)
+    mesh = TriangleMesh(raw.vertices * scale, raw.faces)
+    if len(mesh.vertices) and (size := np.ptp(mesh.vertices, axis=0)).max() > _LONGEST:
+        x, y, z = size
+        raise UsageError(
+            f"mesh {path.name!r} is {x:.4g} x {y:.4g} x {z:.4g} m, but may be at most {_LONGEST:g} m long; scale is "
+            "metres per unit of the file, such as 0.001 for millimetres; of a hole, cut off what the part cannot reach"
+        )
+    return closed_mesh(mesh, path.name)
 
 
 def file_digest(path: Path) -> str:

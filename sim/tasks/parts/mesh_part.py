@@ -54,20 +54,37 @@ def grasped_sides(mesh: TriangleMesh, grasp_height: tuple[float, float]) -> tupl
 
 def found_symmetry(mesh: TriangleMesh, name: str) -> tuple[int, tuple[str, ...]]:
     """The rotations about z that leave a mesh unchanged (0: round, see `Part.symmetry`), and its mirror axes."""
-    points = np.concatenate([mesh.vertices, mesh_surface(mesh, count=400)[0]])
+    points = _samples(mesh)
 
     def unchanged(moved: Array) -> bool:
-        return bool(np.linalg.norm(moved - nearest_points(mesh, moved, name), axis=1).max() < _SAME_SHAPE)
-
-    def turned(parts: int) -> bool:
-        angle = 2 * np.pi / parts
-        cos, sin = np.cos(angle), np.sin(angle)
-        return unchanged(points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
+        return _largest_distance(mesh, moved, name) < _SAME_SHAPE
 
     mirror = tuple(axis for axis, signs in (("x", (-1, 1, 1)), ("y", (1, -1, 1))) if unchanged(points * signs))
-    if all(turned(parts) for parts in _ROUND):
+    if all(unchanged(_turned(points, parts)) for parts in _ROUND):
         return 0, mirror
-    return max((n for n in range(2, _LARGEST_SYMMETRY + 1) if turned(n)), default=1), mirror
+    numbers = range(2, _LARGEST_SYMMETRY + 1)
+    return max((parts for parts in numbers if unchanged(_turned(points, parts))), default=1), mirror
+
+
+def rotation_error(mesh: TriangleMesh, name: str, rotations: int) -> float:
+    """Largest distance [m] of a mesh from itself after the rotations of `Part.symmetry`."""
+    points = _samples(mesh)
+    turns = (rotations,) if rotations else _ROUND
+    return max(_largest_distance(mesh, _turned(points, parts), name) for parts in turns)
+
+
+def _samples(mesh: TriangleMesh) -> Array:
+    return np.concatenate([mesh.vertices, mesh_surface(mesh, count=400)[0]])
+
+
+def _turned(points: Array, parts: int) -> Array:
+    """Points after 1/parts of a turn about z."""
+    cos, sin = np.cos(2 * np.pi / parts), np.sin(2 * np.pi / parts)
+    return np.asarray(points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))
+
+
+def _largest_distance(mesh: TriangleMesh, points: Array, name: str) -> float:
+    return float(np.linalg.norm(points - nearest_points(mesh, points, name), axis=1).max())
 
 
 class MeshPart(PartGeometry):

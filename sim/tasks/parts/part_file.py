@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m³]
+_HEAVIEST = 8.0  # [kg]; two pads hold 80 N at the largest grasp force (16 N) and friction (2.5) of the randomization
 _TABLES = ("format", "name", "part", "hole", "grasp", "descent", "misalignment", "symmetry")
 _PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}
 _WEIGHTS = ("density", "mass")
@@ -67,9 +68,12 @@ def _read_part(top: TomlTable, path: Path) -> Part:
     table.check_keys(("shape", *_PART_KEYS[shape], *_WEIGHTS))
     hole = _hole_fields(top.table("hole"), path, shape)
     part = _read_mesh_part(top, path, hole) if shape == "mesh" else _read_solid(top, path, shape, hole)
+    _check_weight(part, table)
     if part.hole_mesh:
         part = _fitted(part)
     given = top.table("symmetry")
+    if "rotations" in given.data:
+        _check_rotations(part, given)
     return replace(part, mirror=_mirror(given)) if "mirror" in given.data else part
 
 
@@ -173,7 +177,33 @@ def _density(table: TomlTable, volume: float) -> float:
         return table.number("density", _DEFAULT_DENSITY)
     if "density" in table.data:
         raise UsageError(f"{table.location}: give either mass or density")
-    return table.number("mass") / volume if volume > 0 else 0.0
+    mass = table.number("mass", minimum=0)
+    return mass / volume if volume > 0 else _DEFAULT_DENSITY
+
+
+def _check_weight(part: Part, table: TomlTable) -> None:
+    """Raises UsageError for a part that is heavier than the pads can hold."""
+    from gelflow.sim.tasks.parts.registry import part_geometry
+
+    if (mass := part_geometry(part).mass) > _HEAVIEST:
+        raise UsageError(
+            f"{table.location}: the part weighs {mass:.3g} kg; the gripper holds at most {_HEAVIEST:g} kg (mass is in "
+            "kg, density in kg/m³)"
+        )
+
+
+def _check_rotations(part: Part, table: TomlTable) -> None:
+    """Raises UsageError for rotations after which the mesh of a part does not fit into its hole."""
+    from gelflow.sim.tasks.parts import mesh_part
+
+    mesh, _ = mesh_part.centred(mesh_part.MeshPart(part).mesh)
+    error, gap = mesh_part.rotation_error(mesh, part.name, part.symmetry), max(part.clearance) / 2
+    if error > gap:
+        kind = "round (rotations = 0)" if part.is_round else f"equal after 1/{part.symmetry} of a turn"
+        raise UsageError(
+            f"{table.location}: the mesh is not {kind}: it differs by {1e3 * error:.2g} mm, the gap beside the part is "
+            f"{1e3 * gap:.2g} mm; rotations = 1 is a part without such a symmetry"
+        )
 
 
 def _pair(table: TomlTable, key: str, default: tuple[float, float]) -> tuple[float, float]:

@@ -6,6 +6,7 @@ requested one is imported, so that `gelflow --help` loads neither torch nor Open
 
 import argparse
 import contextlib
+import errno
 import importlib
 import os
 import sys
@@ -44,6 +45,8 @@ COMMANDS = {
     "demo": "insert five parts with the mock robot, with pictures and a recorded session",
 }
 
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+
 # Commands whose modules are in a folder of gelflow.cli.commands.
 _FOLDERS = {
     **dict.fromkeys(("train", "sweep", "eval", "reproduce", "export"), "training"),
@@ -65,7 +68,16 @@ def _one_line(message: Warning | str, *_: object, **__: object) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    requested = next((a for a in arguments if not a.startswith("-")), None)
+    requested = next((a for a in arguments if not a.startswith("-")), "")
+    try:
+        return _run(arguments, requested)
+    except KeyboardInterrupt:  # also during the imports of a command
+        print(f"gelflow {requested}".rstrip() + ": interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run(arguments: Sequence[str], requested: str) -> int:
+    """Run the sub-command `requested` and print any gelflow error as one line."""
     parser = argparse.ArgumentParser(prog="gelflow", description="Sim-to-real for tactile manipulation.")
     parser.add_argument("--version", action="version", version=f"gelflow {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -90,10 +102,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         print(f"gelflow {args.command}: {text}", file=sys.stderr)
         return ERROR
+    except OSError as error:
+        if error.errno not in _DISK_FULL:
+            raise
+        name = "" if error.filename is None else f" {error.filename}"
+        print(f"gelflow {args.command}: cannot write{name}: {error.strerror}", file=sys.stderr)
+        return ERROR
     except Interrupted as interrupt:
         with contextlib.suppress(OSError):  # after SIGHUP the terminal is gone
             print(f"gelflow {args.command}: ended by {interrupt}", file=sys.stderr)
         return SIGNALLED + interrupt.number
-    except KeyboardInterrupt:
-        print(f"gelflow {args.command}: interrupted", file=sys.stderr)
-        return INTERRUPTED

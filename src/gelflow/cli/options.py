@@ -90,14 +90,16 @@ def add_part(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_randomization(parser: argparse.ArgumentParser) -> None:
-    """`--randomization`: the distribution of the physical parameters."""
+def add_randomization(
+    parser: argparse.ArgumentParser, *, default: str | None = DEFAULT_RANDOMIZATION, text: str = DEFAULT_RANDOMIZATION
+) -> None:
+    """`--randomization`: the distribution of the physical parameters. `text` describes the default."""
     parser.add_argument(
         "--randomization",
-        default=DEFAULT_RANDOMIZATION,
+        default=default,
         metavar="NAME",
         help="physical parameters: default, full, which adds deviations of real pads, or another table of the task, "
-        "such as nominal of the insertion (default %(default)s)",
+        f"such as nominal of the insertion (default {text})",
     )
 
 
@@ -118,7 +120,7 @@ def checkpoint_for(task: InsertionTask, given: Path | None) -> Path:
     from gelflow.policies.checkpoint import default_checkpoint
 
     default = default_checkpoint()
-    path = given or (default if task.part == CUBOID else default.with_name(f"{task.part.name}.safetensors"))
+    path = given or (default if task.part == CUBOID else default.parent / f"{task.part.name}.safetensors")
     if given is None and not path.exists():
         raise UsageError(
             f"no policy for part {task.part.name!r} comes with gelflow; train one with gelflow train insertion --part, "

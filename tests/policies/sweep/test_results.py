@@ -1,12 +1,15 @@
 """Rows, summary and learning curves of a sweep."""
 
 import csv
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from gelflow.cli.commands.training.sweep.table import summary_table
 from gelflow.errors import UsageError
 from gelflow.policies.sweep import curves, results
 from gelflow.policies.sweep.run import Run, RunRecord
@@ -93,3 +96,13 @@ def test_runs_without_learning_curves_have_none(tmp_path: Path) -> None:
     runs, records = sweep_of(tmp_path, {("fast", 0): [(0, 1.0, "")]})
     Path(str(records["fast,0"].result["learning_curve"])).unlink()
     assert curves.read_curves(runs, records) is None
+
+
+def test_a_narrow_table_shows_success_before_other_results() -> None:
+    numbers = {"steps": 4096.0, "minutes": 0.2426, "validation.success": 0.75, "validation.reward": -3.0}
+    ranges = {name: results.Range.of([value]) for name, value in numbers.items()}
+    found = results.Configuration({"envs": 32}, 1, 1, ranges)
+    console = Console(width=32, record=True, file=io.StringIO())
+    console.print(summary_table([found], console))
+    text = console.export_text()
+    assert "success" in text and "0.75" in text and "minutes" not in text

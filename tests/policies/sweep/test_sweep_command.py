@@ -37,10 +37,10 @@ def test_a_sweep_of_real_trainings_collects_and_resumes(tmp_path: Path, capsys: 
 
 def test_a_failed_run_gives_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid = tmp_path / "wrong.toml"
-    grid.write_text('task = "insertion"\n[options]\nattempts = 0\n')
+    grid.write_text('task = "insertion"\n[options]\npreset = "fas"\n')
     assert main(["sweep", str(grid), "--out", str(tmp_path / "sweep")]) == 1
     text = capsys.readouterr().out
-    assert "failed: seed=0: exit code 2: gelflow train: " in text and "above 0" in text
+    assert "failed: seed=0: exit code 2: gelflow train: " in text and "no preset 'fas'" in text
 
 
 @pytest.mark.parametrize(
@@ -50,6 +50,8 @@ def test_a_failed_run_gives_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFi
         ("[options]\nout = 'x'", "every run has a folder of its own"),
         ("[options]\nattempts = 'many'", "argument --steps/--attempts: invalid int value: 'many'"),
         ("[grid]\npresets = ['fast']", "grid: unknown key 'presets'; did you mean 'preset'?"),
+        ("[options]\nattempts = 0", "--attempts must be above 0, got 0"),
+        ("[options]\nrecipe = 'paper'", "--recipe is for other tasks than the insertion"),
     ],
 )
 def test_a_wrong_grid_file_is_an_error_in_one_line(

@@ -1,5 +1,7 @@
 """Every registered environment: Gymnasium's checker, and results that are determined by the seed bit for bit."""
 
+import copy
+import pickle
 import warnings
 from typing import Any
 
@@ -10,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 
 from gelflow.errors import UsageError
 from gelflow.gymnasium_registration import ENVIRONMENTS
-from gelflow.sim.tasks.registry import make_task, task_names
+from gelflow.sim.tasks.registry import make_task, randomizations, task_names
 
 ids = pytest.mark.parametrize("name", ENVIRONMENTS)
 
@@ -29,6 +31,56 @@ def test_a_randomization_is_chosen_by_its_name(name: str) -> None:
     gymnasium.make(name, randomization="default", threads=1)
     with pytest.raises(UsageError, match="randomization"):
         gymnasium.make(name, randomization="broad", threads=1)
+
+
+@ids
+def test_wrong_options_are_errors(name: str) -> None:
+    with pytest.raises((UsageError, TypeError), match="prest"):
+        gymnasium.make(name, prest="fast")
+    for option in ({"randomization": {"mass": 0.1}}, {"task": "grasp"}):
+        with pytest.raises(UsageError, match=f"{next(iter(option))} must be"):
+            gymnasium.make(name, **option)
+
+
+@ids
+def test_a_changed_table_is_kept_in_the_specification_of_the_environment(name: str) -> None:
+    task = ENVIRONMENTS[name][2].get("batch", "insertion")
+    table = randomizations(task)["default"].replace(noise=1e-4)
+    env = gymnasium.make(name, randomization=table, threads=1)
+    assert env.spec is not None and env.spec.kwargs["randomization"]["noise"] == table["noise"]
+    sampled = table.drawn_from({"noise": [1e-5, 1e-4]})
+    assert pickle.loads(pickle.dumps(sampled)).samples["noise"].tolist() == [1e-5, 1e-4]
+
+
+@ids
+def test_a_copy_continues_as_the_environment_does(name: str) -> None:
+    env = gymnasium.make(name, randomization="full", threads=1, preset="fast")
+    env.reset(seed=4)
+    env.action_space.seed(0)
+    env.step(env.action_space.sample())
+    others = [copy.deepcopy(env.unwrapped), pickle.loads(pickle.dumps(env.unwrapped))]
+    for _ in range(3):
+        action = env.action_space.sample()
+        observation, reward, *_ = env.unwrapped.step(action)
+        for other in others:
+            observed = other.step(action)
+            np.testing.assert_array_equal(observed[0], observation)
+            assert observed[1] == reward
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("gelflow/Grasp-v0", {"mass": "heavy"}, "mass must be numeric"),
+        ("gelflow/Pushing-v0", {"mass": 0.0}, "half_size and mass must be above 0"),
+        ("gelflow/Pushing-v0", {"half_size": (0.025, -0.025)}, "half_size and mass must be above 0"),
+        ("gelflow/CapRotation-v0", {"radius": -0.05}, "radius must be above 0"),
+        ("gelflow/Insertion-v0", {"misalignment": (2.0, 1.0, 5.0)}, "misalignment must be within the workspace"),
+    ],
+)
+def test_an_impossible_start_is_an_error(name: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        gymnasium.make(name, threads=1).reset(seed=0, options=options)
 
 
 @ids

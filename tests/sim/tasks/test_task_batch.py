@@ -115,7 +115,7 @@ def test_episodes_that_end_at_once_are_drawn_again_unless_kept() -> None:
     np.testing.assert_array_equal(batch.terminated, batch.info["success"])
     batch.reset(batch.all, rng, options={"x": 0.1})
     assert batch.terminated.all()
-    with pytest.raises(SimulationError, match="line: no valid start in 100 rounds"):
+    with pytest.raises(SimulationError, match=r"line: no valid start in 100 rounds: .* 2 succeeded and 0 failed"):
         Line(2, tolerance=2.0).reset(np.ones(2, dtype=bool), rng)
 
 
@@ -135,8 +135,12 @@ def test_bad_input_is_named() -> None:
     batch, rng = Line(3), np.random.default_rng(0)
     with pytest.raises(UsageError, match=r"actions must have shape \(3, 1\), got \(3,\)"):
         batch.step(np.zeros(3), rng)
+    with pytest.raises(UsageError, match="actions must be numeric"):
+        TaskEnv(Line(1)).step("left")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="actions must be finite, got nan"):
         batch.step(np.full((3, 1), np.nan), rng)
+    with pytest.raises(UsageError, match="line: reset the environments before their first step"):
+        batch.step(np.zeros((3, 1)), rng)
     with pytest.raises(UsageError, match=r"must be \(3,\) bool, got \(2,\) bool"):
         batch.reset(np.ones(2, dtype=bool), rng)
     with pytest.raises(UsageError, match="line: reset has no option 'y'; there are 'x': start"):

@@ -92,6 +92,13 @@ def test_a_file_may_give_the_symmetry(tmp_path: Path) -> None:
     assert (part.symmetry, part.mirror) == (1, ())
 
 
+def test_a_symmetry_that_the_mesh_does_not_have_is_refused(tmp_path: Path) -> None:
+    for rotations, message in ((0, "not round"), (5, "not equal after 1/5 of a turn")):
+        with pytest.raises(UsageError, match=rf"symmetry: the mesh is {message}.*gap beside the part is 1 mm"):
+            load_part(written(tmp_path, prism(BOX, 60.0), f"{PART}[symmetry]\nrotations = {rotations}\n"))
+    assert load_part(written(tmp_path, prism(BOX, 60.0), f"{PART}[symmetry]\nrotations = 1\n")).part.symmetry == 1
+
+
 def test_pads_meet_the_outermost_sides_at_their_height(tmp_path: Path) -> None:
     """A wedge that widens to the top: only the sides where the pads are count."""
     mesh = prism(BOX * 1e-3, 60e-3)
@@ -137,6 +144,14 @@ def test_an_open_mesh_is_refused_with_the_number_of_open_edges(tmp_path: Path) -
     with pytest.raises(UsageError, match="not watertight: 3 of its") as error:
         load_part(path)
     assert str(path) in str(error.value)
+
+
+def test_a_mesh_in_millimetres_without_its_scale_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, prism(BOX, 60.0))
+    for scale in ("", "scale = 0.1"):
+        path.write_text(PART.replace("scale = 0.001", scale))
+        with pytest.raises(UsageError, match=r"part.obj' is [\d.]+ x [\d.]+ x [\d.]+ m, .* 0\.001 for millimetres"):
+            load_part(path)
 
 
 def test_a_missing_mesh_and_a_changed_one_are_refused(tmp_path: Path) -> None:

@@ -4,12 +4,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
 from gelflow.cli.commands.training.task_training import TASKS, refuse, task_options
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import (
+    DEFAULT_RANDOMIZATION,
     add_checkpoint,
     add_json,
     add_out,
@@ -34,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=list(TASKS), help="task of the policy")
     add_part(parser)
-    add_randomization(parser)
+    add_randomization(parser, default=None, text="of the training; of the insertion: default")
     add_checkpoint(parser, default="the included insertion policy")
     parser.add_argument("--episodes", type=int, default=200, metavar="N", help="episodes (default %(default)s)")
     parser.add_argument("--envs", type=int, default=64, metavar="N", help="parallel environments (default %(default)s)")
@@ -70,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
             {"task": args.task, "checkpoint": path, "results": rows, "failures": failures, "files": report.files}
         )
         return SUCCESS
-    output.console.print(_table(report.results, args.task, path, args.episodes))
+    output.console.print(result_table(report.results, args.task, path, args.episodes))
     for line in report.worst_ranges():
         output.text(line)
     for file in report.files:
@@ -87,7 +89,7 @@ def _insertion(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
     network = load_policy(path, task=task).network
     from gelflow.sim.tasks.registry import make_task
 
-    options = {"preset": args.preset, "randomization": args.randomization}
+    options = {"preset": args.preset, "randomization": args.randomization or DEFAULT_RANDOMIZATION}
     return path, network, make_task("insertion", min(args.envs, args.episodes), task=task, **options)
 
 
@@ -100,19 +102,31 @@ def _recipe_task(args: argparse.Namespace) -> "tuple[Path, Network, TaskBatch]":
 
     training = load_checkpoint(args.checkpoint).training
     options = {**training.get("options", {}), **task_options(args)}
+    if args.randomization is not None:  # "default" too
+        options["randomization"] = args.randomization
     recipe = recipes.recipe_for(args.task, training.get("recipe", recipes.DEFAULT))
     batch = recipe.make_task(min(args.envs, args.episodes), **options)
     return args.checkpoint, load_network(args.checkpoint, task=batch.description), batch
 
 
-def _table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
+def result_table(results: "list[EvaluationResult]", task: str, path: Path, episodes: int) -> Table:
+    """The results as a table, one row each; `episodes` is their number, `path` the checkpoint."""
     unit = results[0].length_unit
-    table = Table(title=f"{task} in simulation: {episodes} episodes, {path.name}")
-    for heading in ("actions", "success", "95 % interval", unit, "return", *results[0].metrics):
-        table.add_column(escape(heading), justify="left" if heading == "actions" else "right")
-    for result in results:
-        low, high = result.confidence_interval()
-        length = f"{result.length:.2f}" if result.successes else "none"
-        row = (f"{result.success:.1%}", f"{low:.1%} to {high:.1%}", length, f"{result.reward:.1f}")
-        table.add_row(result.name, *row, *(f"{value:.2f}" for value in result.metrics.values()))
+    title = f"{task} in simulation: {episodes} episodes, {path.name}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    headings = ("actions", "success", "95 % interval", unit, "return", *results[0].metrics)
+    rows = [_cells(result) for result in results]
+    for column, heading in enumerate(headings):
+        word = max(len(text) for row in rows for text in row[column].split())  # numbers are never cut off
+        table.add_column(escape(heading), justify="left" if column == 0 else "right", min_width=word)
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _cells(result: "EvaluationResult") -> list[str]:
+    low, high = result.confidence_interval()
+    length = f"{result.length:.2f}" if result.successes else "none"
+    metrics = [f"{value:.2f}" for value in result.metrics.values()]
+    interval = f"{low:.1%} to {high:.1%}"
+    return [result.name, f"{result.success:.1%}", interval, length, f"{result.reward:.1f}", *metrics]

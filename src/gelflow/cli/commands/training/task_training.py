@@ -1,6 +1,7 @@
 """`gelflow train` for the tasks that recipes train; the insertion has options and an output of its own."""
 
 import argparse
+import math
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import TaskProgressColumn, TimeElapsedColumn
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import DEFAULT_RANDOMIZATION, check_at_least
+from gelflow.cli.options import DEFAULT_RANDOMIZATION
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 
@@ -32,14 +33,13 @@ def refuse(args: argparse.Namespace, **unset: object) -> None:
 def task_options(args: argparse.Namespace) -> dict[str, Any]:
     """Options of the environments that `--preset` and `--randomization` set; empty where they have their defaults."""
     options = {} if args.preset is None else {"preset": args.preset}
-    if args.randomization != DEFAULT_RANDOMIZATION:
+    if args.randomization not in (None, DEFAULT_RANDOMIZATION):
         options["randomization"] = args.randomization
     return options
 
 
 def train_task(args: argparse.Namespace) -> int:
     """Train a policy with a progress bar, then print the result."""
-    check_at_least(args, envs=1, seed=0)
     from gelflow.policies import recipes  # deferred: torch is slow to import
 
     recipe = recipes.recipe_for(args.task, args.recipe)
@@ -51,11 +51,13 @@ def train_task(args: argparse.Namespace) -> int:
         bar = progress.add_task("training", total=steps)
 
         def report(point: "Progress") -> None:
-            numbers = "  ".join(f"{name} {value:.3g}" for name, value in list(point.numbers.items())[:2])
+            first = [(name, value) for name, value in list(point.numbers.items())[:2] if math.isfinite(value)]
+            numbers = "  ".join(f"{name} {value:.3g}" for name, value in first)
             progress.update(bar, completed=point.steps, description=numbers)
             if point.evaluation is not None:
                 progress.console.print(
-                    f"after {point.steps:>9,} steps, {point.minutes:5.1f} min: {_line(point.evaluation)}"
+                    f"after {point.steps:>9,} steps, {point.minutes:5.1f} min: {_line(point.evaluation)}",
+                    soft_wrap=True,
                 )
 
         result = recipes.train(
@@ -91,7 +93,8 @@ def train_task(args: argparse.Namespace) -> int:
 
 def _line(result: "EvaluationResult") -> str:
     low, high = result.confidence_interval()
-    return f"success {result.success:.1%} ({low:.1%} to {high:.1%}), {result.length:.2f} {result.length_unit}"
+    length = f", {result.length:.2f} {result.length_unit}" if result.successes else ""
+    return f"success {result.success:.1%} ({low:.1%} to {high:.1%}){length}"
 
 
 def _command(args: argparse.Namespace, steps: int, folder: Path) -> list[str]:

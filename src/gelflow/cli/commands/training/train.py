@@ -1,6 +1,7 @@
 """`gelflow train TASK`: train a policy in simulation; the insertion by imitation of the true pose or with PPO."""
 
 import argparse
+import math
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 
 if TYPE_CHECKING:
+    from gelflow.policies.evaluation import EvaluationResult
     from gelflow.policies.training.run import Progress as RunProgress
     from gelflow.policies.training.run import TrainingResult
 
@@ -73,19 +75,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
+    check(args)
     if args.task != "insertion":
-        refuse(args, part=None, algorithm=_DEFAULT, calibration=None, start=None)
         args.recipe = args.recipe or DEFAULT_RECIPE
         return train_task(args)
-    if args.recipe is not None:
-        raise UsageError("--recipe is for other tasks than the insertion, which has --algorithm")
     args.out = args.out or Path("runs/insertion")
-    check_at_least(args, envs=1, seed=0)
     output = Output(args.json)
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         made = _train(args, progress)
     best = made.best
-    output.text(f"best on validation: {best.success:.1%} inserted in {best.length:.2f} corrections")
+    output.text(f"best on validation: {_inserted(best)}")
     seconds = {name: made.seconds[name] for name in ("simulation", "learning")}
     total = sum(seconds.values())
     share = seconds["simulation"] / total
@@ -105,6 +104,28 @@ def run(args: argparse.Namespace) -> int:
     return SUCCESS
 
 
+def check(args: argparse.Namespace) -> None:
+    """Raises UsageError for options that the task does not have, numbers out of range, and an unknown recipe."""
+    insertion = args.task == "insertion"
+    if insertion and args.recipe is not None:
+        raise UsageError("--recipe is for other tasks than the insertion, which has --algorithm")
+    if not insertion:
+        refuse(args, part=None, algorithm=_DEFAULT, calibration=None, start=None)
+    check_at_least(args, envs=1, seed=0)
+    for name, value in (("attempts" if insertion else "steps", args.attempts), ("minutes", args.minutes)):
+        if value is not None and not value > 0:
+            raise UsageError(f"--{name} must be above 0, got {value}")
+    if args.task in UNTRAINED or args.recipe is not None:
+        from gelflow.policies.recipes import recipe_for  # deferred: torch is slow to import
+
+        recipe_for(args.task, args.recipe or DEFAULT_RECIPE)
+
+
+def _inserted(result: "EvaluationResult") -> str:
+    corrections = f" in {result.length:.2f} corrections" if result.successes else ""
+    return f"{result.success:.1%} inserted{corrections}"
+
+
 def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     from gelflow.policies import recipes  # deferred: torch is slow to import
     from gelflow.policies.checkpoint import default_checkpoint
@@ -122,12 +143,12 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     bar = progress.add_task("training", total=attempts)
 
     def report(point: "RunProgress") -> None:
-        text = f"reward {point.numbers['reward']:6.2f}  inserted {point.numbers['success']:4.0%}"
+        reward, success = point.numbers["reward"], point.numbers["success"]
+        text = f"reward {reward:6.2f}" + (f"  inserted {success:4.0%}" if math.isfinite(success) else "")
         progress.update(bar, completed=point.steps, description=text)
         if evaluation := point.evaluation:
             progress.console.print(
-                f"after {point.steps:>9,} attempts, {point.minutes:5.1f} min:"
-                f" inserted {evaluation.success:6.1%} in {evaluation.length:.2f} corrections"
+                f"after {point.steps:>9,} attempts, {point.minutes:5.1f} min: {_inserted(evaluation)}", soft_wrap=True
             )
 
     return recipes.train(

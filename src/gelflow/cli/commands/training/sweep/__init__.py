@@ -86,7 +86,7 @@ def train_options() -> "CommandOptions":
     }
 
     def check(arguments: Sequence[str]) -> None:
-        parser.parse_args(arguments)
+        train.check(parser.parse_args(arguments))
 
     return CommandOptions(
         names=[name for name in actions if name not in _RESERVED],

@@ -12,9 +12,13 @@ if TYPE_CHECKING:
     from gelflow.policies.sweep.results import Configuration, Range
 
 
+_FIRST = ("success", "reward")  # of the results, where not all fit
+
+
 def summary_table(found: Sequence["Configuration"], console: Console) -> Table:
     """Options, complete runs and results of the configurations, with as many results as fit the console."""
     names = list(dict.fromkeys(name for configuration in found for name in configuration.results))
+    names.sort(key=lambda name: name.split(".")[-1] not in _FIRST)
     view = _table(found, [])
     for count in range(len(names), 0, -1):
         wider = _table(found, names[:count])
