@@ -92,6 +92,8 @@ def _fit(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, DotModel]
 def _with_masks(image: NDArray[np.uint8], grid: MarkerGrid, windows: DotWindows, model: DotModel) -> DotModel:
     """The model with the masks of damaged dots, except those whose intact part does not determine the centre."""
     damaged = find_damaged(windows, model.rest, model.shape, model.profile)
+    if not damaged.markers.size:
+        return model
     rest, shape, mask_of = model.rest.copy(), model.shape.copy(), model.mask_of.copy()
     rest[damaged.markers], shape[damaged.markers] = damaged.rest, damaged.shape
     mask_of[damaged.markers] = np.arange(len(damaged.markers))
