@@ -3,6 +3,7 @@
 All dots have one profile over the distance from the centre relative to the outline. The outline of a dot begins as an
 ellipse: the local grid steps, which contain tilt, keystone and lens distortion, times one common matrix for the print.
 Its own size, ellipse and raggedness follow by least squares. Centres, outlines and profile are estimated alternately.
+At last, damaged dots get an outline and a mask from their intact part.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from gelflow.perception.grid_detection.grid import MarkerGrid
 _ROUNDS = 2  # of the alternating estimation
 _MIN_MATCHING = 0.6  # fraction of the dots that must match the common profile
 _TOLERATED = (0.16, 0.7)  # smallest and largest tolerated residual / contrast
-_USUAL = 0.03  # standard deviation of the residuals of a sound dot / contrast: JPEG, quantization
+_USUAL = 0.03  # standard deviation of the residuals of an intact dot / contrast: JPEG, quantization
 _UNEXPLAINED = 6.0  # tolerated residual / standard deviation of what the model does not explain at rest
 
 
@@ -111,7 +112,7 @@ def _with_masks(image: NDArray[np.uint8], grid: MarkerGrid, windows: DotWindows,
 def _tolerated(windows: DotWindows, model: DotModel) -> Floats:
     """Tolerated residuals as in `DotModel`: more for a dot that the model does not explain at rest.
 
-    Damaged dots, whose shape is the common one, get the smallest value: their other parts must be without weight.
+    Dots with a mask, or without an outline of their own, get the smallest value: damaged pixels must be without weight.
     """
     shape = model.shape[windows.markers]
     radius = DotPixels.at(*windows.offsets(model.rest, windows.markers), shape).radius
@@ -120,9 +121,9 @@ def _tolerated(windows: DotWindows, model: DotModel) -> Floats:
     inside = radius < 1.5
     variance = (residual**2 * inside).sum(1) / inside.sum(1) - (model.noise / model.contrast[windows.markers]) ** 2
     variance -= _USUAL**2
-    sound = (shape != windows.common[windows.markers]).any(axis=1) & (model.mask_of[windows.markers] < 0)
+    intact = (shape != windows.common[windows.markers]).any(axis=1) & (model.mask_of[windows.markers] < 0)
     result = np.full(len(model.rest), _TOLERATED[0])
-    unexplained = np.sqrt(np.maximum(variance, 0.0)) * sound
+    unexplained = np.sqrt(np.maximum(variance, 0.0)) * intact
     result[windows.markers] = np.clip(_TOLERATED[0] + _UNEXPLAINED * unexplained, *_TOLERATED)
     return result
 

@@ -16,9 +16,9 @@ PROFILE_REACH = 2.2  # the profile ends at this many radii
 _SHAPE_STEPS = 2  # of the fit of the shapes
 _WAVE_LIMIT = 0.25  # smallest |z|² of a wave, as in csrc/dot_fit.hpp
 _MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
-# The outline of a sound dot differs from that of the median dot by less than this [radii], or a multiple of the median
+# The outline of an intact dot differs from that of the median dot by less than this [radii], or a multiple of the median
 # difference. Others are damaged, or joined to another one.
-_SOUND = 0.04
+_INTACT = 0.04
 _LARGEST_SIZE = 0.6  # difference from the size of the median dot [radii]
 _RINGS = 44  # bins of the radius in which the profile is averaged
 
@@ -81,9 +81,9 @@ class DotWindows:
             down -= moved[:, 1]
             refined = reshaped(refined, change)
         size, raggedness = deviations(refined, self.common[markers])
-        sound = (raggedness < max(_SOUND, 3.5 * float(np.median(raggedness)))) & (size < _LARGEST_SIZE)
+        intact = (raggedness < max(_INTACT, 3.5 * float(np.median(raggedness)))) & (size < _LARGEST_SIZE)
         result = shape.copy()
-        result[markers[sound]] = refined[sound]
+        result[markers[intact]] = refined[intact]
         return result
 
     def offsets(self, rest: Floats, markers: NDArray[np.intp]) -> tuple[Pixels, Pixels]:
@@ -105,9 +105,9 @@ class DotWindows:
         radius = DotPixels.at(*self.offsets(rest, self.markers[use]), shape[self.markers[use]]).radius
         ink, ratio = self.ink_at(radius, use)
         ring = np.minimum(radius / PROFILE_REACH * _RINGS, _RINGS).astype(np.intp)
-        sound = np.abs(ink - initial_profile(radius)) < 0.75  # excludes damaged parts of dots
-        count = np.bincount(ring[sound], minlength=_RINGS + 1)[:_RINGS]
-        total = np.bincount(ring[sound], ink[sound], minlength=_RINGS + 1)[:_RINGS]
+        intact = np.abs(ink - initial_profile(radius)) < 0.75  # excludes damaged parts of dots
+        count = np.bincount(ring[intact], minlength=_RINGS + 1)[:_RINGS]
+        total = np.bincount(ring[intact], ink[intact], minlength=_RINGS + 1)[:_RINGS]
         middle = (np.arange(_RINGS) + 0.5) / _RINGS * PROFILE_REACH
         mean = np.interp(middle, middle[count > 0], total[count > 0] / count[count > 0])
         mean = np.convolve(np.pad(mean, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid")
