@@ -16,8 +16,8 @@ PROFILE_REACH = 2.2  # the profile ends at this many radii
 _SHAPE_STEPS = 2  # of the fit of the shapes
 _WAVE_LIMIT = 0.25  # smallest |z|² of a wave, as in csrc/dot_fit.hpp
 _MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
-# The outline of an intact dot differs from that of the median dot by less than this [radii], or a multiple of the median
-# difference. Others are damaged, or joined to another one.
+# The outline of an intact dot differs from that of the median dot by less than this [radii], or a multiple of the
+# median difference. Others are damaged, or joined to another one.
 _INTACT = 0.04
 _LARGEST_SIZE = 0.6  # difference from the size of the median dot [radii]
 _RINGS = 44  # bins of the radius in which the profile is averaged
