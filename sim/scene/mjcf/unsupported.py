@@ -1,5 +1,6 @@
 """Elements of model files that the simulator does not support: an error if they affect the motion, else a notice."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -37,6 +38,7 @@ _TRANSMISSIONS = {
     mujoco.mjtTrn.mjTRN_BODY: "on a body (adhesion)",
 }
 
+_LOSSES = ("damping", "frictionloss")  # fields of joints and tendons that must not be negative
 _ROTATING_JOINTS = {int(mujoco.mjtJoint.mjJNT_FREE): "free", int(mujoco.mjtJoint.mjJNT_BALL): "ball"}
 
 
@@ -108,6 +110,9 @@ def _elements(model: Any) -> Iterator[Unsupported]:
             yield f"range of springlength of tendon {tendons[t]!r}", "give one length"
     for t in _nonzero(model, "tendon_", "stiffnesspoly", "dampingpoly"):
         yield f"polynomial stiffness or damping of tendon {tendons[t]!r}", "give one coefficient"
+    for t, field in itertools.product(range(model.ntendon), _LOSSES):
+        if getattr(model, f"tendon_{field}")[t] < 0:
+            yield f"negative {field} of tendon {tendons[t]!r}", "give 0 or more"
     for t in _nonzero(model, "tendon_", "actfrclimited"):
         if (count := actuated.count(t)) > 1:
             yield f"actuatorfrcrange of tendon {tendons[t]!r} with {count} actuators", "give each actuator a forcerange"
@@ -155,6 +160,9 @@ def _joints(model: Any) -> Iterator[Unsupported]:
             yield f"polynomial stiffness of joint {joint!r}", "give one coefficient"
         if model.jnt_dofadr[j] in polynomial_damping:
             yield f"polynomial damping of joint {joint!r}", "give one coefficient"
+        for field in _LOSSES:
+            if getattr(model, f"dof_{field}")[model.jnt_dofadr[j]] < 0:
+                yield f"negative {field} of joint {joint!r}", "give 0 or more"
         if model.jnt_actgravcomp[j] and model.jnt_actfrclimited[j]:
             yield f"actuatorgravcomp of joint {joint!r} with an actuatorfrcrange", "remove one of them"
         if model.jnt_actfrclimited[j] and j in by_tendon:

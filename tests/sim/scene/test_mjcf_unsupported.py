@@ -106,6 +106,8 @@ UNSUPPORTED = [
         "stiffness of free joint 'floating' is not supported: remove it",
     ),
     (swing('stiffness="1 2"'), "polynomial stiffness of joint 'swing' is not supported: give one coefficient"),
+    (swing('frictionloss="-1"'), "negative frictionloss of joint 'swing' is not supported: give 0 or more"),
+    (section(TENDON.format('damping="-1"')), "negative damping of tendon 'split' is not supported: give 0 or more"),
     (swing('damping="1 2"'), "polynomial damping of joint 'swing' is not supported: give one coefficient"),
     (
         actuator('<motor joint="socket"/>'),
