@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from gelflow.cli.commands import replay
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.observation import FlowMap, flow_map
@@ -22,11 +23,12 @@ from gelflow.policies import checkpoint
 from gelflow.policies.networks.flow_map_policy import NetworkPolicy
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 from gelflow.protocols import CameraImage, GripperState
+from gelflow.session import records
 from gelflow.session.decision_picture import draw_comparisons
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
-from gelflow.session.records import Decision, describe_session
+from gelflow.session.records import TRACKER_VERSION, Decision, describe_session
 from gelflow.task import INSERTION
 
 CLOCK = ScaledClock(1.0)
@@ -125,6 +127,15 @@ def test_the_command_detects_another_policy(
     assert reddish(picture) > 100  # the corrections of the other policy
     assert main(["replay", str(real_session), "--out", str(tmp_path / "same.png")]) == 0
     assert reddish(tmp_path / "same.png") == 0
+
+
+def test_a_session_of_a_former_tracker_is_named(
+    real_session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "TRACKER_VERSION", "99")
+    assert main(["replay", str(real_session)]) == 0
+    assert f"recorded with tracker {TRACKER_VERSION}, installed is 99" in capsys.readouterr().out
+    assert "recorded with tracker 1, installed is 99" in replay._notes({"versions": {}}, None)
 
 
 def test_a_session_finds_its_policy_among_those_shipped(

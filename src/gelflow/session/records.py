@@ -24,6 +24,7 @@ from gelflow.task import InsertionTask
 
 FORMAT = 1
 SENSORS = ("left", "right")  # topic names of sensor 0 and 1
+TRACKER_VERSION = "2"  # increases with each change of what the marker tracker measures
 VERSIONED_PACKAGES = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
 _NUMBERS = re.compile(r"\[(\n[-+.,\deE\s]+)\]")  # a list of numbers in indented JSON
 Record = TypeVar("Record")
@@ -179,8 +180,9 @@ def file_digest(path: str | Path) -> str:
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of the packages that affect the numbers of a replay, and the machine type."""
-    versions = {"gelflow": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    """Versions of tracker and packages that affect the numbers of a replay, and the machine type."""
+    versions = {"gelflow": __version__, "tracker": TRACKER_VERSION}
+    versions |= {"python": platform.python_version(), "machine": platform.machine()}
     for package in VERSIONED_PACKAGES:
         try:
             versions[package] = metadata.version(package)

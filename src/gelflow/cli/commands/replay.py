@@ -23,6 +23,8 @@ from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import SENSORS, file_digest, from_plain, software_versions
 
+_FORMER_VERSIONS = {"tracker": "1"}  # of sessions that do not state them
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
@@ -146,7 +148,7 @@ def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]
     if checkpoint and recorded and file_digest(checkpoint) != recorded["digest"]:
         notes.append(f"{checkpoint} is not the policy that the session ran")
     installed = software_versions()
-    for name, version in description.get("versions", {}).items():
+    for name, version in (_FORMER_VERSIONS | description.get("versions", {})).items():
         if installed.get(name) != version:
             notes.append(f"recorded with {name} {version}, installed is {installed.get(name, 'none')}")
     return notes
