@@ -102,8 +102,8 @@ class Calibration:
     def predicted(self) -> bool | None:
         """Whether the residual of the held-out attempts is at most `PREDICTED`; None: none held out.
 
-        A fit that ends in a wrong minimum may reproduce the recordings as well, because the poses of their insertions
-        make up for wrong forces. The pose of another insertion does not.
+        A fit that ends in a wrong minimum may reproduce the recordings as well, because the fitted poses of their
+        insertions compensate wrong forces. The pose of an insertion that was not fitted does not.
         """
         return _predicted(self.held_out_residual)
 
@@ -189,7 +189,7 @@ def _predicted(residual: float | None) -> bool | None:
 
 
 def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> tuple[Estimate, ...]:
-    """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is.
+    """Estimates of the parameters, and of the ratio of the gains, which may be known although neither gain is.
 
     None is confirmed unless the fit converged and reproduces the recordings. The parameters of the simulator are
     confirmed only if the held-out insertion is predicted too: gains, rotations and crosstalk are differences between
@@ -225,7 +225,10 @@ def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str,
 
 
 def _flow_maps(problem: Problem, after: tuple[Array, Array], rng: np.random.Generator) -> FlowMaps:
-    """Flow maps with the scene's values, whose poses and start heights are searched, and with a point and its poses."""
+    """Recorded flow maps, and simulated ones with the scene's values and with those of `after`: a point and its poses.
+
+    With the scene's values, the poses and start heights are searched.
+    """
     before = find_poses(problem, problem.scene_point(), rng)
     recorded = problem.recorded_flow()
     return FlowMaps(
