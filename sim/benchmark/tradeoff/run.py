@@ -223,9 +223,8 @@ def _flow(run: MotionResult, reference: MotionResult) -> Array:
     shear = np.linalg.norm(reference.field[..., :2] - reference.field[0, :, :2], axis=-1)
     floor = min(MIN_DIVISORS["N"], _FLOOR * float(shear.max()))
     one = (1, -1, 1, 2)  # sensors, rows, columns: how markers are arranged makes no difference to the vectors
-    image, _ = normalize(
-        run.field[reference.evaluation_frame, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), min_divisor=floor
-    )
+    evaluated, start = run.field[reference.evaluation_frame, :, :2], run.field[0, :, :2]
+    image, _ = normalize(evaluated.reshape(1, *one), start.reshape(one), min_divisor=floor)
     return np.asarray(image).reshape(2, -1).T
 
 
