@@ -19,11 +19,11 @@ Array = NDArray[np.float64]
 
 FORMAT = 2  # of report.json
 KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
-REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
-ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
+REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals are not valid
+ALLOWED_ERROR = 1.5  # largest error of held-out flow maps relative to the noise, up to which the model explains them
 PREDICTED = 1.5  # largest residual of the held-out attempts relative to noise and model error
 _HEIGHT_OFFSET = 1.5  # largest mean of the fitted start heights relative to their expected standard deviation
-_CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
+_CORRELATED = 0.8  # absolute correlation above which only the combination of two parameters is determined
 
 
 @dataclass(frozen=True)
